@@ -1,0 +1,1 @@
+"""The experiment: data, network, training loop, checkpoints, photographs and logs."""
