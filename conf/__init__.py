@@ -1,0 +1,1 @@
+"""Hydra's configuration: one choice per group. A package, so that it travels with an installation."""

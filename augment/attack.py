@@ -1,0 +1,140 @@
+"""Descent on the adversarial cost over any parameters that render differentiably, until the classifier is fooled."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from augment.cost import adversarial_cost
+from augment.phases import Phases
+from renderer.errors import InputError
+
+STEPS = ("unit", "raw", "sign")
+
+
+@dataclass
+class AttackSettings:
+    """The paper's appendix C: 0.05 along the gradient's direction, at most 30 steps.
+
+    step: what "along the direction" means: the gradient at unit L2 norm per example, as it is, or its sign.
+    batch_size: examples per pass through the classifier.
+    """
+
+    step: str = "unit"
+    step_size: float = 0.05
+    max_steps: int = 30
+    batch_size: int = 128
+
+    def __post_init__(self):
+        if self.step not in STEPS:
+            raise InputError(f"augment.attack.step={self.step}: choose one of {', '.join(STEPS)}")
+        if not self.step_size > 0 or self.max_steps < 0 or self.batch_size < 1:
+            raise InputError(
+                f"augment.attack: step_size={self.step_size}, max_steps={self.max_steps} and "
+                f"batch_size={self.batch_size} must be positive"
+            )
+
+
+@dataclass(frozen=True)
+class AttackResult:
+    """What an attack did, per example; all tensors have E rows and lie on the parameters' device.
+
+    parameters, images: where the descent ended. steps: int64, taken. fooled_before, fooled: bool.
+    loss_before, loss: cross entropy of the true class. zero_gradient: bool, the first gradient was exactly zero.
+    """
+
+    parameters: Tensor
+    images: Tensor
+    steps: Tensor
+    fooled_before: Tensor
+    fooled: Tensor
+    loss_before: Tensor
+    loss: Tensor
+    zero_gradient: Tensor
+
+
+@torch.enable_grad()
+def descend(
+    model: nn.Module,
+    render: Callable[[Tensor], Tensor],
+    start: Tensor,
+    labels: Tensor,
+    settings: AttackSettings,
+    phases: Phases,
+) -> AttackResult:
+    """Step each example's parameters down the cost until the classifier errs; fooled examples leave the batch.
+
+    model: (N, 3, H, W) in [0, 1] → logits; used in eval mode and left as it was found. render: parameters (E, ...) →
+    images (E, 3, H, W). start: (E, ...). labels: (E,) int64, the true classes. The forward pass that yields the
+    gradient also tells who is fooled; the renderer's share is a product with the transfer operators.
+    """
+    parameters = start.detach().clone()
+    steps = torch.zeros_like(labels)
+    loss, fooled = start.new_zeros(len(labels)), torch.zeros_like(labels, dtype=torch.bool)
+    active = torch.arange(len(labels), device=labels.device)
+    with as_found(model):
+        for step in range(settings.max_steps + 1):
+            images = render(parameters.requires_grad_(True))
+            with phases("attack_classifier"):
+                losses, errs, gradients = _classifier_pass(model, images.detach(), labels, active, settings.batch_size)
+            (gradient,) = torch.autograd.grad(images, parameters, gradients)
+            parameters = parameters.detach()
+            loss[active], fooled[active] = losses, errs
+            if step == 0:
+                fooled_before, loss_before = fooled.clone(), loss.clone()
+                zero_gradient = gradient.flatten(1).abs().amax(1) == 0
+            active = active[~errs]
+            if step == settings.max_steps or not len(active):
+                break
+            parameters[active] -= settings.step_size * _direction(gradient[active], settings.step)
+            steps[active] += 1
+    return AttackResult(parameters, images.detach(), steps, fooled_before, fooled, loss_before, loss, zero_gradient)
+
+
+def _classifier_pass(
+    model: nn.Module, images: Tensor, labels: Tensor, active: Tensor, batch_size: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Loss (A,), misclassified (A,) of the active examples, and the cost's gradient for all images (zero elsewhere)."""
+    gradients = torch.zeros_like(images)
+    losses, errs = [], []
+    for batch in active.split(batch_size):
+        pictures = images[batch].requires_grad_(True)
+        logits = model(pictures)
+        cost = adversarial_cost(logits, labels[batch])
+        (gradients[batch],) = torch.autograd.grad(cost.sum(), pictures)
+        losses.append(-cost.detach())
+        errs.append(logits.detach().argmax(1) != labels[batch])
+    return torch.cat(losses), torch.cat(errs), gradients
+
+
+def _direction(gradient: Tensor, step: str) -> Tensor:
+    """The gradient (A, ...) as a step: unit L2 norm per example (a zero gradient stays zero), raw, or its sign."""
+    if step == "raw":
+        return gradient
+    if step == "sign":
+        return gradient.sign()
+    # Scaling by the largest entry first keeps tiny gradients from underflowing when squared.
+    flat = gradient.flatten(1)
+    scaled = flat / flat.abs().amax(1, keepdim=True).clamp(min=torch.finfo(flat.dtype).tiny)
+    return (scaled / scaled.norm(dim=1, keepdim=True).clamp(min=1)).view_as(gradient)
+
+
+@contextmanager
+def as_found(model: nn.Module) -> Iterator[None]:
+    """Eval mode and no gradients for parameters inside; mode, requires_grad and random state restored after."""
+    modes = [(module, module.training) for module in model.modules()]
+    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    devices = {parameter.device for parameter in model.parameters() if parameter.is_cuda}
+    model.eval()
+    for parameter in trainable:
+        parameter.requires_grad_(False)
+    try:
+        with torch.random.fork_rng(devices=sorted(devices, key=str)):
+            yield
+    finally:
+        for parameter in trainable:
+            parameter.requires_grad_(True)
+        for module, mode in modes:
+            module.training = mode

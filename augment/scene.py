@@ -1,0 +1,140 @@
+"""The examples an augmentation renders: every mesh from every view over every background, as stacked operators."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from renderer.camera import ring
+from renderer.errors import InputError
+from renderer.harmonics import live_coefficients
+from renderer.image import clamped, develop
+from renderer.mesh import Mesh, load_mesh, normalise
+from renderer.shapes import solid
+from renderer.transfer import DEGREE, Operator, Settings, build_operators
+from renderer.visibility import Backend
+
+
+@dataclass
+class ObjectSettings:
+    """One mesh of a scene.
+
+    mesh: a file that trimesh reads, or `solid:NAME` or `solid:NAME:SEED`, a built-in procedural solid. label: the
+    name of its class. up: the axis that points up in the file, auto|y|z. gain: multiplies the albedo.
+    """
+
+    mesh: str
+    label: str
+    up: str = "auto"
+    gain: float = 1.0
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """The operators (one per view) of one mesh, and the name of its class."""
+
+    label: str
+    operators: Sequence[Operator]
+
+
+def count_views(examples: int, objects: int, backgrounds: int, views: int | None) -> int:
+    """Views per mesh, so that meshes × views × backgrounds are the examples; views=None derives them.
+
+    The paper's 100 examples are 2 meshes × 10 views × 5 backgrounds. InputError where no such product exists.
+    """
+    if not objects or not backgrounds:
+        raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
+    derived, rest = divmod(examples, objects * backgrounds)
+    if rest or derived < 1:
+        raise InputError(
+            f"augment.examples={examples} is not a multiple of {objects} meshes × {backgrounds} backgrounds: "
+            f"set it to a multiple of {objects * backgrounds}"
+        )
+    if views is not None and views != derived:
+        raise InputError(
+            f"augment.examples={examples} is not {objects} meshes × {views} views × {backgrounds} backgrounds = "
+            f"{objects * views * backgrounds}: change one of them, or set scene.views=null to derive the views"
+        )
+    return derived
+
+
+def build_objects(
+    objects: Sequence[ObjectSettings], views: int, field_of_view: float, settings: Settings, backend: Backend
+) -> list[SceneObject]:
+    """Load, normalise and rasterise every mesh from a ring of views."""
+    cameras = ring(views, field_of_view)
+    return [
+        SceneObject(item.label, build_operators(_normalised(item), cameras, settings, backend, item.gain))
+        for item in objects
+    ]
+
+
+def _normalised(item: ObjectSettings) -> Mesh:
+    kind, _, name = item.mesh.partition(":")
+    if kind != "solid":
+        return normalise(load_mesh(item.mesh, up=item.up))
+    name, _, seed = name.partition(":")
+    if seed and not seed.isdecimal():
+        raise InputError(f"scene.meshes: the seed in {item.mesh!r} must be a whole number, as in solid:orange:3")
+    return normalise(solid(name, int(seed or 0)))
+
+
+class Scene:
+    """E = views of all meshes × backgrounds examples, in that order, each lit by a light of its own.
+
+    Views share nothing but the index of pixels that any of them covers; the other pixels are neither stored nor
+    shaded. Backgrounds share their view's operator.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[SceneObject],
+        backgrounds: Sequence[float],
+        settings: Settings,
+        device: torch.device | str = "cpu",
+    ):
+        operators = [operator for item in objects for operator in item.operators]
+        self.settings = settings
+        self.labels = [item.label for item in objects for _ in item.operators for _ in backgrounds]
+        self.pixels = torch.cat([operator.pixels for operator in operators]).unique()
+        self.transfer, self.coverage = _stack(operators, self.pixels)
+        self.backgrounds = torch.tensor(backgrounds, dtype=torch.float32)
+        self._live = live_coefficients(DEGREE)
+        for name in ("pixels", "transfer", "coverage", "backgrounds", "_live"):
+            setattr(self, name, getattr(self, name).to(device))
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def render(self, lights: Tensor) -> Tensor:
+        """Pictures (E, 3, size, size) in [0, 1] of lights (E, 49, 3); differentiable in the lights."""
+        covered = develop(*self._layers(lights), encoding=self.settings.encoding)
+        size = self.settings.size
+        canvas = self.backgrounds.view(1, -1, 1, 1).expand(len(self.coverage), -1, 3, size**2)
+        pictures = canvas.reshape(len(self), 3, size**2).index_copy(2, self.pixels, covered.flatten(0, 1))
+        return pictures.view(len(self), 3, size, size)
+
+    def clamped_share(self, lights: Tensor) -> Tensor:
+        """Per example, the share of its covered pixels' values that the clamp changes. (E,)"""
+        over = clamped(*self._layers(lights), encoding=self.settings.encoding)
+        covered = (self.coverage > 0).expand_as(over)
+        return (((over & covered).sum((2, 3))) / covered.sum((2, 3)).clamp(min=1)).flatten()
+
+    def _layers(self, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Radiance (O, B, 3, P), coverage (O, 1, 1, P) and backgrounds (B, 1, 1) for O operators, B backgrounds."""
+        live = lights.index_select(1, self._live).view(len(self.coverage), -1, len(self._live), 3)
+        radiance = live.permute(0, 3, 1, 2) @ self.transfer
+        return radiance.transpose(1, 2), self.coverage, self.backgrounds.view(-1, 1, 1)
+
+
+def _stack(operators: Sequence[Operator], pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Operators over a common set of pixels: transfer (O, 3, K, P), coverage (O, 1, 1, P), zero where uncovered."""
+    live = len(live_coefficients(DEGREE))
+    transfer = torch.zeros(len(operators), 3, live, len(pixels))
+    coverage = torch.zeros(len(operators), 1, 1, len(pixels))
+    for row, operator in enumerate(operators):
+        columns = torch.searchsorted(pixels, operator.pixels)
+        transfer[row][:, :, columns] = operator.transfer.transpose(0, 1)
+        coverage[row, 0, 0, columns] = operator.coverage
+    return transfer, coverage

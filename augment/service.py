@@ -1,0 +1,167 @@
+"""The augmentation service: each epoch, a fresh batch of labelled renders made against the current weights."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from augment.attack import AttackResult, AttackSettings, as_found, descend
+from augment.phases import Phases
+from augment.scene import Scene
+from augment.seeding import generator
+from renderer.errors import InputError
+from renderer.lights import perturb
+
+ARMS = ("none", "random", "adversarial")
+STARTS = ("light", "random")
+SCHEDULES = ("restart", "continue")
+
+
+@dataclass
+class RandomLights:
+    """Perturbations of the initial light: uniform ±amplitude, or scaled to an L2 radius (see `lights.perturb`)."""
+
+    amplitude: float = 0.5
+    radius: float | None = None
+
+    def __post_init__(self):
+        if not self.amplitude > 0:
+            raise InputError(f"augment.random.amplitude={self.amplitude} must be positive")
+        if self.radius is not None and not self.radius > 0:
+            raise InputError(f"augment.random.radius={self.radius} must be positive, or null for ±amplitude")
+
+
+@dataclass
+class AugmentationSettings:
+    """What is regenerated each epoch.
+
+    start: where an attack begins, the scene's light or a random perturbation of it. lights: "restart" begins there
+    each epoch, "continue" begins where the last epoch's attack ended.
+    """
+
+    arm: str = "adversarial"
+    examples: int = 100
+    start: str = "light"
+    lights: str = "restart"
+    random: RandomLights = field(default_factory=RandomLights)
+    attack: AttackSettings = field(default_factory=AttackSettings)
+
+    def __post_init__(self):
+        for name, value, choices in [
+            ("arm", self.arm, ARMS),
+            ("start", self.start, STARTS),
+            ("lights", self.lights, SCHEDULES),
+        ]:
+            if value not in choices:
+                raise InputError(f"augment.{name}={value}: choose one of {', '.join(choices)}")
+        if self.examples < 0:
+            raise InputError(f"augment.examples={self.examples} must not be negative")
+
+    @property
+    def renders(self) -> bool:
+        """Whether any example is rendered at all."""
+        return self.arm != "none" and self.examples > 0
+
+
+@dataclass(frozen=True)
+class Renders:
+    """An epoch's examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers."""
+
+    images: Tensor
+    labels: Tensor
+    diagnostics: Mapping[str, float]
+
+
+class AugmentationService:
+    """Holds the scene and, where lights continue, the adversaries' lights from epoch to epoch."""
+
+    def __init__(
+        self,
+        settings: AugmentationSettings,
+        scene: Scene | None,
+        labels: Tensor,
+        light: Tensor,
+        seed: int,
+        phases: Phases,
+    ):
+        """scene: None where nothing is rendered. labels: (E,) int64 classes. light: (49, 3), where lights begin."""
+        self.settings = settings
+        self._scene = scene
+        self._labels = labels
+        self._light = light
+        self._seed = seed
+        self._phases = phases
+        self._continued: Tensor | None = None
+
+    def regenerate(self, model: nn.Module, epoch: int) -> Renders:
+        """This epoch's examples for the model's current weights; the model is left as it was found.
+
+        The draw depends on the seed and the epoch alone, so a resumed run repeats it.
+        """
+        if self._scene is None:
+            return Renders(torch.zeros(0), self._labels[:0], {})
+        make = self._random if self.settings.arm == "random" else self._adversarial
+        return make(model, epoch)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The adversaries' lights, where they continue; empty otherwise."""
+        return {} if self._continued is None else {"lights": self._continued.cpu()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` gave."""
+        if "lights" in state:
+            self._continued = state["lights"].to(self._labels.device)
+
+    def _random(self, model: nn.Module, epoch: int) -> Renders:
+        lights = self._perturbed(epoch)
+        images = self._scene.render(lights)
+        with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
+            logits = torch.cat([model(batch) for batch in images.split(self.settings.attack.batch_size)])
+        diagnostics = {
+            "fooled": _mean(logits.argmax(1) != self._labels),
+            "loss": _mean(nn.functional.cross_entropy(logits, self._labels)),
+        }
+        return Renders(images, self._labels, diagnostics | self._light_diagnostics(lights, self._start()))
+
+    def _adversarial(self, model: nn.Module, epoch: int) -> Renders:
+        start = self._starting_lights(epoch)
+        result = descend(model, self._scene.render, start, self._labels, self.settings.attack, self._phases)
+        if self.settings.lights == "continue":
+            self._continued = result.parameters
+        diagnostics = self._attack_diagnostics(result) | self._light_diagnostics(result.parameters, start)
+        return Renders(result.images, self._labels, diagnostics)
+
+    def _starting_lights(self, epoch: int) -> Tensor:
+        if self._continued is not None:
+            return self._continued
+        return self._perturbed(epoch) if self.settings.start == "random" else self._start()
+
+    def _start(self) -> Tensor:
+        return self._light.expand(len(self._scene), -1, -1)
+
+    def _perturbed(self, epoch: int) -> Tensor:
+        random, draws = self.settings.random, generator(self._seed, epoch, "lights")
+        lights = perturb(self._light.cpu(), len(self._scene), random.amplitude, random.radius, draws)
+        return lights.to(self._light.device)
+
+    def _attack_diagnostics(self, result: AttackResult) -> dict[str, float]:
+        return {
+            "fooled_before": _mean(result.fooled_before),
+            "fooled": _mean(result.fooled),
+            "steps": _mean(result.steps),
+            "used_all_steps": _mean(result.steps == self.settings.attack.max_steps),
+            "loss_before": _mean(result.loss_before),
+            "loss": _mean(result.loss),
+            "zero_gradient": _mean(result.zero_gradient),
+        }
+
+    def _light_diagnostics(self, lights: Tensor, start: Tensor) -> dict[str, float]:
+        return {
+            "light_change": _mean((lights - start).flatten(1).norm(dim=1)),
+            "clamped": _mean(self._scene.clamped_share(lights)),
+        }
+
+
+def _mean(values: Tensor) -> float:
+    return float(values.double().mean())

@@ -1,0 +1,41 @@
+"""Orthographic cameras that look at the origin, and rings of them. World axes are right-handed with z up."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class OrthographicCamera:
+    """A parallel projection from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
+
+    field_of_view: width of the square picture in world units; a normalised mesh spans at most [-1, 1] per axis.
+    """
+
+    polar: float
+    azimuth: float
+    field_of_view: float
+
+    def axes(self) -> np.ndarray:
+        """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""
+        sin_polar, cos_polar = math.sin(self.polar), math.cos(self.polar)
+        sin_azimuth, cos_azimuth = math.sin(self.azimuth), math.cos(self.azimuth)
+        back = [sin_polar * cos_azimuth, sin_polar * sin_azimuth, cos_polar]
+        right = [-sin_azimuth, cos_azimuth, 0.0]
+        return np.array([right, np.cross(back, right), back])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """World points (V, 3) to normalised device coordinates (V, 3): x right, y up, z depth.
+
+        The picture is [-1, 1]² in x and y. Depth is smaller where nearer and in [-1, 1] within 2 world units of the
+        origin, which every normalised mesh (radius at most √3) is.
+        """
+        right, up, towards = (points @ self.axes().T).T
+        half = self.field_of_view / 2
+        return np.stack([right / half, up / half, -towards / 2], axis=1)
+
+
+def ring(views: int, field_of_view: float, polar: float = math.pi / 3) -> list[OrthographicCamera]:
+    """Cameras at one polar angle and equally spaced azimuths from 0 (the paper's appendix C: π/3 and 10)."""
+    return [OrthographicCamera(polar, 2 * math.pi * view / views, field_of_view) for view in range(views)]

@@ -1,0 +1,48 @@
+"""Radiance to picture: background, clamp and encoding, in one place and last, since clamping is not linear."""
+
+import torch
+from torch import Tensor
+
+from renderer.errors import InputError
+
+ENCODINGS = ("linear", "srgb")
+
+
+def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
+    """Picture values in [0, 1] as a classifier sees them.
+
+    radiance: (..., 3, P) linear, already weighted with coverage. coverage: (..., 1, P) in [0, 1].
+    background: (..., 3 or 1, 1) picture values behind the surface. Returns (..., 3, P).
+    """
+    behind = decode(background, encoding)
+    return encode((radiance + (1 - coverage) * behind).clamp(0, 1), encoding)
+
+
+def clamped(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
+    """Which picture values `develop` clamps, where the gradient is therefore zero. Boolean (..., 3, P)."""
+    composite = radiance + (1 - coverage) * decode(background, encoding)
+    return (composite < 0) | (composite > 1)
+
+
+def encode(linear: Tensor, encoding: str) -> Tensor:
+    """Linear values in [0, 1] to picture values: unchanged, or the sRGB transfer function (IEC 61966-2-1)."""
+    check_encoding(encoding)
+    if encoding == "linear":
+        return linear
+    # The power's derivative is infinite at 0, in the branch that is not taken; the floor keeps it finite.
+    curve = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
+
+
+def decode(picture: Tensor, encoding: str) -> Tensor:
+    """Inverse of `encode`. Under "linear" a texture's values are taken as the albedo as they stand."""
+    check_encoding(encoding)
+    if encoding == "linear":
+        return picture
+    return torch.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
+
+
+def check_encoding(encoding: str) -> None:
+    """InputError unless the encoding is known."""
+    if encoding not in ENCODINGS:
+        raise InputError(f"renderer.encoding={encoding}: choose one of {', '.join(ENCODINGS)}")

@@ -1,0 +1,120 @@
+"""Distant light as coefficients (49, 3): named probes, environment maps and random perturbations. Linear RGB radiance.
+
+Coefficients live in world axes (z up) and follow the index of `renderer.harmonics`.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer.errors import InputError
+from renderer.harmonics import basis, live_coefficients, rotate
+from renderer.transfer import COEFFICIENTS, DEGREE
+
+# Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps", figure 2: RGB rows
+# L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22 in the probes' own axes, whose y is up.
+_PUBLISHED_PROBES = {
+    "grace": [
+        (0.79, 0.44, 0.54), (0.39, 0.35, 0.60), (-0.34, -0.18, -0.27), (-0.29, -0.06, 0.01), (-0.11, -0.05, -0.12),
+        (-0.26, -0.22, -0.47), (-0.16, -0.09, -0.15), (0.56, 0.21, 0.14), (0.21, -0.05, -0.30),
+    ],
+    "eucalyptus": [
+        (0.38, 0.43, 0.45), (0.29, 0.36, 0.41), (0.04, 0.03, 0.01), (-0.10, -0.10, -0.09), (-0.06, -0.06, -0.04),
+        (0.01, -0.01, -0.05), (-0.09, -0.13, -0.15), (-0.06, -0.05, -0.04), (0.02, 0.00, -0.05),
+    ],
+    "st_peters": [
+        (0.36, 0.26, 0.23), (0.18, 0.14, 0.13), (-0.02, -0.01, 0.00), (0.03, 0.02, 0.00), (0.02, 0.01, 0.00),
+        (-0.05, -0.03, -0.01), (-0.09, -0.08, -0.07), (0.01, 0.00, 0.00), (-0.08, -0.03, 0.00),
+    ],
+}  # fmt: skip
+PROBES = tuple(_PUBLISHED_PROBES)
+_Y_UP_TO_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+
+
+def load_light(light: str) -> Tensor:
+    """Coefficients (49, 3) float32 of a named probe or of an environment map's file (.npy).
+
+    A map is scaled to the mean luminance of the grace probe, since maps come in any unit.
+    InputError for an unknown name, a missing file or an array that is no map.
+    """
+    if light in _PUBLISHED_PROBES:
+        return probe(light)
+    if Path(light).suffix == ".npy":
+        coefficients = project_environment(_read_map(Path(light)))
+        return (coefficients * (_mean_luminance(probe("grace")) / _mean_luminance(coefficients))).float()
+    raise InputError(f"light {light!r} is not known: choose {', '.join(PROBES)} or the path of an .npy environment map")
+
+
+def probe(name: str) -> Tensor:
+    """Coefficients (49, 3) float32 of a published probe, turned upright; bands 3 to 6 are zero."""
+    published = torch.tensor(_PUBLISHED_PROBES[name], dtype=torch.float64)
+    coefficients = torch.zeros(COEFFICIENTS, 3)
+    coefficients[:9] = rotate(published, _Y_UP_TO_Z_UP).float()
+    return coefficients
+
+
+def project_environment(radiance: np.ndarray) -> Tensor:
+    """Coefficients (49, 3) float64 of an equirectangular map (H, W, 3) of linear radiance.
+
+    Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
+    """
+    height, width = radiance.shape[:2]
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    z = (edges[:-1] + edges[1:]) / 2  # the mean of z over a row's solid angle
+    azimuth = np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width
+    radius = np.sqrt(1 - z**2)[:, None]
+    grid = [radius * np.cos(azimuth), radius * np.sin(azimuth), np.broadcast_to(z[:, None], (height, width))]
+    directions = torch.from_numpy(np.stack(grid, axis=-1).reshape(-1, 3))
+    solid_angles = torch.from_numpy(np.repeat((edges[:-1] - edges[1:]) * 2 * np.pi / width, width))
+    weighted = torch.from_numpy(radiance.reshape(-1, 3)).double() * solid_angles[:, None]
+    return basis(directions, DEGREE).T @ weighted
+
+
+def ambient(color: Tensor) -> Tensor:
+    """Coefficients (49, 3) of the same radiance (3,) from everywhere: irradiance π × color."""
+    coefficients = torch.zeros(COEFFICIENTS, 3, dtype=color.dtype)
+    coefficients[0] = math.sqrt(4 * math.pi) * color
+    return coefficients
+
+
+def directional(direction: Tensor, color: Tensor) -> Tensor:
+    """Coefficients (49, 3) of parallel light from a unit direction (3,), of irradiance color (3,) where it meets a
+    surface head on. Truncated at degree 6, the irradiance is off by up to 0.043 of it."""
+    return basis(direction, DEGREE)[:, None] * color
+
+
+def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, generator: torch.Generator) -> Tensor:
+    """Random lights (count, 49, 3) around one light (49, 3).
+
+    Uniform in ±amplitude on every coefficient (the paper's random arm: 0.5). With a radius, the live coefficients'
+    perturbation is scaled to that L2 norm and the dead ones, which reach no pixel, stay.
+    """
+    offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
+    if radius is not None:
+        live = torch.zeros(COEFFICIENTS, 1).index_fill_(0, live_coefficients(DEGREE), 1.0)
+        offsets = offsets * live
+        offsets = offsets * (radius / offsets.flatten(1).norm(dim=1).clamp(min=1e-12))[:, None, None]
+    return light + offsets.to(light)
+
+
+def _mean_luminance(coefficients: Tensor) -> float:
+    return float(coefficients[0].double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64))
+
+
+def _read_map(path: Path) -> np.ndarray:
+    if not path.is_file():
+        raise InputError(f"environment map {path} does not exist: give the path of an .npy file")
+    try:
+        radiance = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise InputError(f"environment map {path} is not a readable .npy file: {error}") from error
+    if radiance.ndim != 3 or radiance.shape[2] != 3 or not np.isfinite(radiance).all() or radiance.min() < 0:
+        raise InputError(
+            f"environment map {path} has shape {radiance.shape}: it must hold finite radiance ≥ 0, (height, width, 3)"
+        )
+    if not radiance.any():
+        raise InputError(f"environment map {path} is black everywhere: give a map with some light in it")
+    return radiance

@@ -1,0 +1,254 @@
+"""Triangle meshes with colours: the data class, loading, checking and normalising.
+
+World axes are right-handed with z up. Colours stay as authored for display (sRGB-encoded); whoever
+needs linear light decodes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual.base import Visuals
+from trimesh.visual.material import Material, PBRMaterial, empty_material
+
+from renderer.errors import InputError
+
+Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """F triangles over V vertices, with colours held per corner so that seams need no split vertices.
+
+    vertices       (V, 3) float64, world coordinates
+    faces          (F, 3) int64, counter-clockwise seen from outside
+    corner_colors  (F, 3, 3) float32, RGB in [0, 1], sRGB-encoded
+    corner_uvs     (F, 3, 2) float32, origin at the bottom left of the texture; zeros where there is none
+    texture_ids    (F,) int32, index into `textures`, -1 where there is none
+    textures       tuple of (H, W, 3) uint8, sRGB-encoded, row 0 at the top
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    corner_colors: np.ndarray
+    corner_uvs: np.ndarray
+    texture_ids: np.ndarray
+    textures: tuple[np.ndarray, ...] = ()
+
+    @staticmethod
+    def plain(vertices, faces, color=(1.0, 1.0, 1.0)) -> Mesh:
+        """An untextured mesh. `color` is one RGB (3,) or one per vertex (V, 3), sRGB-encoded in [0, 1]."""
+        vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
+        vertex_colors = np.broadcast_to(np.asarray(color, dtype=np.float32), vertices.shape)
+        return Mesh(
+            vertices=vertices,
+            faces=faces,
+            corner_colors=vertex_colors[faces],
+            corner_uvs=np.zeros((len(faces), 3, 2), dtype=np.float32),
+            texture_ids=np.full(len(faces), -1, dtype=np.int32),
+        )
+
+    def face_normals(self) -> np.ndarray:
+        """(F, 3) unit normals, outward for counter-clockwise faces; the zero vector for zero-area faces."""
+        doubled = self._doubled_area_vectors()
+        length = np.linalg.norm(doubled, axis=1, keepdims=True)
+        return np.divide(doubled, length, out=np.zeros_like(doubled), where=length > 0)
+
+    def face_areas(self) -> np.ndarray:
+        """(F,) areas in squared world units."""
+        return np.linalg.norm(self._doubled_area_vectors(), axis=1) / 2
+
+    def colors(self, faces: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+        """(S, 3) float32 sRGB-encoded colour at S surface points: corner colour × texture.
+
+        faces (S,) holds face indices, barycentric (S, 3) the weights of their corners. Textures are
+        looked up bilinearly and repeat outside [0, 1].
+        """
+        weights = np.asarray(barycentric, dtype=np.float32)
+        result = np.einsum("sc,scd->sd", weights, self.corner_colors[faces])
+        texture_ids = self.texture_ids[faces]
+        for index, texture in enumerate(self.textures):
+            here = np.flatnonzero(texture_ids == index)
+            uvs = np.einsum("sc,scd->sd", weights[here], self.corner_uvs[faces[here]])
+            result[here] *= _sample_bilinear(texture, uvs)
+        return result
+
+    def _doubled_area_vectors(self) -> np.ndarray:
+        a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
+        return np.cross(b - a, c - a)
+
+
+def concatenate(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh with the faces of all, in order; vertices are not merged."""
+    first_vertex = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    first_texture = np.cumsum([0] + [len(mesh.textures) for mesh in meshes])
+    texture_ids = [
+        np.where(mesh.texture_ids >= 0, mesh.texture_ids + offset, -1)
+        for mesh, offset in zip(meshes, first_texture, strict=False)
+    ]
+    return Mesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        faces=np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, first_vertex, strict=False)]),
+        corner_colors=np.concatenate([mesh.corner_colors for mesh in meshes]),
+        corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
+        texture_ids=np.concatenate(texture_ids).astype(np.int32),
+        textures=tuple(texture for mesh in meshes for texture in mesh.textures),
+    )
+
+
+def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
+    """Read a mesh with its colours and textures from .glb, .gltf, .obj, .ply, .stl or what else trimesh reads.
+
+    All parts of a scene, placed by their nodes, become one mesh; vertices at one position become one vertex, so
+    that moving it opens no seam, and unused vertices are dropped. A colour is the product of the material's
+    colour, the texture and the vertex or face colours that the file has, white where it has none; alpha, other
+    material properties and the texture's wrap mode are left out. glTF's colours other than textures are linear
+    by its standard and are encoded here.
+
+    up: "y" turns the y axis up to z, "z" leaves the mesh as it is, and "auto" takes y for glTF, z otherwise.
+    InputError: missing, unreadable or corrupt file, unknown format or `up`; no faces, faces that name missing
+    vertices, coordinates that are not finite, zero area.
+    """
+    path = Path(path)
+    if up not in ("auto", "y", "z"):
+        raise InputError(f"up={up} for {path}: choose auto, y or z")
+    is_gltf = path.suffix.lower() in (".glb", ".gltf")
+    placed = _read(path, linear=is_gltf)
+    if not placed:
+        raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
+    mesh = _weld(concatenate(placed))
+    _check(mesh, path)
+    return _transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
+
+
+def normalise(mesh: Mesh) -> Mesh:
+    """Move the area-weighted centroid of the faces to the origin and scale the largest |coordinate| to 1.
+
+    The same point is the average of the vertices weighted with the areas around them (the paper's appendix).
+    Needs a positive area, as `load_mesh` ensures.
+    """
+    centroids = mesh.vertices[mesh.faces].mean(axis=1)
+    centred = mesh.vertices - np.average(centroids, axis=0, weights=mesh.face_areas())
+    return replace(mesh, vertices=centred / np.abs(centred).max())
+
+
+def _read(path: Path, linear: bool) -> list[Mesh]:
+    """Every part of a file where its node puts it. `linear`: the file's colours, textures aside, are linear."""
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: give the path of a mesh file")
+    formats = trimesh.available_formats()
+    if path.suffix.lower().lstrip(".") not in formats:
+        raise InputError(f"{path} has no known mesh format: use one of {', '.join(sorted(formats))}")
+    try:
+        scene = trimesh.load(path, force="scene", process=False)
+        parts = {
+            name: _part(geometry, linear)
+            for name, geometry in scene.geometry.items()
+            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)
+        }
+    except Exception as error:  # each of trimesh's readers raises its own
+        raise InputError(f"{path} cannot be read as a mesh ({error}): export it again") from error
+    nodes = [scene.graph[node] for node in scene.graph.nodes_geometry]
+    return [_transformed(parts[name], matrix) for matrix, name in nodes if name in parts]
+
+
+def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
+    """One geometry of a file, in its own coordinates. Raises whatever its contents make numpy or Pillow raise."""
+    faces = np.asarray(geometry.faces)
+    if faces.min() < 0 or faces.max() >= len(geometry.vertices):
+        raise IndexError("faces name vertices that are not there")
+    colors, image = _corner_colors(geometry.visual, faces)
+    mesh = replace(
+        Mesh.plain(geometry.vertices, faces),
+        corner_colors=(_encode(colors) if linear else colors).astype(np.float32),
+    )
+    uvs = getattr(geometry.visual, "uv", None)
+    if image is None or uvs is None:
+        return mesh
+    return replace(
+        mesh,
+        corner_uvs=uvs[faces, :2].astype(np.float32),
+        texture_ids=np.zeros(len(faces), dtype=np.int32),
+        textures=(np.array(image.convert("RGB")),),
+    )
+
+
+def _corner_colors(visual: Visuals, faces: np.ndarray) -> tuple[np.ndarray, Image.Image | None]:
+    """(F, 3, 3) colours in [0, 1] as the file has them, and the texture if there is one."""
+    colors, image = np.ones((len(faces), 3, 3)), None
+    if visual.kind == "vertex":
+        colors *= _unit_rgb(visual.vertex_colors)[faces]
+    elif visual.kind == "face":
+        colors *= _unit_rgb(visual.face_colors)[:, None]
+    elif visual.kind == "texture":
+        color, image = _material(visual.material)
+        colors *= color
+        if "color" in visual.vertex_attributes:
+            colors *= _unit_rgb(visual.vertex_attributes["color"])[faces]
+    return colors, image
+
+
+def _material(material: Material) -> tuple[np.ndarray, Image.Image | None]:
+    """A material's colour (3,) in [0, 1], white where the file gives none, and its picture."""
+    if isinstance(material, PBRMaterial):
+        factor, image = material.baseColorFactor, material.baseColorTexture
+        return np.ones(3) if factor is None else _unit_rgb(factor), image
+    # trimesh puts a grey colour, or a grey picture, where the file has none; what it has is under its own name.
+    image = None if material.image == empty_material().image else material.image
+    return np.clip(material.kwargs.get("kd", np.ones(3)), 0, 1), image
+
+
+def _unit_rgb(colors: np.ndarray) -> np.ndarray:
+    """Red, green and blue in [0, 1], from integers of any width or from numbers that are so already."""
+    rgb = np.asarray(colors)[..., :3]
+    return rgb / np.iinfo(rgb.dtype).max if rgb.dtype.kind in "ui" else rgb
+
+
+def _encode(linear: np.ndarray) -> np.ndarray:
+    """The sRGB transfer function (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def _transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+    """The mesh under an affine matrix (4, 4). A mirroring one turns the faces round, so that outside stays out."""
+    order = [0, 1, 2] if np.linalg.det(matrix[:3, :3]) >= 0 else [0, 2, 1]
+    return replace(
+        mesh,
+        vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3],
+        faces=mesh.faces[:, order],
+        corner_colors=mesh.corner_colors[:, order],
+        corner_uvs=mesh.corner_uvs[:, order],
+    )
+
+
+def _weld(mesh: Mesh) -> Mesh:
+    """One vertex for each position that the faces use."""
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    vertices, indices = np.unique(corners, axis=0, return_inverse=True)
+    return replace(mesh, vertices=vertices, faces=indices.reshape(-1, 3))
+
+
+def _check(mesh: Mesh, path: Path) -> None:
+    if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.corner_uvs).all()):
+        raise InputError(f"{path} has coordinates that are not finite: export it again")
+    if not mesh.face_areas().sum() > 0:
+        raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
+
+
+def _sample_bilinear(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """(S, 3) float32 in [0, 1]; texel centres at half-integers, v = 0 at the bottom row's lower edge."""
+    height, width = texture.shape[:2]
+    x = uvs[:, 0].astype(np.float64) * width - 0.5
+    y = (1.0 - uvs[:, 1].astype(np.float64)) * height - 0.5
+    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    fx, fy = (x - column)[:, None], (y - row)[:, None]
+    left, right = column % width, (column + 1) % width
+    top, bottom = row % height, (row + 1) % height
+    upper = texture[top, left] * (1 - fx) + texture[top, right] * fx
+    lower = texture[bottom, left] * (1 - fx) + texture[bottom, right] * fx
+    return ((upper * (1 - fy) + lower * fy) / 255.0).astype(np.float32)

@@ -1,0 +1,66 @@
+"""Which face covers each sample: two back ends, OpenGL and NumPy, under one contract.
+
+rasterise(points, faces, resolution) -> ids
+
+points      (N, V, 3) float64, the vertices as N views project them: x right, y up, both in [-1, 1] across
+            a square picture; z is depth in [-1, 1), smaller is nearer, and surface outside is clipped
+faces       (F, 3) integer; drawn from both sides
+resolution  samples per side R; sample (i, j) sits at x = (2j + 1)/R - 1, y = 1 - (2i + 1)/R
+ids         (N, R, R) int32, row 0 at the top: the nearest face's index, the lower one where depths tie, or -1
+
+Both back ends snap vertices to 1/256 of a sample, so faces that share an edge cover each sample once.
+"""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from renderer.errors import InputError
+from renderer.visibility import opengl, software
+
+NAMES = ("auto", "opengl", "software")
+LARGEST_WINDOW = 2**21  # samples; the edge function of fixed-point corners within it fits in int64
+_RASTERISERS = {"opengl": opengl.rasterise, "software": software.rasterise}
+_SOFTWARE_OPENGL = re.compile("llvmpipe|softpipe|swrast|swiftshader|software rasterizer", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to rasterise. `description` names it, and the device, for the line logged at the start."""
+
+    name: str
+    description: str
+
+    def rasterise(self, points: np.ndarray, faces: np.ndarray, resolution: int) -> np.ndarray:
+        """Ids (N, R, R) int32 by the module's contract. ValueError: points that are not finite."""
+        if not np.isfinite(points).all():
+            raise ValueError("points hold NaN or infinity")
+        reach = LARGEST_WINDOW / resolution
+        return _RASTERISERS[self.name](np.clip(points, -reach, reach), faces, resolution)
+
+
+def choose(backend: str = "auto") -> Backend:
+    """Settle on a back end, once at the start.
+
+    "auto" takes OpenGL where a GPU drives it and software otherwise. InputError: unknown name, or "opengl"
+    on a machine that cannot.
+    """
+    if backend not in NAMES:
+        raise InputError(f"renderer.visibility={backend}: choose one of {', '.join(NAMES)}")
+    if backend == "software":
+        return Backend("software", "software (NumPy)")
+    try:
+        device = opengl.device()
+    except InputError as error:
+        if backend == "opengl":
+            raise
+        return Backend("software", f"software ({error})")
+    if backend == "auto" and _SOFTWARE_OPENGL.search(device):
+        return Backend("software", "software (no GPU drives OpenGL)")
+    return Backend("opengl", f"opengl ({device})")
+
+
+def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int, backend: str = "auto") -> np.ndarray:
+    """Ids (N, R, R) int32 by the module's contract. To draw more than once, `choose` a back end and keep it."""
+    return choose(backend).rasterise(points, faces, resolution)

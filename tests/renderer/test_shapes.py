@@ -1,0 +1,153 @@
+import colorsys
+from collections import Counter
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from renderer.errors import InputError
+from renderer.shapes import SOLIDS, orange, solid
+
+SHELLS = dict.fromkeys(SOLIDS, 1) | {"cup": 2}  # a cup's handle is a shell of its own
+SEEDS = range(4)
+
+
+@pytest.fixture(params=[(name, seed) for name in SOLIDS for seed in SEEDS], ids=lambda p: f"{p[0]}-{p[1]}")
+def named(request):
+    name, seed = request.param
+    return name, solid(name, seed)
+
+
+def enclosed_volume(vertices, faces):
+    """Divergence theorem: the signed tetrahedra from the origin to each face."""
+    return np.linalg.det(vertices[faces]).sum() / 6
+
+
+def shells(mesh):
+    """The faces (F_i, 3) of each connected component."""
+    a, b, c = mesh.faces.T
+    rows, columns = np.concatenate([a, b]), np.concatenate([b, c])
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(mesh.vertices),) * 2)
+    count, of_vertex = connected_components(links, directed=False)
+    return [mesh.faces[of_vertex[a] == shell] for shell in range(count)]
+
+
+def test_each_directed_edge_occurs_once_and_so_does_its_reverse(named):
+    _, mesh = named
+    edges = Counter((face[i], face[(i + 1) % 3]) for face in mesh.faces.tolist() for i in range(3))
+    assert set(edges.values()) == {1}
+    assert all((b, a) in edges for a, b in edges)
+
+
+def test_each_shell_is_a_topological_sphere_that_encloses_a_positive_volume(named):
+    name, mesh = named
+    parts = shells(mesh)
+    assert len(parts) == SHELLS[name]
+    for faces in parts:
+        assert len(np.unique(faces)) - 3 * len(faces) / 2 + len(faces) == 2
+        assert enclosed_volume(mesh.vertices, faces) > 1e-3
+
+
+def test_no_face_is_degenerate_and_no_vertex_is_unused(named):
+    _, mesh = named
+    assert mesh.face_areas().min() > 1e-6
+    np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
+
+
+def test_a_solid_fills_about_the_unit_box(named):
+    _, mesh = named
+    assert 0.8 < np.abs(mesh.vertices).max() < 1.05
+
+
+def test_colours_are_display_values_per_corner(named):
+    _, mesh = named
+    assert mesh.corner_colors.dtype == np.float32 and mesh.corner_colors.shape == (len(mesh.faces), 3, 3)
+    assert mesh.corner_colors.min() >= 0 and mesh.corner_colors.max() <= 1
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_a_seed_picks_one_individual(name):
+    one, again, other = solid(name, 1), solid(name, 1), solid(name, 2)
+    for field in ("vertices", "faces", "corner_colors"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(again, field))
+    assert not np.array_equal(one.vertices, other.vertices)
+    assert not np.array_equal(one.corner_colors, other.corner_colors)
+
+
+def test_an_unknown_name_is_answered_with_the_nearest_and_all_known():
+    with pytest.raises(InputError, match="'ornage': use 'orange'") as error:
+        solid("ornage")
+    assert all(name in str(error.value) for name in SOLIDS)
+
+
+def spheroid(mesh):
+    """Least-squares semi-axes (a, a, c) of the mesh's vertices."""
+    squares = mesh.vertices**2
+    design = np.stack([squares[:, 0] + squares[:, 1], squares[:, 2]], axis=1)
+    equatorial, polar = np.linalg.lstsq(design, np.ones(len(design)), rcond=None)[0] ** -0.5
+    return np.array([equatorial, equatorial, polar])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+class TestOrange:
+    def test_encloses_the_volume_of_its_oblate_sphere(self, seed):
+        mesh = solid("orange", seed)
+        axes = spheroid(mesh)
+        assert 0.85 < axes[2] / axes[0] < 1
+        # 5,120 faces inscribed in a sphere lose 0.2 % of it; dents about the fit cancel to first order.
+        expected = 4 / 3 * np.pi * axes.prod()
+        assert enclosed_volume(mesh.vertices, mesh.faces) == pytest.approx(expected, rel=0.005)
+
+    def test_pores_and_dents_are_hundredths_of_the_radius(self, seed):
+        mesh = solid("orange", seed)
+        relief = np.linalg.norm(mesh.vertices / spheroid(mesh), axis=1) - 1
+        assert relief.std() > 0.005
+        assert np.abs(relief).max() < 0.08
+
+    def test_every_normal_points_outward(self, seed):
+        mesh = solid("orange", seed)
+        centres = mesh.vertices[mesh.faces].mean(axis=1)
+        outward = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+        assert (mesh.face_normals() * outward).sum(axis=1).min() > 0.85
+
+    def test_mean_colour_is_orange(self, seed):
+        mesh = solid("orange", seed)
+        mean = np.average(mesh.corner_colors.mean(axis=1), axis=0, weights=mesh.face_areas())
+        hue, saturation, value = colorsys.rgb_to_hsv(*mean.tolist())
+        assert 15 < hue * 360 < 42 and saturation > 0.7 and value > 0.8
+
+    def test_the_navel_is_on_top_and_dark(self, seed):
+        mesh = solid("orange", seed)
+        brightness = mesh.corner_colors.mean(axis=(1, 2))
+        centres = mesh.vertices[mesh.faces].mean(axis=1)
+        near_top = (np.hypot(centres[:, 0], centres[:, 1]) < 0.08) & (centres[:, 2] > 0)
+        assert brightness[near_top].max() < 0.8 * brightness.mean()
+
+
+@pytest.mark.parametrize("subdivisions", range(5))
+def test_each_subdivision_of_the_orange_quadruples_its_faces(subdivisions):
+    assert len(orange(np.random.default_rng(0), subdivisions).faces) == 20 * 4**subdivisions
+
+
+def test_a_tables_volume_is_that_of_its_board_and_legs():
+    mesh = solid("table")
+    board, leg, cells = 14 * 10, 9, 14 * 10 * 10
+    box = np.ptp(mesh.vertices, axis=0).prod()
+    expected = box * (board + 4 * leg) / cells
+    assert enclosed_volume(mesh.vertices, mesh.faces) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_bottles_label_and_cap_end_sharply():
+    mesh = solid("bottle")
+    height = mesh.vertices[mesh.faces, 2].mean(axis=1)
+    cap, label = height > 0.8 - 1e-9, (height > -0.75) & (height < -0.15)
+    colors = [np.unique(mesh.corner_colors[part].reshape(-1, 3), axis=0) for part in (cap, label, ~(cap | label))]
+    assert [len(part) for part in colors] == [1, 1, 1]
+    assert len(np.unique(np.concatenate(colors), axis=0)) == 3
+
+
+def test_a_cup_is_hollow():
+    mesh = solid("cup")
+    height = mesh.vertices[np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]) < 1e-6, 2]
+    assert len(height) == 2 and height.max() < 0.8 * mesh.vertices[:, 2].max()

@@ -1,0 +1,91 @@
+"""Checkpoints: written atomically, read without pickle, and checked against the network that they are to fill."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import nn
+
+from renderer.errors import InputError
+from train.wideresnet import WideResNet
+
+LAST, BEST, PUBLISHED = "last.pt", "best.pt", "model.safetensors"
+
+
+def save(path: Path, state: Mapping[str, Any]) -> None:
+    """Write tensors and plain values so that the file is, at any moment, either the old one or the new one."""
+    temporary = path.with_suffix(".tmp")
+    with open(temporary, "wb") as file:
+        torch.save(dict(state), file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """What `save` wrote, on the CPU; InputError for a file that is not there or not a checkpoint."""
+    if not path.is_file():
+        raise InputError(f"checkpoint {path} does not exist: give a run folder that holds one")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for a damaged or foreign file
+        raise InputError(f"checkpoint {path} is damaged or no checkpoint; use another one of the run") from error
+    if not isinstance(state, dict) or not {"model", "architecture"} <= state.keys():
+        raise InputError(f"checkpoint {path} lacks its model or architecture: give one that `python -m train` wrote")
+    return state
+
+
+def load_weights(network: nn.Module, weights: Mapping[str, torch.Tensor], path: Path) -> None:
+    """Fill the network; InputError naming the file where the weights belong to another architecture."""
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    found = {name: tuple(value.shape) for name, value in weights.items()}
+    if expected != found:
+        name = next(iter(sorted(set(expected.items()) ^ set(found.items()))))[0]
+        raise InputError(
+            f"checkpoint {path} is from another architecture: {name} has shape {found.get(name, 'none')} there and "
+            f"{expected.get(name, 'none')} here; use the model settings that it was trained with"
+        )
+    network.load_state_dict(weights)
+
+
+def load_network(run: Path) -> tuple[WideResNet, tuple[str, ...]]:
+    """The selected network of a run folder (best.pt or model.safetensors) or of such a file, and its class names."""
+    path = run if run.is_file() else next((run / name for name in (BEST, PUBLISHED) if (run / name).is_file()), None)
+    if path is None:
+        raise InputError(
+            f"run={run} holds neither {BEST} nor {PUBLISHED}: give a run folder that `python -m train` wrote"
+        )
+    state = _load_published(path) if path.suffix == ".safetensors" else load(path)
+    try:
+        shape = dict(state["architecture"])
+        classes = tuple(shape.pop("classes"))
+        network = WideResNet(len(classes), **shape)
+    except (TypeError, ValueError, KeyError) as error:
+        raise InputError(f"checkpoint {path} is from another architecture than this WideResNet: {error}") from error
+    load_weights(network, state["model"], path)
+    return network.eval(), classes
+
+
+def publish(path: Path, state: Mapping[str, Any]) -> None:
+    """Write a checkpoint's network as half-precision safetensors, its architecture in the file's metadata."""
+    weights = {
+        name: value.half().contiguous() if value.is_floating_point() else value
+        for name, value in state["model"].items()
+    }
+    safetensors.torch.save_file(weights, path, metadata={"architecture": json.dumps(state["architecture"])})
+
+
+def _load_published(path: Path) -> dict[str, Any]:
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
+        return {"model": weights, "architecture": json.loads(metadata["architecture"])}
+    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error

@@ -1,0 +1,70 @@
+"""What every entry point shares: one-sentence errors, and the nearest valid key for a mistyped override."""
+
+import difflib
+import functools
+import sys
+from collections.abc import Callable, Iterator
+
+from hydra import compose, initialize_config_module
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from renderer.errors import InputError
+
+USER_ERROR = 2
+
+
+def one_sentence_errors(function: Callable) -> Callable:
+    """Print an InputError as one line, without a traceback, and exit with status 2."""
+
+    @functools.wraps(function)
+    def wrapped(*arguments):
+        try:
+            return function(*arguments)
+        except InputError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(USER_ERROR)
+
+    return wrapped
+
+
+def with_suggestions(main: Callable[[], None], config_name: str) -> None:
+    """Run a Hydra main; where Hydra rejects an override, print the nearest valid key below its error."""
+    try:
+        main()
+    except SystemExit as stop:
+        if stop.code == 1:
+            for line in _suggestions(sys.argv[1:], config_name):
+                print(line, file=sys.stderr)
+        raise
+
+
+def _suggestions(arguments: list[str], config_name: str) -> Iterator[str]:
+    overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
+    accepted: list[str] = []
+    rejected: list[str] = []
+    with initialize_config_module("conf", version_base="1.3"):
+        for override in overrides:
+            (accepted if _composes(config_name, [*accepted, override]) else rejected).append(override)
+        keys = list(_keys(compose(config_name, accepted)))
+    for override in rejected:
+        key = override.partition("=")[0].lstrip("+~")
+        nearest = difflib.get_close_matches(key, keys, n=1, cutoff=0.5)
+        if key not in keys and nearest:
+            yield f"Nearest valid key to {key!r}: {nearest[0]}"
+
+
+def _composes(config_name: str, overrides: list[str]) -> bool:
+    try:
+        compose(config_name, [override.split(",")[0] for override in overrides])
+    except HydraException:
+        return False
+    return True
+
+
+def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
+    for key in node:
+        yield prefix + key
+        child = node._get_node(key)
+        if OmegaConf.is_dict(child) and not child._is_none():
+            yield from _keys(child, f"{prefix}{key}.")

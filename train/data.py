@@ -1,0 +1,160 @@
+"""Labelled pictures as uint8 arrays: CIFAR-100, an .npz file, a folder of class folders, or rendered shapes."""
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torchvision
+from torch import Tensor
+
+from augment.seeding import generator
+from renderer.errors import InputError
+from train.photographs import find_photographs, load_photographs
+
+
+@dataclass(frozen=True)
+class Split:
+    """images: (N, 3, H, W) uint8 RGB. labels: (N,) int64."""
+
+    images: Tensor
+    labels: Tensor
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def to(self, device: torch.device) -> "Split":
+        return Split(self.images.to(device), self.labels.to(device))
+
+    def __getitem__(self, rows: Tensor) -> "Split":
+        return Split(self.images[rows], self.labels[rows])
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """Class names in label order, a training and a test split."""
+
+    classes: tuple[str, ...]
+    train: Split
+    test: Split
+
+    @property
+    def size(self) -> int:
+        """Pixels per side."""
+        return self.train.images.shape[-1]
+
+
+def class_index(classes: Sequence[str], name: str, key: str) -> int:
+    """The label of a class name; InputError with the nearest name where the list lacks it."""
+    if name in classes:
+        return list(classes).index(name)
+    nearest = difflib.get_close_matches(name, classes, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else f": the classes are {', '.join(list(classes)[:10])}, ..."
+    raise InputError(f"{key}: the data has no class {name!r}{hint}")
+
+
+def stratified_split(split: Split, share: float, seed: int) -> tuple[Split, Split]:
+    """(train, validation) with the share of every class's pictures, rounded, in validation."""
+    if not 0 < share < 1:
+        raise InputError(f"data.validation={share} must lie between 0 and 1")
+    held_out = torch.zeros(len(split), dtype=torch.bool)
+    draws = generator(seed, "validation")
+    for label in split.labels.unique():
+        members = torch.nonzero(split.labels == label).squeeze(1)
+        count = round(share * len(members))
+        if not 0 < count < len(members):
+            raise InputError(f"data.validation={share} of {len(members)} pictures leaves class {int(label)} empty")
+        held_out[members[torch.randperm(len(members), generator=draws)[:count]]] = True
+    return split[~held_out], split[held_out]
+
+
+def channel_statistics(images: Tensor) -> tuple[list[float], list[float]]:
+    """Mean and standard deviation of each channel in [0, 1], exact: from histograms of the 256 values."""
+    values = torch.arange(256, dtype=torch.float64) / 255
+    histograms = [torch.bincount(images[:, channel].flatten(), minlength=256).double() for channel in range(3)]
+    means = [float(counts @ values / counts.sum()) for counts in histograms]
+    deviations = [
+        float((counts @ (values - mean) ** 2 / counts.sum()).sqrt())
+        for counts, mean in zip(histograms, means, strict=True)
+    ]
+    return means, [max(deviation, 1e-3) for deviation in deviations]
+
+
+def load_cifar100(path: str) -> DataSet:
+    """torchvision's CIFAR-100 in folder `path`, downloaded where there is a network, checksums verified."""
+    try:
+        train, test = (torchvision.datasets.CIFAR100(path, train=part, download=True) for part in (True, False))
+    except (OSError, RuntimeError) as error:
+        raise InputError(
+            f"data.path={path}: CIFAR-100 is not there and cannot be downloaded ({error}); "
+            "fetch it on a machine with a network, or use data=npz"
+        ) from error
+    splits = [Split(_channels_first(part.data), torch.tensor(part.targets)) for part in (train, test)]
+    return DataSet(tuple(train.classes), *splits)
+
+
+def load_npz(path: str) -> DataSet:
+    """Arrays train_images and test_images (N, 3, H, W) uint8, train_labels and test_labels (N,), classes (C,) str."""
+    if not Path(path).is_file():
+        raise InputError(f"data.path={path} does not exist: give the path of an .npz file")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"data.path={path} is not an .npz file that loads without pickle: {error}") from error
+    required = ("train_images", "train_labels", "test_images", "test_labels", "classes")
+    if missing := [name for name in required if name not in arrays]:
+        raise InputError(f"data.path={path} lacks the array {missing[0]}: it needs {', '.join(required)}")
+    classes = arrays["classes"]
+    if classes.ndim != 1 or classes.dtype.kind != "U" or len(set(classes.tolist())) != len(classes):
+        raise InputError(f"data.path={path}: classes must be distinct strings, one per class")
+    splits = [_npz_split(path, arrays, part, len(classes)) for part in ("train", "test")]
+    if splits[0].images.shape[1:] != splits[1].images.shape[1:]:
+        raise InputError(f"data.path={path}: train_images and test_images differ in size; make them alike")
+    return DataSet(tuple(classes.tolist()), *splits)
+
+
+def load_folder(path: str, size: int, test: float) -> DataSet:
+    """Class folders of pictures, or `train` and `test` folders of them; centre squares reduced to size × size.
+
+    Without a `test` folder, that share of every class is held out as the test split.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise InputError(f"data.path={path} is not a folder: give a folder with one folder of pictures per class")
+    divided = (root / "train").is_dir() and (root / "test").is_dir()
+    train_root = root / "train" if divided else root
+    classes = tuple(sorted(entry.name for entry in train_root.iterdir() if entry.is_dir()))
+    if len(classes) < 2:
+        raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
+    train = _folder_split(train_root, classes, size)
+    if divided:
+        return DataSet(classes, train, _folder_split(root / "test", classes, size))
+    return DataSet(classes, *stratified_split(train, test, seed=0))
+
+
+def _folder_split(root: Path, classes: tuple[str, ...], size: int) -> Split:
+    photographs, images, _ = load_photographs(root, find_photographs(root, classes, classes[0]), size)
+    return Split(images, torch.tensor([classes.index(photograph.label) for photograph in photographs]))
+
+
+def _npz_split(path: str, arrays: dict[str, np.ndarray], part: str, classes: int) -> Split:
+    images, labels = arrays[f"{part}_images"], arrays[f"{part}_labels"]
+    if images.ndim != 4 or images.shape[1] != 3 or images.shape[2] != images.shape[3] or images.dtype != np.uint8:
+        raise InputError(
+            f"data.path={path}: {part}_images is {images.dtype} of shape {images.shape}; it must be uint8 (N, 3, S, S)"
+        )
+    if labels.shape != images.shape[:1] or labels.dtype.kind not in "iu":
+        raise InputError(
+            f"data.path={path}: {part}_labels is {labels.dtype} of shape {labels.shape}; "
+            f"it must be integers ({len(images)},)"
+        )
+    if not len(labels) or labels.min() < 0 or labels.max() >= classes:
+        raise InputError(f"data.path={path}: {part}_labels must hold labels 0 to {classes - 1}, one at least")
+    return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
+
+
+def _channels_first(images: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2)))

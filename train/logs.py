@@ -1,0 +1,52 @@
+"""Scalars and pictures of a run: TensorBoard, one JSON line per epoch, and a line on the console."""
+
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+
+import torchvision
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+METRICS = "metrics.jsonl"
+console = logging.getLogger("train")
+
+
+class RunLog:
+    """Writes a run folder's metrics.jsonl, TensorBoard events and grids of renders.
+
+    epochs_done: what of an earlier, interrupted run is kept; later lines are dropped, since they will come again.
+    """
+
+    def __init__(self, folder: Path, epochs_done: int = 0):
+        self._metrics = folder / METRICS
+        self._renders = folder / "renders"
+        kept = [line for line in read_metrics(folder) if line.get("epoch", epochs_done + 1) <= epochs_done]
+        self._metrics.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        self._board = SummaryWriter(str(folder), purge_step=epochs_done + 1 if epochs_done else None)
+
+    def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
+        """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores."""
+        line = values if epoch is None else {"epoch": epoch, **values}
+        with open(self._metrics, "a") as file:
+            file.write(json.dumps(line) + "\n")
+        for name, value in values.items():
+            self._board.add_scalar(name, value, epoch or 0)
+        self._board.flush()
+
+    def renders(self, images: Tensor, epoch: int) -> None:
+        """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
+        grid = torchvision.utils.make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0)
+        self._board.add_image("renders", grid, epoch)
+        self._renders.mkdir(exist_ok=True)
+        torchvision.utils.save_image(grid, self._renders / f"epoch_{epoch:03d}.png")
+
+    def close(self) -> None:
+        self._board.close()
+
+
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """The lines of a run's metrics.jsonl, one per epoch and a last one with the final scores; [] without a file."""
+    path = folder / METRICS
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []

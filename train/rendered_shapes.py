@@ -1,0 +1,104 @@
+"""A small labelled data set that the project renders itself, so that the experiment runs with nothing downloaded.
+
+Training and test pictures stand in soft, even light, as stock photographs do. The held-out pictures, written to a
+folder and scored like photographs, show other individuals in hard light from one side. They are renders.
+"""
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from augment.scene import Scene, SceneObject
+from augment.seeding import generator
+from renderer.camera import OrthographicCamera
+from renderer.lights import ambient, directional
+from renderer.mesh import normalise
+from renderer.shapes import SOLIDS, solid
+from renderer.transfer import Settings, build_operators
+from renderer.visibility import Backend, choose
+from train.batches import to_bytes
+from train.data import DataSet, Split
+
+CLASSES = tuple(sorted(SOLIDS))
+SETTINGS = Settings(samples=4)
+VIEWS, BACKGROUNDS = 5, 4  # pictures per individual: every view on every background, each in a light of its own
+HELD_OUT_PER_CLASS = 60
+SOURCE = "rendered, hard light"
+
+Lights = Callable[[Tensor, torch.Generator], Tensor]
+
+
+def load_shapes(train: int, test: int, size: int, seed: int) -> DataSet:
+    """That many training and test pictures of every class, in even light; whole individuals (20 pictures) each."""
+    settings = replace(SETTINGS, size=size)
+    splits = [
+        _render_split(per_class, seed, part, even_light, settings)
+        for per_class, part in [(train, "train"), (test, "test")]
+    ]
+    return DataSet(CLASSES, *splits)
+
+
+def write_held_out(folder: Path, size: int, seed: int) -> None:
+    """Class folders of PNG pictures in hard light, with a photos.csv that calls them rendered."""
+    split = _render_split(HELD_OUT_PER_CLASS, seed, "held out", hard_light, replace(SETTINGS, size=size))
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "photos.csv", "w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["path", "source_tag"])
+        for number, (image, label) in enumerate(zip(split.images, split.labels, strict=True)):
+            path = Path(CLASSES[label]) / f"rendered_{number:04d}.png"
+            (folder / path).parent.mkdir(exist_ok=True)
+            Image.fromarray(image.permute(1, 2, 0).numpy()).save(folder / path)
+            rows.writerow([path.as_posix(), SOURCE])
+
+
+def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
+    """A lamp near the camera and bright surroundings. back: (3,), towards the camera. Coefficients (49, 3)."""
+    direction = _unit(back + 0.5 * torch.randn(3, generator=draws))
+    tint = 1 + 0.05 * torch.randn(3, generator=draws)
+    strength = 0.9 + 0.2 * torch.rand(1, generator=draws)
+    return ambient(0.2 * strength * tint) + directional(direction, 0.45 * strength * tint)
+
+
+def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
+    """One lamp of any colour from above, far to one side of the camera, in dim surroundings. (49, 3)"""
+    direction = _unit(torch.randn(3, generator=draws) + 0.5 * torch.tensor([0.0, 0.0, 1.0]) - 0.3 * back)
+    tint = torch.tensor([1.0, 0.8, 0.6]).lerp(torch.tensor([0.6, 0.8, 1.0]), torch.rand(1, generator=draws))
+    strength = 0.5 + 1.2 * torch.rand(1, generator=draws)
+    return ambient(0.06 * tint) + directional(direction, strength * tint)
+
+
+def _render_split(per_class: int, seed: int, part: str, light: Lights, settings: Settings) -> Split:
+    draws, backend = generator(seed, part), choose("software")
+    individuals = math.ceil(per_class / (VIEWS * BACKGROUNDS))
+    images, labels = [], []
+    for label, name in enumerate(CLASSES):
+        pictures = [_portraits(name, light, settings, backend, draws) for _ in range(individuals)]
+        images.append(torch.cat(pictures)[:per_class])
+        labels += [label] * per_class
+    return Split(torch.cat(images), torch.tensor(labels))
+
+
+def _portraits(name: str, light: Lights, settings: Settings, backend: Backend, draws: torch.Generator) -> Tensor:
+    """20 pictures of one individual: uint8 (20, 3, size, size)."""
+    mesh = normalise(solid(name, int(torch.randint(2**31, (1,), generator=draws))))
+    polar, azimuth, field = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
+    cameras = [
+        OrthographicCamera(math.radians(40 + 45 * p), 2 * math.pi * a, 2 + f)
+        for p, a, f in zip(polar.tolist(), azimuth.tolist(), field.tolist(), strict=True)
+    ]
+    operators = build_operators(mesh, cameras, settings, backend)
+    backgrounds = torch.rand(BACKGROUNDS, generator=draws).tolist()
+    scene = Scene([SceneObject(name, operators)], backgrounds, settings)
+    towards = [torch.tensor(camera.axes()[2], dtype=torch.float32) for camera in cameras for _ in backgrounds]
+    return to_bytes(scene.render(torch.stack([light(back, draws) for back in towards])))
+
+
+def _unit(vector: Tensor) -> Tensor:
+    return vector / vector.norm()

@@ -1,0 +1,83 @@
+"""Wide residual networks (Zagoruyko and Komodakis 2016). WRN-16-4 for 100 classes has 2.77 M parameters."""
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from renderer.errors import InputError
+
+
+class WideResNet(nn.Module):
+    """WRN-depth-width for small pictures of any size.
+
+    Takes (N, 3, H, W) RGB in [0, 1], normalises with the data's own mean and std inside, gives logits (N, classes).
+    depth is 6n + 4: n blocks of two convolutions in each of three groups.
+    """
+
+    def __init__(
+        self,
+        classes: int,
+        depth: int = 16,
+        width: int = 4,
+        dropout: float = 0.3,
+        mean: Sequence[float] = (0.5, 0.5, 0.5),
+        std: Sequence[float] = (0.25, 0.25, 0.25),
+    ):
+        super().__init__()
+        if depth < 10 or (depth - 4) % 6 or width < 1:
+            raise InputError(
+                f"model.depth={depth}, model.width={width}: depth is 10, 16, 22, 28, ... and width at least 1"
+            )
+        channels = [16, 16 * width, 32 * width, 64 * width]
+        self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
+        self.stem = nn.Conv2d(3, channels[0], 3, padding=1, bias=False)
+        self.groups = nn.Sequential(
+            *(
+                _group(channels[i], channels[i + 1], (depth - 4) // 6, stride=2 if i else 1, dropout=dropout)
+                for i in range(3)
+            )
+        )
+        self.norm = nn.BatchNorm2d(channels[3])
+        self.head = nn.Linear(channels[3], classes)
+        self.apply(_initialise)
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.groups(self.stem((images - self.mean) / self.std))
+        return self.head(F.relu(self.norm(features)).mean((2, 3)))
+
+
+class _Block(nn.Module):
+    """Pre-activation: norm, ReLU, convolution, twice, with dropout between; the shortcut starts after the ReLU."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, dropout: float):
+        super().__init__()
+        self.norm1 = nn.BatchNorm2d(inputs)
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
+        self.norm2 = nn.BatchNorm2d(outputs)
+        self.dropout = nn.Dropout(dropout)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        same = inputs == outputs and stride == 1
+        self.shortcut = None if same else nn.Conv2d(inputs, outputs, 1, stride, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        activated = F.relu(self.norm1(x))
+        shortcut = x if self.shortcut is None else self.shortcut(activated)
+        hidden = self.conv1(activated)
+        return self.conv2(self.dropout(F.relu(self.norm2(hidden)))) + shortcut
+
+
+def _group(inputs: int, outputs: int, blocks: int, stride: int, dropout: float) -> nn.Sequential:
+    first = _Block(inputs, outputs, stride, dropout)
+    return nn.Sequential(first, *(_Block(outputs, outputs, 1, dropout) for _ in range(blocks - 1)))
+
+
+def _initialise(module: nn.Module) -> None:
+    """He initialisation (He et al. 2015)."""
+    if isinstance(module, nn.Conv2d):
+        nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+    elif isinstance(module, nn.Linear):
+        nn.init.kaiming_normal_(module.weight, nonlinearity="linear")
+        nn.init.zeros_(module.bias)
