@@ -58,7 +58,7 @@ class AttackResult:
 @torch.enable_grad()
 def descend(
     model: nn.Module,
-    render: Callable[[Tensor], Tensor],
+    render: Callable[[Tensor, Tensor], Tensor],
     start: Tensor,
     labels: Tensor,
     settings: AttackSettings,
@@ -66,47 +66,49 @@ def descend(
 ) -> AttackResult:
     """Step each example's parameters down the cost until the classifier errs; fooled examples leave the batch.
 
-    model: (N, 3, H, W) in [0, 1] → logits; used in eval mode and left as it was found. render: parameters (E, ...) →
-    images (E, 3, H, W). start: (E, ...). labels: (E,) int64, the true classes. The forward pass that yields the
-    gradient also tells who is fooled; the renderer's share is a product with the transfer operators.
+    model: (N, 3, H, W) in [0, 1] → logits; used in eval mode and left as it was found. render: parameters (A, ...) of
+    the examples with indices (A,) → images (A, 3, H, W). start: (E, ...). labels: (E,) int64, the true classes. The
+    forward pass that yields the gradient also tells who is fooled, and only examples that go on are rendered.
     """
     parameters = start.detach().clone()
-    steps = torch.zeros_like(labels)
-    loss, fooled = start.new_zeros(len(labels)), torch.zeros_like(labels, dtype=torch.bool)
     active = torch.arange(len(labels), device=labels.device)
+    steps, fooled = torch.zeros_like(labels), torch.zeros_like(labels, dtype=torch.bool)
+    loss = start.new_zeros(len(labels))
     with as_found(model):
         for step in range(settings.max_steps + 1):
-            images = render(parameters.requires_grad_(True))
+            chosen = parameters[active].requires_grad_(True)
+            rendered = render(chosen, active)
             with phases("attack_classifier"):
-                losses, errs, gradients = _classifier_pass(model, images.detach(), labels, active, settings.batch_size)
-            (gradient,) = torch.autograd.grad(images, parameters, gradients)
-            parameters = parameters.detach()
-            loss[active], fooled[active] = losses, errs
+                passed = _classifier_pass(model, rendered.detach(), labels[active], settings.batch_size)
+            loss[active], fooled[active], pixel_gradient = passed
+            (gradient,) = torch.autograd.grad(rendered, chosen, pixel_gradient)
             if step == 0:
+                images = rendered.detach().clone()
                 fooled_before, loss_before = fooled.clone(), loss.clone()
                 zero_gradient = gradient.flatten(1).abs().amax(1) == 0
-            active = active[~errs]
+            images[active] = rendered.detach()
+            going = ~fooled[active]
+            active = active[going]
             if step == settings.max_steps or not len(active):
                 break
-            parameters[active] -= settings.step_size * _direction(gradient[active], settings.step)
+            parameters[active] -= settings.step_size * _direction(gradient[going], settings.step)
             steps[active] += 1
-    return AttackResult(parameters, images.detach(), steps, fooled_before, fooled, loss_before, loss, zero_gradient)
+    return AttackResult(parameters, images, steps, fooled_before, fooled, loss_before, loss, zero_gradient)
 
 
 def _classifier_pass(
-    model: nn.Module, images: Tensor, labels: Tensor, active: Tensor, batch_size: int
+    model: nn.Module, images: Tensor, labels: Tensor, batch_size: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Loss (A,), misclassified (A,) of the active examples, and the cost's gradient for all images (zero elsewhere)."""
-    gradients = torch.zeros_like(images)
-    losses, errs = [], []
-    for batch in active.split(batch_size):
-        pictures = images[batch].requires_grad_(True)
+    """Cross entropy (A,), misclassified (A,) and the cost's gradient (A, 3, H, W) for images (A, 3, H, W)."""
+    losses, errs, gradients = [], [], []
+    for batch, truth in zip(images.split(batch_size), labels.split(batch_size), strict=True):
+        pictures = batch.detach().requires_grad_(True)
         logits = model(pictures)
-        cost = adversarial_cost(logits, labels[batch])
-        (gradients[batch],) = torch.autograd.grad(cost.sum(), pictures)
+        cost = adversarial_cost(logits, truth)
+        gradients += torch.autograd.grad(cost.sum(), pictures)
         losses.append(-cost.detach())
-        errs.append(logits.detach().argmax(1) != labels[batch])
-    return torch.cat(losses), torch.cat(errs), gradients
+        errs.append(logits.detach().argmax(1) != truth)
+    return torch.cat(losses), torch.cat(errs), torch.cat(gradients)
 
 
 def _direction(gradient: Tensor, step: str) -> Tensor:

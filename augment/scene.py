@@ -107,34 +107,53 @@ class Scene:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def render(self, lights: Tensor) -> Tensor:
-        """Pictures (E, 3, size, size) in [0, 1] of lights (E, 49, 3); differentiable in the lights."""
-        covered = develop(*self._layers(lights), encoding=self.settings.encoding)
-        size = self.settings.size
-        canvas = self.backgrounds.view(1, -1, 1, 1).expand(len(self.coverage), -1, 3, size**2)
-        pictures = canvas.reshape(len(self), 3, size**2).index_copy(2, self.pixels, covered.flatten(0, 1))
-        return pictures.view(len(self), 3, size, size)
+    def render(self, lights: Tensor, examples: Tensor | None = None) -> Tensor:
+        """Pictures (A, 3, size, size) in [0, 1] of lights (A, 49, 3); differentiable in the lights.
+
+        examples: (A,) ascending indices, when not all are wanted; operators that they do not need are left alone.
+        """
+        if examples is None:
+            examples = torch.arange(len(self), device=lights.device)
+        covered = develop(*self._layers(lights, examples), encoding=self.settings.encoding)
+        behind = self.backgrounds[examples % len(self.backgrounds)].view(-1, 1, 1)
+        pictures = behind.repeat(1, 3, self.settings.size**2).index_copy(2, self.pixels, covered)
+        return pictures.unflatten(2, (self.settings.size, self.settings.size))
 
     def clamped_share(self, lights: Tensor) -> Tensor:
         """Per example, the share of its covered pixels' values that the clamp changes. (E,)"""
-        over = clamped(*self._layers(lights), encoding=self.settings.encoding)
-        covered = (self.coverage > 0).expand_as(over)
-        return (((over & covered).sum((2, 3))) / covered.sum((2, 3)).clamp(min=1)).flatten()
+        examples = torch.arange(len(self), device=lights.device)
+        radiance, coverage, background = self._layers(lights, examples)
+        over = clamped(radiance, coverage, background, encoding=self.settings.encoding)
+        covered = (coverage > 0).expand_as(over)
+        return (over & covered).sum((1, 2)) / covered.sum((1, 2)).clamp(min=1)
 
-    def _layers(self, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Radiance (O, B, 3, P), coverage (O, 1, 1, P) and backgrounds (B, 1, 1) for O operators, B backgrounds."""
-        live = lights.index_select(1, self._live).view(len(self.coverage), -1, len(self._live), 3)
-        radiance = live.permute(0, 3, 1, 2) @ self.transfer
-        return radiance.transpose(1, 2), self.coverage, self.backgrounds.view(-1, 1, 1)
+    def _layers(self, lights: Tensor, examples: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Radiance (A, 3, P), coverage (A, 1, P) and background (A, 1, 1) of A examples.
+
+        One product per operator, for all of its backgrounds at once: lights are laid out on a grid of the operators
+        in use × backgrounds, which leaves gaps where an example is not wanted.
+        """
+        per_operator = len(self.backgrounds)
+        used, row = torch.unique(examples // per_operator, return_inverse=True)
+        cell = row * per_operator + examples % per_operator
+        live = lights.index_select(1, self._live)
+        grid = live.new_zeros(len(used) * per_operator, *live.shape[1:]).index_copy(0, cell, live)
+        transfer = self.transfer if len(used) == len(self.transfer) else self.transfer[used]
+        radiance = grid.unflatten(0, (len(used), per_operator)).permute(0, 3, 1, 2) @ transfer
+        return (
+            radiance.transpose(1, 2).flatten(0, 1)[cell],
+            self.coverage[used][row],
+            self.backgrounds[examples % per_operator].view(-1, 1, 1),
+        )
 
 
 def _stack(operators: Sequence[Operator], pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Operators over a common set of pixels: transfer (O, 3, K, P), coverage (O, 1, 1, P), zero where uncovered."""
+    """Operators over a common set of pixels: transfer (O, 3, K, P), coverage (O, 1, P), zero where uncovered."""
     live = len(live_coefficients(DEGREE))
     transfer = torch.zeros(len(operators), 3, live, len(pixels))
-    coverage = torch.zeros(len(operators), 1, 1, len(pixels))
+    coverage = torch.zeros(len(operators), 1, len(pixels))
     for row, operator in enumerate(operators):
         columns = torch.searchsorted(pixels, operator.pixels)
         transfer[row][:, :, columns] = operator.transfer.transpose(0, 1)
-        coverage[row, 0, 0, columns] = operator.coverage
+        coverage[row, 0, columns] = operator.coverage
     return transfer, coverage

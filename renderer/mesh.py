@@ -85,18 +85,19 @@ class Mesh:
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh with the faces of all, in order; vertices are not merged."""
-    first_vertex = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-    first_texture = np.cumsum([0] + [len(mesh.textures) for mesh in meshes])
+    vertices_before = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])[:-1]
+    textures_before = np.cumsum([0] + [len(mesh.textures) for mesh in meshes])[:-1]
+    faces = [mesh.faces + before for mesh, before in zip(meshes, vertices_before, strict=True)]
     texture_ids = [
-        np.where(mesh.texture_ids >= 0, mesh.texture_ids + offset, -1)
-        for mesh, offset in zip(meshes, first_texture, strict=False)
+        np.where(mesh.texture_ids < 0, -1, mesh.texture_ids + before).astype(np.int32)
+        for mesh, before in zip(meshes, textures_before, strict=True)
     ]
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
-        faces=np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, first_vertex, strict=False)]),
+        faces=np.concatenate(faces),
         corner_colors=np.concatenate([mesh.corner_colors for mesh in meshes]),
         corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
-        texture_ids=np.concatenate(texture_ids).astype(np.int32),
+        texture_ids=np.concatenate(texture_ids),
         textures=tuple(texture for mesh in meshes for texture in mesh.textures),
     )
 
@@ -122,7 +123,8 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     if not placed:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = _weld(concatenate(placed))
-    _check(mesh, path)
+    if not mesh.face_areas().sum() > 0:
+        raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
     return _transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
 
 
@@ -159,15 +161,14 @@ def _read(path: Path, linear: bool) -> list[Mesh]:
 
 def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
     """One geometry of a file, in its own coordinates. Raises whatever its contents make numpy or Pillow raise."""
-    faces = np.asarray(geometry.faces)
-    if faces.min() < 0 or faces.max() >= len(geometry.vertices):
+    vertices, faces, uvs = geometry.vertices, np.asarray(geometry.faces), getattr(geometry.visual, "uv", None)
+    if faces.min() < 0 or faces.max() >= len(vertices):
         raise IndexError("faces name vertices that are not there")
+    if not (np.isfinite(vertices).all() and (uvs is None or np.isfinite(uvs).all())):
+        raise ValueError("coordinates are not finite")
     colors, image = _corner_colors(geometry.visual, faces)
-    mesh = replace(
-        Mesh.plain(geometry.vertices, faces),
-        corner_colors=(_encode(colors) if linear else colors).astype(np.float32),
-    )
-    uvs = getattr(geometry.visual, "uv", None)
+    colors = (_encode(colors) if linear else colors).astype(np.float32)
+    mesh = replace(Mesh.plain(vertices, faces), corner_colors=colors)
     if image is None or uvs is None:
         return mesh
     return replace(
@@ -231,13 +232,6 @@ def _weld(mesh: Mesh) -> Mesh:
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     vertices, indices = np.unique(corners, axis=0, return_inverse=True)
     return replace(mesh, vertices=vertices, faces=indices.reshape(-1, 3))
-
-
-def _check(mesh: Mesh, path: Path) -> None:
-    if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.corner_uvs).all()):
-        raise InputError(f"{path} has coordinates that are not finite: export it again")
-    if not mesh.face_areas().sum() > 0:
-        raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
 
 
 def _sample_bilinear(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue
 
 from renderer.errors import InputError
 
@@ -15,15 +16,18 @@ USER_ERROR = 2
 
 
 def one_sentence_errors(function: Callable) -> Callable:
-    """Print an InputError as one line, without a traceback, and exit with status 2."""
+    """Print what the user can mend as one line, without a traceback, and exit with status 2."""
 
     @functools.wraps(function)
     def wrapped(*arguments):
         try:
             return function(*arguments)
         except InputError as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(USER_ERROR)
+            message = str(error)
+        except MissingMandatoryValue as error:
+            message = f"{error.full_key} is not set: give {error.full_key}=..."
+        print(f"error: {message}", file=sys.stderr)
+        sys.exit(USER_ERROR)
 
     return wrapped
 

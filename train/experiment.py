@@ -28,6 +28,7 @@ from train.data import (
     load_npz,
     stratified_split,
 )
+from train.device import choose_device
 from train.fit import Trainer, TrainSettings, evaluate
 from train.logs import RunLog, console
 from train.photographs import evaluate_photographs, format_summary
@@ -72,7 +73,7 @@ class RendererSettings:
 def run(config: DictConfig, data: DataSet, folder: Path) -> None:
     """Train one arm into `folder` and score it; everything found out is in the folder's files."""
     settings = read_settings(TrainSettings, config.train, "train")
-    device = _choose_device(settings.device)
+    device = choose_device(settings.device)
     trainer, log, (train, validation) = _prepare(config, settings, data, folder, device)
     trainer.fit(train, validation, log)
     scores = _test_scores(trainer, data, device)
@@ -85,8 +86,6 @@ def run(config: DictConfig, data: DataSet, folder: Path) -> None:
 def load_data(config: DictConfig) -> DataSet:
     """The data set that `config.data` names."""
     data = config.data
-    if data.name != "shapes" and data.path is None:
-        raise InputError(f"data=path of {data.name} is not set: give data.path=...")
     if data.name == "cifar100":
         return load_cifar100(data.path)
     if data.name == "npz":
@@ -188,16 +187,6 @@ def _read_object(item, label: str, index: int) -> ObjectSettings:
     return read_settings(ObjectSettings, OmegaConf.create({"label": label, **node}), f"scene.meshes[{index}]")
 
 
-def _choose_device(name: str) -> torch.device:
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(f"train.device={name} is not available here: use auto or cpu") from error
-    return torch.device(name)
-
-
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
     """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
     test = data.test.to(device)
@@ -223,4 +212,5 @@ def _photograph_scores(
         device=device,
     )
     console.info("%s", format_summary(summary))
-    return {f"photographs/{name}": summary[name]["value"] for name in ("recall", "top5", "false_alarms")}
+    shares = {f"photographs/{name}": summary[name]["value"] for name in ("recall", "top5", "false_alarms")}
+    return {name: value for name, value in shares.items() if value is not None}

@@ -1,7 +1,6 @@
 """Mixed precision: bfloat16 arithmetic where the machine is faster at it, float32 weights and logits always."""
 
 import functools
-import statistics
 import time
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor, nn
 from renderer.errors import InputError
 
 PRECISIONS = ("auto", "bfloat16", "float32")
+MEASUREMENTS = 8
 
 
 class MixedPrecision(nn.Module):
@@ -44,14 +44,20 @@ def _faster_precision(device: torch.device) -> str:
     with torch.random.fork_rng(devices=[]):
         layer = MixedPrecision(nn.Conv2d(64, 64, 3, padding=1, bias=False), "float32")
         images = torch.rand(32, 64, 32, 32)
-    return min(("bfloat16", "float32"), key=lambda precision: _step_time(layer, images, precision))
+    candidates = ("bfloat16", "float32")
+    seconds = {precision: [] for precision in candidates}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # threads that wait for a busy core would blur the comparison
+    try:
+        for precision in candidates * MEASUREMENTS:  # in turn; the least counts, so a busy machine disturbs both alike
+            seconds[precision].append(_step_time(layer, images, precision))
+    finally:
+        torch.set_num_threads(threads)
+    return min(candidates, key=lambda precision: min(seconds[precision]))
 
 
 def _step_time(layer: MixedPrecision, images: Tensor, precision: str) -> float:
     layer.precision = precision
-    seconds = []
-    for _ in range(7):
-        start = time.perf_counter()
-        layer(images).sum().backward()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds[2:])
+    start = time.perf_counter()
+    layer(images).sum().backward()
+    return time.perf_counter() - start

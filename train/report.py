@@ -1,28 +1,35 @@
-"""Tables of finished runs, from the files in their folders."""
+"""Tables and model cards of finished runs, from the files in their folders."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
+from train import checkpoint
 from train.logs import read_metrics
+from train.photographs import share
+
+PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; others are parts of these, or once a run
+RECIPE = ("epochs", "batch_size", "learning_rate", "momentum", "weight_decay", "schedule", "precision")
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a run's folder says: its arm, its final scores and its mean seconds per epoch and phase."""
+    """What a run's folder says: its resolved configuration, final scores and mean seconds per epoch and phase."""
 
     folder: Path
-    arm: str
-    seed: int
-    label: str
+    config: DictConfig
     scores: dict[str, float]
     seconds: dict[str, float]
     photographs: dict | None
+
+    @property
+    def arm(self) -> str:
+        return self.config.augment.arm
 
 
 def summarise(folder: Path) -> RunSummary:
@@ -30,14 +37,11 @@ def summarise(folder: Path) -> RunSummary:
     lines = read_metrics(folder)
     if not lines or "epoch" in lines[-1]:
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")
-    config = OmegaConf.load(folder / "config.yaml")
-    phases = sorted({name for line in lines for name in line if name.startswith("seconds/")})
     photographs = folder / "photographs" / "summary.json"
+    phases = sorted({name for line in lines for name in line if name.startswith("seconds/")})
     return RunSummary(
         folder=folder,
-        arm=config.augment.arm,
-        seed=config.seed,
-        label=config.label,
+        config=OmegaConf.load(folder / "config.yaml"),
         scores=lines[-1],
         seconds={name.partition("/")[2]: fmean(line.get(name, 0.0) for line in lines[:-1]) for name in phases},
         photographs=json.loads(photographs.read_text()) if photographs.is_file() else None,
@@ -45,36 +49,120 @@ def summarise(folder: Path) -> RunSummary:
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
-    """A Markdown table, one row per run, and the pictures to look at."""
-    label = runs[0].label
+    """A Markdown table of the headline figures, one row per run, and the pictures to look at."""
+    label = runs[0].config.label
     header = ["augment", "seed", "test accuracy", f"{label} recognised", f"others called {label}", "seconds per epoch"]
-    rows = [[run.arm, str(run.seed), f"{run.scores['test/accuracy']:.3f}", *_shares(run), _epoch(run)] for run in runs]
-    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
-    lines = [
-        _row(header, widths),
-        _row(["-" * width for width in widths], widths),
-        *(_row(row, widths) for row in rows),
+    rows = [
+        [
+            run.arm,
+            str(run.config.seed),
+            f"{run.scores['test/accuracy']:.3f}",
+            *(_interval(run.photographs and run.photographs[name]) for name in ("recall", "false_alarms")),
+            f"{sum(run.seconds[phase] for phase in PHASES):.1f}",
+        ]
+        for run in runs
     ]
     sheets = [run.folder / "photographs" / "contact_sheet.png" for run in runs if run.photographs]
-    return "\n".join([*lines, *(f"picture: {sheet}" for sheet in sheets)])
+    return "\n".join([_markdown(header, rows), *(f"picture: {sheet}" for sheet in sheets)])
 
 
-def _shares(run: RunSummary) -> list[str]:
-    if run.photographs is None:
-        return ["-", "-"]
-    return [_interval(run.photographs["recall"]), _interval(run.photographs["false_alarms"])]
+def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str]) -> str:
+    """Markdown tables of runs: accuracy, recall and false alarms by source, and seconds per epoch and phase.
+
+    exclude: sources that the pooled figures leave out.
+    """
+    tables = [("Accuracy on the test set", _accuracy_table(runs)), ("Seconds per epoch", _seconds_table(runs))]
+    if all(run.photographs for run in runs):
+        label = runs[0].config.label
+        tables[1:1] = [
+            (f"Photographs of {label} recognised", _source_table(runs, "recall", exclude)),
+            (f"Photographs of other things called {label}", _source_table(runs, "false_alarms", exclude)),
+        ]
+    return "\n\n".join(f"### {title}\n\n{table}" for title, table in tables)
 
 
-def _interval(share: dict) -> str:
-    if share["value"] is None:
+def publish_run(folder: Path, out: Path) -> None:
+    """Write a finished run's selected network as half-precision safetensors, and a card beside it."""
+    run = summarise(folder)
+    out.mkdir(parents=True, exist_ok=True)
+    checkpoint.publish(out / checkpoint.PUBLISHED, checkpoint.load(folder / checkpoint.BEST))
+    (out / "README.md").write_text(_card(run))
+
+
+def _accuracy_table(runs: Sequence[RunSummary]) -> str:
+    header = ["augment", "seed", "selected on validation", "at epoch", "last epoch"]
+    rows = [
+        [
+            run.arm,
+            str(run.config.seed),
+            f"{run.scores['test/accuracy']:.4f}",
+            str(run.scores["test/epoch"]),
+            f"{run.scores['test/accuracy_last']:.4f}",
+        ]
+        for run in runs
+    ]
+    return _markdown(header, rows)
+
+
+def _source_table(runs: Sequence[RunSummary], figure: str, exclude: Sequence[str]) -> str:
+    sources = sorted({source for run in runs for source in run.photographs["by_source"]})
+    pooled = [source for source in sources if source not in exclude]
+    rows = [
+        [source, *_per_run(runs, lambda run, source=source: run.photographs["by_source"][source][figure])]
+        for source in sources
+    ]
+    title = f"all but {', '.join(exclude)}" if exclude else "all"
+    rows.append([title, *_per_run(runs, lambda run: _pool(run.photographs["by_source"], pooled, figure))])
+    return _markdown(["source", *(run.arm for run in runs)], [row for row in rows if set(row[1:]) != {"-"}])
+
+
+def _per_run(runs: Sequence[RunSummary], figure: Callable[[RunSummary], dict]) -> list[str]:
+    return [_interval(figure(run)) for run in runs]
+
+
+def _pool(by_source: dict, sources: Sequence[str], figure: str) -> dict:
+    counts = [by_source[source][figure] for source in sources]
+    return share(sum(count["hits"] for count in counts), sum(count["n"] for count in counts))
+
+
+def _seconds_table(runs: Sequence[RunSummary]) -> str:
+    phases = [*PHASES, "attack_classifier", "operators"]
+    rows = [[run.arm, *(f"{run.seconds.get(phase, 0.0):.2f}" for phase in phases)] for run in runs]
+    return _markdown(["augment", *phases], rows)
+
+
+def _card(run: RunSummary) -> str:
+    config, scores = run.config, run.scores
+    architecture = f"WideResNet-{config.model.depth}-{config.model.width}, dropout {config.model.dropout}"
+    data = Path(config.data.path).name if "path" in config.data else config.data.name
+    meshes = [Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in config.scene.meshes]
+    renders = f"{config.augment.examples} renders of {', '.join(meshes)}" if run.arm != "none" else "none"
+    rows = [
+        ("network", architecture),
+        ("data", f"{data}, {config.data.validation:.0%} of training for validation"),
+        ("augmentation", f"{run.arm}; renders each epoch: {renders}"),
+        ("recipe", ", ".join(f"{name} {config.train[name]}" for name in RECIPE)),
+        ("seed", str(config.seed)),
+        ("epoch", f"{scores['test/epoch']}, selected on validation"),
+        ("test accuracy", f"{scores['test/accuracy']:.4f}"),
+        *((name, _interval(run.photographs[name])) for name in ("recall", "false_alarms") if run.photographs),
+        ("versions", ", ".join(f"{name} {version}" for name, version in config.versions.items())),
+    ]
+    title = f"# {architecture}, augment={run.arm}"
+    note = "Half-precision weights; images are RGB in [0, 1], normalised inside. Score photographs with"
+    command = f"`python scripts/evaluate_photos.py run=pretrained/{run.arm} photos=...`."
+    return f"{title}\n\n{note} {command}\n\n{_markdown(['what', 'value'], [list(row) for row in rows])}\n"
+
+
+def _interval(figure: dict | None) -> str:
+    if not figure or figure["value"] is None:
         return "-"
-    return f"{share['value']:.3f} [{share['low']:.3f}, {share['high']:.3f}]"
+    return f"{figure['value']:.3f} [{figure['low']:.3f}, {figure['high']:.3f}]"
 
 
-def _epoch(run: RunSummary) -> str:
-    nested = {"attack_classifier", "operators"}  # a part of the attack's time; once per run
-    return f"{sum(value for name, value in run.seconds.items() if name not in nested):.1f}"
-
-
-def _row(cells: Sequence[str], widths: Sequence[int]) -> str:
-    return "| " + " | ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)) + " |"
+def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
+    lines = [header, ["-" * width for width in widths], *rows]
+    return "\n".join(
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
+    )

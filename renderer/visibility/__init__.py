@@ -3,7 +3,7 @@
 rasterise(points, faces, resolution) -> ids
 
 points      (N, V, 3) float64, the vertices as N views project them: x right, y up, both in [-1, 1] across
-            a square picture; z is depth in [-1, 1), smaller is nearer, and surface outside is clipped
+            a square picture; z is depth, smaller is nearer, and surface outside [-1, 1) is clipped
 faces       (F, 3) integer; drawn from both sides
 resolution  samples per side R; sample (i, j) sits at x = (2j + 1)/R - 1, y = 1 - (2i + 1)/R
 ids         (N, R, R) int32, row 0 at the top: the nearest face's index, the lower one where depths tie, or -1
@@ -20,7 +20,7 @@ from renderer.errors import InputError
 from renderer.visibility import opengl, software
 
 NAMES = ("auto", "opengl", "software")
-LARGEST_WINDOW = 2**21  # samples; the edge function of fixed-point corners within it fits in int64
+SPAN = 2**21  # samples; vertices outside are pulled in, so that fixed-point edge functions fit in int64
 _RASTERISERS = {"opengl": opengl.rasterise, "software": software.rasterise}
 _SOFTWARE_OPENGL = re.compile("llvmpipe|softpipe|swrast|swiftshader|software rasterizer", re.IGNORECASE)
 
@@ -36,7 +36,8 @@ class Backend:
         """Ids (N, R, R) int32 by the module's contract. ValueError: points that are not finite."""
         if not np.isfinite(points).all():
             raise ValueError("points hold NaN or infinity")
-        reach = LARGEST_WINDOW / resolution
+        reach = SPAN / resolution
+        faces = np.sort(faces, axis=1)  # one order of corners, so that duplicate faces have one depth and tie
         return _RASTERISERS[self.name](np.clip(points, -reach, reach), faces, resolution)
 
 

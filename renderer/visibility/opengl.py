@@ -1,7 +1,8 @@
 """The OpenGL rasteriser: moderngl over EGL, without a window.
 
-A context is made, used and released in one call: kept, it returns stale data in another thread and hangs a
-forked child. Ids come from gl_VertexID, since some Mesa versions count gl_PrimitiveID wrongly.
+A context is made, used and released in one call, since one that is kept returns stale data in another thread.
+After a fork only the process that made a context first can make another: under Mesa a child hangs. Ids come from
+gl_VertexID, since some Mesa versions count gl_PrimitiveID wrongly.
 """
 
 from __future__ import annotations

@@ -39,10 +39,13 @@ def _rasterise_view(points: np.ndarray, faces: np.ndarray, resolution: int) -> n
 
 
 def _snap(points: np.ndarray, resolution: int) -> np.ndarray:
-    """(V, 2) int64 of x right, y down from the top left, in 1/256 sample; in float32 up to there, as GPUs are."""
-    half = np.float32(resolution / 2)
+    """(V, 2) int64 of x right, y down from the top left, in 1/256 sample.
+
+    Before that they are float32 numbers, from a multiply-add that rounds once, as GPUs have it.
+    """
+    half = resolution / 2
     window = points.astype(np.float32) * np.array([half, -half]) + half
-    return np.rint(window * np.float32(SUBSAMPLES)).astype(np.int64)
+    return np.rint(window.astype(np.float32) * SUBSAMPLES).astype(np.int64)
 
 
 def _boxes(corners: np.ndarray, resolution: int) -> np.ndarray:

@@ -1,11 +1,15 @@
-"""A sheet of small pictures with captions, in titled sections one below the other."""
+"""A sheet of small pictures with captions, in titled sections: what to show of the answers, and its drawing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from PIL import Image, ImageDraw, ImageFont
 
+from train.photographs.answers import Answer
+
+TILES_PER_SECTION = 40
 COLUMNS = 10
 PICTURE = 96  # px, the side of an enlarged picture
 FRAME = 4
@@ -45,6 +49,41 @@ class Section:
     def height(self) -> int:
         rows = -(-len(self.tiles) // COLUMNS)
         return TITLE_HEIGHT + rows * self.cell_height + GAP
+
+
+def choose_sections(answers: Sequence[Answer], images: torch.Tensor, label: str) -> list[Section]:
+    """Hits, misses and false alarms; `images` are the answers' pictures, (N, 3, H, W) uint8 sRGB."""
+    asked = list(zip(answers, images.permute(0, 2, 3, 1).numpy(), strict=True))
+    mine = [pair for pair in asked if pair[0].photograph.label == label]
+    others = [pair for pair in asked if pair[0].photograph.label != label]
+    hits = [pair for pair in mine if pair[0].prediction == label]
+    misses = [pair for pair in mine if pair[0].prediction != label]
+    alarms = [pair for pair in others if pair[0].prediction == label]
+    return [
+        _section(f"{label}, recognised: {len(hits)} of {len(mine)}", "#2e9e5b", hits),
+        _section(f"{label}, called something else: {len(misses)} of {len(mine)}", "#d03b3b", misses),
+        _section(f"other things called {label}: {len(alarms)} of {len(others)}", "#e8a317", alarms),
+    ]
+
+
+def _section(title: str, colour: str, asked: Sequence[tuple[Answer, np.ndarray]]) -> Section:
+    """The surest answers first; where there are too many, evenly drawn down to the least sure."""
+    ordered = sorted(asked, key=lambda pair: -pair[0].probability)
+    if len(ordered) > TILES_PER_SECTION:
+        title += f" ({TILES_PER_SECTION} drawn evenly from the surest to the least sure)"
+        drawn = np.linspace(0, len(ordered) - 1, TILES_PER_SECTION).round().astype(int)
+        ordered = [ordered[index] for index in drawn]
+    return Section(title, colour, [Tile(picture, _caption(answer)) for answer, picture in ordered])
+
+
+def _caption(answer: Answer) -> tuple[str, ...]:
+    """The prediction and, where it is wrong, the true class below it."""
+    said = f"{answer.probability:.0%} {answer.prediction}"
+    if answer.true_rank == 1:
+        return (said,)
+    if answer.true_rank is None:
+        return said, answer.photograph.label
+    return said, f"{answer.true_probability:.0%} {answer.photograph.label}"
 
 
 def draw_contact_sheet(sections: Sequence[Section]) -> Image.Image:

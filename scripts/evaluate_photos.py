@@ -1,0 +1,36 @@
+"""Score a trained network on a folder of photographs: python scripts/evaluate_photos.py run=... photos=..."""
+
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from train.checkpoint import load_network
+from train.cli import one_sentence_errors, with_suggestions
+from train.device import choose_device
+from train.photographs import evaluate_photographs, format_summary
+from train.precision import MixedPrecision, choose_precision
+
+
+@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="evaluate_photos")
+@one_sentence_errors
+def main(config: DictConfig) -> None:
+    device = choose_device(config.device)
+    network, classes = load_network(Path(config.run))
+    model = MixedPrecision(network.to(device), choose_precision(config.precision, device))
+    summary = evaluate_photographs(
+        model,
+        classes,
+        Path(config.photos),
+        config.label,
+        Path(config.out),
+        size=config.size,
+        skip_unreadable=config.skip_unreadable,
+        device=device,
+    )
+    print(format_summary(summary))
+    print(f"\ntable, scores and picture: {config.out}")
+
+
+if __name__ == "__main__":
+    with_suggestions(main, "evaluate_photos")

@@ -1,0 +1,287 @@
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from renderer.errors import InputError
+from train.photographs import Photograph, find_photographs, load_photographs
+
+CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
+DATA = Path(__file__).parents[4] / "shared" / "data"
+
+
+def save(path: Path, pixels: np.ndarray | Image.Image, **options) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)
+    image.save(path, **options)
+    return path
+
+
+def plain(colour=(255, 128, 0), size=(32, 32)) -> Image.Image:
+    return Image.new("RGB", size, colour)
+
+
+def touch(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def load_one(path: Path, size: int = 32) -> np.ndarray:
+    """The picture as (size, size, 3) integers."""
+    photograph = Photograph(PurePosixPath(path.name), "orange", None)
+    _, images, _ = load_photographs(path.parent, [photograph], size)
+    return images[0].permute(1, 2, 0).numpy().astype(int)
+
+
+# ---------------------------------------------------------------------------------------- finding
+
+
+def test_class_folders_give_the_class_at_any_depth_in_sorted_order(tmp_path):
+    touch(tmp_path, "pear/b.PNG", "orange/2026/may/c.jpeg", "orange/a.webp", "other_tomato__none/d.TIF")
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    assert [(str(photograph.path), photograph.label) for photograph in found] == [
+        ("orange/2026/may/c.jpeg", "orange"),
+        ("orange/a.webp", "orange"),
+        ("other_tomato__none/d.TIF", "other_tomato__none"),
+        ("pear/b.PNG", "pear"),
+    ]
+    assert {photograph.source for photograph in found} == {None}
+
+
+def test_pictures_without_class_folders_are_all_of_the_given_class(tmp_path):
+    touch(tmp_path, "b.jpg", "a.gif")
+    assert find_photographs(tmp_path, CLASSES, "pear") == [
+        Photograph(PurePosixPath("a.gif"), "pear", None),
+        Photograph(PurePosixPath("b.jpg"), "pear", None),
+    ]
+
+
+def test_hidden_files_and_other_kinds_of_file_are_passed_over(tmp_path):
+    touch(tmp_path, "orange/a.jpg", "orange/._a.jpg", "orange/.cache/b.jpg", ".git/c.jpg", "orange/notes.txt")
+    (tmp_path / "orange" / "folder.jpg").mkdir()
+    assert [str(photograph.path) for photograph in find_photographs(tmp_path, CLASSES, "orange")] == ["orange/a.jpg"]
+
+
+def test_an_empty_class_folder_is_passed_over(tmp_path):
+    touch(tmp_path, "orange/a.jpg")
+    (tmp_path / "pear").mkdir()
+    assert [str(photograph.path) for photograph in find_photographs(tmp_path, CLASSES, "orange")] == ["orange/a.jpg"]
+
+
+def test_sources_come_from_photos_csv_whatever_its_other_columns_and_rows(tmp_path):
+    touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "pear/c.jpg")
+    rows = "path,class,source_tag\norange/a.jpg,orange,web\norange/b.jpg,orange,\nfig/gone.jpg,fig,web\n\n"
+    (tmp_path / "photos.csv").write_text("\ufeff" + rows, encoding="utf-8")
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    assert [photograph.source for photograph in found] == ["web", None, None]
+
+
+@pytest.mark.parametrize("table", [b"", b"path,source\na.jpg,web\n", b"path,source_tag\n\xff.jpg,web\n"])
+def test_a_photos_csv_without_its_columns_is_refused_by_name(tmp_path, table):
+    touch(tmp_path, "a.jpg")
+    (tmp_path / "photos.csv").write_bytes(table)
+    with pytest.raises(InputError, match=r"photos\.csv .* columns path and source_tag"):
+        find_photographs(tmp_path, CLASSES, "orange")
+
+
+@pytest.mark.parametrize(
+    ("files", "folder", "label", "message"),
+    [
+        ((), "gone", "orange", "gone does not exist"),
+        (("a.jpg",), "a.jpg", "orange", r"a\.jpg is not a folder"),
+        ((), ".", "orange", "holds no photographs"),
+        (("orange/notes.txt",), ".", "orange", "holds no photographs"),
+        (("Oranges/a.jpg",), ".", "orange", "Oranges is not .* 'orange'.* other_Oranges"),
+        (("orange /a.jpg",), ".", "orange", "orange  is not .* 'orange'"),
+        (("orange/a.jpg", "b.jpg"), ".", "orange", r"b\.jpg lies beside class folders"),
+        (("a.jpg",), ".", "PAER", "'PAER' is not a class .* 'pear'"),
+        (("other_lemon/a.jpg",), ".", "other_lemon", "'other_lemon' is not a class"),
+    ],
+)
+def test_what_cannot_be_labelled_is_refused_in_one_sentence(tmp_path, files, folder, label, message):
+    touch(tmp_path, *files)
+    with pytest.raises(InputError, match=message) as caught:
+        find_photographs(tmp_path / folder, CLASSES, label)
+    assert "\n" not in str(caught.value)
+
+
+# ---------------------------------------------------------------------------------------- loading
+
+
+# EXIF 2.3, tag 274: which sides of the upright picture the stored first row and first column are.
+ORIENTATIONS = {
+    1: ("top", "left"),
+    2: ("top", "right"),
+    3: ("bottom", "right"),
+    4: ("bottom", "left"),
+    5: ("left", "top"),
+    6: ("right", "top"),
+    7: ("right", "bottom"),
+    8: ("left", "bottom"),
+}
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+@pytest.mark.parametrize(("orientation", "sides"), ORIENTATIONS.items())
+def test_every_exif_orientation_is_undone(tmp_path, orientation, sides, suffix):
+    blocks = np.random.default_rng(orientation).integers(0, 256, (4, 4, 3), dtype=np.uint8)
+    upright = blocks.repeat(8, axis=0).repeat(8, axis=1)
+    stored = upright if sides[0] in ("top", "bottom") else upright.transpose(1, 0, 2)
+    stored = stored[::-1] if sides[0] in ("bottom", "right") else stored
+    stored = stored[:, ::-1] if sides[1] in ("bottom", "right") else stored
+    exif = Image.Exif()
+    exif[274] = orientation
+    options = {"quality": 100, "subsampling": 0} if suffix == "jpg" else {}
+    path = save(tmp_path / f"a.{suffix}", np.ascontiguousarray(stored), exif=exif, **options)
+    tolerance = 3 if suffix == "jpg" else 0  # JPEG rounds YCbCr and cosine coefficients to integers
+    assert np.abs(load_one(path) - upright).max() <= tolerance
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_only_the_central_square_is_kept(tmp_path, axis):
+    thirds = [np.broadcast_to(np.uint8(colour), (32, 32, 3)) for colour in ((255, 0, 0), (0, 200, 0), (0, 0, 255))]
+    path = save(tmp_path / "a.png", np.concatenate(thirds, axis=axis))
+    np.testing.assert_array_equal(load_one(path), thirds[1])
+
+
+def test_the_square_is_exactly_central_so_that_a_turned_picture_loads_turned(tmp_path):
+    pixels = np.random.default_rng(0).integers(64, 192, (67, 90, 3), dtype=np.uint8)  # no clipping
+    loaded = load_one(save(tmp_path / "a.png", pixels))
+    turned = load_one(save(tmp_path / "b.png", np.ascontiguousarray(np.rot90(pixels))))
+    # Pillow filters along rows first and rounds to 8 bits in between.
+    assert np.abs(turned - np.rot90(loaded)).max() <= 1
+
+
+@pytest.mark.parametrize("side", [64, 100, 333])
+def test_detail_too_fine_to_show_reduces_to_grey(tmp_path, side):
+    checkerboard = (np.indices((side, side)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    loaded = load_one(save(tmp_path / "a.png", checkerboard))
+    assert np.abs(loaded - 127.5)[3:-3, 3:-3].max() <= 1.5  # rounded to 8 bits twice
+    assert np.abs(loaded - 127.5).max() <= 4  # at the rim the filter is cut off
+
+
+def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
+    rng = np.random.default_rng(0)
+    coarse = Image.fromarray(rng.integers(0, 256, (24, 32, 3), dtype=np.uint8))
+    path = save(tmp_path / "a.jpg", coarse.resize((2333, 1801), Image.Resampling.BICUBIC), quality=90)
+    with Image.open(path) as image:
+        whole = save(tmp_path / "a.bmp", image.convert("RGB"))
+    difference = np.abs(load_one(path) - load_one(whole))
+    # Halving an odd side rounds it up, which moves the centre by 1/100 of a final pixel.
+    assert difference.max() <= 8 and difference.mean() <= 1
+
+
+def with_alpha(mode: str, colour: tuple[int, ...]) -> Image.Image:
+    return Image.new(mode, (40, 40), colour)
+
+
+def palette() -> Image.Image:
+    image = Image.new("P", (40, 40), 1)
+    image.putpalette([0, 0, 0, 10, 200, 30])
+    return image
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "options", "expected"),
+    [
+        ("grey.png", Image.new("L", (40, 40), 100), {}, (100, 100, 100)),
+        ("black-and-white.png", Image.new("1", (40, 40), 1), {}, (255, 255, 255)),
+        ("palette.png", palette(), {}, (10, 200, 30)),
+        ("palette.gif", palette(), {}, (10, 200, 30)),
+        ("clear-palette.png", palette(), {"transparency": 1}, (255, 255, 255)),
+        ("half-clear-palette.png", palette(), {"transparency": bytes([255, 51])}, (206, 244, 210)),
+        ("colour-key.png", plain((10, 20, 30)), {"transparency": (10, 20, 30)}, (255, 255, 255)),
+        ("alpha.png", Image.new("RGBA", (40, 40), (255, 0, 0, 51)), {}, (255, 204, 204)),
+        ("grey-alpha.png", Image.new("LA", (40, 40), (0, 51)), {}, (204, 204, 204)),
+        ("alpha.webp", Image.new("RGBA", (40, 40), (255, 0, 0, 0)), {"lossless": True}, (255, 255, 255)),
+        ("cmyk.tif", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {}, (255, 0, 0)),
+        ("cmyk.jpg", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {"quality": 100}, (255, 0, 0)),
+        ("sixteen.png", Image.fromarray(np.full((40, 40), 0x80C0, np.uint16)), {}, (128, 128, 128)),
+        ("sixteen.tif", Image.fromarray(np.full((40, 40), 0xFFFF, np.uint16)), {}, (255, 255, 255)),
+        ("thirty-two.tif", Image.fromarray(np.full((40, 40), 0x40FF, np.int32)), {}, (64, 64, 64)),
+        ("plain.bmp", plain((1, 2, 3)), {}, (1, 2, 3)),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_any_mode_becomes_rgb_over_white(tmp_path, name, image, options, expected):
+    loaded = load_one(save(tmp_path / name, image, **options))
+    assert np.abs(loaded - expected).max() <= (2 if name.endswith("jpg") else 0)
+
+
+def test_pictures_come_as_bytes_in_the_order_asked_for(tmp_path):
+    colours = {"c.png": (255, 0, 0), "a.png": (0, 255, 0), "b.png": (0, 0, 255)}
+    for name, colour in colours.items():
+        save(tmp_path / name, plain(colour, (50, 40)))
+    photographs = [Photograph(PurePosixPath(name), "orange", None) for name in colours]
+    kept, images, unreadable = load_photographs(tmp_path, photographs, size=8)
+    assert (kept, unreadable) == (photographs, [])
+    assert images.dtype == torch.uint8 and images.shape == (3, 3, 8, 8) and images.is_contiguous()
+    assert [tuple(image[:, 4, 4].tolist()) for image in images] == list(colours.values())
+
+
+def truncated(path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    save(path, noise)
+    path.write_bytes(path.read_bytes()[:2000])
+
+
+BROKEN = {
+    "truncated.jpg": truncated,
+    "truncated.png": truncated,
+    "empty.jpg": Path.touch,
+    "text.png": lambda path: path.write_text("not a picture"),
+    "huge.png": lambda path: save(path, plain(size=(100, 100))),
+    "float.tif": lambda path: save(path, np.ones((40, 40), np.float32)),
+}
+
+
+@pytest.fixture
+def small_bomb_limit(monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4096)  # Pillow refuses what has over twice as many
+
+
+@pytest.mark.parametrize(("name", "break_picture"), BROKEN.items())
+def test_an_unreadable_picture_is_named_or_skipped(tmp_path, small_bomb_limit, name, break_picture):
+    break_picture(tmp_path / name)
+    save(tmp_path / "good.png", plain())
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    with pytest.raises(
+        InputError, match=rf"1 of 2 .*{name} .* set skip_unreadable=true \(evaluate\.skip_unreadable=true in training\)"
+    ):
+        load_photographs(tmp_path, found)
+    kept, images, unreadable = load_photographs(tmp_path, found, skip_unreadable=True)
+    assert [str(photograph.path) for photograph in kept] == ["good.png"]
+    assert images.shape == (1, 3, 32, 32) and unreadable == [name]
+
+
+def test_many_unreadable_pictures_are_counted_and_the_first_is_named(tmp_path, small_bomb_limit):
+    for name, break_picture in BROKEN.items():
+        break_picture(tmp_path / name)
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    for skip_unreadable in (False, True):  # there is nothing to go on with
+        with pytest.raises(InputError, match=r"6 of 6 .*empty\.jpg .*replace them$"):
+            load_photographs(tmp_path, found, skip_unreadable=skip_unreadable)
+
+
+# -------------------------------------------------------------------------------------- real data
+
+
+@pytest.mark.realdata
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
+def test_the_shared_photographs_are_found_labelled_and_loaded():
+    with np.load(DATA / "cifar100.npz") as archive:
+        classes = archive["classes"].tolist()
+    found = find_photographs(DATA / "photos", classes, "orange")
+    oranges = [photograph for photograph in found if photograph.label == "orange"]
+    assert (len(oranges), len(found) - len(oranges)) == (527, 920)
+    sources = {photograph.source for photograph in oranges}
+    assert sources == {"tiny", "web1", "web2", "web3", "turntable"}
+    kept, images, unreadable = load_photographs(DATA / "photos", found[::10])
+    assert (kept, unreadable) == (found[::10], [])
+    assert images.shape == (145, 3, 32, 32)
+    of_oranges = images[[photograph.label == "orange" for photograph in kept]].float().mean(dim=(0, 2, 3))
+    assert of_oranges[0] > of_oranges[1] > of_oranges[2]  # red above green above blue

@@ -1,0 +1,220 @@
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.special import softmax
+from scipy.stats import binomtest
+
+from renderer.errors import InputError
+from train.photographs import evaluate_photographs, format_summary
+
+
+def share(hits: int, n: int) -> dict:
+    interval = binomtest(hits, n).proportion_ci(method="wilson")
+    return {"value": hits / n, "low": interval.low, "high": interval.high, "hits": hits, "n": n}
+
+
+NOTHING = {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
+
+STORY_SUMMARY = {
+    "label": "orange",
+    "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0},
+    "recall": share(1, 5),
+    "top5": share(4, 5),
+    "false_alarms": share(2, 5),
+    "most_common_wrong": {"pear": 2, "apple": 1, "plum": 1},
+    "by_source": {
+        "lab": {"n": 2, "recall": share(1, 2), "top5": share(2, 2), "false_alarms": NOTHING},
+        "shop": {"n": 2, "recall": NOTHING, "top5": NOTHING, "false_alarms": share(1, 2)},
+        "street": {"n": 4, "recall": share(0, 2), "top5": share(1, 2), "false_alarms": share(1, 2)},
+    },
+    "by_class": {
+        "orange": {
+            "n": 5,
+            "recall": share(1, 5),
+            "top5": share(4, 5),
+            "called_label": share(1, 5),
+            "most_common_wrong": {"pear": 2, "apple": 1, "plum": 1},
+        },
+        "other_lemon": {
+            "n": 2,
+            "recall": NOTHING,
+            "top5": NOTHING,
+            "called_label": share(1, 2),
+            "most_common_wrong": {"lime": 1, "orange": 1},
+        },
+        "pear": {
+            "n": 3,
+            "recall": share(1, 3),
+            "top5": share(2, 3),
+            "called_label": share(1, 3),
+            "most_common_wrong": {"apple": 1, "orange": 1},
+        },
+    },
+    "unreadable": [],
+}
+
+
+def rounded(tree):
+    """The same tree with its floats to 12 digits, below which the order of the operations shows."""
+    if isinstance(tree, dict):
+        return {key: rounded(value) for key, value in tree.items()}
+    return round(tree, 12) if isinstance(tree, float) else tree
+
+
+@pytest.mark.parametrize("batch_size", [1, 3, 256])
+def test_every_figure_of_a_known_model_is_right(story, tmp_path, batch_size):
+    summary = evaluate_photographs(*story, "orange", tmp_path / "out", batch_size=batch_size)
+    assert rounded(summary) == rounded(STORY_SUMMARY)
+    ordered = summary["by_class"]["orange"]["most_common_wrong"]
+    assert list(ordered.items()) == [("pear", 2), ("apple", 1), ("plum", 1)]
+
+
+def test_the_summary_written_is_the_summary_returned_in_strict_json(story, tmp_path):
+    summary = evaluate_photographs(*story, "orange", tmp_path / "new" / "out")
+    text = (tmp_path / "new" / "out" / "summary.json").read_text(encoding="utf-8")
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    assert json.loads(text, parse_constant=refuse) == summary
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_csv_gives_each_photograph_its_probabilities_and_brute_force_ranks(known_model, tmp_path):
+    classes = ["apple", "fig", "lime", "orange", "pear", "plum"]
+    names = [f"{label}/{index}.png" for label in ("orange", "other_x", "plum") for index in range(4)]
+    logits = np.random.default_rng(0).normal(0, 3, (len(names), len(classes))).astype(np.float32)
+    evaluate_photographs(*known_model(names, logits, classes), "orange", tmp_path)
+    rows = read_csv(tmp_path / "photographs.csv")
+    assert [row["path"] for row in rows] == names
+    for row, scores in zip(rows, logits.astype(float), strict=True):
+        probabilities = dict(zip(classes, softmax(scores), strict=True))
+        ranking = sorted(classes, key=probabilities.get, reverse=True)
+        label = row["path"].split("/")[0]
+        assert (row["label"], row["source"], row["prediction"]) == (label, "", ranking[0])
+        assert float(row["probability"]) == pytest.approx(probabilities[ranking[0]], rel=1e-12)
+        assert float(row["orange_probability"]) == pytest.approx(probabilities["orange"], rel=1e-12)
+        assert int(row["orange_rank"]) == ranking.index("orange") + 1
+        if label == "other_x":
+            assert (row["true_probability"], row["true_rank"]) == ("", "")
+        else:
+            assert float(row["true_probability"]) == pytest.approx(probabilities[label], rel=1e-12)
+            assert int(row["true_rank"]) == ranking.index(label) + 1
+
+
+def test_ranks_hold_where_probabilities_round_to_zero(known_model, tmp_path):
+    evaluate_photographs(*known_model(["a.png"], [[0, -5000, -4000]], ["a", "b", "c"]), "c", tmp_path)
+    (row,) = read_csv(tmp_path / "photographs.csv")
+    assert (float(row["c_probability"]), row["c_rank"]) == (0, "2")
+
+
+@pytest.mark.parametrize("place", [0, 1, 4, 5, 299])
+def test_a_tie_of_all_classes_goes_to_the_first_alone(known_model, tmp_path, place):
+    classes = [f"class {index}" for index in range(300)]  # sorts that are not stable show it at this size
+    undecided = known_model(["a.png"], np.zeros((1, 300)), classes)
+    summary = evaluate_photographs(*undecided, classes[place], tmp_path)
+    assert summary["recall"]["value"] == (place == 0)
+    assert summary["top5"]["value"] == (place < 5)
+
+
+def test_black_reaches_the_model_as_0_and_white_as_1(tmp_path):
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (32, 32), (0, 255, 51)).save(tmp_path / "photos" / "a.png")
+
+    def check(images):
+        assert images.tolist() == torch.tensor([0, 1, 0.2]).view(1, 3, 1, 1).expand(1, 3, 8, 8).tolist()
+        return torch.zeros(1, 2)
+
+    evaluate_photographs(check, ["orange", "pear"], tmp_path / "photos", "orange", tmp_path, size=8)
+
+
+def test_a_model_that_calls_everything_orange_has_recall_1_and_false_alarms_1(story, tmp_path):
+    _, classes, folder = story
+    orange = torch.tensor([float(name == "orange") for name in classes])
+    summary = evaluate_photographs(lambda x: orange.expand(len(x), -1), classes, folder, "orange", tmp_path)
+    assert summary["recall"]["value"] == summary["false_alarms"]["value"] == 1
+    assert summary["most_common_wrong"] == {}
+    assert all(figures["called_label"]["value"] == 1 for figures in summary["by_class"].values())
+
+
+def test_a_class_without_photographs_has_no_recall_rather_than_a_wrong_one(story, tmp_path):
+    summary = evaluate_photographs(*story, "fig", tmp_path)
+    assert summary["recall"] == summary["top5"] == NOTHING
+    assert rounded(summary["false_alarms"]) == rounded(share(0, 10))
+
+
+def test_skipped_photographs_are_counted_and_named_but_not_scored(story, tmp_path):
+    _, _, folder = story
+    (folder / "orange" / "broken.jpg").touch()
+    with pytest.raises(InputError, match="1 of 11 "):
+        evaluate_photographs(*story, "orange", tmp_path)
+    summary = evaluate_photographs(*story, "orange", tmp_path, skip_unreadable=True)
+    assert summary["unreadable"] == ["orange/broken.jpg"]
+    assert summary["n"] == {"photographs": 10, "label": 5, "others": 5, "unreadable": 1}
+    assert format_summary(summary).endswith("1 unreadable: orange/broken.jpg")
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_model_is_asked_in_eval_mode_without_gradients_and_left_as_it_was(story, tmp_path, fails):
+    oracle, classes, folder = story
+
+    class Spy(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.live, self.frozen = torch.nn.BatchNorm2d(3), torch.nn.BatchNorm2d(3).eval()
+
+        def forward(self, images):
+            assert not any(module.training for module in self.modules())
+            assert not self.live(images).requires_grad
+            if fails:
+                raise RuntimeError("out of memory")
+            return oracle(images)
+
+    model = Spy()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    try:
+        evaluate_photographs(model, classes, folder, "orange", tmp_path)
+    except RuntimeError:
+        assert fails
+    assert (model.training, model.live.training, model.frozen.training) == (True, True, False)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [(torch.zeros(10), r"shape \(10, 10\), not \(10, 6\)"), (torch.full((6,), torch.nan), "not finite")],
+)
+def test_a_model_that_does_not_fit_is_refused(story, tmp_path, answer, message):
+    _, classes, folder = story
+    with pytest.raises(InputError, match=message):
+        evaluate_photographs(lambda x: answer.expand(len(x), -1), classes, folder, "orange", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("out", ["photos", "photos/out", "photos/orange", "link/out", "new/../photos/out"])
+def test_scores_are_never_written_among_the_photographs(story, tmp_path, out):
+    _, classes, folder = story
+    (tmp_path / "link").symlink_to(folder)
+    before = sorted(folder.rglob("*"))
+
+    def refuse(images):
+        raise AssertionError("the model was asked")
+
+    with pytest.raises(InputError, match=r"^out=.* lies inside the photographs' folder: choose another$"):
+        evaluate_photographs(refuse, classes, folder, "orange", tmp_path / out)
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize("out", [".", "photos_scored", "photos/../scored"])
+def test_scores_may_be_written_beside_or_above_the_photographs(story, tmp_path, out):
+    evaluate_photographs(*story, "orange", tmp_path / out)
+    assert (tmp_path / out / "summary.json").is_file()

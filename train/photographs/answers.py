@@ -1,0 +1,92 @@
+"""Ask a model about pictures: its probabilities, and where it ranks the classes that matter."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+
+from renderer.errors import InputError
+from train.photographs.folder import Photograph
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the model says of one photograph.
+
+    Ranks count from 1, the model's prediction. The figures of the true class are None for a class that
+    the model lacks. `asked` is the class that the evaluation is about.
+    """
+
+    photograph: Photograph
+    prediction: str
+    probability: float
+    true_probability: float | None
+    true_rank: int | None
+    asked_probability: float
+    asked_rank: int
+
+
+def ask(
+    model: Callable[[torch.Tensor], torch.Tensor],
+    images: torch.Tensor,
+    classes: int,
+    batch_size: int,
+    device: str | torch.device,
+) -> torch.Tensor:
+    """The model's logits, (N, classes) float32 on the CPU, for images (N, 3, H, W) uint8 sRGB.
+
+    A module is asked in eval mode and left as it was found. Raises InputError for logits of another shape or not
+    finite.
+    """
+    with _in_eval_mode(model), torch.inference_mode():
+        batches = [model(batch.to(device).float() / 255) for batch in images.split(batch_size)]
+        logits = torch.cat(batches).float().cpu()
+    if logits.shape != (len(images), classes):
+        raise InputError(
+            f"the model answers in shape {tuple(logits.shape)}, not {(len(images), classes)}: "
+            "evaluate a checkpoint that was trained on these classes"
+        )
+    if not logits.isfinite().all():
+        raise InputError("the model's logits are not finite: evaluate a checkpoint of a run that did not diverge")
+    return logits
+
+
+@contextmanager
+def _in_eval_mode(model: Callable) -> Iterator[None]:
+    modules = list(model.modules()) if isinstance(model, torch.nn.Module) else []
+    modes = [module.training for module in modules]  # one by one: a frozen layer may differ from the whole
+    try:
+        for module in modules:
+            module.training = False
+        yield
+    finally:
+        for module, mode in zip(modules, modes, strict=True):
+            module.training = mode
+
+
+def rank_classes(
+    photographs: Sequence[Photograph], logits: torch.Tensor, classes: Sequence[str], label: str
+) -> list[Answer]:
+    """What the logits, (N, C) in the order of `classes`, say of each photograph; `label` is the asked class."""
+    probabilities = logits.double().softmax(dim=1).numpy()
+    # Ranks come from the logits, whose order survives where probabilities round to 0; ties go to the first.
+    order = logits.argsort(dim=1, descending=True, stable=True)
+    ranks = (order.argsort(dim=1) + 1).numpy()
+    index = {name: column for column, name in enumerate(classes)}
+    asked = index[label]
+    answers = []
+    for row, photograph in enumerate(photographs):
+        true, best = index.get(photograph.label), int(order[row, 0])
+        answers.append(
+            Answer(
+                photograph,
+                prediction=classes[best],
+                probability=float(probabilities[row, best]),
+                true_probability=None if true is None else float(probabilities[row, true]),
+                true_rank=None if true is None else int(ranks[row, true]),
+                asked_probability=float(probabilities[row, asked]),
+                asked_rank=int(ranks[row, asked]),
+            )
+        )
+    return answers

@@ -1,0 +1,53 @@
+"""The summary of an evaluation as text for the terminal."""
+
+from collections.abc import Sequence
+
+
+def format_summary(summary: dict) -> str:
+    """The summary of `evaluate_photographs` as aligned plain text, without a newline at the end."""
+    label, n = summary["label"], summary["n"]
+    overall_rows = [
+        ("", "recall", "top-5", "false alarms"),
+        *(
+            (name, *(_interval(figures[key]) for key in ("recall", "top5", "false_alarms")))
+            for name, figures in [("overall", summary), *summary["by_source"].items()]
+        ),
+    ]
+    class_rows = [
+        ("class", "n", "recall", "top-5", f"called {label}", "most common wrong answers"),
+        *(
+            (
+                name,
+                str(figures["n"]),
+                *(_value(figures[key]) for key in ("recall", "top5", "called_label")),
+                ", ".join(f"{answer} {count}" for answer, count in figures["most_common_wrong"].items()),
+            )
+            for name, figures in summary["by_class"].items()
+        ),
+    ]
+    paragraphs = [
+        f"{n['label']} pictures of {label}, {n['others']} of other things",
+        _table(overall_rows, "<>>>"),
+        _table(class_rows, "<>>>><"),
+    ]
+    if summary["unreadable"]:
+        paragraphs.append(f"{n['unreadable']} unreadable: {', '.join(summary['unreadable'])}")
+    return "\n\n".join(paragraphs)
+
+
+def _value(share: dict) -> str:
+    return "-" if share["n"] == 0 else f"{share['value']:.3f}"
+
+
+def _interval(share: dict) -> str:
+    if share["n"] == 0:
+        return "-"
+    return f"{share['hits']}/{share['n']} = {share['value']:.3f} [{share['low']:.3f}, {share['high']:.3f}]"
+
+
+def _table(rows: Sequence[Sequence[str]], alignment: str) -> str:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(row, alignment, widths, strict=True)).rstrip()
+        for row in rows
+    )
