@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment.cost import adversarial_cost
@@ -120,7 +121,7 @@ def _direction(gradient: Tensor, step: str) -> Tensor:
     # Scaling by the largest entry first keeps tiny gradients from underflowing when squared.
     flat = gradient.flatten(1)
     scaled = flat / flat.abs().amax(1, keepdim=True).clamp(min=torch.finfo(flat.dtype).tiny)
-    return (scaled / scaled.norm(dim=1, keepdim=True).clamp(min=1)).view_as(gradient)
+    return F.normalize(scaled, eps=torch.finfo(flat.dtype).tiny).view_as(gradient)
 
 
 @contextmanager

@@ -29,6 +29,10 @@ class ObjectSettings:
     up: str = "auto"
     gain: float = 1.0
 
+    def __post_init__(self):
+        if not self.gain > 0:
+            raise InputError(f"scene.meshes: gain={self.gain} of {self.mesh} must be positive")
+
 
 @dataclass(frozen=True)
 class SceneObject:
@@ -94,6 +98,8 @@ class Scene:
         settings: Settings,
         device: torch.device | str = "cpu",
     ):
+        if not all(0 <= grey <= 1 for grey in backgrounds):
+            raise InputError(f"scene.backgrounds={list(backgrounds)}: give grey values in [0, 1]")
         operators = [operator for item in objects for operator in item.operators]
         self.settings = settings
         self.labels = [item.label for item in objects for _ in item.operators for _ in backgrounds]

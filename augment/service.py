@@ -99,7 +99,7 @@ class AugmentationService:
 
         The draw depends on the seed and the epoch alone, so a resumed run repeats it.
         """
-        if self._scene is None:
+        if not self.settings.renders:
             return Renders(torch.zeros(0), self._labels[:0], {})
         make = self._random if self.settings.arm == "random" else self._adversarial
         return make(model, epoch)

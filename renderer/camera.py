@@ -5,17 +5,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from renderer.errors import InputError
+
 
 @dataclass(frozen=True)
 class OrthographicCamera:
     """A parallel projection from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
 
     field_of_view: width of the square picture in world units; a normalised mesh spans at most [-1, 1] per axis.
+    InputError where it is not positive.
     """
 
     polar: float
     azimuth: float
     field_of_view: float
+
+    def __post_init__(self):
+        if not self.field_of_view > 0:
+            raise InputError(f"scene.field_of_view={self.field_of_view} must be positive")
 
     def axes(self) -> np.ndarray:
         """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""

@@ -57,7 +57,7 @@ def lambertian_factors(degree: int) -> Tensor:
     """
     _check_degree(degree)
     factors = torch.zeros(degree + 1, dtype=torch.float64)
-    factors[:2] = torch.tensor([math.pi, 2 * math.pi / 3][: degree + 1])
+    factors[:2] = torch.tensor([math.pi, 2 * math.pi / 3], dtype=torch.float64)[: degree + 1]
     for l in range(2, degree + 1, 2):
         ratio = math.comb(l, l // 2) / 2.0**l
         factors[l] = 2 * math.pi * (-1) ** (l // 2 - 1) / ((l + 2) * (l - 1)) * ratio

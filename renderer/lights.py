@@ -26,7 +26,7 @@ _PUBLISHED_PROBES = {
         (0.01, -0.01, -0.05), (-0.09, -0.13, -0.15), (-0.06, -0.05, -0.04), (0.02, 0.00, -0.05),
     ],
     "st_peters": [
-        (0.36, 0.26, 0.23), (0.18, 0.14, 0.13), (-0.02, -0.01, 0.00), (0.03, 0.02, 0.00), (0.02, 0.01, 0.00),
+        (0.36, 0.26, 0.23), (0.18, 0.14, 0.13), (-0.02, -0.01, 0.00), (0.03, 0.02, 0.01), (0.02, 0.01, 0.00),
         (-0.05, -0.03, -0.01), (-0.09, -0.08, -0.07), (0.01, 0.00, 0.00), (-0.08, -0.03, 0.00),
     ],
 }  # fmt: skip
@@ -108,10 +108,11 @@ def _read_map(path: Path) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"environment map {path} does not exist: give the path of an .npy file")
     try:
-        radiance = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
+        with path.open("rb") as file:
+            radiance = np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
+    except (ValueError, TypeError, OSError) as error:
         raise InputError(f"environment map {path} is not a readable .npy file: {error}") from error
-    if radiance.ndim != 3 or radiance.shape[2] != 3 or not np.isfinite(radiance).all() or radiance.min() < 0:
+    if radiance.ndim != 3 or radiance.shape[2] != 3 or not np.isfinite(radiance).all() or (radiance < 0).any():
         raise InputError(
             f"environment map {path} has shape {radiance.shape}: it must hold finite radiance ≥ 0, (height, width, 3)"
         )

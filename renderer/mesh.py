@@ -11,12 +11,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 from PIL import Image
 from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
 from renderer.errors import InputError
+from renderer.image import encode
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
@@ -167,8 +169,8 @@ def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
     if not (np.isfinite(vertices).all() and (uvs is None or np.isfinite(uvs).all())):
         raise ValueError("coordinates are not finite")
     colors, image = _corner_colors(geometry.visual, faces)
-    colors = (_encode(colors) if linear else colors).astype(np.float32)
-    mesh = replace(Mesh.plain(vertices, faces), corner_colors=colors)
+    colors = encode(torch.from_numpy(colors), "srgb").numpy() if linear else colors
+    mesh = replace(Mesh.plain(vertices, faces), corner_colors=colors.astype(np.float32))
     if image is None or uvs is None:
         return mesh
     return replace(
@@ -208,11 +210,6 @@ def _unit_rgb(colors: np.ndarray) -> np.ndarray:
     """Red, green and blue in [0, 1], from integers of any width or from numbers that are so already."""
     rgb = np.asarray(colors)[..., :3]
     return rgb / np.iinfo(rgb.dtype).max if rgb.dtype.kind in "ui" else rgb
-
-
-def _encode(linear: np.ndarray) -> np.ndarray:
-    """The sRGB transfer function (IEC 61966-2-1)."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def _transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
 from renderer.harmonics import irradiance_basis
 from renderer.image import decode
 from renderer.mesh import Mesh
@@ -23,11 +24,15 @@ COEFFICIENTS = (DEGREE + 1) ** 2
 
 @dataclass(frozen=True)
 class Settings:
-    """How meshes become operators: picture size and samples per pixel side, encoding, gain on the albedo."""
+    """How meshes become operators: picture size in pixels, samples per pixel side (InputError if none), encoding."""
 
     size: int = 32
     samples: int = 8
     encoding: str = "linear"
+
+    def __post_init__(self):
+        if self.samples < 1:
+            raise InputError(f"renderer.samples={self.samples} must be at least 1")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from train.cli import one_sentence_errors, with_suggestions
-from train.experiment import load_data, run, write_pictures
+from train.experiment import load_data, prepare, write_pictures
 from train.logs import console
 from train.report import format_table, summarise
 
@@ -21,14 +21,15 @@ def main(config: DictConfig) -> None:
     alone = hydra_config.mode == RunMode.RUN  # the cells of a sweep are compared with each other instead
     data = load_data(config)
     write_pictures(config, data.size)
-    folders = []
-    for arm in config.compare if alone else []:
-        console.info("\n== augment=%s, for comparison", arm)
-        folders.append(folder / arm)
-        run(OmegaConf.merge(config, {"augment": {"arm": arm}}), data, folders[-1])
-    console.info("\n== augment=%s", config.augment.arm)
-    run(config, data, folder)
-    console.info("\n%s", format_table([summarise(path) for path in [*folders, folder]]))
+    arms = {
+        folder / arm: OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in (config.compare if alone else [])
+    }
+    arms[folder] = config
+    runs = {path: prepare(arm, data, path) for path, arm in arms.items()}  # all first: a mistake in any shows at once
+    for path, train_and_score in runs.items():
+        console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")
+        train_and_score()
+    console.info("\n%s", format_table([summarise(path) for path in arms]))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue
+from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
 from renderer.errors import InputError
 
@@ -26,6 +26,8 @@ def one_sentence_errors(function: Callable) -> Callable:
             message = str(error)
         except MissingMandatoryValue as error:
             message = f"{error.full_key} is not set: give {error.full_key}=..."
+        except InterpolationResolutionError as error:
+            message = f"{error.full_key}: {str(error.msg).splitlines()[0]}"
         print(f"error: {message}", file=sys.stderr)
         sys.exit(USER_ERROR)
 
@@ -44,26 +46,19 @@ def with_suggestions(main: Callable[[], None], config_name: str) -> None:
 
 
 def _suggestions(arguments: list[str], config_name: str) -> Iterator[str]:
-    overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
-    accepted: list[str] = []
-    rejected: list[str] = []
-    with initialize_config_module("conf", version_base="1.3"):
-        for override in overrides:
-            (accepted if _composes(config_name, [*accepted, override]) else rejected).append(override)
-        keys = list(_keys(compose(config_name, accepted)))
-    for override in rejected:
-        key = override.partition("=")[0].lstrip("+~")
-        nearest = difflib.get_close_matches(key, keys, n=1, cutoff=0.5)
-        if key not in keys and nearest:
-            yield f"Nearest valid key to {key!r}: {nearest[0]}"
-
-
-def _composes(config_name: str, overrides: list[str]) -> bool:
+    """A line for each override whose key is neither a key nor a group of the configuration that the groups make."""
+    overrides = [argument.partition("=") for argument in arguments if "=" in argument and argument[0] not in "+~-"]
     try:
-        compose(config_name, [override.split(",")[0] for override in overrides])
-    except HydraException:
-        return False
-    return True
+        with initialize_config_module("conf", version_base="1.3"):
+            groups = compose(config_name, return_hydra_config=True).hydra.runtime.choices
+            chosen = [f"{key}={value.split(',')[0]}" for key, _, value in overrides if key in groups]
+            known = [*groups, *_keys(compose(config_name, chosen, return_hydra_config=True))]
+    except HydraException:  # a group has no such choice: Hydra's own error lists those it has
+        return
+    for key, _, _ in overrides:
+        nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+        if key not in known and nearest:
+            yield f"Nearest valid key to {key!r}: {nearest[0]}"
 
 
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:

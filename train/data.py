@@ -55,17 +55,20 @@ def class_index(classes: Sequence[str], name: str, key: str) -> int:
     raise InputError(f"{key}: the data has no class {name!r}{hint}")
 
 
-def stratified_split(split: Split, share: float, seed: int) -> tuple[Split, Split]:
-    """(train, validation) with the share of every class's pictures, rounded, in validation."""
+def stratified_split(split: Split, share: float, seed: int, key: str = "data.validation") -> tuple[Split, Split]:
+    """(train, held out) with the share of every class's pictures, rounded, held out. InputError names the key."""
     if not 0 < share < 1:
-        raise InputError(f"data.validation={share} must lie between 0 and 1")
+        raise InputError(f"{key}={share} must lie between 0 and 1")
     held_out = torch.zeros(len(split), dtype=torch.bool)
     draws = generator(seed, "validation")
     for label in split.labels.unique():
         members = torch.nonzero(split.labels == label).squeeze(1)
         count = round(share * len(members))
         if not 0 < count < len(members):
-            raise InputError(f"data.validation={share} of {len(members)} pictures leaves class {int(label)} empty")
+            raise InputError(
+                f"{key}={share} of the {len(members)} pictures of class {int(label)} is all or nothing: "
+                "add pictures or change the share"
+            )
         held_out[members[torch.randperm(len(members), generator=draws)[:count]]] = True
     return split[~held_out], split[held_out]
 
@@ -97,14 +100,14 @@ def load_cifar100(path: str) -> DataSet:
 
 def load_npz(path: str) -> DataSet:
     """Arrays train_images and test_images (N, 3, H, W) uint8, train_labels and test_labels (N,), classes (C,) str."""
+    required = ("train_images", "train_labels", "test_images", "test_labels", "classes")
     if not Path(path).is_file():
         raise InputError(f"data.path={path} does not exist: give the path of an .npz file")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (ValueError, OSError, EOFError) as error:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in required if name in archive}
+    except Exception as error:  # zipfile, zlib and NumPy raise many kinds for a damaged or foreign file
         raise InputError(f"data.path={path} is not an .npz file that loads without pickle: {error}") from error
-    required = ("train_images", "train_labels", "test_images", "test_labels", "classes")
     if missing := [name for name in required if name not in arrays]:
         raise InputError(f"data.path={path} lacks the array {missing[0]}: it needs {', '.join(required)}")
     classes = arrays["classes"]
@@ -126,18 +129,19 @@ def load_folder(path: str, size: int, test: float) -> DataSet:
         raise InputError(f"data.path={path} is not a folder: give a folder with one folder of pictures per class")
     divided = (root / "train").is_dir() and (root / "test").is_dir()
     train_root = root / "train" if divided else root
-    classes = tuple(sorted(entry.name for entry in train_root.iterdir() if entry.is_dir()))
+    folders = [entry.name for entry in train_root.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
+    classes = tuple(sorted(folders))
     if len(classes) < 2:
         raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
     train = _folder_split(train_root, classes, size)
     if divided:
         return DataSet(classes, train, _folder_split(root / "test", classes, size))
-    return DataSet(classes, *stratified_split(train, test, seed=0))
+    return DataSet(classes, *stratified_split(train, test, seed=0, key="data.test"))
 
 
 def _folder_split(root: Path, classes: tuple[str, ...], size: int) -> Split:
     photographs, images, _ = load_photographs(root, find_photographs(root, classes, classes[0]), size)
-    return Split(images, torch.tensor([classes.index(photograph.label) for photograph in photographs]))
+    return Split(images, torch.tensor([class_index(classes, item.label, f"data.path={root}") for item in photographs]))
 
 
 def _npz_split(path: str, arrays: dict[str, np.ndarray], part: str, classes: int) -> Split:

@@ -1,23 +1,24 @@
 """One run from its configuration: data, scene, network, training, scores on the test set and on photographs."""
 
 import platform
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
 import torchvision
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from augment.phases import Phases
 from augment.scene import ObjectSettings, Scene, build_objects, count_views
 from augment.seeding import stream_seed
-from augment.service import AugmentationService, AugmentationSettings
+from augment.service import AugmentationService
 from renderer.errors import InputError
 from renderer.lights import load_light
 from renderer.transfer import Settings
-from renderer.visibility import Backend, choose
+from renderer.visibility import choose
 from train import checkpoint
 from train.data import (
     DataSet,
@@ -29,70 +30,30 @@ from train.data import (
     stratified_split,
 )
 from train.device import choose_device
-from train.fit import Trainer, TrainSettings, evaluate
+from train.fit import Trainer, evaluate
 from train.logs import RunLog, console
-from train.photographs import evaluate_photographs, format_summary
+from train.photographs import evaluate_photographs, find_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
+from train.settings import ExperimentSettings, read_settings
 from train.wideresnet import WideResNet
 
 CONFIG = "config.yaml"
 PHOTOGRAPHS = "photographs"
 
 
-@dataclass
-class ModelSettings:
-    """The WideResNet; its dropout acts between the two convolutions of a block."""
-
-    depth: int = 16
-    width: int = 4
-    dropout: float = 0.3
-
-
-@dataclass
-class SceneSettings:
-    """What is rendered. meshes: each a file, a `solid:NAME`, or a mapping with ObjectSettings' keys."""
-
-    meshes: list
-    backgrounds: list[float] = field(default_factory=list)
-    views: int | None = None
-    field_of_view: float = 2.0
-    light: str = "grace"
-    exposure: float = 1.0
-
-
-@dataclass
-class RendererSettings:
-    """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb."""
-
-    visibility: str = "auto"
-    samples: int = 8
-    encoding: str = "linear"
-
-
-def run(config: DictConfig, data: DataSet, folder: Path) -> None:
-    """Train one arm into `folder` and score it; everything found out is in the folder's files."""
-    settings = read_settings(TrainSettings, config.train, "train")
-    device = choose_device(settings.device)
-    trainer, log, (train, validation) = _prepare(config, settings, data, folder, device)
-    trainer.fit(train, validation, log)
-    scores = _test_scores(trainer, data, device)
-    if config.evaluate.photos:
-        scores |= _photograph_scores(config, trainer.model, data, folder, device)
-    log.scalars(scores)
-    log.close()
-
-
 def load_data(config: DictConfig) -> DataSet:
-    """The data set that `config.data` names."""
-    data = config.data
-    if data.name == "cifar100":
-        return load_cifar100(data.path)
-    if data.name == "npz":
-        return load_npz(data.path)
-    if data.name == "folder":
-        return load_folder(data.path, data.size, data.test)
-    return load_shapes(data.train, data.test, data.size, data.seed)
+    """The data set that `config.data` names; InputError also for a fault elsewhere in the configuration."""
+    data = read_settings(ExperimentSettings, config).data
+    loaders = {
+        "cifar100": lambda: load_cifar100(data.path),
+        "npz": lambda: load_npz(data.path),
+        "folder": lambda: load_folder(data.path, data.size, data.test),
+        "shapes": lambda: load_shapes(data.train, int(data.test), data.size, data.seed),
+    }
+    if data.name not in loaders:
+        raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")
+    return loaders[data.name]()
 
 
 def write_pictures(config: DictConfig, size: int) -> None:
@@ -101,31 +62,41 @@ def write_pictures(config: DictConfig, size: int) -> None:
         write_held_out(Path(config.data.pictures), size, config.data.seed)
 
 
-def read_settings(kind: type, node: DictConfig, key: str):
-    """A settings dataclass from its configuration; InputError naming the key whose value has the wrong type."""
-    try:
-        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), node))
-    except OmegaConfBaseException as error:
-        raise InputError(f"{key}.{error.full_key or ''}: {str(error.msg).splitlines()[0]}") from error
+def run(config: DictConfig, data: DataSet, folder: Path) -> None:
+    """Train one arm into `folder` and score it; everything found out is in the folder's files."""
+    prepare(config, data, folder)()
 
 
-def _prepare(config: DictConfig, settings: TrainSettings, data: DataSet, folder: Path, device: torch.device):
-    """(trainer, log, (train, validation)), ready for the first epoch or, on resume, for the next."""
+def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], None]:
+    """Everything of `run` that comes before the first epoch, where wrong input shows; the result is the rest of it."""
+    settings = read_settings(ExperimentSettings, config)
+    if settings.evaluate.photos:
+        find_photographs(Path(settings.evaluate.photos), data.classes, settings.label)
+    device = choose_device(settings.train.device)
+    train, validation = stratified_split(data.train, settings.data.validation, seed=0)
+    trainer = _build_trainer(settings, data, folder, device)
+    _open_folder(trainer, config)
+
+    def train_and_score() -> None:
+        console.info("%s pictures, %s classes; %s, %s", len(train), len(data.classes), device, trainer.model.precision)
+        with closing(RunLog(folder, trainer.epoch)) as log:
+            trainer.fit(train.to(device), validation.to(device), log)
+            log.scalars(_test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device))
+
+    return train_and_score
+
+
+def _build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
     phases = Phases(device)
-    model_settings = read_settings(ModelSettings, config.model, "model")
-    precision = choose_precision(settings.precision, device)
-    torch.manual_seed(stream_seed(config.seed, "weights"))
+    precision = choose_precision(settings.train.precision, device)
     mean, std = channel_statistics(data.train.images)
-    architecture = OmegaConf.to_container(OmegaConf.structured(model_settings))
+    architecture = asdict(settings.model)
+    torch.manual_seed(stream_seed(settings.seed, "weights"))
     network = WideResNet(len(data.classes), **architecture, mean=mean, std=std).to(device)
-    service = _build_service(config, data, device, phases)
+    service = _build_service(settings, data, device, phases)
     model = MixedPrecision(network, precision)
     checkpointed = {"classes": list(data.classes), **architecture}
-    trainer = Trainer(settings, model, checkpointed, service, phases, folder, config.seed)
-    train, validation = stratified_split(data.train, config.data.validation, seed=0)
-    _open_folder(trainer, config)
-    console.info("%s pictures, %s classes; %s, %s", len(train), len(data.classes), device, trainer.model.precision)
-    return trainer, RunLog(folder, trainer.epoch), (train.to(device), validation.to(device))
+    return Trainer(settings.train, model, checkpointed, service, phases, folder, settings.seed)
 
 
 def _open_folder(trainer: Trainer, config: DictConfig) -> None:
@@ -151,40 +122,35 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
     OmegaConf.save(OmegaConf.create(resolved), folder / CONFIG)
 
 
-def _build_service(config: DictConfig, data: DataSet, device: torch.device, phases: Phases) -> AugmentationService:
-    settings = read_settings(AugmentationSettings, config.augment, "augment")
-    scene_settings = read_settings(SceneSettings, config.scene, "scene")
-    light = load_light(scene_settings.light) * scene_settings.exposure
+def _build_service(
+    settings: ExperimentSettings, data: DataSet, device: torch.device, phases: Phases
+) -> AugmentationService:
+    light = load_light(settings.scene.light) * settings.scene.exposure
     scene, labels = None, torch.zeros(0, dtype=torch.int64)
-    if settings.renders:
+    if settings.augment.renders:
         with phases("operators"):
-            scene = _build_scene(scene_settings, config, data, settings.examples, device)
-        labels = torch.tensor([class_index(data.classes, label, "scene.meshes") for label in scene.labels])
-    return AugmentationService(settings, scene, labels.to(device), light.to(device), config.seed, phases)
+            scene = _build_scene(settings, data, device)
+        labels = torch.tensor([data.classes.index(label) for label in scene.labels])
+    return AugmentationService(settings.augment, scene, labels.to(device), light.to(device), settings.seed, phases)
 
 
-def _build_scene(scene: SceneSettings, config: DictConfig, data: DataSet, examples: int, device: torch.device) -> Scene:
-    renderer = read_settings(RendererSettings, config.renderer, "renderer")
-    objects = [_read_object(item, config.label, index) for index, item in enumerate(scene.meshes)]
-    for item in objects:
-        class_index(data.classes, item.label, "scene.meshes")
-    views = count_views(examples, len(objects), len(scene.backgrounds), scene.views)
-    backend = _choose_backend(renderer.visibility)
-    settings = Settings(data.size, renderer.samples, renderer.encoding)
+def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
+    scene, renderer = settings.scene, settings.renderer
+    objects = [_read_object(item, settings.label, index) for index, item in enumerate(scene.meshes)]
+    for index, item in enumerate(objects):
+        class_index(data.classes, item.label, f"label of scene.meshes[{index}]")
+    views = count_views(settings.augment.examples, len(objects), len(scene.backgrounds), scene.views)
+    backend = choose(renderer.visibility)
+    console.info("visibility: %s", backend.description)
+    pictures = Settings(data.size, renderer.samples, renderer.encoding)
     return Scene(
-        build_objects(objects, views, scene.field_of_view, settings, backend), scene.backgrounds, settings, device
+        build_objects(objects, views, scene.field_of_view, pictures, backend), scene.backgrounds, pictures, device
     )
 
 
-def _choose_backend(visibility: str) -> Backend:
-    backend = choose(visibility)
-    console.info("visibility: %s", backend.description)
-    return backend
-
-
-def _read_object(item, label: str, index: int) -> ObjectSettings:
-    node = item if isinstance(item, dict) else {"mesh": item}
-    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **node}), f"scene.meshes[{index}]")
+def _read_object(item: str | dict, label: str, index: int) -> ObjectSettings:
+    keys = item if isinstance(item, dict) else {"mesh": item}
+    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"scene.meshes[{index}]")
 
 
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
@@ -199,16 +165,19 @@ def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[
 
 
 def _photograph_scores(
-    config: DictConfig, model: MixedPrecision, data: DataSet, folder: Path, device: torch.device
+    settings: ExperimentSettings, trainer: Trainer, data: DataSet, device: torch.device
 ) -> dict[str, float]:
+    """The network's shares on the folder of photographs; empty without one."""
+    if not settings.evaluate.photos:
+        return {}
     summary = evaluate_photographs(
-        model,
+        trainer.model,
         data.classes,
-        Path(config.evaluate.photos),
-        config.label,
-        folder / PHOTOGRAPHS,
+        Path(settings.evaluate.photos),
+        settings.label,
+        trainer.folder / PHOTOGRAPHS,
         size=data.size,
-        skip_unreadable=config.evaluate.skip_unreadable,
+        skip_unreadable=settings.evaluate.skip_unreadable,
         device=device,
     )
     console.info("%s", format_summary(summary))

@@ -43,7 +43,7 @@ class TrainSettings:
         check_schedule(self.schedule)
         if self.epochs < 1 or self.batch_size < 1:
             raise InputError(f"train.epochs={self.epochs} and train.batch_size={self.batch_size} must be at least 1")
-        if not 0 < self.learning_rate < math.inf or not 0 <= self.momentum < 1 or self.weight_decay < 0:
+        if not (0 < self.learning_rate < math.inf and 0 <= self.momentum < 1 and 0 <= self.weight_decay < math.inf):
             raise InputError(
                 f"train.learning_rate={self.learning_rate} must be positive, train.momentum={self.momentum} in [0, 1) "
                 f"and train.weight_decay={self.weight_decay} not negative"
@@ -83,7 +83,10 @@ class Trainer:
         )
 
     def fit(self, train: Split, validation: Split, log: RunLog) -> None:
-        """Train to the last epoch; last.pt after every epoch, best.pt whenever validation improves."""
+        """Train to the last epoch; last.pt after every epoch, best.pt whenever validation improves.
+
+        InputError where training diverges.
+        """
         while self.epoch < self.settings.epochs:
             torch.manual_seed(stream_seed(self.seed, self.epoch, "dropout"))
             with self.phases("attack"):
@@ -93,11 +96,13 @@ class Trainer:
             with self.phases("evaluation"):
                 validated = evaluate(self.model, validation)
             self.epoch += 1
+            self._check_finite(trained["loss"] + validated["loss"])
             with self.phases("input_output"):
-                self._save(validated["accuracy"])
                 if len(renders.labels):
                     log.renders(renders.images, self.epoch)
             self._report(log, trained, validated, renders)
+            with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
+                self._save(validated["accuracy"])
 
     def resume(self) -> None:
         """Go on from the folder's last.pt; InputError where it is from another architecture."""
@@ -135,6 +140,13 @@ class Trainer:
     def _set_learning_rate(self, progress: float) -> None:
         for group in self.optimizer.param_groups:
             group["lr"] = self.settings.learning_rate * SCHEDULES[self.settings.schedule](progress)
+
+    def _check_finite(self, loss: float) -> None:
+        if not math.isfinite(loss):
+            raise InputError(
+                f"train.learning_rate={self.settings.learning_rate} made the loss infinite in epoch {self.epoch}: "
+                "set a lower one"
+            )
 
     def _save(self, accuracy: float) -> None:
         weights = self.model.network.state_dict()

@@ -24,7 +24,7 @@ class RunLog:
         self._renders = folder / "renders"
         kept = [line for line in read_metrics(folder) if line.get("epoch", epochs_done + 1) <= epochs_done]
         self._metrics.write_text("".join(json.dumps(line) + "\n" for line in kept))
-        self._board = SummaryWriter(str(folder), purge_step=epochs_done + 1 if epochs_done else None)
+        self._board = SummaryWriter(str(folder), purge_step=epochs_done + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
         """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores."""
@@ -47,6 +47,10 @@ class RunLog:
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """The lines of a run's metrics.jsonl, one per epoch and a last one with the final scores; [] without a file."""
+    """The lines of a run's metrics.jsonl, one per epoch and a last one with the final scores; [] without a file.
+
+    A line that a crash cut short is passed over.
+    """
     path = folder / METRICS
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
+    return [json.loads(line) for line in lines if line.endswith("\n")]

@@ -17,6 +17,7 @@ from torch import Tensor
 from augment.scene import Scene, SceneObject
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
 from renderer.lights import ambient, directional
 from renderer.mesh import normalise
 from renderer.shapes import SOLIDS, solid
@@ -36,6 +37,8 @@ Lights = Callable[[Tensor, torch.Generator], Tensor]
 
 def load_shapes(train: int, test: int, size: int, seed: int) -> DataSet:
     """That many training and test pictures of every class, in even light; whole individuals (20 pictures) each."""
+    if train < 1 or test < 1:
+        raise InputError(f"data.train={train} and data.test={test} must be at least 1 picture per class")
     settings = replace(SETTINGS, size=size)
     splits = [
         _render_split(per_class, seed, part, even_light, settings)

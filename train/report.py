@@ -1,7 +1,7 @@
 """Tables and model cards of finished runs, from the files in their folders."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -69,14 +69,14 @@ def format_table(runs: Sequence[RunSummary]) -> str:
 def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str]) -> str:
     """Markdown tables of runs: accuracy, recall and false alarms by source, and seconds per epoch and phase.
 
-    exclude: sources that the pooled figures leave out.
+    exclude: sources that the pooled figures leave out; InputError for one that is nowhere.
     """
     tables = [("Accuracy on the test set", _accuracy_table(runs)), ("Seconds per epoch", _seconds_table(runs))]
-    if all(run.photographs for run in runs):
+    if scored := [run for run in runs if run.photographs]:
         label = runs[0].config.label
         tables[1:1] = [
-            (f"Photographs of {label} recognised", _source_table(runs, "recall", exclude)),
-            (f"Photographs of other things called {label}", _source_table(runs, "false_alarms", exclude)),
+            (f"Photographs of {label} recognised", _source_table(scored, "recall", exclude)),
+            (f"Photographs of other things called {label}", _source_table(scored, "false_alarms", exclude)),
         ]
     return "\n\n".join(f"### {title}\n\n{table}" for title, table in tables)
 
@@ -86,7 +86,7 @@ def publish_run(folder: Path, out: Path) -> None:
     run = summarise(folder)
     out.mkdir(parents=True, exist_ok=True)
     checkpoint.publish(out / checkpoint.PUBLISHED, checkpoint.load(folder / checkpoint.BEST))
-    (out / "README.md").write_text(_card(run))
+    (out / "README.md").write_text(_card(run, out.name))
 
 
 def _accuracy_table(runs: Sequence[RunSummary]) -> str:
@@ -106,23 +106,23 @@ def _accuracy_table(runs: Sequence[RunSummary]) -> str:
 
 def _source_table(runs: Sequence[RunSummary], figure: str, exclude: Sequence[str]) -> str:
     sources = sorted({source for run in runs for source in run.photographs["by_source"]})
-    pooled = [source for source in sources if source not in exclude]
+    if unknown := set(exclude).difference(sources):
+        raise InputError(f"exclude: no photograph is of source {min(unknown)!r}; the sources are {', '.join(sources)}")
     rows = [
-        [source, *_per_run(runs, lambda run, source=source: run.photographs["by_source"][source][figure])]
+        [source, *(_interval(run.photographs["by_source"].get(source, {}).get(figure)) for run in runs)]
         for source in sources
     ]
     title = f"all but {', '.join(exclude)}" if exclude else "all"
-    rows.append([title, *_per_run(runs, lambda run: _pool(run.photographs["by_source"], pooled, figure))])
-    return _markdown(["source", *(run.arm for run in runs)], [row for row in rows if set(row[1:]) != {"-"}])
+    rows.append([title, *(_interval(_share_without(run.photographs, exclude, figure)) for run in runs)])
+    header = ["source", *(f"{run.arm}, seed {run.config.seed}" for run in runs)]
+    return _markdown(header, [row for row in rows if set(row[1:]) != {"-"}])
 
 
-def _per_run(runs: Sequence[RunSummary], figure: Callable[[RunSummary], dict]) -> list[str]:
-    return [_interval(figure(run)) for run in runs]
-
-
-def _pool(by_source: dict, sources: Sequence[str], figure: str) -> dict:
-    counts = [by_source[source][figure] for source in sources]
-    return share(sum(count["hits"] for count in counts), sum(count["n"] for count in counts))
+def _share_without(photographs: dict, exclude: Sequence[str], figure: str) -> dict:
+    """The share over all photographs but those of some sources."""
+    by_source = photographs["by_source"]
+    excluded = [by_source[source][figure] for source in set(exclude) if source in by_source]
+    return share(*(photographs[figure][count] - sum(part[count] for part in excluded) for count in ("hits", "n")))
 
 
 def _seconds_table(runs: Sequence[RunSummary]) -> str:
@@ -131,10 +131,10 @@ def _seconds_table(runs: Sequence[RunSummary]) -> str:
     return _markdown(["augment", *phases], rows)
 
 
-def _card(run: RunSummary) -> str:
+def _card(run: RunSummary, name: str) -> str:
     config, scores = run.config, run.scores
     architecture = f"WideResNet-{config.model.depth}-{config.model.width}, dropout {config.model.dropout}"
-    data = Path(config.data.path).name if "path" in config.data else config.data.name
+    data = Path(config.data.path).name if config.data.name in ("npz", "folder") else config.data.name
     meshes = [Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in config.scene.meshes]
     renders = f"{config.augment.examples} renders of {', '.join(meshes)}" if run.arm != "none" else "none"
     rows = [
@@ -150,7 +150,7 @@ def _card(run: RunSummary) -> str:
     ]
     title = f"# {architecture}, augment={run.arm}"
     note = "Half-precision weights; images are RGB in [0, 1], normalised inside. Score photographs with"
-    command = f"`python scripts/evaluate_photos.py run=pretrained/{run.arm} photos=...`."
+    command = f"`python scripts/evaluate_photos.py run=pretrained/{name} photos=...`."
     return f"{title}\n\n{note} {command}\n\n{_markdown(['what', 'value'], [list(row) for row in rows])}\n"
 
 

@@ -30,6 +30,8 @@ class WideResNet(nn.Module):
             raise InputError(
                 f"model.depth={depth}, model.width={width}: depth is 10, 16, 22, 28, ... and width at least 1"
             )
+        if not 0 <= dropout < 1:
+            raise InputError(f"model.dropout={dropout} must be at least 0 and below 1")
         channels = [16, 16 * width, 32 * width, 64 * width]
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))

@@ -1,0 +1,191 @@
+import math
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from augment.attack import AttackSettings, descend
+from augment.phases import Phases
+from augment.scene import ObjectSettings, Scene, build_objects
+from augment.service import AugmentationService, AugmentationSettings, RandomLights
+from renderer.errors import InputError
+from renderer.lights import probe
+from renderer.transfer import Settings
+from renderer.visibility import choose
+
+EPS32 = torch.finfo(torch.float32).eps
+LIGHT = probe("grace")
+CLASSES = {"plate": 0, "table": 2}
+SHORT = AttackSettings(max_steps=5)
+SHARES = {"fooled_before", "fooled", "used_all_steps", "zero_gradient", "clamped"}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """The paper's 2 meshes × 10 views × 5 backgrounds, small."""
+    settings = Settings(size=8, samples=2)
+    objects = [ObjectSettings(f"solid:{name}", name) for name in CLASSES]
+    return Scene(build_objects(objects, 10, 2.0, settings, choose("software")), [0, 0.25, 0.5, 0.75, 1], settings)
+
+
+@pytest.fixture(scope="module")
+def labels(scene) -> Tensor:
+    return torch.tensor([CLASSES[label] for label in scene.labels])
+
+
+@pytest.fixture(scope="module")
+def model(scene, labels) -> nn.Module:
+    """A small network that has learned the two solids in the initial light, so that there is something to fool."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = nn.Sequential(
+            nn.Conv2d(3, 16, 3, padding=1),
+            nn.BatchNorm2d(16),
+            nn.ReLU(),
+            nn.Dropout(0.1),
+            nn.Flatten(),
+            nn.Linear(1024, 3),
+        )
+        optimizer = torch.optim.Adam(network.parameters(), lr=0.003)
+        pictures = scene.render(LIGHT.expand(100, -1, -1))
+        for _ in range(60):
+            optimizer.zero_grad()
+            nn.functional.cross_entropy(network(pictures), labels).backward()
+            optimizer.step()
+    return network
+
+
+@pytest.fixture
+def serve(scene, labels):
+    def service(seed: int = 0, phases: Phases | None = None, **settings) -> AugmentationService:
+        choices = AugmentationSettings(**{"attack": SHORT, **settings})
+        return AugmentationService(choices, scene, labels, LIGHT, seed, phases or Phases())
+
+    return service
+
+
+@pytest.mark.parametrize("settings", [{"arm": "none"}, {"arm": "random", "examples": 0}, {"examples": 0}])
+def test_without_an_arm_or_examples_the_batch_is_empty(serve, model, settings):
+    renders = serve(**settings).regenerate(model, 0)
+    assert len(renders.images) == len(renders.labels) == 0 and renders.diagnostics == {}
+    choices = AugmentationSettings(**settings)
+    assert not choices.renders
+    service = AugmentationService(choices, None, torch.zeros(0, dtype=torch.int64), LIGHT, 0, Phases())
+    assert len(service.regenerate(model, 0).labels) == 0
+
+
+@pytest.mark.parametrize("arm", ["random", "adversarial"])
+def test_100_pictures_come_with_their_labels_and_plain_diagnostics(serve, model, scene, arm):
+    phases = Phases()
+    renders = serve(arm=arm, phases=phases).regenerate(model, 0)
+    assert renders.images.shape == (100, 3, 8, 8) and not renders.images.requires_grad
+    assert renders.images.min() >= 0 and renders.images.max() <= 1
+    assert [CLASSES[name] for name in scene.labels] == renders.labels.tolist()
+    assert renders.labels.dtype == torch.int64
+    assert all(type(value) is float and math.isfinite(value) for value in renders.diagnostics.values())
+    assert all(0 <= renders.diagnostics[name] <= 1 for name in SHARES & renders.diagnostics.keys())
+    assert renders.diagnostics["light_change"] > 0
+    assert phases.take().keys() == {"attack_classifier"}
+
+
+@pytest.mark.parametrize("settings", [{"arm": "random"}, {"arm": "adversarial", "start": "random"}])
+def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
+    images = serve(seed=1, **settings).regenerate(model, 3).images
+    resumed = serve(seed=1, **settings)
+    resumed.regenerate(model, 2)
+    torch.rand(5)
+    torch.testing.assert_close(resumed.regenerate(model, 3).images, images, rtol=0, atol=0)
+    assert (resumed.regenerate(model, 4).images != images).any()
+    assert (serve(seed=2, **settings).regenerate(model, 3).images != images).any()
+
+
+def test_random_diagnostics_are_those_of_the_pictures(serve, model):
+    renders = serve(arm="random").regenerate(model, 0)
+    model.eval()
+    with torch.no_grad():
+        logits = model(renders.images)
+    model.train()
+    assert renders.diagnostics["fooled"] == pytest.approx((logits.argmax(1) != renders.labels).double().mean())
+    loss = nn.functional.cross_entropy(logits.double(), renders.labels)
+    assert renders.diagnostics["loss"] == pytest.approx(float(loss), rel=100 * EPS32)
+    # ±0.5 on 147 coefficients: a norm of 3.5, with a standard deviation of 0.13 that 100 examples bring to 0.013.
+    assert renders.diagnostics["light_change"] == pytest.approx(math.sqrt(147 / 12), abs=5 * 0.013)
+
+
+def test_random_lights_of_a_radius_have_that_norm(serve, model):
+    renders = serve(arm="random", random=RandomLights(radius=1.5)).regenerate(model, 0)
+    assert renders.diagnostics["light_change"] == pytest.approx(1.5, rel=8 * EPS32)
+
+
+def test_random_pictures_leave_the_model_and_the_random_state_as_they_were(serve, model):
+    model.train()
+    before, state = {name: value.clone() for name, value in model.state_dict().items()}, torch.random.get_rng_state()
+    serve(arm="random").regenerate(model, 0)
+    assert all(module.training for module in model.modules())
+    assert all(parameter.requires_grad for parameter in model.parameters())
+    torch.testing.assert_close(dict(model.state_dict()), before, rtol=0, atol=0)
+    torch.testing.assert_close(torch.random.get_rng_state(), state)
+
+
+def test_adversarial_pictures_are_the_attacks_from_the_light(serve, model, scene, labels):
+    renders = serve().regenerate(model, 0)
+    result = descend(model, scene.render, LIGHT.expand(100, -1, -1), labels, SHORT, Phases())
+    torch.testing.assert_close(renders.images, result.images, rtol=0, atol=0)
+    for name in ("fooled_before", "fooled", "steps", "loss_before", "loss", "zero_gradient"):
+        assert renders.diagnostics[name] == pytest.approx(float(getattr(result, name).double().mean()))
+    assert renders.diagnostics["used_all_steps"] == pytest.approx(float((result.steps == 5).double().mean()))
+    change = (result.parameters - LIGHT).flatten(1).norm(dim=1)
+    assert renders.diagnostics["light_change"] == pytest.approx(float(change.mean()), rel=8 * EPS32)
+
+
+def test_the_attack_raises_the_loss_within_its_budget(serve, model):
+    diagnostics = serve(attack=AttackSettings(max_steps=10)).regenerate(model, 0).diagnostics
+    assert diagnostics["fooled_before"] < 0.2 < diagnostics["fooled"]
+    assert diagnostics["loss"] > 2 * diagnostics["loss_before"]
+    assert 0 < diagnostics["light_change"] <= 0.05 * diagnostics["steps"] + 1e-6 <= 0.5 + 1e-6
+
+
+def test_lights_that_restart_begin_at_the_light_each_epoch(serve, model):
+    service = serve(lights="restart")
+    first, second = (service.regenerate(model, epoch) for epoch in range(2))
+    torch.testing.assert_close(second.images, first.images, rtol=0, atol=0)
+    assert service.state_dict() == {}
+
+
+@pytest.mark.parametrize("start", ["light", "random"])
+def test_lights_that_continue_begin_where_they_ended_also_after_a_resume(serve, model, start):
+    service = serve(lights="continue", start=start)
+    first = service.regenerate(model, 0)
+    state = {name: value.clone() for name, value in service.state_dict().items()}
+    second = service.regenerate(model, 1)
+    assert second.diagnostics["loss_before"] == pytest.approx(first.diagnostics["loss"], rel=8 * EPS32)
+    assert second.diagnostics["fooled_before"] == first.diagnostics["fooled"]
+    assert second.diagnostics["loss"] > first.diagnostics["loss"]
+
+    resumed = serve(lights="continue", start=start)
+    resumed.load_state_dict(state)
+    torch.testing.assert_close(resumed.regenerate(model, 1).images, second.images, rtol=0, atol=0)
+
+
+def test_a_random_start_is_the_random_arms_light(serve, model):
+    still = AttackSettings(max_steps=0)
+    started = serve(start="random", attack=still).regenerate(model, 5)
+    torch.testing.assert_close(started.images, serve(arm="random").regenerate(model, 5).images, rtol=0, atol=0)
+    assert started.diagnostics["light_change"] == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: AugmentationSettings(arm="both"), r"augment\.arm=both: choose one of none, random, adversarial"),
+        (lambda: AugmentationSettings(start="dark"), r"augment\.start=dark: choose one of light, random"),
+        (lambda: AugmentationSettings(lights="stay"), r"augment\.lights=stay: choose one of restart, continue"),
+        (lambda: AugmentationSettings(examples=-1), r"augment\.examples=-1"),
+        (lambda: RandomLights(amplitude=0.0), r"augment\.random\.amplitude=0\.0"),
+        (lambda: RandomLights(amplitude=math.nan), r"augment\.random\.amplitude=nan"),
+        (lambda: RandomLights(radius=0.0), r"augment\.random\.radius=0\.0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

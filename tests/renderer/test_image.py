@@ -1,0 +1,114 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from renderer.errors import InputError
+from renderer.image import ENCODINGS, clamped, decode, develop, encode
+
+EPS = torch.finfo(torch.float64).eps
+
+
+def srgb_of(linear: float) -> float:
+    """IEC 61966-2-1, scalar."""
+    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+
+
+def linear_of(srgb: float) -> float:
+    return srgb / 12.92 if srgb <= 0.04045 else ((srgb + 0.055) / 1.055) ** 2.4
+
+
+def pixel(*rgb: float) -> torch.Tensor:
+    return torch.tensor(rgb, dtype=torch.float64).view(3, 1)
+
+
+def share(coverage: float) -> torch.Tensor:
+    return torch.full((1, 1), coverage, dtype=torch.float64)
+
+
+def grey(value: float) -> torch.Tensor:
+    return torch.full((1, 1), value, dtype=torch.float64)
+
+
+def test_the_surface_lies_over_the_background_by_its_coverage():
+    picture = develop(pixel(0.1, 0.2, 0.3), share(0.25), grey(0.4))
+    torch.testing.assert_close(picture, pixel(0.4, 0.5, 0.6), rtol=4 * EPS, atol=0)
+
+
+def test_under_srgb_the_compositing_is_linear():
+    picture = develop(pixel(0.1, 0.2, 0.3), share(0.25), grey(0.5), "srgb")
+    expected = pixel(*(srgb_of(surface + 0.75 * linear_of(0.5)) for surface in (0.1, 0.2, 0.3)))
+    torch.testing.assert_close(picture, expected, rtol=8 * EPS, atol=0)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_clamp_comes_last(encoding):
+    """Half a pixel at radiance 1.5, -0.4 and 2.5: clamped before compositing, the first two would be 0.5 and 0.5."""
+    picture = develop(pixel(0.75, -0.2, 1.25), share(0.5), pixel(0, 1, 1), encoding)
+    composite = pixel(0.75, 0.3, 1.0)
+    torch.testing.assert_close(picture, encode(composite, encoding), rtol=4 * EPS, atol=0)
+
+
+def test_colour_backgrounds_and_batches_broadcast():
+    draws = torch.Generator().manual_seed(0)
+    radiance = torch.rand(2, 1, 3, 5, generator=draws, dtype=torch.float64) / 2
+    coverage = torch.rand(2, 1, 1, 5, generator=draws, dtype=torch.float64)
+    background = torch.rand(4, 3, 1, generator=draws, dtype=torch.float64)
+    pictures = develop(radiance, coverage, background, "srgb")
+    assert pictures.shape == (2, 4, 3, 5)
+    alone = develop(radiance[1, 0], coverage[1, 0], background[2], "srgb")
+    torch.testing.assert_close(pictures[1, 2], alone, rtol=4 * EPS, atol=0)  # vectorised powers round otherwise
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_background_comes_back_where_nothing_covers_it(encoding):
+    greys = torch.linspace(0, 1, 256).view(256, 1, 1)
+    pictures = develop(torch.zeros(1, 3, 1), torch.zeros(1, 1, 1), greys, encoding)
+    # Exactly as it stands; through sRGB and back in float32, powers of some 4 ulps each, multiplied by up to 2.4.
+    tolerance = 0 if encoding == "linear" else 16 * torch.finfo(torch.float32).eps
+    torch.testing.assert_close(pictures, greys.expand(-1, 3, 1), rtol=0, atol=tolerance)
+
+
+def test_encoding_and_decoding_are_the_srgb_standards():
+    values = [*np.linspace(0, 1, 1001), 0.0031308, 0.00313081, 0.04045, 0.04046]
+    encoded, decoded = (function(torch.tensor(values, dtype=torch.float64), "srgb") for function in (encode, decode))
+    np.testing.assert_allclose(encoded, [srgb_of(value) for value in values], rtol=4 * EPS, atol=EPS)
+    np.testing.assert_allclose(decoded, [linear_of(value) for value in values], rtol=8 * EPS)
+    assert encoded[500] == pytest.approx(0.735356983052449) and decoded[500] == pytest.approx(0.214041140482232)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_encoding_and_decoding_undo_each_other(encoding):
+    values = torch.linspace(0, 1, 1000, dtype=torch.float64)
+    torch.testing.assert_close(decode(encode(values, encoding), encoding), values, rtol=16 * EPS, atol=EPS)
+    torch.testing.assert_close(encode(decode(values, encoding), encoding), values, rtol=16 * EPS, atol=EPS)
+
+
+def test_the_gradient_through_srgb_is_its_derivative_and_finite_from_black_to_white():
+    values = [0.0, 1e-30, 0.001, 0.0031308, 0.0032, 0.2, 1.0]
+    linear = torch.tensor(values, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(encode(linear, "srgb").sum(), linear)
+    slopes = [12.92 if value <= 0.0031308 else 1.055 / 2.4 * value ** (1 / 2.4 - 1) for value in values]
+    np.testing.assert_allclose(gradient, slopes, rtol=8 * EPS)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_clamped_values_are_those_without_a_gradient(encoding):
+    radiance = pixel(-0.3, 0.2, 1.4).requires_grad_(True)
+    for background in (0.0, 0.5, 1.0):
+        scene = (radiance, share(0.5), grey(background))
+        (gradient,) = torch.autograd.grad(develop(*scene, encoding).sum(), radiance)
+        assert gradient.isfinite().all()
+        torch.testing.assert_close(clamped(*scene, encoding), gradient == 0)
+    assert clamped(radiance, share(0.5), grey(0.0), encoding).flatten().tolist() == [True, False, True]
+
+
+def test_black_and_white_themselves_are_not_clamped():
+    assert not clamped(pixel(0, 0.5, 1), share(1.0), grey(math.pi / 4)).any()
+
+
+@pytest.mark.parametrize("function", [encode, decode, lambda x, encoding: develop(x, share(1), grey(0), encoding)])
+def test_an_unknown_encoding_is_refused(function):
+    with pytest.raises(InputError, match=r"renderer\.encoding=gamma: choose one of linear, srgb"):
+        function(pixel(0, 0, 0), "gamma")

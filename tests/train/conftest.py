@@ -1,0 +1,101 @@
+"""A small data set, a configuration to match, and one finished run that several tests look at."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import DictConfig
+from PIL import Image
+
+from train.experiment import load_data, run
+
+CLASSES = ["apple", "orange", "pear"]
+TINY = [
+    "data=npz",
+    "seed=7",  # the attack then moves the lights in every epoch
+    "model.depth=10",
+    "model.width=1",
+    "model.dropout=0.3",
+    "train.epochs=3",
+    "train.batch_size=16",
+    "train.learning_rate=0.05",
+    "train.precision=float32",
+    "train.device=cpu",
+    "augment.examples=4",
+    "augment.lights=continue",
+    "augment.attack.max_steps=3",
+    "augment.attack.step_size=0.3",
+    "scene.backgrounds=[0.2,0.8]",
+    "renderer.visibility=software",
+    "renderer.samples=2",
+    "evaluate.photos=null",
+]
+
+
+def coloured_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
+    """Pictures (N, 3, 16, 16) uint8 whose channel `label` is somewhat brighter."""
+    images = rng.integers(0, 200, (len(labels), 3, 16, 16))
+    images[np.arange(len(labels)), labels] += 30
+    return images.astype(np.uint8)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """The networks are so small that threads would wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def tiny_npz(tmp_path_factory) -> Path:
+    """60 training and 30 test pictures of three classes, 16 × 16."""
+    path = tmp_path_factory.mktemp("data") / "tiny.npz"
+    rng = np.random.default_rng(0)
+    train, test = np.repeat(np.arange(3), 20), np.repeat(np.arange(3), 10)
+    np.savez(
+        path,
+        train_images=coloured_noise(rng, train),
+        train_labels=train,
+        test_images=coloured_noise(rng, test),
+        test_labels=test,
+        classes=np.array(CLASSES),
+    )
+    return path
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory) -> Path:
+    """Seven pictures: of two classes, and of a thing that the data has no class for."""
+    folder = tmp_path_factory.mktemp("photos")
+    rng = np.random.default_rng(1)
+    for name, count in [("orange", 3), ("apple", 2), ("other_tomato", 2)]:
+        (folder / name).mkdir()
+        for number in range(count):
+            pixels = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
+            Image.fromarray(pixels).save(folder / name / f"{number}.png")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny(tiny_npz) -> Callable[..., DictConfig]:
+    """The real configuration, small; arguments are further overrides."""
+
+    def composed(*overrides: str) -> DictConfig:
+        with initialize_config_module("conf", version_base="1.3"):
+            return compose("train", [*TINY, f"data.path={tiny_npz}", *overrides])
+
+    return composed
+
+
+@pytest.fixture(scope="session")
+def finished(tiny, photos, tmp_path_factory) -> Path:
+    """The folder of a finished adversarial run, scored on photographs."""
+    folder = tmp_path_factory.mktemp("runs") / "finished"
+    config = tiny(f"evaluate.photos={photos}")
+    run(config, load_data(config), folder)
+    return folder

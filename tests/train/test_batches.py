@@ -1,0 +1,71 @@
+import pytest
+import torch
+import torch.nn.functional as F
+
+from train.batches import PADDING, crop_and_flip, to_bytes, to_unit, training_batches
+
+
+def noise(*shape: int) -> torch.Tensor:
+    return torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+
+
+def epoch_of(count: int, seed: int = 0, epoch: int = 0, batch_size: int = 7) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Batches of plain pictures, each of its own value, which is its label too."""
+    rows = torch.arange(count)
+    images = rows.view(-1, 1, 1, 1).expand(-1, 3, 8, 8).to(torch.uint8)
+    return list(training_batches(images, rows, batch_size, seed, epoch))
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (5, 5), (6, 11)])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_crops_are_those_of_a_reflect_padded_picture_for_every_shift(shape, flipped):
+    height, width = shape
+    images = noise(3, 3, height, width)
+    steps = range(-PADDING, PADDING + 1)
+    shifts = torch.tensor([(down, right) for down in steps for right in steps]).T
+    chosen = torch.arange(shifts.shape[1]) % len(images)
+    cropped = crop_and_flip(images, chosen, shifts, torch.full((len(chosen),), flipped))
+    padded = F.pad(images.double(), (PADDING,) * 4, mode="reflect").to(torch.uint8)
+    for picture, row, (down, right) in zip(cropped, chosen, shifts.T, strict=True):
+        top, left = PADDING + down, PADDING + right
+        expected = padded[row, :, top : top + height, left : left + width]
+        assert torch.equal(picture, expected.flip(2) if flipped else expected)
+
+
+def test_each_epoch_shows_every_picture_once_with_its_own_label():
+    batches = epoch_of(100)
+    assert [len(labels) for _, labels in batches] == [7] * 14 + [2]
+    assert sorted(torch.cat([labels for _, labels in batches]).tolist()) == list(range(100))
+    for images, labels in batches:
+        assert images.dtype == torch.float32 and images.shape == (len(labels), 3, 8, 8)
+        assert torch.equal(images, (labels / 255).view(-1, 1, 1, 1).expand_as(images))
+
+
+def test_batches_are_a_function_of_seed_and_epoch_alone():
+    images, labels = noise(50, 3, 8, 8), torch.arange(50)
+    drawn = {}
+    for key in [(0, 0), (0, 1), (1, 0)]:
+        torch.manual_seed(len(drawn))
+        first, again = (torch.cat([x for x, _ in training_batches(images, labels, 16, *key)]) for _ in range(2))
+        assert torch.equal(first, again)
+        drawn[key] = first
+    assert not torch.equal(drawn[0, 0], drawn[0, 1]) and not torch.equal(drawn[0, 0], drawn[1, 0])
+
+
+def test_shifts_and_flips_are_all_drawn_about_equally_often():
+    count, size, middle = 6000, 11, 5
+    place = torch.arange(size * size).view(1, 1, size, size).expand(count, 3, -1, -1).to(torch.uint8)
+    (images, _), *_ = training_batches(place, torch.zeros(count), count, seed=0, epoch=0)
+    seen = to_bytes(images)[:, 0, middle].long()
+    flipped = seen[:, middle - 1] > seen[:, middle + 1]
+    assert abs(flipped.double().mean() - 0.5) < 4 * 0.5 / count**0.5  # four standard deviations
+    counts = seen[:, middle].bincount(minlength=size * size).view(size, size)[1:-1, 1:-1]
+    assert counts.sum() == count
+    chi_square = ((counts - count / 81) ** 2 / (count / 81)).sum()
+    assert chi_square < 80 + 4 * (2 * 80) ** 0.5  # four standard deviations at 80 degrees of freedom
+
+
+def test_bytes_survive_the_way_to_unit_and_back():
+    values = torch.arange(256, dtype=torch.uint8)
+    assert torch.equal(to_bytes(to_unit(values)), values)
+    assert to_unit(values)[[0, 255]].tolist() == [0, 1]

@@ -1,0 +1,185 @@
+import os
+import pickle
+import re
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+
+from renderer.errors import InputError
+from train import checkpoint
+from train.checkpoint import BEST, LAST, PUBLISHED, load, load_network, load_weights, publish, save
+from train.wideresnet import WideResNet
+
+CLASSES = ["fig", "lime"]
+
+
+def state_of(network: WideResNet, classes: list[str] = CLASSES, **architecture) -> dict:
+    shape = {"depth": 10, "width": 1, "dropout": 0.0} | architecture
+    return {"model": network.state_dict(), "architecture": {"classes": classes, **shape}}
+
+
+@pytest.fixture
+def network() -> WideResNet:
+    """With statistics of its own, as after training."""
+    torch.manual_seed(0)
+    network = WideResNet(2, 10, 1, 0.0, mean=(0.1, 0.2, 0.3), std=(0.3, 0.2, 0.1))
+    with torch.no_grad():
+        for _ in range(3):
+            network(torch.rand(8, 3, 16, 16))
+    return network.eval()
+
+
+class Harmful:
+    def __reduce__(self):
+        return os.mkdir, ("harm",)
+
+
+# ---------------------------------------------------------------------------------------- writing
+
+
+def test_a_checkpoint_comes_back_as_it_was_written(network, tmp_path):
+    state = state_of(network) | {"epoch": 3, "arm": "none"}
+    save(tmp_path / LAST, state)
+    found = load(tmp_path / LAST)
+    assert found.keys() == state.keys()
+    assert {name: found[name] for name in ("epoch", "arm", "architecture")} == {
+        name: state[name] for name in ("epoch", "arm", "architecture")
+    }
+    for name, value in state["model"].items():
+        assert torch.equal(found["model"][name], value)
+    assert os.listdir(tmp_path) == [LAST]
+
+
+@pytest.mark.parametrize("fault", ["torch.save", "os.fsync", "os.replace"])
+def test_a_failure_while_writing_leaves_the_old_checkpoint_whole(network, tmp_path, monkeypatch, fault):
+    save(tmp_path / LAST, state_of(network) | {"epoch": 1})
+    before = (tmp_path / LAST).read_bytes()
+
+    def fail(*arguments):
+        if fault == "torch.save":
+            arguments[1].write(b"the beginning of a checkpoint")
+        raise OSError("no space left")
+
+    module, function = fault.split(".")
+    monkeypatch.setattr(getattr(checkpoint, module), function, fail)
+    with pytest.raises(OSError, match="no space left"):
+        save(tmp_path / LAST, state_of(network) | {"epoch": 2})
+    assert (tmp_path / LAST).read_bytes() == before
+    monkeypatch.undo()
+    save(tmp_path / LAST, state_of(network) | {"epoch": 2})
+    assert load(tmp_path / LAST)["epoch"] == 2
+
+
+# ---------------------------------------------------------------------------------------- reading
+
+
+@pytest.mark.parametrize(
+    "spoil, fault",
+    [
+        pytest.param(lambda path: path.unlink(), "does not exist", id="missing"),
+        pytest.param(lambda path: path.write_bytes(b""), "is damaged", id="empty"),
+        pytest.param(lambda path: path.write_bytes(path.read_bytes()[:2000]), "is damaged", id="truncated"),
+        pytest.param(lambda path: path.write_text("a note"), "is damaged", id="text"),
+        pytest.param(lambda path: path.write_bytes(pickle.dumps({"model": 1})), "is damaged", id="pickle"),
+        pytest.param(lambda path: torch.save(Harmful(), path), "is damaged", id="code"),
+        pytest.param(lambda path: torch.save(torch.zeros(3), path), "lacks its model", id="tensor"),
+        pytest.param(lambda path: torch.save({"state_dict": {}}, path), "lacks its model", id="foreign"),
+        pytest.param(lambda path: torch.save({"model": {}}, path), "lacks its model", id="no architecture"),
+    ],
+)
+def test_a_file_that_is_no_checkpoint_is_named_and_runs_no_code(network, tmp_path, monkeypatch, spoil, fault):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / BEST
+    save(path, state_of(network))
+    spoil(path)
+    with pytest.raises(InputError, match=f"checkpoint {re.escape(str(path))} {fault}"):
+        load(path)
+    assert not Path("harm").exists()
+
+
+def test_weights_of_another_architecture_are_named(network):
+    other = WideResNet(3, 10, 1)
+    with pytest.raises(InputError, match=r"a\.pt is from another architecture: head.bias has shape \(2,\) there"):
+        load_weights(other, network.state_dict(), Path("a.pt"))
+    deeper = WideResNet(2, 16, 1)
+    with pytest.raises(InputError, match=r"groups.0.1.conv1.weight has shape none there"):
+        load_weights(deeper, network.state_dict(), Path("a.pt"))
+    with pytest.raises(InputError, match=r"groups.0.1.conv1.weight has shape \(16, 16, 3, 3\) there and none here"):
+        load_weights(network, deeper.state_dict(), Path("a.pt"))
+
+
+def test_a_network_loads_from_its_file_or_its_run_folder(network, tmp_path):
+    save(tmp_path / BEST, state_of(network))
+    images = torch.rand(3, 3, 16, 16)
+    for path in (tmp_path, tmp_path / BEST):
+        loaded, classes = load_network(path)
+        assert classes == ("fig", "lime") and not loaded.training
+        assert torch.equal(loaded(images), network(images))
+
+
+@pytest.mark.parametrize(
+    "architecture",
+    [
+        {"classes": ["fig", "lime"], "depth": 11},
+        {"classes": ["fig", "lime"], "depth": 10, "heads": 3},
+        {"depth": 10},
+        {"classes": None},
+        ["fig", "lime"],
+        {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1},
+        {"classes": ["fig", "lime"], "depth": 10, "width": 2},
+    ],
+)
+def test_a_checkpoint_of_another_network_is_one_error(network, tmp_path, architecture):
+    save(tmp_path / BEST, state_of(network) | {"architecture": architecture})
+    with pytest.raises(InputError, match=r"best.pt is from another architecture"):
+        load_network(tmp_path)
+
+
+def test_a_folder_without_a_network_is_one_error(tmp_path):
+    with pytest.raises(InputError, match=f"run={re.escape(str(tmp_path))} holds neither best.pt nor model.safetensors"):
+        load_network(tmp_path)
+
+
+# ---------------------------------------------------------------------------------------- publishing
+
+
+def test_a_published_network_is_the_same_to_half_precision(network, tmp_path):
+    publish(tmp_path / PUBLISHED, state_of(network))
+    for path in (tmp_path, tmp_path / PUBLISHED):
+        loaded, classes = load_network(path)
+        assert classes == ("fig", "lime")
+        for (name, value), found in zip(network.state_dict().items(), loaded.state_dict().values(), strict=True):
+            assert found.dtype == value.dtype
+            # rounding to 11 bits; below 2^-14 half precision is spaced evenly
+            bound = value.double().abs() * 2**-11 + 2**-25
+            assert ((found.double() - value.double()).abs() <= bound).all(), name
+
+
+def test_a_published_file_takes_half_the_room_and_any_memory_layout(network, tmp_path):
+    publish(tmp_path / "a.safetensors", state_of(network.to(memory_format=torch.channels_last)))
+    numbers = sum(value.numel() for value in network.state_dict().values())
+    assert (tmp_path / "a.safetensors").stat().st_size < 2 * numbers + 10_000
+    network.to(memory_format=torch.contiguous_format)
+    publish(tmp_path / "b.safetensors", state_of(network))
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(lambda path: path.write_bytes(path.read_bytes()[:-10]), id="truncated"),
+        pytest.param(lambda path: path.write_bytes(b""), id="empty"),
+        pytest.param(lambda path: safetensors.torch.save_file({"a": torch.zeros(1)}, path), id="no architecture"),
+        pytest.param(
+            lambda path: safetensors.torch.save_file({"a": torch.zeros(1)}, path, {"architecture": "{"}), id="no JSON"
+        ),
+    ],
+)
+def test_a_damaged_published_file_is_one_error(network, tmp_path, spoil):
+    path = tmp_path / PUBLISHED
+    publish(path, state_of(network))
+    spoil(path)
+    with pytest.raises(InputError, match=r"model.safetensors is damaged or lacks its architecture"):
+        load_network(tmp_path)

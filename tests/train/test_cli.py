@@ -1,0 +1,153 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from renderer.errors import InputError
+from train.checkpoint import LAST
+from train.cli import USER_ERROR, one_sentence_errors, with_suggestions
+from train.experiment import load_data, prepare
+
+ROOT = Path(__file__).parents[2]
+SMALL = [
+    "model.depth=10", "model.width=1", "train.epochs=1", "train.precision=float32", "augment.examples=4",
+    "scene.backgrounds=[0,1]", "renderer.visibility=software", "renderer.samples=2",
+]  # fmt: skip
+
+
+def train(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    """`python -m train` from another folder than the repository's."""
+    return subprocess.run(
+        [sys.executable, "-m", "train", *arguments],
+        cwd=folder,
+        env={name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
+        | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+
+
+# ---------------------------------------------------------------------------------------- whole commands
+
+
+def test_a_mistyped_override_prints_hydras_error_and_the_nearest_key(tmp_path):
+    done = train(tmp_path, "data=npz", "data.pth=x.npz")
+    assert done.returncode == 1 and done.stdout == ""
+    assert "Could not override 'data.pth'" in done.stderr and "Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1] == "Nearest valid key to 'data.pth': data.path"
+
+
+def test_a_missing_file_is_one_line(tmp_path):
+    done = train(tmp_path, "data=npz", "data.path=none.npz")
+    assert done.returncode == USER_ERROR
+    assert done.stderr == "error: data.path=none.npz does not exist: give the path of an .npz file\n"
+
+
+def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(tmp_path, tiny_npz):
+    done = train(tmp_path, "run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", *SMALL, "scene.views=3")
+    assert done.returncode == USER_ERROR
+    assert done.stderr.startswith("error: augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12")
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.rglob(LAST))
+
+
+def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz, photos):
+    done = train(
+        tmp_path, "run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", "compare=[none]", *SMALL
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = [line.split("|")[1].strip() for line in done.stdout.splitlines() if line.startswith("|")]
+    assert [rows[0], *rows[2:]] == ["augment", "none", "adversarial"]
+    for folder in (tmp_path / "here", tmp_path / "here" / "none"):
+        assert (folder / LAST).is_file() and (folder / "photographs" / "contact_sheet.png").is_file()
+    assert (tmp_path / "here" / "train.log").read_text() == done.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
+
+
+# ---------------------------------------------------------------------------------------- parts
+
+
+@pytest.mark.parametrize(
+    "overrides, message",
+    [
+        (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
+        (["label=ornage"], "label of scene.meshes[0]: the data has no class 'ornage'; did you mean 'orange'?"),
+        (["data.path=???"], "data.path is not set: give data.path=..."),
+    ],
+)
+def test_what_a_user_can_mend_is_one_line_and_status_2(tiny, tmp_path, capsys, overrides, message):
+    command = one_sentence_errors(lambda config: prepare(config, load_data(config), tmp_path))
+    with pytest.raises(SystemExit) as stop:
+        command(tiny(*overrides))
+    assert stop.value.code == USER_ERROR
+    assert capsys.readouterr() == ("", f"error: {message}\n")
+
+
+def test_unset_and_unresolved_keys_are_one_line_too(tiny, capsys):
+    for override, message in [
+        ("data.path=???", "data.path is not set: give data.path=..."),
+        ("data.path=${nowhere}", "data.path: Interpolation key 'nowhere' not found"),
+    ]:
+        with pytest.raises(SystemExit):
+            one_sentence_errors(lambda config: config.data.path)(tiny(override))
+        assert capsys.readouterr().err == f"error: {message}\n"
+
+
+def test_what_is_no_users_fault_keeps_its_traceback():
+    def broken(config):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        one_sentence_errors(broken)(None)
+
+
+def test_a_command_that_succeeds_is_left_alone(capsys):
+    assert one_sentence_errors(lambda config: config + 1)(1) == 2
+    with_suggestions(lambda: print("done"), "train")
+    assert capsys.readouterr() == ("done\n", "")
+
+
+NEAREST = [
+    ("train", ["train.epoch=3"], {"train.epoch": "train.epochs"}),
+    ("train", ["agument=none"], {"agument": "augment"}),
+    ("train", ["exeriment=paper"], {"exeriment": "experiment"}),
+    ("train", ["data=npz", "data.pth=x"], {"data.pth": "data.path"}),
+    ("train", ["experiment=paper", "data=npz", "data.pth=x"], {"data.pth": "data.path"}),
+    ("train", ["-m", "seed=0,1", "data=npz,cifar100", "data.pth=x"], {"data.pth": "data.path"}),
+    ("train", ["train.epoch=3", "sed=1"], {"train.epoch": "train.epochs", "sed": "seed"}),
+    ("train", ["train.epochs=[1", "scene.background=[0,1]"], {"scene.background": "scene.backgrounds"}),
+    ("train", ["epochs=3", "batch_size=8"], {"epochs": "train.epochs", "batch_size": "train.batch_size"}),
+    ("evaluate_photos", ["run=x", "photo=y"], {"photo": "photos"}),
+    ("compare_runs", ["rusn=[a,b]"], {"rusn": "runs"}),
+    # nothing to suggest: the key is right, is added or deleted, or is like no other
+    ("train", ["experiment=papper"], {}),
+    ("train", ["data=mnist", "train.epoch=3"], {}),
+    ("train", ["train.epochs=[1"], {}),
+    ("train", ["data=[npz"], {}),
+    ("train", ["hydra.verbose=true"], {}),
+    ("train", ["+train.epoch=3", "~train.epoch=3", "--config-dir=x"], {}),
+    ("train", ["qqqqqqqq=1", "=", "word"], {}),
+]
+
+
+@pytest.mark.parametrize("config, arguments, nearest", NEAREST, ids=[" ".join(row[1]) for row in NEAREST])
+def test_keys_that_hydra_rejects_get_the_nearest_one(monkeypatch, capsys, config, arguments, nearest):
+    monkeypatch.setattr(sys, "argv", ["train", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        with_suggestions(lambda: sys.exit(1), config)
+    assert stop.value.code == 1
+    lines = [f"Nearest valid key to {key!r}: {valid}" for key, valid in nearest.items()]
+    assert capsys.readouterr() == ("", "".join(line + "\n" for line in lines))
+
+
+def test_an_error_of_the_users_input_is_not_followed_by_suggestions(monkeypatch, capsys):
+    def main():
+        raise InputError("said before")
+
+    monkeypatch.setattr(sys, "argv", ["train", "train.epoch=3"])
+    with pytest.raises(SystemExit) as stop:
+        with_suggestions(one_sentence_errors(main), "train")
+    assert stop.value.code == USER_ERROR
+    assert capsys.readouterr().err == "error: said before\n"

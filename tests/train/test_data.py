@@ -1,0 +1,280 @@
+import hashlib
+import io
+import pickle
+import re
+from pathlib import Path
+from urllib.error import URLError
+
+import numpy as np
+import pytest
+import torch
+import torchvision
+from PIL import Image
+
+from renderer.errors import InputError
+from train.data import (
+    Split,
+    channel_statistics,
+    class_index,
+    load_cifar100,
+    load_folder,
+    load_npz,
+    stratified_split,
+)
+
+DATA = Path(__file__).parents[2].parent / "shared" / "data"
+
+
+def arrays(**changes) -> dict[str, np.ndarray]:
+    """What an .npz file of two classes holds, some of it changed; None leaves an array out."""
+    rng = np.random.default_rng(0)
+    good = {
+        "train_images": rng.integers(0, 256, (5, 3, 8, 8), dtype=np.uint8),
+        "train_labels": np.array([0, 1, 1, 0, 1]),
+        "test_images": rng.integers(0, 256, (2, 3, 8, 8), dtype=np.uint8),
+        "test_labels": np.array([1, 0]),
+        "classes": np.array(["lime", "fig"]),
+    }
+    return {name: array for name, array in (good | changes).items() if array is not None}
+
+
+def numbered(count: int, classes: int = 1) -> Split:
+    """Pictures (N, 3, 1, 1) that show their row's number, with labels in turn."""
+    rows = torch.arange(count)
+    return Split(rows.view(-1, 1, 1, 1).expand(-1, 3, 1, 1).to(torch.uint8), rows % classes)
+
+
+def save_picture(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (value, value, value)).save(path)
+
+
+# ---------------------------------------------------------------------------------------- .npz
+
+
+def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
+    np.savez(tmp_path / "data.npz", **arrays())
+    data = load_npz(str(tmp_path / "data.npz"))
+    assert data.classes == ("lime", "fig") and data.size == 8
+    for name in ("train", "test"):
+        split = getattr(data, name)
+        assert split.images.dtype == torch.uint8 and split.labels.dtype == torch.int64
+        np.testing.assert_array_equal(split.images, arrays()[f"{name}_images"])
+        np.testing.assert_array_equal(split.labels, arrays()[f"{name}_labels"])
+
+
+def test_arrays_that_are_not_needed_are_not_read(tmp_path):
+    np.savez(tmp_path / "data.npz", **arrays(), notes=np.array([{"pickled": True}]))
+    assert len(load_npz(str(tmp_path / "data.npz")).train) == 5
+
+
+@pytest.mark.parametrize(
+    "changes, fault",
+    [
+        ({"test_labels": None}, "lacks the array test_labels"),
+        ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"train_images is uint8 of shape \(5, 8, 8, 3\)"),
+        ({"train_images": np.zeros((5, 3, 8, 9), np.uint8)}, r"train_images is uint8 of shape \(5, 3, 8, 9\)"),
+        ({"train_images": np.zeros((5, 3, 8), np.uint8)}, r"train_images is uint8 of shape \(5, 3, 8\)"),
+        ({"test_images": np.zeros((2, 3, 8, 8), np.float32)}, "test_images is float32"),
+        ({"test_images": np.zeros((2, 3, 9, 9), np.uint8)}, "differ in size"),
+        ({"train_labels": np.zeros(4, int)}, r"train_labels is int64 of shape \(4,\); it must be integers \(5,\)"),
+        ({"train_labels": np.zeros(5)}, "train_labels is float64"),
+        ({"train_labels": np.array([0, 1, 2, 0, 1])}, "train_labels must hold labels 0 to 1"),
+        ({"test_labels": np.array([0, -1])}, "test_labels must hold labels 0 to 1"),
+        ({"test_images": np.zeros((0, 3, 8, 8), np.uint8), "test_labels": np.zeros(0, int)}, "one at least"),
+        ({"classes": np.array(["fig", "fig"])}, "classes must be distinct strings"),
+        ({"classes": np.array([0, 1])}, "classes must be distinct strings"),
+        ({"classes": np.array(["lime", "fig"], dtype=object)}, "loads without pickle"),
+    ],
+)
+def test_a_fault_in_an_npz_file_is_named(tmp_path, changes, fault):
+    path = tmp_path / "data.npz"
+    np.savez(path, **arrays(**changes))
+    with pytest.raises(InputError, match=f"data.path={re.escape(str(path))}.*{fault}"):
+        load_npz(str(path))
+
+
+def npy_file() -> bytes:
+    file = io.BytesIO()
+    np.save(file, np.zeros(3))
+    return file.getvalue()
+
+
+def damage_checksum(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[300] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(lambda path: path.write_text("text"), id="text"),
+        pytest.param(lambda path: path.write_bytes(b""), id="empty"),
+        pytest.param(lambda path: path.write_bytes(path.read_bytes()[:900]), id="truncated"),
+        pytest.param(lambda path: path.write_bytes(pickle.dumps([1])), id="pickle"),
+        pytest.param(lambda path: path.write_bytes(npy_file()), id="npy"),
+        pytest.param(damage_checksum, id="flipped bit"),
+    ],
+)
+def test_a_file_that_is_no_sound_npz_is_one_error(tmp_path, spoil):
+    path = tmp_path / "data.npz"
+    np.savez(path, **arrays())
+    spoil(path)
+    with pytest.raises(InputError, match=f"data.path={re.escape(str(path))} is not an .npz file"):
+        load_npz(str(path))
+
+
+def test_a_missing_npz_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"none.npz does not exist"):
+        load_npz(str(tmp_path / "none.npz"))
+
+
+@pytest.mark.realdata
+def test_cifar100_has_its_published_classes_and_statistics():
+    path = DATA / "cifar100.npz"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    data = load_npz(str(path))
+    assert (len(data.train), len(data.test), len(data.classes), data.size) == (50_000, 10_000, 100, 32)
+    assert class_index(data.classes, "orange", "label") == 53
+    assert data.train.labels.bincount().tolist() == [500] * 100
+    means, deviations = channel_statistics(data.train.images)
+    assert np.round(means, 4).tolist() == [0.5071, 0.4865, 0.4409]
+    assert np.round(deviations, 4).tolist() == [0.2673, 0.2564, 0.2762]
+
+
+# ---------------------------------------------------------------------------------------- folders
+
+
+def test_class_folders_become_classes_and_pictures_of_any_size_are_reduced(tmp_path):
+    for label, name in enumerate(["lime", "fig"]):
+        for number in range(10):
+            save_picture(tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30))
+    (tmp_path / ".thumbnails").mkdir()
+    data = load_folder(str(tmp_path), size=8, test=0.2)
+    assert data.classes == ("fig", "lime")
+    assert data.train.images.shape == (16, 3, 8, 8) and data.test.images.shape == (4, 3, 8, 8)
+    shown = {}
+    for split in (data.train, data.test):
+        for image, label in zip(split.images, split.labels, strict=True):
+            assert len(image.unique()) == 1
+            shown[int(image[0, 0, 0])] = data.classes[label]
+    assert shown == {100 * label + n: name for label, name in enumerate(["lime", "fig"]) for n in range(10)}
+
+
+def test_train_and_test_folders_are_the_splits(tmp_path):
+    for part, name, value in [("train", "fig", 1), ("train", "lime", 2), ("test", "lime", 3)]:
+        save_picture(tmp_path / part / name / "a.png", value)
+    data = load_folder(str(tmp_path), size=8, test=0.1)
+    assert data.train.images[:, 0, 0, 0].tolist() == [1, 2] and data.train.labels.tolist() == [0, 1]
+    assert data.test.images[:, 0, 0, 0].tolist() == [3] and data.test.labels.tolist() == [1]
+
+
+def test_a_class_of_the_test_folder_alone_is_an_error(tmp_path):
+    for name in ("train/fig", "train/lime", "test/fig", "test/other_limes"):
+        save_picture(tmp_path / name / "a.png", 0)
+    with pytest.raises(InputError, match="has no class 'other_limes'"):
+        load_folder(str(tmp_path), size=8, test=0.1)
+
+
+@pytest.mark.parametrize(
+    "pictures, test, fault",
+    [
+        (None, 0.1, "is not a folder"),
+        (["fig/a.png"], 0.1, "holds 1 class folders: it needs two or more"),
+        (["fig/a.png", "lime/a.png"], 0.1, "data.test=0.1 of the 1 pictures of class 0"),
+        (["fig/a.png", "lime/a.png"], 60, "data.test=60 must lie between 0 and 1"),
+    ],
+)
+def test_a_fault_in_a_folder_is_named(tmp_path, pictures, test, fault):
+    for name in pictures or []:
+        save_picture(tmp_path / "data" / name, 0)
+    with pytest.raises(InputError, match=fault):
+        load_folder(str(tmp_path / "data"), 8, test)
+
+
+# ---------------------------------------------------------------------------------------- CIFAR-100
+
+
+def write_cifar100(root: Path, monkeypatch) -> dict[str, np.ndarray]:
+    """torchvision's own layout, with few pictures, and the checksums that torchvision then expects."""
+    rng = np.random.default_rng(0)
+    cifar100, folder = torchvision.datasets.CIFAR100, root / torchvision.datasets.CIFAR100.base_folder
+    folder.mkdir(parents=True)
+    names = [f"class {number:02d}" for number in range(100)]
+    pixels = {part: rng.integers(0, 256, (100, 3072), dtype=np.uint8) for part in ("train", "test")}
+    contents = {part: {"data": pixels[part], "fine_labels": list(range(100))} for part in pixels}
+    checksums = {}
+    for part, content in {**contents, "meta": {"fine_label_names": names}}.items():
+        pickled = pickle.dumps(content)
+        (folder / part).write_bytes(pickled)
+        checksums[part] = hashlib.md5(pickled).hexdigest()
+    monkeypatch.setattr(cifar100, "train_list", [["train", checksums["train"]]])
+    monkeypatch.setattr(cifar100, "test_list", [["test", checksums["test"]]])
+    monkeypatch.setattr(cifar100, "meta", {**cifar100.meta, "md5": checksums["meta"]})
+    return pixels
+
+
+def test_torchvisions_files_are_read_where_they_are_there_already(tmp_path, monkeypatch):
+    pixels = write_cifar100(tmp_path, monkeypatch)
+    data = load_cifar100(str(tmp_path))
+    assert data.classes == tuple(f"class {number:02d}" for number in range(100))
+    for part, split in [("train", data.train), ("test", data.test)]:
+        np.testing.assert_array_equal(split.images, pixels[part].reshape(-1, 3, 32, 32))
+        assert split.labels.tolist() == list(range(100))
+
+
+def test_without_files_and_network_there_is_one_error(tmp_path, monkeypatch):
+    def download(self):
+        raise URLError("no route to host")
+
+    monkeypatch.setattr(torchvision.datasets.CIFAR100, "download", download)
+    with pytest.raises(InputError, match=f"data.path={re.escape(str(tmp_path))}: CIFAR-100 .* no route to host"):
+        load_cifar100(str(tmp_path))
+
+
+# ---------------------------------------------------------------------------------------- splits and statistics
+
+
+def test_a_stratified_split_is_complete_disjoint_and_holds_out_a_share_of_every_class():
+    kept, held_out = stratified_split(numbered(200, classes=4), share=0.1, seed=0)
+    rows = [split.images[:, 0, 0, 0].tolist() for split in (kept, held_out)]
+    assert sorted(rows[0] + rows[1]) == list(range(200))
+    assert held_out.labels.bincount().tolist() == [5] * 4
+    for split, shown in zip((kept, held_out), rows, strict=True):
+        assert split.labels.tolist() == [row % 4 for row in shown]
+
+
+def test_a_stratified_split_depends_on_its_seed_alone():
+    torch.manual_seed(1)
+    first, again, other = (stratified_split(numbered(200, 4), 0.1, seed)[1].images for seed in (0, 0, 1))
+    assert torch.equal(first, again) and not torch.equal(first, other)
+
+
+@pytest.mark.parametrize("share", [0, 1, -0.1, float("nan"), 0.001, 0.999])
+def test_a_share_that_leaves_a_split_empty_is_an_error(share):
+    with pytest.raises(InputError, match=f"data.validation={share} "):
+        stratified_split(numbered(200, classes=4), share, seed=0)
+
+
+def test_channel_statistics_are_those_of_float64():
+    images = np.random.default_rng(0).beta(0.5, 2, (40, 3, 9, 9)) * [[[[250]], [[255]], [[20]]]]
+    images = images.astype(np.uint8)
+    means, deviations = channel_statistics(torch.from_numpy(images))
+    # the sums differ in order alone
+    np.testing.assert_allclose(means, (images / 255).mean((0, 2, 3)), rtol=1e-12)
+    np.testing.assert_allclose(deviations, (images / 255).std((0, 2, 3)), rtol=1e-12)
+
+
+def test_a_channel_without_contrast_can_be_divided_by():
+    assert min(channel_statistics(torch.zeros(2, 3, 4, 4, dtype=torch.uint8))[1]) > 0
+
+
+def test_a_class_is_found_by_name_and_a_mistyped_one_by_its_nearest():
+    classes = ("apple", "orange", "sweet_pepper")
+    assert [class_index(classes, name, "label") for name in classes] == [0, 1, 2]
+    with pytest.raises(InputError, match="label: the data has no class 'ornage'; did you mean 'orange'"):
+        class_index(classes, "ornage", "label")
+    with pytest.raises(InputError, match="the classes are apple, orange, sweet_pepper"):
+        class_index(classes, "xyz", "label")

@@ -1,0 +1,332 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from renderer.errors import InputError
+from train import checkpoint, fit
+from train.data import DataSet
+from train.experiment import load_data, prepare, run
+from train.logs import read_metrics
+from train.settings import ExperimentSettings, read_settings
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return torch.load(path, weights_only=True)["model"]
+
+
+def assert_same_weights(first: Path, second: Path) -> None:
+    expected = weights(second)
+    for name, value in weights(first).items():
+        assert torch.equal(value, expected[name]), name
+
+
+def metrics_without_times(folder: Path) -> list[dict]:
+    return [{k: v for k, v in line.items() if not k.startswith("seconds/")} for line in read_metrics(folder)]
+
+
+def interrupt_in_the_second_epoch(monkeypatch) -> None:
+    """After its first batch."""
+    training_batches = fit.training_batches
+
+    def interrupted(images, labels, batch_size, seed, epoch):
+        for number, batch in enumerate(training_batches(images, labels, batch_size, seed, epoch)):
+            if (epoch, number) == (1, 1):
+                raise KeyboardInterrupt
+            yield batch
+
+    monkeypatch.setattr(fit, "training_batches", interrupted)
+
+
+def interrupt_while_the_second_checkpoint_is_written(monkeypatch) -> None:
+    save = torch.save
+
+    def interrupted(state, file):
+        if "optimizer" in state and state["epoch"] == 2:
+            file.write(b"the beginning of a checkpoint")
+            raise KeyboardInterrupt
+        save(state, file)
+
+    monkeypatch.setattr(checkpoint.torch, "save", interrupted)
+
+
+# ---------------------------------------------------------------------------------------- resuming
+
+
+@pytest.mark.parametrize("interrupt", [interrupt_in_the_second_epoch, interrupt_while_the_second_checkpoint_is_written])
+def test_an_interrupted_and_resumed_run_ends_as_an_uninterrupted_one(
+    tiny, photos, finished, tmp_path, monkeypatch, interrupt
+):
+    """Bit for bit, with adversaries whose lights continue from epoch to epoch, and dropout."""
+    settings = OmegaConf.load(finished / "config.yaml")
+    assert (settings.augment.arm, settings.augment.lights, settings.model.dropout) == ("adversarial", "continue", 0.3)
+    assert all(line["augment/light_change"] > 0 for line in read_metrics(finished)[:-1])
+    with monkeypatch.context() as patch:
+        interrupt(patch)
+        with pytest.raises(KeyboardInterrupt):
+            run(tiny(), load_data(tiny()), tmp_path)
+    assert checkpoint.load(tmp_path / checkpoint.LAST)["epoch"] == 1
+    torch.manual_seed(17)
+    resumed = tiny("train.resume=true", f"evaluate.photos={photos}")
+    run(resumed, load_data(resumed), tmp_path)
+    for name in (checkpoint.LAST, checkpoint.BEST):
+        assert_same_weights(tmp_path / name, finished / name)
+    assert metrics_without_times(tmp_path) == metrics_without_times(finished)
+    for name in ("epoch_002.png", "epoch_003.png"):
+        assert (tmp_path / "renders" / name).read_bytes() == (finished / "renders" / name).read_bytes()
+
+
+KILLED = """
+import os, signal, sys
+import torch
+from omegaconf import OmegaConf
+from train import experiment, fit
+
+def kill_in_the_second_epoch(images, labels, batch_size, seed, epoch, batches=fit.training_batches):
+    for number, batch in enumerate(batches(images, labels, batch_size, seed, epoch)):
+        if (epoch, number) == (1, 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield batch
+
+torch.set_num_threads(1)
+fit.training_batches = kill_in_the_second_epoch
+config = OmegaConf.load(sys.argv[1])
+experiment.run(config, experiment.load_data(config), experiment.Path(sys.argv[2]))
+"""
+
+
+def test_a_killed_run_can_be_resumed_too(tiny, finished, tmp_path):
+    OmegaConf.save(OmegaConf.create(OmegaConf.to_container(tiny(), resolve=True)), tmp_path / "config.yaml")
+    folder = tmp_path / "run"
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-c", KILLED, tmp_path / "config.yaml", folder]
+    process = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(root)}, cwd=tmp_path, capture_output=True)
+    assert process.returncode == -signal.SIGKILL, process.stderr.decode()
+    resumed = tiny("train.resume=true")
+    run(resumed, load_data(resumed), folder)
+    assert_same_weights(folder / checkpoint.LAST, finished / checkpoint.LAST)
+    assert metrics_without_times(folder)[:-1] == metrics_without_times(finished)[:-1]
+
+
+def test_resuming_a_finished_run_trains_no_further_and_scores_the_same(tiny, tmp_path):
+    config = tiny("augment=none", "train.epochs=1")
+    run(config, load_data(config), tmp_path)
+    before, last = metrics_without_times(tmp_path), (tmp_path / checkpoint.LAST).read_bytes()
+    again = tiny("augment=none", "train.epochs=1", "train.resume=true")
+    run(again, load_data(again), tmp_path)
+    assert metrics_without_times(tmp_path) == before
+    assert (tmp_path / checkpoint.LAST).read_bytes() == last
+
+
+def test_a_folder_that_holds_a_run_is_not_written_over(tiny, finished):
+    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=r"holds a run already: set train.resume=true to go on, or choose another"):
+        run(tiny(), load_data(tiny()), finished)
+    assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("change", ["model.width=2", "model.depth=16", "model.dropout=0.1"])
+def test_resuming_with_another_architecture_is_refused(tiny, finished, change):
+    config = tiny("train.resume=true", change)
+    with pytest.raises(InputError, match=r"last.pt is from another architecture.*config.yaml"):
+        prepare(config, load_data(config), finished)
+
+
+# ---------------------------------------------------------------------------------------- arms
+
+
+def test_no_examples_and_no_augmentation_train_the_same_weights(tiny, tmp_path):
+    """So the arms differ in their renders alone: nothing else draws from the training's random streams."""
+    arms = {"none": ["augment=none"], "empty": ["augment.examples=0"], "renders": []}
+    for name, overrides in arms.items():
+        config = tiny("train.epochs=2", *overrides)
+        run(config, load_data(config), tmp_path / name)
+    assert_same_weights(tmp_path / "empty" / checkpoint.LAST, tmp_path / "none" / checkpoint.LAST)
+    first, other = (weights(tmp_path / name / checkpoint.LAST)["head.weight"] for name in ("none", "renders"))
+    assert not torch.equal(first, other)
+    assert not (tmp_path / "none" / "renders").exists()
+
+
+@pytest.mark.parametrize("arm", ["none", "random", "adversarial"])
+def test_a_run_is_a_function_of_its_seed(tiny, tmp_path, arm):
+    for name, seed in [("first", 0), ("again", 0), ("other", 1)]:
+        torch.manual_seed(len(name))
+        config = tiny("train.epochs=1", f"augment={arm}", f"seed={seed}")
+        run(config, load_data(config), tmp_path / name)
+    assert_same_weights(tmp_path / "again" / checkpoint.LAST, tmp_path / "first" / checkpoint.LAST)
+    first, other = (weights(tmp_path / name / checkpoint.LAST)["stem.weight"] for name in ("first", "other"))
+    assert not torch.equal(first, other)
+
+
+def test_meshes_of_several_classes_are_rendered_with_their_own_labels(tiny, tmp_path, monkeypatch):
+    trained = []
+    with_renders = fit.with_renders
+    monkeypatch.setattr(
+        fit, "with_renders", lambda split, renders: trained.append(renders) or with_renders(split, renders)
+    )
+    meshes = "scene.meshes=[{mesh: 'solid:pear', label: pear}, 'solid:orange', {mesh: 'solid:apple:2', label: apple}]"
+    config = tiny("train.epochs=1", meshes, "augment.examples=12")
+    run(config, load_data(config), tmp_path)
+    (renders,) = trained
+    # mesh by mesh: 2 views × 2 backgrounds each
+    assert renders.labels.tolist() == [2] * 4 + [1] * 4 + [0] * 4
+    assert len(renders.images.unique(dim=0)) == 12
+
+
+# ---------------------------------------------------------------------------------------- what a run leaves
+
+
+def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(finished, tiny_npz, photos):
+    config = OmegaConf.load(finished / "config.yaml")
+    assert OmegaConf.missing_keys(config) == set()
+    assert (config.data.path, config.evaluate.photos, config.train.epochs) == (str(tiny_npz), str(photos), 3)
+    assert set(config.versions) == {"python", "torch", "torchvision", "numpy"}
+    last, best = (torch.load(finished / name, weights_only=True) for name in ("last.pt", "best.pt"))
+    assert (last["epoch"], last["seed"], last["arm"], last["precision"]) == (3, 7, "adversarial", "float32")
+    assert last["model"].keys() == best["model"].keys() and "optimizer" not in best
+    assert sorted(path.name for path in (finished / "renders").iterdir()) == [f"epoch_00{n}.png" for n in (1, 2, 3)]
+    assert {path.name for path in (finished / "photographs").iterdir()} == {
+        "photographs.csv", "summary.json", "contact_sheet.png"
+    }  # fmt: skip
+    assert not list(finished.glob("*.tmp")) and list(finished.glob("events.out.tfevents.*"))
+
+
+def test_metrics_have_each_epochs_losses_attack_and_seconds_and_the_final_scores(finished):
+    *epochs, scores = read_metrics(finished)
+    assert [line["epoch"] for line in epochs] == [1, 2, 3]
+    for line in epochs:
+        assert {
+            "train/loss", "train/accuracy", "train/learning_rate", "validation/loss", "validation/accuracy",
+            "augment/fooled_before", "augment/fooled", "augment/steps", "augment/loss_before", "augment/loss",
+            "augment/light_change", "augment/clamped",
+            "seconds/attack", "seconds/training", "seconds/evaluation", "seconds/input_output",
+        } <= line.keys()  # fmt: skip
+        assert all(isinstance(value, int | float) for value in line.values())
+    summary = json.loads((finished / "photographs" / "summary.json").read_text())
+    assert scores.keys() == {
+        "test/accuracy", "test/accuracy_last", "test/epoch",
+        "photographs/recall", "photographs/top5", "photographs/false_alarms",
+    }  # fmt: skip
+    for name in ("recall", "top5", "false_alarms"):
+        assert scores[f"photographs/{name}"] == summary[name]["value"]
+
+
+def test_the_selected_network_is_the_best_on_validation_and_the_one_that_is_scored(finished, tiny):
+    *epochs, scores = read_metrics(finished)
+    accuracies = [line["validation/accuracy"] for line in epochs]
+    best = checkpoint.load(finished / checkpoint.BEST)
+    assert best["epoch"] == scores["test/epoch"] == accuracies.index(max(accuracies)) + 1
+    network, classes = checkpoint.load_network(finished)
+    test = load_data(tiny()).test
+    logits = network(test.images / 255)
+    assert scores["test/accuracy"] == pytest.approx((logits.argmax(1) == test.labels).double().mean().item())
+    assert classes == ("apple", "orange", "pear")
+
+
+class GuardedData:
+    """A data set whose test split can be had only once the last epoch is done."""
+
+    def __init__(self, data: DataSet, folder: Path, epochs: int):
+        self.classes, self.train, self.size = data.classes, data.train, data.size
+        self._test, self._last, self._epochs = data.test, folder / checkpoint.LAST, epochs
+        self.looks = 0
+
+    @property
+    def test(self):
+        assert checkpoint.load(self._last)["epoch"] == self._epochs
+        self.looks += 1
+        return self._test
+
+
+def test_the_test_set_is_looked_at_once_after_the_last_epoch(tiny, tmp_path):
+    data = GuardedData(load_data(tiny()), tmp_path, epochs=3)
+    run(tiny(), data, tmp_path)
+    assert data.looks == 1
+
+
+def test_training_and_validation_pictures_are_apart(tiny, tmp_path, monkeypatch):
+    seen = {}
+
+    def record(self, train, validation, log):
+        seen.update(train=train, validation=validation)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fit.Trainer, "fit", record)
+    data = load_data(tiny())
+    with pytest.raises(KeyboardInterrupt):
+        run(tiny(), data, tmp_path)
+    assert (len(seen["train"]), len(seen["validation"])) == (54, 6)
+    assert seen["validation"].labels.bincount().tolist() == [2, 2, 2]
+    both = torch.cat([seen["train"].images, seen["validation"].images])
+    assert torch.equal(both.unique(dim=0), data.train.images.unique(dim=0))
+
+
+# ---------------------------------------------------------------------------------------- wrong input
+
+
+@pytest.mark.parametrize(
+    "overrides, fault",
+    [
+        (["seed=-1"], "seed=-1 must not be negative"),
+        (["seed=abc"], "seed: Value 'abc' of type 'str' could not be converted to Integer"),
+        (["train.epochs=abc"], "train.epochs: Value 'abc'"),
+        (["train.epochs=0"], "train.epochs=0"),
+        (["data.validation=abc"], "data.validation: Value 'abc'"),
+        (["data.validation=1.5"], "data.validation=1.5 must lie between 0 and 1"),
+        (["data.path=???"], "data.path is not set: give data.path=..."),
+        (["data.name=mnist"], "data.name=mnist: choose one of cifar100, npz, folder, shapes"),
+        (["+train.epoch=3"], "train.epoch: Key 'epoch' not in"),
+        (["augment.attack.step_size=abc"], "augment.attack.step_size: Value 'abc'"),
+        (["augment.arm=adverserial"], "augment.arm=adverserial: choose one of"),
+        (["augment.random=3"], "RandomLights"),
+        (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12"),
+        (["augment.examples=5"], "augment.examples=5 is not a multiple of 2 meshes × 2 backgrounds"),
+        (["scene.meshes=solid:orange"], "scene.meshes"),
+        (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], r"scene.meshes\[0\].lable: Key 'lable'"),
+        (["scene.meshes=[{label: orange}]", "augment.examples=2"], r"mesh"),
+        (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
+        (["scene.exposure=0"], "scene.exposure=0.0 must be positive"),
+        (["scene.light=graze"], "'graze' is not known"),
+        (["label=ornage"], r"label of scene.meshes\[0\]: the data has no class 'ornage'; did you mean 'orange'"),
+        (["renderer.samples=0"], "renderer.samples=0"),
+        (["renderer.visibility=opengll"], "opengll"),
+        (["model.dropout=2"], "model.dropout=2"),
+        (["train.device=cuda:99"], "device=cuda:99 is not available here"),
+        (["evaluate.photos=/no/such/folder"], "/no/such/folder does not exist"),
+        (["evaluate.skip_unreadable=perhaps"], "evaluate.skip_unreadable: Value 'perhaps'"),
+    ],
+)
+def test_wrong_input_is_one_error_before_the_first_epoch(tiny, tmp_path, overrides, fault):
+    config = tiny(*overrides)
+    with pytest.raises(InputError, match=fault) as caught:
+        prepare(config, load_data(config), tmp_path / "run")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_photographs_of_an_unknown_label_are_refused_before_the_first_epoch(tiny, photos, tmp_path):
+    config = tiny("augment=none", "label=ornage", f"evaluate.photos={photos}")
+    with pytest.raises(InputError, match="'ornage' is not a class of the model: did you mean 'orange'"):
+        prepare(config, load_data(config), tmp_path)
+
+
+@pytest.mark.parametrize("choices", [["experiment=demo"], ["experiment=cpu"], ["experiment=paper"]])
+def test_every_experiment_is_a_configuration_that_runs_on_other_data_too(tiny_npz, choices):
+    """The command line's data set wins over the experiment's, and no photographs are asked for."""
+    with initialize_config_module("conf", version_base="1.3"):
+        config = compose("train", [*choices, "data=npz", f"data.path={tiny_npz}", "run=here"])
+    assert read_settings(ExperimentSettings, config).evaluate.photos is None
+    assert len(load_data(config).train) == 60
+
+
+def test_the_demonstration_is_scored_on_the_pictures_that_it_renders():
+    with initialize_config_module("conf", version_base="1.3"):
+        settings = read_settings(ExperimentSettings, compose("train", ["run=here"]))
+    assert settings.evaluate.photos == settings.data.pictures == "here/rendered_pictures"

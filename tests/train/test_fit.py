@@ -1,0 +1,229 @@
+import copy
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from augment.phases import Phases
+from augment.service import Renders
+from renderer.errors import InputError
+from train import checkpoint, fit
+from train.data import Split
+from train.fit import Trainer, TrainSettings, evaluate, with_renders
+from train.logs import RunLog, read_metrics
+from train.precision import MixedPrecision
+from train.schedule import cosine
+from train.wideresnet import WideResNet
+
+ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
+
+
+class NoRenders:
+    """Stands for the augmentation service."""
+
+    class settings:
+        arm = "none"
+
+    def regenerate(self, model, epoch):
+        return Renders(torch.zeros(0), torch.zeros(0, dtype=torch.int64), {})
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        assert state == {}
+
+
+def noise(count: int) -> Split:
+    draws = torch.Generator().manual_seed(count)
+    images = torch.randint(0, 256, (count, 3, 16, 16), dtype=torch.uint8, generator=draws)
+    return Split(images, torch.randint(0, 3, (count,), generator=draws))
+
+
+def make_trainer(folder, **settings) -> Trainer:
+    torch.manual_seed(0)
+    model = MixedPrecision(WideResNet(3, 10, 1, dropout=0.0), "float32")
+    settings = TrainSettings(**{"epochs": 3, "batch_size": 16, "learning_rate": 0.05} | settings)
+    return Trainer(settings, model, ARCHITECTURE, NoRenders(), Phases(), folder, seed=0)
+
+
+def fit_noise(trainer: Trainer) -> list[dict]:
+    log = RunLog(trainer.folder)
+    try:
+        trainer.fit(noise(40), noise(20), log)
+    finally:
+        log.close()
+    return read_metrics(trainer.folder)
+
+
+@pytest.mark.parametrize(
+    "settings, key",
+    [
+        ({"epochs": 0}, "train.epochs=0"),
+        ({"batch_size": 0}, "train.batch_size=0"),
+        ({"learning_rate": 0.0}, "train.learning_rate=0.0"),
+        ({"learning_rate": math.inf}, "train.learning_rate=inf"),
+        ({"learning_rate": math.nan}, "train.learning_rate=nan"),
+        ({"momentum": 1.0}, "train.momentum=1.0"),
+        ({"momentum": -0.1}, "train.momentum=-0.1"),
+        ({"weight_decay": -1.0}, "train.weight_decay=-1.0"),
+        ({"weight_decay": math.nan}, "train.weight_decay=nan"),
+        ({"schedule": "linear"}, "train.schedule=linear"),
+    ],
+)
+def test_settings_out_of_range_name_their_key(settings, key):
+    with pytest.raises(InputError, match=key):
+        TrainSettings(**settings)
+
+
+def test_the_recipe_is_the_papers():
+    settings = TrainSettings()
+    assert (settings.epochs, settings.batch_size, settings.learning_rate) == (150, 128, 0.125)
+    assert (settings.momentum, settings.weight_decay, settings.schedule) == (0.9, 5e-4, "step")
+
+
+# ---------------------------------------------------------------------------------------- parts
+
+
+def test_renders_follow_the_data_as_bytes_with_their_labels():
+    data = noise(5)
+    renders = Renders(torch.rand(2, 3, 16, 16), torch.tensor([1, 1]), {})
+    joined = with_renders(data, renders)
+    assert torch.equal(joined.images[:5], data.images)
+    assert (joined.images[5:] / 255 - renders.images).abs().max() <= 0.5 / 255 + 1e-6
+    assert joined.labels.tolist() == [*data.labels.tolist(), 1, 1]
+
+
+def test_without_renders_the_data_stay_as_they_are():
+    data = noise(5)
+    assert with_renders(data, NoRenders().regenerate(None, 0)) is data
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_evaluation_is_the_mean_over_all_pictures_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
+    monkeypatch.setattr(fit, "EVALUATION_BATCH", 7)
+    torch.manual_seed(0)
+    model = WideResNet(3, 10, 1, dropout=0.5).train(training)
+    before = copy.deepcopy(model.state_dict())
+    split = noise(40)
+    found = evaluate(model, split)
+    assert model.training == training
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    logits = model.eval().double()(split.images / 255)
+    assert found["loss"] == pytest.approx(F.cross_entropy(logits, split.labels).item(), rel=1e-5)
+    assert found["accuracy"] == (logits.argmax(1) == split.labels).double().mean().item()
+
+
+# ---------------------------------------------------------------------------------------- the loop
+
+
+def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tmp_path, monkeypatch):
+    """Two steps of a linear network against the update written down."""
+    images, labels = torch.rand(2, 4, 3, 2, 2), torch.tensor([[0, 1, 2, 0], [1, 1, 2, 0]])
+    monkeypatch.setattr(fit, "training_batches", lambda *arguments: zip(images, labels, strict=True))
+    monkeypatch.setattr(fit, "evaluate", lambda *arguments: {"loss": 1.0, "accuracy": 0.0})
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
+    weight, bias = (parameter.detach().clone().requires_grad_() for parameter in network[1].parameters())
+    settings = TrainSettings(1, 4, 0.5, momentum=0.9, weight_decay=0.1, schedule="cosine")
+    trainer = Trainer(settings, MixedPrecision(network, "float32"), {}, NoRenders(), Phases(), tmp_path, seed=0)
+    log = RunLog(tmp_path)
+    trainer.fit(Split(images.flatten(0, 1), labels.flatten()), noise(1), log)
+    log.close()
+
+    velocities = [torch.zeros_like(weight), torch.zeros_like(bias)]
+    losses = []
+    for step in range(2):
+        loss = F.cross_entropy(images[step].flatten(1) @ weight.T + bias, labels[step])
+        losses.append(loss.item())
+        gradients = torch.autograd.grad(loss, (weight, bias))
+        with torch.no_grad():
+            for parameter, gradient, velocity in zip((weight, bias), gradients, velocities, strict=True):
+                gradient = gradient + 0.1 * parameter
+                velocity.mul_(0.9).add_(gradient)
+                parameter -= 0.5 * cosine(step / 2) * (gradient + 0.9 * velocity)
+    torch.testing.assert_close(network[1].weight, weight)
+    torch.testing.assert_close(network[1].bias, bias)
+    (line,) = read_metrics(tmp_path)
+    assert line["train/loss"] == pytest.approx(sum(losses) / 2, rel=1e-6)
+    assert line["train/learning_rate"] == 0.5 * cosine(1 / 2)
+
+
+def test_best_is_the_first_epoch_of_the_highest_validation_accuracy(tmp_path, monkeypatch):
+    trainer = make_trainer(tmp_path, epochs=5)
+    accuracies, weights = [0.2, 0.6, 0.5, 0.6, 0.1], []
+
+    def scripted(model, split):
+        weights.append(copy.deepcopy(model.network.state_dict()))
+        return {"loss": 1.0, "accuracy": accuracies[len(weights) - 1]}
+
+    monkeypatch.setattr(fit, "evaluate", scripted)
+    fit_noise(trainer)
+    best, last = (checkpoint.load(tmp_path / name) for name in (checkpoint.BEST, checkpoint.LAST))
+    assert (best["epoch"], best["validation_accuracy"]) == (2, 0.6)
+    assert (last["epoch"], last["epoch_best"], last["validation_accuracy_best"]) == (5, 2, 0.6)
+    for state, expected in [(best, weights[1]), (last, weights[4])]:
+        assert all(torch.equal(value, expected[name]) for name, value in state["model"].items())
+
+
+def test_a_resumed_run_remembers_the_best_epoch(tmp_path, monkeypatch):
+    for epochs, accuracy in [(1, 0.6), (2, 0.5)]:
+        monkeypatch.setattr(fit, "evaluate", lambda *arguments, value=accuracy: {"loss": 1.0, "accuracy": value})
+        trainer = make_trainer(tmp_path, epochs=epochs)
+        if epochs > 1:
+            trainer.resume()
+        fit_noise(trainer)
+    assert checkpoint.load(tmp_path / checkpoint.BEST)["epoch"] == 1
+    last = checkpoint.load(tmp_path / checkpoint.LAST)
+    assert (last["epoch"], last["epoch_best"], last["validation_accuracy_best"]) == (2, 1, 0.6)
+
+
+def test_epochs_train_in_training_mode_however_the_network_is_found(tmp_path):
+    trainer = make_trainer(tmp_path, epochs=2)
+    trainer.model.eval()
+    fit_noise(trainer)
+    assert trainer.model.network.norm.num_batches_tracked == 2 * math.ceil(40 / 16)
+
+
+def test_a_loss_that_is_not_finite_ends_the_run_with_the_last_good_checkpoint(tmp_path, monkeypatch):
+    trainer = make_trainer(tmp_path)
+    losses = iter([1.0, math.nan])
+    monkeypatch.setattr(fit, "evaluate", lambda *arguments: {"loss": next(losses), "accuracy": 0.5})
+    with pytest.raises(InputError, match=r"train.learning_rate=0.05 made the loss infinite in epoch 2"):
+        fit_noise(trainer)
+    assert checkpoint.load(tmp_path / checkpoint.LAST)["epoch"] == 1
+    assert [line["epoch"] for line in read_metrics(tmp_path)] == [1]
+
+
+def test_training_learns_what_can_be_told_apart(tmp_path):
+    data = noise(64)
+    data.images[torch.arange(64), data.labels] //= 4
+    log = RunLog(tmp_path)
+    make_trainer(tmp_path, epochs=5, schedule="one_cycle").fit(data, data, log)
+    log.close()
+    assert read_metrics(tmp_path)[-1]["validation/accuracy"] > 0.95
+
+
+def test_resuming_with_another_architecture_is_an_error(tmp_path):
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    other = make_trainer(tmp_path)
+    other.architecture = {**ARCHITECTURE, "classes": ["fig", "lime", "plum"]}
+    with pytest.raises(InputError, match=r"last.pt is from another architecture or other classes: resume with"):
+        other.resume()
+
+
+def test_every_epoch_has_its_line_before_its_checkpoint(tmp_path, monkeypatch):
+    """A crash between the two then loses nothing: the epoch comes again."""
+    lines_at_save = []
+    save = checkpoint.save
+
+    def recorded(path, state):
+        lines_at_save.append((path.name, state["epoch"], [line["epoch"] for line in read_metrics(tmp_path)]))
+        save(path, state)
+
+    monkeypatch.setattr(checkpoint, "save", recorded)
+    fit_noise(make_trainer(tmp_path, epochs=2))
+    last = [entry[1:] for entry in lines_at_save if entry[0] == checkpoint.LAST]
+    assert last == [(1, [1]), (2, [1, 2])]

@@ -1,0 +1,82 @@
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from train.logs import METRICS, RunLog, read_metrics
+
+
+def write_epochs(folder, epochs: range, done: int = 0) -> None:
+    log = RunLog(folder, done)
+    for epoch in epochs:
+        log.scalars({"train/loss": 1 / epoch, "validation/accuracy": 0.25}, epoch)
+    log.close()
+
+
+def test_each_epoch_is_one_line_of_json_and_the_final_scores_another(tmp_path):
+    log = RunLog(tmp_path)
+    log.scalars({"train/loss": 0.1 + 0.2}, epoch=1)
+    first = (tmp_path / METRICS).read_text()  # at once, for whoever looks on
+    log.scalars({"test/accuracy": 1.0})
+    log.close()
+    assert first == '{"epoch": 1, "train/loss": 0.30000000000000004}\n'
+    lines = (tmp_path / METRICS).read_text().splitlines()
+    assert [json.loads(line) for line in lines] == read_metrics(tmp_path)
+    assert read_metrics(tmp_path) == [{"epoch": 1, "train/loss": 0.1 + 0.2}, {"test/accuracy": 1.0}]
+
+
+def test_a_folder_without_metrics_has_no_lines(tmp_path):
+    assert read_metrics(tmp_path) == []
+
+
+@pytest.mark.parametrize("done, kept", [(0, []), (2, [1, 2]), (5, [1, 2, 3])])
+def test_resuming_keeps_the_epochs_done_and_drops_what_comes_again(tmp_path, done, kept):
+    write_epochs(tmp_path, range(1, 4))
+    log = RunLog(tmp_path, 3)
+    log.scalars({"test/accuracy": 0.5})
+    log.close()
+    before = read_metrics(tmp_path)
+    RunLog(tmp_path, done).close()
+    assert read_metrics(tmp_path) == before[: len(kept)]
+    assert [line["epoch"] for line in read_metrics(tmp_path)] == kept
+
+
+def test_a_line_cut_short_by_a_crash_is_passed_over(tmp_path):
+    write_epochs(tmp_path, range(1, 3))
+    whole = read_metrics(tmp_path)
+    with open(tmp_path / METRICS, "a") as file:
+        file.write('{"epoch": 3, "train/lo')
+    assert read_metrics(tmp_path) == whole
+    write_epochs(tmp_path, range(3, 4), done=2)
+    assert [line["epoch"] for line in read_metrics(tmp_path)] == [1, 2, 3]
+
+
+def test_tensorboard_reads_the_scalars_and_the_renders(tmp_path):
+    renders = torch.rand(5, 3, 16, 16)
+    log = RunLog(tmp_path)
+    log.scalars({"train/loss": 0.5}, epoch=1)
+    log.scalars({"train/loss": 0.25}, epoch=2)
+    log.renders(renders, epoch=2)
+    log.close()
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("train/loss")] == [(1, 0.5), (2, 0.25)]
+    (image,) = events.Images("renders")
+    png = image.encoded_image_string
+    assert image.step == 2 and struct.unpack(">II", png[16:24]) == (image.width, image.height)
+    with Image.open(tmp_path / "renders" / "epoch_002.png") as grid:
+        pixels = np.asarray(grid)
+    assert pixels.shape == (image.height, image.width, 3) == (18, 5 * 17 + 1, 3)
+    for number, render in enumerate(renders):
+        shown = pixels[1:17, 17 * number + 1 : 17 * number + 17]
+        np.testing.assert_allclose(shown / 255, render.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
+
+
+def test_tensorboard_shows_each_epoch_of_a_resumed_run_once(tmp_path):
+    write_epochs(tmp_path, range(1, 4))
+    write_epochs(tmp_path, range(2, 5), done=1)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [event.step for event in events.Scalars("train/loss")] == [1, 2, 3, 4]

@@ -1,0 +1,96 @@
+import csv
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from renderer.errors import InputError
+from renderer.harmonics import irradiance_basis, live_coefficients
+from train import rendered_shapes
+from train.photographs import find_photographs, load_photographs
+from train.rendered_shapes import CLASSES, SOURCE, even_light, hard_light, load_shapes, write_held_out
+
+SIZE = 8
+FEW = ("apple", "orange", "plate")
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """Few classes and pictures, one sample per pixel: the tests look at what is rendered, not at how well."""
+    monkeypatch.setattr(rendered_shapes, "CLASSES", FEW)
+    monkeypatch.setattr(rendered_shapes, "SETTINGS", rendered_shapes.Settings(samples=1))
+    monkeypatch.setattr(rendered_shapes, "HELD_OUT_PER_CLASS", 3)
+
+
+@pytest.fixture
+def individuals(monkeypatch) -> list[tuple[str, int]]:
+    """The solids made, in order, as (name, seed)."""
+    made = []
+    solid = rendered_shapes.solid
+
+    def recorded(name, seed):
+        made.append((name, seed))
+        return solid(name, seed)
+
+    monkeypatch.setattr(rendered_shapes, "solid", recorded)
+    return made
+
+
+def test_the_classes_are_ten_solids_the_orange_among_them():
+    assert len(set(CLASSES)) == len(CLASSES) == 10 and "orange" in CLASSES
+
+
+def test_every_class_has_the_pictures_asked_for_of_as_many_individuals_as_that_takes(individuals):
+    data = load_shapes(train=21, test=2, size=SIZE, seed=0)
+    assert data.classes == FEW
+    assert data.train.images.shape == (63, 3, SIZE, SIZE) and data.train.images.dtype == torch.uint8
+    assert data.train.labels.tolist() == [label for label in range(3) for _ in range(21)]
+    assert data.test.labels.tolist() == [label for label in range(3) for _ in range(2)]
+    assert [name for name, _ in individuals] == [name for name in FEW for _ in range(2)] + list(FEW)
+    assert len(data.train.images.unique(dim=0)) == 63
+
+
+def test_no_individual_is_in_two_of_training_test_and_held_out_pictures(individuals, tmp_path):
+    load_shapes(train=1, test=1, size=SIZE, seed=0)
+    write_held_out(tmp_path, SIZE, seed=0)
+    assert len(individuals) == len(set(individuals)) == 9
+
+
+def test_pictures_are_a_function_of_the_seed():
+    torch.manual_seed(1)
+    first, again, other = (load_shapes(1, 1, SIZE, seed) for seed in (0, 0, 1))
+    for part in ("train", "test"):
+        assert torch.equal(getattr(first, part).images, getattr(again, part).images)
+        assert not torch.equal(getattr(first, part).images, getattr(other, part).images)
+
+
+def test_held_out_pictures_are_a_folder_of_photographs_that_says_they_are_rendered(tmp_path):
+    write_held_out(tmp_path, SIZE, seed=0)
+    found = find_photographs(tmp_path, FEW, "orange")
+    assert [item.label for item in found] == [name for name in FEW for _ in range(3)]
+    assert {item.source for item in found} == {SOURCE} == {"rendered, hard light"}
+    with open(tmp_path / "photos.csv", newline="") as file:
+        assert {row["path"] for row in csv.DictReader(file)} == {str(item.path) for item in found}
+    _, images, _ = load_photographs(tmp_path, found, SIZE)
+    split = rendered_shapes._render_split(3, 0, "held out", hard_light, rendered_shapes.Settings(SIZE, samples=1))
+    assert torch.equal(images, split.images)
+
+
+def test_training_light_leaves_no_side_dark_and_held_out_light_does():
+    draws = torch.Generator().manual_seed(0)
+    normals = torch.nn.functional.normalize(torch.randn(2000, 3, generator=draws, dtype=torch.float64), dim=1)
+    back = torch.tensor([math.cos(1.0), 0.0, math.sin(1.0)])
+    shading = irradiance_basis(normals, 6).numpy()
+    ratios = {}
+    for light in (even_light, hard_light):
+        lights = torch.stack([light(back, draws) for _ in range(200)])[:, live_coefficients(6)].double().numpy()
+        luminance = np.einsum("nk,lkc->ln", shading, lights)
+        ratios[light] = luminance.min(1) / luminance.max(1)
+    assert ratios[even_light].min() > 0.45 > 0.3 > ratios[hard_light].max()
+
+
+@pytest.mark.parametrize("train, test", [(0, 1), (1, 0)])
+def test_no_pictures_of_a_class_is_an_error(train, test):
+    with pytest.raises(InputError, match=f"data.train={train} and data.test={test} must be at least 1"):
+        load_shapes(train, test, SIZE, seed=0)

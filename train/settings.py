@@ -1,0 +1,103 @@
+"""conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
+
+import math
+from dataclasses import dataclass, field
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from augment.service import AugmentationSettings
+from renderer.errors import InputError
+from train.fit import TrainSettings
+
+
+@dataclass
+class DataSettings:
+    """What the choices of conf/data set between them; see the loader of each. test: a share, or a count per class."""
+
+    name: str = "shapes"
+    validation: float = 0.1
+    path: str = ""
+    size: int = 32
+    train: int = 300
+    test: float = 60
+    seed: int = 0
+    pictures: str | None = None
+
+    def __post_init__(self):
+        if self.size < 1 or self.seed < 0:
+            raise InputError(f"data.size={self.size} must be at least 1 and data.seed={self.seed} not negative")
+
+
+@dataclass
+class SceneSettings:
+    """What is rendered. meshes: each a file, a `solid:NAME`, or a mapping with ObjectSettings' keys."""
+
+    meshes: list = field(default_factory=list)
+    backgrounds: list[float] = field(default_factory=list)
+    views: int | None = None
+    field_of_view: float = 2.0
+    light: str = "grace"
+    exposure: float = 1.0
+
+    def __post_init__(self):
+        if not 0 < self.exposure < math.inf:
+            raise InputError(f"scene.exposure={self.exposure} must be positive")
+
+
+@dataclass
+class RendererSettings:
+    """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb."""
+
+    visibility: str = "auto"
+    samples: int = 8
+    encoding: str = "linear"
+
+
+@dataclass
+class ModelSettings:
+    """The WideResNet; its dropout acts between the two convolutions of a block."""
+
+    depth: int = 16
+    width: int = 4
+    dropout: float = 0.3
+
+
+@dataclass
+class EvaluationSettings:
+    """photos: a folder of photographs to score the network on. skip_unreadable: pass over those that are broken."""
+
+    photos: str | None = None
+    skip_unreadable: bool = False
+
+
+@dataclass
+class ExperimentSettings:
+    """A whole run. run: its folder. label: the class under study. compare: arms to train beside it."""
+
+    run: str = ""
+    seed: int = 0
+    label: str = "orange"
+    compare: list[str] = field(default_factory=list)
+    data: DataSettings = field(default_factory=DataSettings)
+    augment: AugmentationSettings = field(default_factory=AugmentationSettings)
+    scene: SceneSettings = field(default_factory=SceneSettings)
+    renderer: RendererSettings = field(default_factory=RendererSettings)
+    model: ModelSettings = field(default_factory=ModelSettings)
+    train: TrainSettings = field(default_factory=TrainSettings)
+    evaluate: EvaluationSettings = field(default_factory=EvaluationSettings)
+
+    def __post_init__(self):
+        if self.seed < 0:
+            raise InputError(f"seed={self.seed} must not be negative")
+
+
+def read_settings(kind: type, config: DictConfig, parent: str = ""):
+    """The dataclass from its configuration; InputError naming the key that is unknown, unset or of the wrong type."""
+    if unset := OmegaConf.missing_keys(config):
+        raise InputError(f"{min(unset)} is not set: give {min(unset)}=...")
+    try:
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), config))
+    except OmegaConfBaseException as error:
+        key = ".".join(filter(None, (parent, error.full_key)))
+        raise InputError(": ".join(filter(None, (key, str(error.msg).splitlines()[0])))) from error
