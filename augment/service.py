@@ -94,13 +94,17 @@ class AugmentationService:
         self._phases = phases
         self._continued: Tensor | None = None
 
+    def __len__(self) -> int:
+        """Examples per epoch."""
+        return len(self._labels)
+
     def regenerate(self, model: nn.Module, epoch: int) -> Renders:
         """This epoch's examples for the model's current weights; the model is left as it was found.
 
         The draw depends on the seed and the epoch alone, so a resumed run repeats it.
         """
         if not self.settings.renders:
-            return Renders(torch.zeros(0), self._labels[:0], {})
+            return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
         make = self._random if self.settings.arm == "random" else self._adversarial
         return make(model, epoch)
 
@@ -109,9 +113,15 @@ class AugmentationService:
         return {} if self._continued is None else {"lights": self._continued.cpu()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` gave."""
-        if "lights" in state:
-            self._continued = state["lights"].to(self._labels.device)
+        """Restore what `state_dict` gave; InputError where it is from another number of examples."""
+        if "lights" not in state:
+            return
+        if len(state["lights"]) != len(self._labels):
+            raise InputError(
+                f"augment.examples: the checkpoint continues {len(state['lights'])} lights and the scene has "
+                f"{len(self._labels)}; resume with the settings of the run"
+            )
+        self._continued = state["lights"].to(self._labels.device)
 
     def _random(self, model: nn.Module, epoch: int) -> Renders:
         lights = self._perturbed(epoch)
@@ -122,14 +132,14 @@ class AugmentationService:
             "fooled": _mean(logits.argmax(1) != self._labels),
             "loss": _mean(nn.functional.cross_entropy(logits, self._labels)),
         }
-        return Renders(images, self._labels, diagnostics | self._light_diagnostics(lights, self._start()))
+        return Renders(images, self._labels, diagnostics | self._light_diagnostics(lights))
 
     def _adversarial(self, model: nn.Module, epoch: int) -> Renders:
         start = self._starting_lights(epoch)
         result = descend(model, self._scene.render, start, self._labels, self.settings.attack, self._phases)
         if self.settings.lights == "continue":
             self._continued = result.parameters
-        diagnostics = self._attack_diagnostics(result) | self._light_diagnostics(result.parameters, start)
+        diagnostics = self._attack_diagnostics(result) | self._light_diagnostics(result.parameters)
         return Renders(result.images, self._labels, diagnostics)
 
     def _starting_lights(self, epoch: int) -> Tensor:
@@ -156,9 +166,9 @@ class AugmentationService:
             "zero_gradient": _mean(result.zero_gradient),
         }
 
-    def _light_diagnostics(self, lights: Tensor, start: Tensor) -> dict[str, float]:
+    def _light_diagnostics(self, lights: Tensor) -> dict[str, float]:
         return {
-            "light_change": _mean((lights - start).flatten(1).norm(dim=1)),
+            "light_change": _mean((lights - self._light).flatten(1).norm(dim=1)),
             "clamped": _mean(self._scene.clamped_share(lights)),
         }
 

@@ -53,12 +53,14 @@ def load_data(config: DictConfig) -> DataSet:
     }
     if data.name not in loaders:
         raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")
+    console.info("data: %s", data.name)
     return loaders[data.name]()
 
 
 def write_pictures(config: DictConfig, size: int) -> None:
     """Write the rendered held-out pictures that `data=shapes` is scored on, where the configuration asks for them."""
     if config.data.name == "shapes" and config.data.pictures:
+        console.info("writing held-out renders in hard light (not photographs) to %s", config.data.pictures)
         write_held_out(Path(config.data.pictures), size, config.data.seed)
 
 

@@ -87,12 +87,14 @@ class Trainer:
 
         InputError where training diverges.
         """
+        mixed = with_room(train, len(self.service))
         while self.epoch < self.settings.epochs:
             torch.manual_seed(stream_seed(self.seed, self.epoch, "dropout"))
             with self.phases("attack"):
                 renders = self.service.regenerate(self.model, self.epoch)
+                put_last(mixed, renders)
             with self.phases("training"):
-                trained = self._train_epoch(with_renders(train, renders))
+                trained = self._train_epoch(mixed)
             with self.phases("evaluation"):
                 validated = evaluate(self.model, validation)
             self.epoch += 1
@@ -196,12 +198,19 @@ class Trainer:
         )
 
 
-def with_renders(split: Split, renders: Renders) -> Split:
-    """The training pictures and, behind them, this epoch's renders as 8-bit pictures."""
-    if not len(renders.labels):
-        return split
-    images = torch.cat([split.images, to_bytes(renders.images)])
-    return Split(images, torch.cat([split.labels, renders.labels]))
+def with_room(split: Split, count: int) -> Split:
+    """The split's pictures and, behind them, room for an epoch's renders."""
+    images, labels = split.images, split.labels
+    return Split(
+        torch.cat([images, images.new_zeros(count, *images.shape[1:])]), torch.cat([labels, labels.new_zeros(count)])
+    )
+
+
+def put_last(split: Split, renders: Renders) -> None:
+    """Overwrite the split's last pictures with the renders, as 8-bit pictures."""
+    first = len(split) - len(renders.labels)
+    split.images[first:] = to_bytes(renders.images)
+    split.labels[first:] = renders.labels
 
 
 @torch.inference_mode()

@@ -5,9 +5,12 @@ import logging
 from collections.abc import Mapping
 from pathlib import Path
 
-import torchvision
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
+from torchvision.io import write_png
+from torchvision.utils import make_grid
+
+from train.batches import to_bytes
 
 METRICS = "metrics.jsonl"
 console = logging.getLogger("train")
@@ -37,10 +40,10 @@ class RunLog:
 
     def renders(self, images: Tensor, epoch: int) -> None:
         """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
-        grid = torchvision.utils.make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0)
+        grid = to_bytes(make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0))
         self._board.add_image("renders", grid, epoch)
         self._renders.mkdir(exist_ok=True)
-        torchvision.utils.save_image(grid, self._renders / f"epoch_{epoch:03d}.png")
+        write_png(grid, str(self._renders / f"epoch_{epoch:03d}.png"), compression_level=1)
 
     def close(self) -> None:
         self._board.close()

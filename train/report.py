@@ -43,7 +43,7 @@ def summarise(folder: Path) -> RunSummary:
         folder=folder,
         config=OmegaConf.load(folder / "config.yaml"),
         scores=lines[-1],
-        seconds={name.partition("/")[2]: fmean(line.get(name, 0.0) for line in lines[:-1]) for name in phases},
+        seconds={name.partition("/")[2]: fmean(line[name] for line in lines if name in line) for name in phases},
         photographs=json.loads(photographs.read_text()) if photographs.is_file() else None,
     )
 
@@ -126,9 +126,22 @@ def _share_without(photographs: dict, exclude: Sequence[str], figure: str) -> di
 
 
 def _seconds_table(runs: Sequence[RunSummary]) -> str:
-    phases = [*PHASES, "attack_classifier", "operators"]
-    rows = [[run.arm, *(f"{run.seconds.get(phase, 0.0):.2f}" for phase in phases)] for run in runs]
-    return _markdown(["augment", *phases], rows)
+    """Means per epoch; the operators are built once a run. The own share is the attack outside the classifier."""
+    header = ["augment", *PHASES, "attack's own share", "attack's share of the epoch", "operators, once"]
+    return _markdown(header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
+
+
+def _seconds_row(seconds: dict[str, float]) -> list[str]:
+    phases = [f"{seconds[phase]:.2f}" for phase in PHASES]
+    if "attack_classifier" not in seconds:
+        return [*phases, "-", "-", "-"]
+    own = 1 - seconds["attack_classifier"] / seconds["attack"]
+    return [
+        *phases,
+        f"{own:.1%}",
+        f"{seconds['attack'] / sum(seconds[phase] for phase in PHASES):.1%}",
+        f"{seconds['operators']:.2f}",
+    ]
 
 
 def _card(run: RunSummary, name: str) -> str:

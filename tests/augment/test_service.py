@@ -170,8 +170,14 @@ def test_lights_that_continue_begin_where_they_ended_also_after_a_resume(serve, 
 def test_a_random_start_is_the_random_arms_light(serve, model):
     still = AttackSettings(max_steps=0)
     started = serve(start="random", attack=still).regenerate(model, 5)
-    torch.testing.assert_close(started.images, serve(arm="random").regenerate(model, 5).images, rtol=0, atol=0)
-    assert started.diagnostics["light_change"] == 0
+    random = serve(arm="random").regenerate(model, 5)
+    torch.testing.assert_close(started.images, random.images, rtol=0, atol=0)
+    assert started.diagnostics["light_change"] == random.diagnostics["light_change"] > 0
+
+
+def test_continued_lights_of_another_number_of_examples_are_refused(serve):
+    with pytest.raises(InputError, match=r"augment\.examples: the checkpoint continues 3 lights and the scene has"):
+        serve(lights="continue").load_state_dict({"lights": torch.zeros(3, 49, 3)})
 
 
 @pytest.mark.parametrize(

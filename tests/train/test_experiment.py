@@ -167,10 +167,8 @@ def test_a_run_is_a_function_of_its_seed(tiny, tmp_path, arm):
 
 def test_meshes_of_several_classes_are_rendered_with_their_own_labels(tiny, tmp_path, monkeypatch):
     trained = []
-    with_renders = fit.with_renders
-    monkeypatch.setattr(
-        fit, "with_renders", lambda split, renders: trained.append(renders) or with_renders(split, renders)
-    )
+    put_last = fit.put_last
+    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
     meshes = "scene.meshes=[{mesh: 'solid:pear', label: pear}, 'solid:orange', {mesh: 'solid:apple:2', label: apple}]"
     config = tiny("train.epochs=1", meshes, "augment.examples=12")
     run(config, load_data(config), tmp_path)

@@ -11,7 +11,7 @@ from augment.service import Renders
 from renderer.errors import InputError
 from train import checkpoint, fit
 from train.data import Split
-from train.fit import Trainer, TrainSettings, evaluate, with_renders
+from train.fit import Trainer, TrainSettings, evaluate, put_last, with_room
 from train.logs import RunLog, read_metrics
 from train.precision import MixedPrecision
 from train.schedule import cosine
@@ -26,8 +26,11 @@ class NoRenders:
     class settings:
         arm = "none"
 
+    def __len__(self):
+        return 0
+
     def regenerate(self, model, epoch):
-        return Renders(torch.zeros(0), torch.zeros(0, dtype=torch.int64), {})
+        return Renders(torch.zeros(0, 3, 1, 1), torch.zeros(0, dtype=torch.int64), {})
 
     def state_dict(self):
         return {}
@@ -90,15 +93,27 @@ def test_the_recipe_is_the_papers():
 def test_renders_follow_the_data_as_bytes_with_their_labels():
     data = noise(5)
     renders = Renders(torch.rand(2, 3, 16, 16), torch.tensor([1, 1]), {})
-    joined = with_renders(data, renders)
-    assert torch.equal(joined.images[:5], data.images)
-    assert (joined.images[5:] / 255 - renders.images).abs().max() <= 0.5 / 255 + 1e-6
-    assert joined.labels.tolist() == [*data.labels.tolist(), 1, 1]
+    mixed = with_room(data, 2)
+    put_last(mixed, renders)
+    assert torch.equal(mixed.images[:5], data.images)
+    assert (mixed.images[5:] / 255 - renders.images).abs().max() <= 0.5 / 255 + 1e-6
+    assert mixed.labels.tolist() == [*data.labels.tolist(), 1, 1]
+
+
+def test_the_next_epochs_renders_replace_the_last_ones():
+    mixed = with_room(noise(5), 2)
+    for value in (0.0, 1.0):
+        put_last(mixed, Renders(torch.full((2, 3, 16, 16), value), torch.tensor([0, 1]), {}))
+    assert len(mixed) == 7
+    assert (mixed.images[5:] == 255).all()
 
 
 def test_without_renders_the_data_stay_as_they_are():
     data = noise(5)
-    assert with_renders(data, NoRenders().regenerate(None, 0)) is data
+    mixed = with_room(data, 0)
+    put_last(mixed, NoRenders().regenerate(None, 0))
+    assert torch.equal(mixed.images, data.images)
+    assert torch.equal(mixed.labels, data.labels)
 
 
 @pytest.mark.parametrize("training", [True, False])
