@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
-from torchvision.io import write_png
+from torchvision.transforms.functional import to_pil_image
 from torchvision.utils import make_grid
 
 from train.batches import to_bytes
@@ -43,7 +43,7 @@ class RunLog:
         grid = to_bytes(make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0))
         self._board.add_image("renders", grid, epoch)
         self._renders.mkdir(exist_ok=True)
-        write_png(grid, str(self._renders / f"epoch_{epoch:03d}.png"), compression_level=1)
+        to_pil_image(grid).save(self._renders / f"epoch_{epoch:03d}.png", compress_level=1)
 
     def close(self) -> None:
         self._board.close()
