@@ -18,6 +18,8 @@ from train.report import format_table, summarise
 def main(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
+    config.run = str(folder)
+    OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
     alone = hydra_config.mode == RunMode.RUN  # the cells of a sweep are compared with each other instead
     data = load_data(config)
     write_pictures(config, data.size)

@@ -12,7 +12,7 @@ import torchvision
 from omegaconf import DictConfig, OmegaConf
 
 from augment.phases import Phases
-from augment.scene import ObjectSettings, Scene, build_objects, count_views
+from augment.scene import ObjectSettings, Scene, build_objects
 from augment.seeding import stream_seed
 from augment.service import AugmentationService
 from renderer.errors import InputError
@@ -141,12 +141,14 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
     objects = [_read_object(item, settings.label, index) for index, item in enumerate(scene.meshes)]
     for index, item in enumerate(objects):
         class_index(data.classes, item.label, f"label of scene.meshes[{index}]")
-    views = count_views(settings.augment.examples, len(objects), len(scene.backgrounds), scene.views)
     backend = choose(renderer.visibility)
     console.info("visibility: %s", backend.description)
     pictures = Settings(data.size, renderer.samples, renderer.encoding)
     return Scene(
-        build_objects(objects, views, scene.field_of_view, pictures, backend), scene.backgrounds, pictures, device
+        build_objects(objects, settings.views, scene.field_of_view, pictures, backend),
+        scene.backgrounds,
+        pictures,
+        device,
     )
 
 

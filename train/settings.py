@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from augment.scene import count_views
 from augment.service import AugmentationSettings
 from renderer.errors import InputError
 from train.fit import TrainSettings
@@ -90,6 +91,14 @@ class ExperimentSettings:
     def __post_init__(self):
         if self.seed < 0:
             raise InputError(f"seed={self.seed} must not be negative")
+        if self.augment.renders:
+            _ = self.views  # fails on an inconsistent product before any data is read
+
+    @property
+    def views(self) -> int:
+        """Views per mesh; see `count_views`."""
+        scene = self.scene
+        return count_views(self.augment.examples, len(scene.meshes), len(scene.backgrounds), scene.views)
 
 
 def read_settings(kind: type, config: DictConfig, parent: str = ""):
