@@ -119,7 +119,7 @@ def load_npz(path: str) -> DataSet:
     return DataSet(tuple(classes.tolist()), *splits)
 
 
-def load_folder(path: str, size: int, test: float) -> DataSet:
+def load_folder(path: str, size: int, test_share: float) -> DataSet:
     """Class folders of pictures, or `train` and `test` folders of them; centre squares reduced to size × size.
 
     Without a `test` folder, that share of every class is held out as the test split.
@@ -136,7 +136,7 @@ def load_folder(path: str, size: int, test: float) -> DataSet:
     train = _folder_split(train_root, classes, size)
     if divided:
         return DataSet(classes, train, _folder_split(root / "test", classes, size))
-    return DataSet(classes, *stratified_split(train, test, seed=0, key="data.test"))
+    return DataSet(classes, *stratified_split(train, test_share, seed=0, key="data.test_share"))
 
 
 def _folder_split(root: Path, classes: tuple[str, ...], size: int) -> Split:

@@ -48,8 +48,8 @@ def load_data(config: DictConfig) -> DataSet:
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
-        "folder": lambda: load_folder(data.path, data.size, data.test),
-        "shapes": lambda: load_shapes(data.train, int(data.test), data.size, data.seed),
+        "folder": lambda: load_folder(data.path, data.size, data.test_share),
+        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed),
     }
     if data.name not in loaders:
         raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")

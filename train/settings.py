@@ -14,14 +14,15 @@ from train.fit import TrainSettings
 
 @dataclass
 class DataSettings:
-    """What the choices of conf/data set between them; see the loader of each. test: a share, or a count per class."""
+    """What the choices of conf/data set between them; see the loader of each."""
 
     name: str = "shapes"
     validation: float = 0.1
     path: str = ""
     size: int = 32
-    train: int = 300
-    test: float = 60
+    test_share: float = 0.1
+    train_per_class: int = 300
+    test_per_class: int = 60
     seed: int = 0
     pictures: str | None = None
 

@@ -152,7 +152,7 @@ def test_class_folders_become_classes_and_pictures_of_any_size_are_reduced(tmp_p
         for number in range(10):
             save_picture(tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30))
     (tmp_path / ".thumbnails").mkdir()
-    data = load_folder(str(tmp_path), size=8, test=0.2)
+    data = load_folder(str(tmp_path), size=8, test_share=0.2)
     assert data.classes == ("fig", "lime")
     assert data.train.images.shape == (16, 3, 8, 8) and data.test.images.shape == (4, 3, 8, 8)
     shown = {}
@@ -166,7 +166,7 @@ def test_class_folders_become_classes_and_pictures_of_any_size_are_reduced(tmp_p
 def test_train_and_test_folders_are_the_splits(tmp_path):
     for part, name, value in [("train", "fig", 1), ("train", "lime", 2), ("test", "lime", 3)]:
         save_picture(tmp_path / part / name / "a.png", value)
-    data = load_folder(str(tmp_path), size=8, test=0.1)
+    data = load_folder(str(tmp_path), size=8, test_share=0.1)
     assert data.train.images[:, 0, 0, 0].tolist() == [1, 2] and data.train.labels.tolist() == [0, 1]
     assert data.test.images[:, 0, 0, 0].tolist() == [3] and data.test.labels.tolist() == [1]
 
@@ -175,7 +175,7 @@ def test_a_class_of_the_test_folder_alone_is_an_error(tmp_path):
     for name in ("train/fig", "train/lime", "test/fig", "test/other_limes"):
         save_picture(tmp_path / name / "a.png", 0)
     with pytest.raises(InputError, match="has no class 'other_limes'"):
-        load_folder(str(tmp_path), size=8, test=0.1)
+        load_folder(str(tmp_path), size=8, test_share=0.1)
 
 
 @pytest.mark.parametrize(
@@ -183,8 +183,8 @@ def test_a_class_of_the_test_folder_alone_is_an_error(tmp_path):
     [
         (None, 0.1, "is not a folder"),
         (["fig/a.png"], 0.1, "holds 1 class folders: it needs two or more"),
-        (["fig/a.png", "lime/a.png"], 0.1, "data.test=0.1 of the 1 pictures of class 0"),
-        (["fig/a.png", "lime/a.png"], 60, "data.test=60 must lie between 0 and 1"),
+        (["fig/a.png", "lime/a.png"], 0.1, "data.test_share=0.1 of the 1 pictures of class 0"),
+        (["fig/a.png", "lime/a.png"], 60, "data.test_share=60 must lie between 0 and 1"),
     ],
 )
 def test_a_fault_in_a_folder_is_named(tmp_path, pictures, test, fault):

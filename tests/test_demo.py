@@ -1,0 +1,30 @@
+"""The demonstration, run as the README's first command runs it."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.slow
+def test_the_demonstration_ends_with_a_table_that_shows_the_effect_and_a_picture(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-m", "train"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    *_, pictures = re.findall(r"^picture: (.*)$", done.stdout, re.M)
+    folder = Path(pictures).parents[1]
+    assert Path(pictures).read_bytes().startswith(b"\x89PNG")
+    recall = {
+        arm: json.loads((path / "photographs" / "summary.json").read_text())["recall"]["value"]
+        for arm, path in [("none", folder / "none"), ("adversarial", folder)]
+    }
+    assert recall["adversarial"] > recall["none"]
+    for arm, value in recall.items():
+        assert re.search(rf"^\| {arm} .*\b{value:.3f}\b", done.stdout, re.M)

@@ -1,0 +1,34 @@
+"""Imports go one way: train → augment → renderer."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ALLOWED = {"renderer": {"renderer"}, "augment": {"augment", "renderer"}, "train": {"train", "augment", "renderer"}}
+
+
+def imported_packages(module: Path) -> set[str]:
+    nodes = list(ast.walk(ast.parse(module.read_text())))
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module for node in nodes if isinstance(node, ast.ImportFrom)]
+    return {name.partition(".")[0] for name in names}
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_a_package_imports_no_package_above_it(package):
+    modules = list((ROOT / package).rglob("*.py"))
+    assert len(modules) > 5
+    for module in modules:
+        assert imported_packages(module) & ALLOWED.keys() <= ALLOWED[package], module
+
+
+def test_only_one_module_imports_opengl():
+    users = [
+        path.relative_to(ROOT).as_posix()
+        for package in ALLOWED
+        for path in (ROOT / package).rglob("*.py")
+        if "moderngl" in imported_packages(path)
+    ]
+    assert users == ["renderer/visibility/opengl.py"]
