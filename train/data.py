@@ -1,7 +1,5 @@
 """Labelled pictures as uint8 arrays: CIFAR-100, an .npz file, a folder of class folders, or rendered shapes."""
 
-import difflib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +10,7 @@ from torch import Tensor
 
 from augment.seeding import generator
 from renderer.errors import InputError
+from train.classes import class_index
 from train.photographs import find_photographs, load_photographs
 
 
@@ -44,15 +43,6 @@ class DataSet:
     def size(self) -> int:
         """Pixels per side."""
         return self.train.images.shape[-1]
-
-
-def class_index(classes: Sequence[str], name: str, key: str) -> int:
-    """The label of a class name; InputError with the nearest name where the list lacks it."""
-    if name in classes:
-        return list(classes).index(name)
-    nearest = difflib.get_close_matches(name, classes, n=1)
-    hint = f"; did you mean {nearest[0]!r}?" if nearest else f": the classes are {', '.join(list(classes)[:10])}, ..."
-    raise InputError(f"{key}: the data has no class {name!r}{hint}")
 
 
 def stratified_split(split: Split, share: float, seed: int, key: str = "data.validation") -> tuple[Split, Split]:

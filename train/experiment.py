@@ -20,10 +20,10 @@ from renderer.lights import load_light
 from renderer.transfer import Settings
 from renderer.visibility import choose
 from train import checkpoint
+from train.classes import class_index
 from train.data import (
     DataSet,
     channel_statistics,
-    class_index,
     load_cifar100,
     load_folder,
     load_npz,

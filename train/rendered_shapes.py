@@ -38,7 +38,9 @@ Lights = Callable[[Tensor, torch.Generator], Tensor]
 def load_shapes(train: int, test: int, size: int, seed: int) -> DataSet:
     """That many training and test pictures of every class, in even light; whole individuals (20 pictures) each."""
     if train < 1 or test < 1:
-        raise InputError(f"data.train_per_class={train} and data.test_per_class={test} must be at least 1 picture per class")
+        raise InputError(
+            f"data.train_per_class={train} and data.test_per_class={test} must be at least 1 picture per class"
+        )
     settings = replace(SETTINGS, size=size)
     splits = [
         _render_split(per_class, seed, part, even_light, settings)

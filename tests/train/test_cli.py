@@ -73,7 +73,7 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
     "overrides, message",
     [
         (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
-        (["label=ornage"], "label of scene.meshes[0]: the data has no class 'ornage'; did you mean 'orange'?"),
+        (["label=ornage"], "label of scene.meshes[0]: 'ornage' is not a class of the model: did you mean 'orange'?"),
         (["data.path=???"], "data.path is not set: give data.path=..."),
     ],
 )

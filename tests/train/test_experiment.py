@@ -292,7 +292,7 @@ def test_training_and_validation_pictures_are_apart(tiny, tmp_path, monkeypatch)
         (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
         (["scene.exposure=0"], "scene.exposure=0.0 must be positive"),
         (["scene.light=graze"], "'graze' is not known"),
-        (["label=ornage"], r"label of scene.meshes\[0\]: the data has no class 'ornage'; did you mean 'orange'"),
+        (["label=ornage"], r"label of scene.meshes\[0\]: 'ornage' is not a class of the model: did you mean 'orange'"),
         (["renderer.samples=0"], "renderer.samples=0"),
         (["renderer.visibility=opengll"], "opengll"),
         (["model.dropout=2"], "model.dropout=2"),

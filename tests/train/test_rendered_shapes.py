@@ -92,5 +92,7 @@ def test_training_light_leaves_no_side_dark_and_held_out_light_does():
 
 @pytest.mark.parametrize("train, test", [(0, 1), (1, 0)])
 def test_no_pictures_of_a_class_is_an_error(train, test):
-    with pytest.raises(InputError, match=f"data.train_per_class={train} and data.test_per_class={test} must be at least 1"):
+    with pytest.raises(
+        InputError, match=f"data.train_per_class={train} and data.test_per_class={test} must be at least 1"
+    ):
         load_shapes(train, test, SIZE, seed=0)

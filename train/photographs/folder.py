@@ -1,7 +1,6 @@
 """Find the pictures of a folder, tell their classes, and reduce them to the classifier's size."""
 
 import csv
-import difflib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import torch
 from PIL import Image, ImageOps
 
 from renderer.errors import InputError
+from train.classes import class_index, nearest_class
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 FOREIGN = "other_"  # starts the name of a folder whose class the model lacks
@@ -39,8 +39,7 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
     Raises InputError for a folder that is missing, empty or mixes both layouts, for a sub-folder or `label`
     that is no class, and for a `photos.csv` without those columns.
     """
-    if label not in classes:
-        raise InputError(f"label '{label}' is not a class of the model: did you mean '{_nearest(label, classes)}'?")
+    class_index(classes, label, "label")
     paths = _picture_paths(folder)
     has_class_folders = _check_layout(folder, paths, classes)
     sources = _read_sources(folder / TABLE)
@@ -73,17 +72,12 @@ def _check_layout(folder: Path, paths: Sequence[PurePosixPath], classes: Sequenc
         if name not in classes and not name.startswith(FOREIGN):
             raise InputError(
                 f"{folder / name} is not named after a class of the model (the nearest is "
-                f"'{_nearest(name, classes)}'): rename it, to {FOREIGN}{name} if the model lacks its class"
+                f"'{nearest_class(classes, name)}'): rename it, to {FOREIGN}{name} if the model lacks its class"
             )
     loose = [path for path in paths if len(path.parts) == 1]
     if names and loose:
         raise InputError(f"{folder / loose[0]} lies beside class folders: move it into the folder of its class")
     return bool(names)
-
-
-def _nearest(name: str, classes: Sequence[str]) -> str:
-    by_lower_case = {each.lower(): each for each in classes}
-    return by_lower_case[difflib.get_close_matches(name.lower(), by_lower_case, n=1, cutoff=0)[0]]
 
 
 def _read_sources(table: Path) -> dict[PurePosixPath, str]:
