@@ -12,7 +12,7 @@ from renderer.harmonics import live_coefficients
 from renderer.image import clamped, develop
 from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
-from renderer.transfer import DEGREE, Operator, Settings, build_operators
+from renderer.transfer import COEFFICIENTS, DEGREE, Operator, Settings, build_operators
 from renderer.visibility import Backend
 
 
@@ -106,8 +106,8 @@ class Scene:
         self.pixels = torch.cat([operator.pixels for operator in operators]).unique()
         self.transfer, self.coverage = _stack(operators, self.pixels)
         self.backgrounds = torch.tensor(backgrounds, dtype=torch.float32)
-        self._live = live_coefficients(DEGREE)
-        for name in ("pixels", "transfer", "coverage", "backgrounds", "_live"):
+        self._coefficients = _kept_coefficients()
+        for name in ("pixels", "transfer", "coverage", "backgrounds", "_coefficients"):
             setattr(self, name, getattr(self, name).to(device))
 
     def __len__(self) -> int:
@@ -142,24 +142,30 @@ class Scene:
         per_operator = len(self.backgrounds)
         used, row = torch.unique(examples // per_operator, return_inverse=True)
         cell = row * per_operator + examples % per_operator
-        live = lights.index_select(1, self._live)
-        grid = live.new_zeros(len(used) * per_operator, *live.shape[1:]).index_copy(0, cell, live)
+        kept = lights.index_select(1, self._coefficients)
+        grid = kept.new_zeros(len(used) * per_operator, *kept.shape[1:]).index_copy(0, cell, kept)
         transfer = self.transfer if len(used) == len(self.transfer) else self.transfer[used]
         radiance = grid.unflatten(0, (len(used), per_operator)).permute(0, 3, 1, 2) @ transfer
         return (
-            radiance.transpose(1, 2).flatten(0, 1)[cell],
-            self.coverage[used][row],
+            radiance.transpose(1, 2).flatten(0, 1).index_select(0, cell),
+            self.coverage[examples // per_operator],
             self.backgrounds[examples % per_operator].view(-1, 1, 1),
         )
 
 
+def _kept_coefficients() -> Tensor:
+    """The 31 live coefficients and a dead one, whose row is zero: 32 rows make the gradient's product twice as fast."""
+    live = live_coefficients(DEGREE)
+    dead = next(index for index in range(COEFFICIENTS) if index not in live)
+    return torch.cat([live, torch.tensor([dead])])
+
+
 def _stack(operators: Sequence[Operator], pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Operators over a common set of pixels: transfer (O, 3, K, P), coverage (O, 1, P), zero where uncovered."""
-    live = len(live_coefficients(DEGREE))
-    transfer = torch.zeros(len(operators), 3, live, len(pixels))
+    """Operators over a common set of pixels: transfer (O, 3, 32, P), coverage (O, 1, P), zero where uncovered."""
+    transfer = torch.zeros(len(operators), 3, len(_kept_coefficients()), len(pixels))
     coverage = torch.zeros(len(operators), 1, len(pixels))
     for row, operator in enumerate(operators):
         columns = torch.searchsorted(pixels, operator.pixels)
-        transfer[row][:, :, columns] = operator.transfer.transpose(0, 1)
+        transfer[row][:, :-1, columns] = operator.transfer.transpose(0, 1)
         coverage[row, 0, columns] = operator.coverage
     return transfer, coverage
