@@ -12,7 +12,7 @@ from renderer.harmonics import live_coefficients
 from renderer.image import clamped, develop
 from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
-from renderer.transfer import COEFFICIENTS, DEGREE, Operator, Settings, build_operators
+from renderer.transfer import COEFFICIENTS, DEGREE, Operator, PictureSettings, build_operators
 from renderer.visibility import Backend
 
 
@@ -64,7 +64,7 @@ def count_views(examples: int, objects: int, backgrounds: int, views: int | None
 
 
 def build_objects(
-    objects: Sequence[ObjectSettings], views: int, field_of_view: float, settings: Settings, backend: Backend
+    objects: Sequence[ObjectSettings], views: int, field_of_view: float, settings: PictureSettings, backend: Backend
 ) -> list[SceneObject]:
     """Load, normalise and rasterise every mesh from a ring of views."""
     cameras = ring(views, field_of_view)
@@ -95,7 +95,7 @@ class Scene:
         self,
         objects: Sequence[SceneObject],
         backgrounds: Sequence[float],
-        settings: Settings,
+        settings: PictureSettings,
         device: torch.device | str = "cpu",
     ):
         if not all(0 <= grey <= 1 for grey in backgrounds):

@@ -23,7 +23,7 @@ COEFFICIENTS = (DEGREE + 1) ** 2
 
 
 @dataclass(frozen=True)
-class Settings:
+class PictureSettings:
     """How meshes become operators: picture size in pixels, samples per pixel side (InputError if none), encoding."""
 
     size: int = 32
@@ -50,7 +50,7 @@ class Operator:
 
 
 def build_operators(
-    mesh: Mesh, cameras: Sequence[OrthographicCamera], settings: Settings, backend: Backend, gain: float = 1.0
+    mesh: Mesh, cameras: Sequence[OrthographicCamera], settings: PictureSettings, backend: Backend, gain: float = 1.0
 ) -> list[Operator]:
     """One operator per camera. gain multiplies the albedo, for meshes whose texture is darker than the thing."""
     points = np.stack([camera.project(mesh.vertices) for camera in cameras])
@@ -66,7 +66,7 @@ def _operator(
     camera: OrthographicCamera,
     projected: np.ndarray,
     face_ids: np.ndarray,
-    settings: Settings,
+    settings: PictureSettings,
     gain: float,
 ) -> Operator:
     rows, columns = np.nonzero(face_ids >= 0)

@@ -17,7 +17,7 @@ from augment.seeding import stream_seed
 from augment.service import AugmentationService
 from renderer.errors import InputError
 from renderer.lights import load_light
-from renderer.transfer import Settings
+from renderer.transfer import PictureSettings
 from renderer.visibility import choose
 from train import checkpoint
 from train.classes import class_index
@@ -143,7 +143,7 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         class_index(data.classes, item.label, f"label of scene.meshes[{index}]")
     backend = choose(renderer.visibility)
     console.info("visibility: %s", backend.description)
-    pictures = Settings(data.size, renderer.samples, renderer.encoding)
+    pictures = PictureSettings(data.size, renderer.samples, renderer.encoding)
     return Scene(
         build_objects(objects, settings.views, scene.field_of_view, pictures, backend),
         scene.backgrounds,

@@ -21,13 +21,13 @@ from renderer.errors import InputError
 from renderer.lights import ambient, directional
 from renderer.mesh import normalise
 from renderer.shapes import SOLIDS, solid
-from renderer.transfer import Settings, build_operators
+from renderer.transfer import PictureSettings, build_operators
 from renderer.visibility import Backend, choose
 from train.batches import to_bytes
 from train.data import DataSet, Split
 
 CLASSES = tuple(sorted(SOLIDS))
-SETTINGS = Settings(samples=4)
+SETTINGS = PictureSettings(samples=4)
 VIEWS, BACKGROUNDS = 5, 4  # pictures per individual: every view on every background, each in a light of its own
 HELD_OUT_PER_CLASS = 60
 SOURCE = "rendered, hard light"
@@ -79,7 +79,7 @@ def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
     return ambient(0.06 * tint) + directional(direction, strength * tint)
 
 
-def _render_split(per_class: int, seed: int, part: str, light: Lights, settings: Settings) -> Split:
+def _render_split(per_class: int, seed: int, part: str, light: Lights, settings: PictureSettings) -> Split:
     draws, backend = generator(seed, part), choose("software")
     individuals = math.ceil(per_class / (VIEWS * BACKGROUNDS))
     images, labels = [], []
@@ -90,7 +90,7 @@ def _render_split(per_class: int, seed: int, part: str, light: Lights, settings:
     return Split(torch.cat(images), torch.tensor(labels))
 
 
-def _portraits(name: str, light: Lights, settings: Settings, backend: Backend, draws: torch.Generator) -> Tensor:
+def _portraits(name: str, light: Lights, settings: PictureSettings, backend: Backend, draws: torch.Generator) -> Tensor:
     """20 pictures of one individual: uint8 (20, 3, size, size)."""
     mesh = normalise(solid(name, int(torch.randint(2**31, (1,), generator=draws))))
     polar, azimuth, field = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)

@@ -10,12 +10,12 @@ from renderer.image import ENCODINGS, develop
 from renderer.lights import ambient, probe
 from renderer.mesh import normalise
 from renderer.shapes import solid
-from renderer.transfer import Operator, Settings, build_operators
+from renderer.transfer import Operator, PictureSettings, build_operators
 from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
 BACKEND = choose("software")
-SETTINGS = Settings(size=8, samples=2)
+SETTINGS = PictureSettings(size=8, samples=2)
 SIZE = 5
 GREYS = [0.0, 0.25, 1.0]
 LIVE = live_coefficients(6)
@@ -40,7 +40,7 @@ def scene(request) -> Scene:
         SceneObject("orange", [random_operator(0, 6), random_operator(1, 4)]),
         SceneObject("pear", [random_operator(2, 9), random_operator(3, 0)]),
     ]
-    return Scene(objects, GREYS, Settings(size=SIZE, encoding=request.param))
+    return Scene(objects, GREYS, PictureSettings(size=SIZE, encoding=request.param))
 
 
 def random_lights(count: int, seed: int = 0) -> torch.Tensor:
@@ -104,7 +104,7 @@ def test_uncovered_pixels_and_dead_coefficients_have_gradients_of_exactly_zero(s
 def test_the_gradient_is_the_transfer_where_nothing_clamps():
     """Under the linear encoding and whatever the background."""
     operator = random_operator(4, 7)
-    scene = Scene([SceneObject("orange", [operator])], [0.5], Settings(size=SIZE))
+    scene = Scene([SceneObject("orange", [operator])], [0.5], PictureSettings(size=SIZE))
     lights = ambient(torch.full((3,), 0.1)).expand(1, -1, -1).clone().requires_grad_(True)
     weights = torch.randn(1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
     (gradient,) = torch.autograd.grad(scene.render(lights), lights, weights)
@@ -120,7 +120,7 @@ def test_the_clamped_share_counts_covered_values_alone():
         Operator(unit, torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2])),
         Operator(torch.zeros(31, 3, 1), torch.ones(1), torch.tensor([3])),
     ]
-    scene = Scene([SceneObject("orange", views)], [0.0, 1.0], Settings(size=2))
+    scene = Scene([SceneObject("orange", views)], [0.0, 1.0], PictureSettings(size=2))
     lights = torch.zeros(4, 49, 3)
     lights[:, 0] = torch.tensor([0.9, 1.6, 2.4])
     # Over black: 0.9, 1.6, 2.4; 0.45, 0.8, 1.2; all negative: 2 + 1 + 3 clamped. Over white, half of it at the second
@@ -129,7 +129,7 @@ def test_the_clamped_share_counts_covered_values_alone():
 
 
 def test_a_scene_that_nothing_covers_is_its_backgrounds():
-    scene = Scene([SceneObject("orange", [random_operator(0, 0)])], GREYS, Settings(size=SIZE))
+    scene = Scene([SceneObject("orange", [random_operator(0, 0)])], GREYS, PictureSettings(size=SIZE))
     pictures = scene.render(random_lights(3))
     torch.testing.assert_close(pictures, torch.tensor(GREYS).view(3, 1, 1, 1).expand_as(pictures), rtol=0, atol=0)
     assert scene.clamped_share(random_lights(3)).tolist() == [0, 0, 0]
@@ -138,7 +138,7 @@ def test_a_scene_that_nothing_covers_is_its_backgrounds():
 @pytest.mark.parametrize("grey", [-0.1, 1.01, 255, float("nan")])
 def test_backgrounds_that_no_picture_has_are_refused(grey):
     with pytest.raises(InputError, match=r"scene\.backgrounds"):
-        Scene([SceneObject("orange", [random_operator(0, 1)])], [0.5, grey], Settings(size=SIZE))
+        Scene([SceneObject("orange", [random_operator(0, 1)])], [0.5, grey], PictureSettings(size=SIZE))
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
         ],
         4,
         4.0,
-        Settings(size=32, samples=4),
+        PictureSettings(size=32, samples=4),
         BACKEND,
     )
     # From azimuth π/2: as wide as it was and sin π/3 high standing, cos π/3 high lying; half a sample's width of 1/64

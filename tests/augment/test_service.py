@@ -10,7 +10,7 @@ from augment.scene import ObjectSettings, Scene, build_objects
 from augment.service import AugmentationService, AugmentationSettings, RandomLights
 from renderer.errors import InputError
 from renderer.lights import probe
-from renderer.transfer import Settings
+from renderer.transfer import PictureSettings
 from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
@@ -23,7 +23,7 @@ SHARES = {"fooled_before", "fooled", "used_all_steps", "zero_gradient", "clamped
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """The paper's 2 meshes × 10 views × 5 backgrounds, small."""
-    settings = Settings(size=8, samples=2)
+    settings = PictureSettings(size=8, samples=2)
     objects = [ObjectSettings(f"solid:{name}", name) for name in CLASSES]
     return Scene(build_objects(objects, 10, 2.0, settings, choose("software")), [0, 0.25, 0.5, 0.75, 1], settings)
 

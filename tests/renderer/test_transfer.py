@@ -13,7 +13,7 @@ from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
 from renderer.lights import ambient, directional
 from renderer.mesh import Mesh, concatenate
-from renderer.transfer import Operator, Settings, build_operators
+from renderer.transfer import Operator, PictureSettings, build_operators
 from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
@@ -108,7 +108,7 @@ def albedo_at(mesh: Mesh, face: int, weights: np.ndarray, encoding: str) -> np.n
     return color
 
 
-def shade_slowly(mesh: Mesh, camera: OrthographicCamera, light: torch.Tensor, settings: Settings) -> tuple:
+def shade_slowly(mesh: Mesh, camera: OrthographicCamera, light: torch.Tensor, settings: PictureSettings) -> tuple:
     """(size, size, 3) radiance and (size, size) coverage, sample by sample."""
     projected = camera.project(mesh.vertices)
     resolution = settings.size * settings.samples
@@ -133,7 +133,7 @@ def shade_slowly(mesh: Mesh, camera: OrthographicCamera, light: torch.Tensor, se
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 def test_operators_are_what_shading_every_sample_gives(encoding):
-    mesh, settings = patchwork(), Settings(size=9, samples=3, encoding=encoding)
+    mesh, settings = patchwork(), PictureSettings(size=9, samples=3, encoding=encoding)
     cameras = [OrthographicCamera(0.4, 5.0, 1.7), OrthographicCamera(math.pi / 3, 0.0, 2.0)]
     for camera, operator in zip(cameras, build_operators(mesh, cameras, settings, BACKEND), strict=True):
         for light in (random_light(0), random_light(1)):
@@ -145,7 +145,7 @@ def test_operators_are_what_shading_every_sample_gives(encoding):
 
 
 def test_pixels_are_in_order_and_coverage_is_positive_up_to_1():
-    (operator,) = build_operators(sphere(2), ring(1, 1.5), Settings(size=8, samples=3), BACKEND)
+    (operator,) = build_operators(sphere(2), ring(1, 1.5), PictureSettings(size=8, samples=3), BACKEND)
     assert operator.transfer.shape == (31, 3, len(operator.pixels))
     assert (operator.transfer.dtype, operator.coverage.dtype) == (torch.float32, torch.float32)
     assert (operator.pixels.diff() > 0).all()
@@ -154,7 +154,7 @@ def test_pixels_are_in_order_and_coverage_is_positive_up_to_1():
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 def test_white_under_white_ambient_light_is_pi_times_coverage(encoding):
-    settings = Settings(size=12, samples=4, encoding=encoding)
+    settings = PictureSettings(size=12, samples=4, encoding=encoding)
     for operator in build_operators(sphere(2), ring(3, 2.0), settings, BACKEND):
         expected = math.pi * operator.coverage.double().numpy() * np.array([[0.5], [1.0], [2.0]])
         lit = radiance(operator, ambient(torch.tensor([0.5, 1.0, 2.0])))
@@ -166,7 +166,7 @@ def test_a_sphere_under_directional_light_has_the_truncated_cosines_shading(ligh
     """Facets reach an angle ρ from their centre, so normals are off by at most ρ + ρ²; the series' slope is 1.02."""
     camera, size, samples = OrthographicCamera(1.1, 0.7, 2.0), 16, 4
     mesh = sphere(5)
-    (operator,) = build_operators(mesh, [camera], Settings(size, samples), BACKEND)
+    (operator,) = build_operators(mesh, [camera], PictureSettings(size, samples), BACKEND)
     lit = picture(operator, directional(torch.tensor(light_from), torch.ones(3)), size)
 
     steps = (np.arange(size * samples) + 0.5) / (size * samples) * 2 - 1
@@ -187,7 +187,7 @@ def test_a_sphere_under_directional_light_has_the_truncated_cosines_shading(ligh
 
 def test_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
     """Half-width 5/8 at 8 pixels of 1/4: two pixels' worth and a half on either side of the centre."""
-    (operator,) = build_operators(square(0.625), [ABOVE], Settings(size=8, samples=4), BACKEND)
+    (operator,) = build_operators(square(0.625), [ABOVE], PictureSettings(size=8, samples=4), BACKEND)
     along = [0, 0.5, 1, 1, 1, 1, 0.5, 0]
     np.testing.assert_array_equal(coverage_map(operator, 8), np.outer(along, along))
 
@@ -195,7 +195,7 @@ def test_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
 @pytest.mark.parametrize("turn", [0.1, 0.5, 1.2])
 def test_coverage_of_a_turned_square_adds_up_to_its_area(turn):
     """Each side, of length 1, is off by at most half a sample's width, 1/128, along its length."""
-    (operator,) = build_operators(square(0.5, turn), [ABOVE], Settings(size=16, samples=8), BACKEND)
+    (operator,) = build_operators(square(0.5, turn), [ABOVE], PictureSettings(size=16, samples=8), BACKEND)
     area = float(operator.coverage.sum()) * (2 / 16) ** 2
     assert area == pytest.approx(1.0, abs=4 / 128)
 
@@ -204,12 +204,12 @@ def test_the_picture_is_upright():
     """From θ = π/2 on the +x side, up is up and right is +y."""
     corners = [[0, 0.5, 0.5], [0, 1, 0.5], [0, 1, 1], [0, 0.5, 1]]
     mesh = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
-    (operator,) = build_operators(mesh, [OrthographicCamera(math.pi / 2, 0, 2.0)], Settings(4, 2), BACKEND)
+    (operator,) = build_operators(mesh, [OrthographicCamera(math.pi / 2, 0, 2.0)], PictureSettings(4, 2), BACKEND)
     assert operator.pixels.tolist() == [3]
 
 
 def test_each_view_is_what_it_is_alone():
-    mesh, cameras, settings = patchwork(), ring(3, 2.0), Settings(size=6, samples=2)
+    mesh, cameras, settings = patchwork(), ring(3, 2.0), PictureSettings(size=6, samples=2)
     together = build_operators(mesh, cameras, settings, BACKEND)
     for camera, operator in zip(cameras, together, strict=True):
         (alone,) = build_operators(mesh, [camera], settings, BACKEND)
@@ -218,7 +218,7 @@ def test_each_view_is_what_it_is_alone():
 
 
 def test_winding_does_not_matter():
-    mesh, settings = patchwork(), Settings(size=8, samples=3)
+    mesh, settings = patchwork(), PictureSettings(size=8, samples=3)
     flipped = replace(
         mesh,
         faces=mesh.faces[:, ::-1],
@@ -238,7 +238,7 @@ def test_winding_does_not_matter():
 
 def test_faces_turned_away_do_not_shade():
     box = trimesh.convex.convex_hull(CUBE)
-    camera, settings = OrthographicCamera(math.pi / 3, 0.4, 2.0), Settings(size=8, samples=4)
+    camera, settings = OrthographicCamera(math.pi / 3, 0.4, 2.0), PictureSettings(size=8, samples=4)
     white = Mesh.plain(box.vertices, box.faces)
     away = white.face_normals() @ camera.axes()[2] < 0
     assert 0 < away.sum() < len(away)
@@ -250,14 +250,14 @@ def test_faces_turned_away_do_not_shade():
 def test_hidden_faces_do_not_shade():
     """A red square just below a white one, listed first."""
     below = replace(square(0.5, color=(1.0, 0.0, 0.0)), vertices=square(0.5).vertices - [0, 0, 0.1])
-    settings = Settings(size=8, samples=2)
+    settings = PictureSettings(size=8, samples=2)
     (both,) = build_operators(concatenate([below, square(0.5)]), [ABOVE], settings, BACKEND)
     (alone,) = build_operators(square(0.5), [ABOVE], settings, BACKEND)
     torch.testing.assert_close(both.transfer, alone.transfer, rtol=0, atol=0)
 
 
 def test_gain_multiplies_the_radiance_and_leaves_the_coverage():
-    mesh, settings = patchwork(), Settings(size=6, samples=2, encoding="srgb")
+    mesh, settings = patchwork(), PictureSettings(size=6, samples=2, encoding="srgb")
     (plain,), (bright,) = (build_operators(mesh, ring(1, 2.0), settings, BACKEND, gain) for gain in (1.0, 2.5))
     torch.testing.assert_close(bright.transfer, 2.5 * plain.transfer, rtol=2 * EPS32, atol=0)
     torch.testing.assert_close(bright.coverage, plain.coverage, rtol=0, atol=0)
@@ -265,13 +265,13 @@ def test_gain_multiplies_the_radiance_and_leaves_the_coverage():
 
 def test_a_mesh_outside_the_picture_leaves_an_empty_operator():
     mesh = replace(square(0.1), vertices=square(0.1).vertices + np.array([0.8, 0, 0]))
-    (operator,) = build_operators(mesh, [OrthographicCamera(0, 0, 0.5)], Settings(size=4, samples=2), BACKEND)
+    (operator,) = build_operators(mesh, [OrthographicCamera(0, 0, 0.5)], PictureSettings(size=4, samples=2), BACKEND)
     assert operator.transfer.shape == (31, 3, 0)
     assert len(operator.coverage) == len(operator.pixels) == 0
 
 
 def test_settings_that_make_no_picture_are_refused():
     with pytest.raises(InputError, match=r"renderer\.samples=0"):
-        Settings(samples=0)
+        PictureSettings(samples=0)
     with pytest.raises(InputError, match=r"renderer\.encoding=gamma"):
-        build_operators(square(0.5), [ABOVE], Settings(size=4, samples=1, encoding="gamma"), BACKEND)
+        build_operators(square(0.5), [ABOVE], PictureSettings(size=4, samples=1, encoding="gamma"), BACKEND)

@@ -19,7 +19,7 @@ FEW = ("apple", "orange", "plate")
 def coarse(monkeypatch):
     """Few classes and pictures, one sample per pixel: the tests look at what is rendered, not at how well."""
     monkeypatch.setattr(rendered_shapes, "CLASSES", FEW)
-    monkeypatch.setattr(rendered_shapes, "SETTINGS", rendered_shapes.Settings(samples=1))
+    monkeypatch.setattr(rendered_shapes, "SETTINGS", rendered_shapes.PictureSettings(samples=1))
     monkeypatch.setattr(rendered_shapes, "HELD_OUT_PER_CLASS", 3)
 
 
@@ -73,7 +73,9 @@ def test_held_out_pictures_are_a_folder_of_photographs_that_says_they_are_render
     with open(tmp_path / "photos.csv", newline="") as file:
         assert {row["path"] for row in csv.DictReader(file)} == {str(item.path) for item in found}
     _, images, _ = load_photographs(tmp_path, found, SIZE)
-    split = rendered_shapes._render_split(3, 0, "held out", hard_light, rendered_shapes.Settings(SIZE, samples=1))
+    split = rendered_shapes._render_split(
+        3, 0, "held out", hard_light, rendered_shapes.PictureSettings(SIZE, samples=1)
+    )
     assert torch.equal(images, split.images)
 
 
