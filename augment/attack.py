@@ -1,7 +1,6 @@
 """Descent on the adversarial cost over any parameters that render differentiably, until the classifier is fooled."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment.cost import adversarial_cost
+from augment.model_state import as_found
 from augment.phases import Phases
 from renderer.errors import InputError
 
@@ -122,22 +122,3 @@ def _direction(gradient: Tensor, step: str) -> Tensor:
     flat = gradient.flatten(1)
     scaled = flat / flat.abs().amax(1, keepdim=True).clamp(min=torch.finfo(flat.dtype).tiny)
     return F.normalize(scaled, eps=torch.finfo(flat.dtype).tiny).view_as(gradient)
-
-
-@contextmanager
-def as_found(model: nn.Module) -> Iterator[None]:
-    """Eval mode and no gradients for parameters inside; mode, requires_grad and random state restored after."""
-    modes = [(module, module.training) for module in model.modules()]
-    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    devices = {parameter.device for parameter in model.parameters() if parameter.is_cuda}
-    model.eval()
-    for parameter in trainable:
-        parameter.requires_grad_(False)
-    try:
-        with torch.random.fork_rng(devices=sorted(devices, key=str)):
-            yield
-    finally:
-        for parameter in trainable:
-            parameter.requires_grad_(True)
-        for module, mode in modes:
-            module.training = mode

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from augment.attack import AttackResult, AttackSettings, as_found, descend
+from augment.attack import AttackResult, AttackSettings, descend
+from augment.model_state import as_found
 from augment.phases import Phases
 from augment.scene import Scene
 from augment.seeding import generator
@@ -96,7 +97,7 @@ class AugmentationService:
 
     def __len__(self) -> int:
         """Examples per epoch."""
-        return len(self._labels)
+        return len(self._labels) if self.settings.renders else 0
 
     def regenerate(self, model: nn.Module, epoch: int) -> Renders:
         """This epoch's examples for the model's current weights; the model is left as it was found.
@@ -145,9 +146,8 @@ class AugmentationService:
     def _starting_lights(self, epoch: int) -> Tensor:
         if self._continued is not None:
             return self._continued
-        return self._perturbed(epoch) if self.settings.start == "random" else self._start()
-
-    def _start(self) -> Tensor:
+        if self.settings.start == "random":
+            return self._perturbed(epoch)
         return self._light.expand(len(self._scene), -1, -1)
 
     def _perturbed(self, epoch: int) -> Tensor:

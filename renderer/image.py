@@ -14,14 +14,17 @@ def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: st
     radiance: (..., 3, P) linear, already weighted with coverage. coverage: (..., 1, P) in [0, 1].
     background: (..., 3 or 1, 1) picture values behind the surface. Returns (..., 3, P).
     """
-    behind = decode(background, encoding)
-    return encode((radiance + (1 - coverage) * behind).clamp(0, 1), encoding)
+    return encode(_composite(radiance, coverage, background, encoding).clamp(0, 1), encoding)
 
 
 def clamped(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
     """Which picture values `develop` clamps, where the gradient is therefore zero. Boolean (..., 3, P)."""
-    composite = radiance + (1 - coverage) * decode(background, encoding)
+    composite = _composite(radiance, coverage, background, encoding)
     return (composite < 0) | (composite > 1)
+
+
+def _composite(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str) -> Tensor:
+    return radiance + (1 - coverage) * decode(background, encoding)
 
 
 def encode(linear: Tensor, encoding: str) -> Tensor:

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from augment.model_state import eval_mode
 from augment.phases import Phases
 from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
@@ -216,14 +217,12 @@ def put_last(split: Split, renders: Renders) -> None:
 @torch.inference_mode()
 def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
     """Mean cross entropy and top-1 accuracy in eval mode; the model's mode is restored."""
-    training = model.training
-    model.eval()
     loss_sum, correct = torch.zeros(2, device=split.images.device)
-    for images, labels in _batched(split):
-        logits = model(to_unit(images))
-        loss_sum += F.cross_entropy(logits, labels, reduction="sum")
-        correct += (logits.argmax(1) == labels).sum()
-    model.train(training)
+    with eval_mode(model):
+        for images, labels in _batched(split):
+            logits = model(to_unit(images))
+            loss_sum += F.cross_entropy(logits, labels, reduction="sum")
+            correct += (logits.argmax(1) == labels).sum()
     return {"loss": float(loss_sum) / len(split), "accuracy": float(correct) / len(split)}
 
 

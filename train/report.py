@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
 from train import checkpoint
+from train.experiment import CONFIG, PHOTOGRAPHS
 from train.logs import read_metrics
 from train.photographs import share
 
@@ -37,11 +38,11 @@ def summarise(folder: Path) -> RunSummary:
     lines = read_metrics(folder)
     if not lines or "epoch" in lines[-1]:
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")
-    photographs = folder / "photographs" / "summary.json"
+    photographs = folder / PHOTOGRAPHS / "summary.json"
     phases = sorted({name for line in lines for name in line if name.startswith("seconds/")})
     return RunSummary(
         folder=folder,
-        config=OmegaConf.load(folder / "config.yaml"),
+        config=OmegaConf.load(folder / CONFIG),
         scores=lines[-1],
         seconds={name.partition("/")[2]: fmean(line[name] for line in lines if name in line) for name in phases},
         photographs=json.loads(photographs.read_text()) if photographs.is_file() else None,
@@ -62,7 +63,7 @@ def format_table(runs: Sequence[RunSummary]) -> str:
         ]
         for run in runs
     ]
-    sheets = [run.folder / "photographs" / "contact_sheet.png" for run in runs if run.photographs]
+    sheets = [run.folder / PHOTOGRAPHS / "contact_sheet.png" for run in runs if run.photographs]
     return "\n".join([_markdown(header, rows), *(f"picture: {sheet}" for sheet in sheets)])
 
 

@@ -1,12 +1,14 @@
 """Ask a model about pictures: its probabilities, and where it ranks the classes that matter."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
 
+from augment.model_state import eval_mode
 from renderer.errors import InputError
+from train.batches import to_unit
 from train.photographs.folder import Photograph
 
 
@@ -39,8 +41,8 @@ def ask(
     A module is asked in eval mode and left as it was found. Raises InputError for logits of another shape or not
     finite.
     """
-    with _in_eval_mode(model), torch.inference_mode():
-        batches = [model(batch.to(device).float() / 255) for batch in images.split(batch_size)]
+    with eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(), torch.inference_mode():
+        batches = [model(to_unit(batch.to(device))) for batch in images.split(batch_size)]
         logits = torch.cat(batches).float().cpu()
     if logits.shape != (len(images), classes):
         raise InputError(
@@ -50,19 +52,6 @@ def ask(
     if not logits.isfinite().all():
         raise InputError("the model's logits are not finite: evaluate a checkpoint of a run that did not diverge")
     return logits
-
-
-@contextmanager
-def _in_eval_mode(model: Callable) -> Iterator[None]:
-    modules = list(model.modules()) if isinstance(model, torch.nn.Module) else []
-    modes = [module.training for module in modules]  # one by one: a frozen layer may differ from the whole
-    try:
-        for module in modules:
-            module.training = False
-        yield
-    finally:
-        for module, mode in zip(modules, modes, strict=True):
-            module.training = mode
 
 
 def rank_classes(

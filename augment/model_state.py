@@ -1,0 +1,34 @@
+"""Using a model without leaving a trace: its mode, gradients and random state come back, also after an error."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import nn
+
+
+@contextmanager
+def eval_mode(model: nn.Module) -> Iterator[None]:
+    """Eval mode inside; each module's own mode restored after, since a frozen layer may differ from the whole."""
+    modes = [(module, module.training) for module in model.modules()]
+    model.eval()
+    try:
+        yield
+    finally:
+        for module, mode in modes:
+            module.training = mode
+
+
+@contextmanager
+def as_found(model: nn.Module) -> Iterator[None]:
+    """Eval mode and no gradients for parameters inside; mode, requires_grad and random state restored after."""
+    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    devices = {parameter.device for parameter in model.parameters() if parameter.is_cuda}
+    for parameter in trainable:
+        parameter.requires_grad_(False)
+    try:
+        with eval_mode(model), torch.random.fork_rng(devices=sorted(devices, key=str)):
+            yield
+    finally:
+        for parameter in trainable:
+            parameter.requires_grad_(True)
