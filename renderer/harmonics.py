@@ -94,10 +94,31 @@ def quadrature(degree: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(np.stack(grid, -1).reshape(-1, 3)), torch.from_numpy(weights)
 
 
-def project(function: Callable[[Tensor], Tensor], degree: int, quadrature_degree: int = 128) -> Tensor:
-    """Coefficients ((degree + 1)², C) float64 of function: directions (N, 3) float64 → radiance (N, C)."""
-    directions, weights = quadrature(quadrature_degree)
-    return basis(directions, degree).T @ (weights[:, None] * function(directions).to(torch.float64))
+def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Directions (H, W, 3) and solid angles (H, W) of an environment map's texels, float64.
+
+    Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
+    """
+    edges = torch.cos(math.pi * torch.arange(height + 1, dtype=torch.float64) / height)
+    z = (edges[:-1] + edges[1:]) / 2  # the mean of z over a row's solid angle
+    azimuth = math.pi - 2 * math.pi * (torch.arange(width, dtype=torch.float64) + 0.5) / width
+    radius = (1 - z**2).sqrt()[:, None]
+    directions = [radius * azimuth.cos(), radius * azimuth.sin(), z[:, None].expand(height, width)]
+    solid_angles = (edges[:-1] - edges[1:]) * (2 * math.pi / width)
+    return torch.stack(directions, dim=-1), solid_angles[:, None].expand(height, width)
+
+
+def project(radiance: Callable[[Tensor], Tensor] | Tensor, degree: int, quadrature_degree: int = 128) -> Tensor:
+    """Coefficients ((degree + 1)², C) float64 of light on the sphere.
+
+    radiance: a function of directions (N, 3) float64 → (N, C), integrated by `quadrature`, exactly where it is a
+    polynomial of degree `quadrature_degree - degree`; or an environment map (H, W, C) laid out by `equirectangular`.
+    """
+    if callable(radiance):
+        directions, weights = quadrature(quadrature_degree)
+        return basis(directions, degree).T @ (weights[:, None] * radiance(directions).to(torch.float64))
+    grid = zip(*equirectangular(*radiance.shape[:2]), radiance, strict=True)  # by rows: maps may have 10⁸ texels
+    return sum(basis(row, degree).T @ (weights[:, None] * texels.to(row)) for row, weights, texels in grid)
 
 
 def rotate(coefficients: Tensor, rotation: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.harmonics import basis, live_coefficients, rotate
+from renderer.harmonics import basis, live_coefficients, project, rotate
 from renderer.transfer import COEFFICIENTS, DEGREE
 
 # Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps", figure 2: RGB rows
@@ -61,16 +61,7 @@ def project_environment(radiance: np.ndarray) -> Tensor:
 
     Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
     """
-    height, width = radiance.shape[:2]
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    z = (edges[:-1] + edges[1:]) / 2  # the mean of z over a row's solid angle
-    azimuth = np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width
-    radius = np.sqrt(1 - z**2)[:, None]
-    grid = [radius * np.cos(azimuth), radius * np.sin(azimuth), np.broadcast_to(z[:, None], (height, width))]
-    directions = torch.from_numpy(np.stack(grid, axis=-1).reshape(-1, 3))
-    solid_angles = torch.from_numpy(np.repeat((edges[:-1] - edges[1:]) * 2 * np.pi / width, width))
-    weighted = torch.from_numpy(radiance.reshape(-1, 3)).double() * solid_angles[:, None]
-    return basis(directions, DEGREE).T @ weighted
+    return project(torch.from_numpy(radiance), DEGREE)
 
 
 def ambient(color: Tensor) -> Tensor:
