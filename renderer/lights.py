@@ -1,15 +1,16 @@
-"""Distant light as coefficients (49, 3): named probes, environment maps and random perturbations. Linear RGB radiance.
+"""Distant light as coefficients (49, 3): named probes, files and random perturbations. Linear RGB radiance.
 
 Coefficients live in world axes (z up) and follow the index of `renderer.harmonics`.
 """
 
+import json
 import math
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from renderer.environment import SUFFIXES, read_map
 from renderer.errors import InputError
 from renderer.harmonics import basis, live_coefficients, project, rotate
 from renderer.transfer import COEFFICIENTS, DEGREE
@@ -35,17 +36,30 @@ _Y_UP_TO_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]
 
 
 def load_light(light: str) -> Tensor:
-    """Coefficients (49, 3) float32 of a named probe or of an environment map's file (.npy).
+    """Coefficients (49, 3) float32 of a named probe, of an environment map's file (.npy, .hdr, .exr) or of a file of
+    coefficients (.json, as `save_light` writes it).
 
-    A map is scaled to the mean luminance of the grace probe, since maps come in any unit.
-    InputError for an unknown name, a missing file or an array that is no map.
+    A map is scaled to the mean luminance of the grace probe, since maps come in any unit, and may be negative in
+    places, as series are that were written as a map; coefficients stay as they are.
+    InputError for an unknown name, a missing file or one that holds no light.
     """
+    suffix = Path(light).suffix.lower()
     if light in _PUBLISHED_PROBES:
         return probe(light)
-    if Path(light).suffix == ".npy":
-        coefficients = project_environment(_read_map(Path(light)))
-        return (coefficients * (_mean_luminance(probe("grace")) / _mean_luminance(coefficients))).float()
-    raise InputError(f"light {light!r} is not known: choose {', '.join(PROBES)} or the path of an .npy environment map")
+    if suffix == ".json":
+        return _read_coefficients(Path(light))
+    if suffix in SUFFIXES:
+        return _read_light_map(Path(light)).float()
+    raise InputError(
+        f"light {light!r} is not known: choose {', '.join(PROBES)} or the path of an environment map "
+        f"({', '.join(SUFFIXES)}) or of coefficients (.json)"
+    )
+
+
+def save_light(path: Path, coefficients: Tensor) -> None:
+    """Write coefficients (49, 3) as JSON, a row [r, g, b] each. `load_light` reads float32 back to the bit."""
+    rows = ",\n".join(json.dumps(row, allow_nan=False) for row in coefficients.tolist())
+    path.write_text(f"[\n{rows}\n]\n")
 
 
 def probe(name: str) -> Tensor:
@@ -56,12 +70,12 @@ def probe(name: str) -> Tensor:
     return coefficients
 
 
-def project_environment(radiance: np.ndarray) -> Tensor:
-    """Coefficients (49, 3) float64 of an equirectangular map (H, W, 3) of linear radiance.
+def project_environment(radiance: Tensor) -> Tensor:
+    """Coefficients (49, 3) float64 of an environment map (H, W, 3) of linear radiance.
 
     Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
     """
-    return project(torch.from_numpy(radiance), DEGREE)
+    return project(radiance, DEGREE)
 
 
 def ambient(color: Tensor) -> Tensor:
@@ -95,18 +109,25 @@ def _mean_luminance(coefficients: Tensor) -> float:
     return float(coefficients[0].double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64))
 
 
-def _read_map(path: Path) -> np.ndarray:
+def _read_light_map(path: Path) -> Tensor:
+    """Coefficients (49, 3) float64 of a map, at the grace probe's mean luminance."""
+    coefficients = project_environment(read_map(path))
+    luminance = _mean_luminance(coefficients)
+    if not luminance > 0:
+        raise InputError(f"environment map {path} has a mean luminance of {luminance:g}: give a map with light in it")
+    return coefficients * (_mean_luminance(probe("grace")) / luminance)
+
+
+def _read_coefficients(path: Path) -> Tensor:
     if not path.is_file():
-        raise InputError(f"environment map {path} does not exist: give the path of an .npy file")
+        raise InputError(f"light {path} does not exist: give the path of a .json file of coefficients")
     try:
-        with path.open("rb") as file:
-            radiance = np.lib.format.read_array(file, allow_pickle=False).astype(np.float64)
-    except (ValueError, TypeError, OSError) as error:
-        raise InputError(f"environment map {path} is not a readable .npy file: {error}") from error
-    if radiance.ndim != 3 or radiance.shape[2] != 3 or not np.isfinite(radiance).all() or (radiance < 0).any():
+        coefficients = torch.tensor(json.loads(path.read_text()), dtype=torch.float32)
+    except (ValueError, TypeError, RuntimeError, OverflowError, OSError) as error:
+        raise InputError(f"light {path} is not a readable list of coefficients: {error}") from error
+    if coefficients.shape != (COEFFICIENTS, 3) or not coefficients.isfinite().all():
         raise InputError(
-            f"environment map {path} has shape {radiance.shape}: it must hold finite radiance ≥ 0, (height, width, 3)"
+            f"light {path} has shape {tuple(coefficients.shape)}: it must hold {COEFFICIENTS} rows [r, g, b] of finite "
+            "numbers"
         )
-    if not radiance.any():
-        raise InputError(f"environment map {path} is black everywhere: give a map with some light in it")
-    return radiance
+    return coefficients

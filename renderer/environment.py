@@ -1,0 +1,154 @@
+"""Environment maps: files (.npy, .hdr, .exr) in and out, and the map that a light's coefficients stand for.
+
+Maps are tensors (H, W, 3) of linear RGB radiance in the layout of `renderer.harmonics.equirectangular`: row 0 is up
+(+z), the middle column faces +x and azimuth grows to the left, as seen from inside.
+
+Blender's Environment Texture lies so too and needs no rotation. Mitsuba 3's `envmap` has y up and the middle column
+towards +z, as OpenEXR defines such maps: a `to_world` of the rows (0, 0, 1), (1, 0, 0), (0, 1, 0) brings it here. Both
+shade with albedo / π where this project leaves out the π: a strength of π gives the same picture.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer.errors import InputError
+from renderer.harmonics import basis, equirectangular
+
+SUFFIXES = (".npy", ".hdr", ".exr")
+
+
+def to_map(coefficients: Tensor, height: int) -> Tensor:
+    """Radiance (height, 2 · height, 3) float64 of a light's coefficients ((degree + 1)², 3), at the texels' centres.
+
+    Negative where the series rings. `renderer.harmonics.project` takes it back, off by its midpoint rule along z:
+    at degree 6 by up to 22.2 / height² of the coefficients' L2 norm (3.4e-4 at a height of 256).
+    """
+    degree = math.isqrt(len(coefficients)) - 1
+    directions, _ = equirectangular(height, 2 * height)
+    return torch.stack([basis(row, degree) @ coefficients.to(row) for row in directions])  # by rows: see `project`
+
+
+def negative_share(radiance: Tensor) -> float:
+    """The negative part of a map's radiance (H, W, 3), integrated over the sphere, as a share of its magnitude."""
+    _, solid_angles = equirectangular(*radiance.shape[:2])
+    power = radiance * solid_angles[..., None]
+    return float((-power).clamp(min=0).sum() / power.abs().sum().clamp(min=torch.finfo(power.dtype).tiny))
+
+
+def read_map(path: Path) -> Tensor:
+    """Radiance (H, W, 3) float32 of an .npy, .hdr or .exr file, taken as linear and in the file's own unit.
+
+    Alpha is dropped and grey repeated; an .npy array is (H, W, C) with 1, 3 or 4 channels. Of an .exr file with
+    layers, the unnamed one counts, or else the first that has red, green and blue.
+    InputError where the file is missing, unreadable, no such map, or holds NaN or infinity.
+    """
+    if not path.is_file():
+        raise InputError(f"environment map {path} does not exist: give the path of an .npy, .hdr or .exr file")
+    texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_picture(path)
+    radiance = texels[..., _color_channels(path, names)]
+    if not np.isfinite(radiance).all():
+        raise InputError(f"environment map {path} holds NaN or infinity: give a map of finite radiance")
+    return torch.from_numpy(radiance)
+
+
+def write_map(path: Path, radiance: Tensor) -> None:
+    """Write a map's radiance (H, W, 3) as float32 to an .npy or .exr file, or as RGBE to an .hdr file.
+
+    RGBE has no sign and one exponent for three channels: radiance below zero becomes zero (`negative_share` says how
+    much that is), the rest is off by up to 2⁻⁸ of its texel's largest channel. The other two keep negative radiance.
+    InputError where the suffix is another or the file cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path} is no name for an environment map: give one that ends in {', '.join(SUFFIXES)}")
+    radiance = radiance.detach().cpu().float()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if suffix == ".npy":
+            with path.open("wb") as file:  # given a path, NumPy appends .npy to .NPY
+                np.save(file, radiance.numpy())
+        else:
+            _write_picture(path, _to_rgbe_precision(radiance) if suffix == ".hdr" else radiance)
+    except OSError as error:
+        raise InputError(f"environment map {path} cannot be written: {error}") from error
+
+
+def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    try:
+        with path.open("rb") as file:
+            array = np.lib.format.read_array(file, allow_pickle=False).astype(np.float32)
+    except (ValueError, TypeError, OSError) as error:
+        raise InputError(f"environment map {path} is not a readable .npy file: {error}") from error
+    names = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(array.shape[-1] if array.ndim == 3 else 0)
+    if names is None:
+        raise InputError(
+            f"environment map {path} has shape {array.shape}: it must be (height, width, channels), 1, 3 or 4 channels"
+        )
+    return array, names
+
+
+def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    openimageio = _openimageio(path)
+    file = openimageio.ImageInput.open(str(path))
+    if file is None:
+        raise InputError(f"environment map {path} is not a readable picture: {_first_line(openimageio.geterror())}")
+    if file.format_name() not in ("hdr", "openexr"):
+        raise InputError(f"environment map {path} is a {file.format_name()} picture: give an .hdr or .exr file")
+    spec = file.spec()
+    if spec.roi != spec.roi_full or spec.get_int_attribute("Orientation", 1) != 1:
+        raise InputError(f"environment map {path} is stored cropped or turned: save it whole, its top row first")
+    texels = file.read_image("float")
+    if texels is None:
+        raise InputError(f"environment map {path} is damaged: {_first_line(file.geterror())}")
+    return texels, spec.channelnames
+
+
+def _write_picture(path: Path, radiance: Tensor) -> None:
+    openimageio = _openimageio(path)
+    height, width, channels = radiance.shape
+    file = openimageio.ImageOutput.create(str(path))
+    spec = openimageio.ImageSpec(width, height, channels, "float")
+    if not (file.open(str(path), spec) and file.write_image(radiance.contiguous().numpy()) and file.close()):
+        raise OSError(_first_line(file.geterror()))
+
+
+def _to_rgbe_precision(radiance: Tensor) -> Tensor:
+    """Radiance rounded to what RGBE holds: the library truncates, which darkens and tints the light."""
+    radiance = radiance.clamp(min=0)
+    _, exponent = torch.frexp(radiance.amax(dim=-1, keepdim=True))
+    unit = torch.ldexp(torch.ones_like(radiance[..., :1]), exponent - 8)
+    return (radiance / unit).round().clamp(max=255) * unit
+
+
+def _color_channels(path: Path, names: tuple[str, ...]) -> list[int]:
+    """Where red, green and blue lie; three times the same where all but alpha is one grey channel."""
+    split = [name.casefold().rpartition(".")[::2] for name in names]  # (layer, channel)
+    for layer, _ in split:  # the library puts the unnamed layer first
+        for colors in (("r", "g", "b"), ("red", "green", "blue")):
+            wanted = [(layer, color) for color in colors]
+            if set(wanted) <= set(split):
+                return [split.index(channel) for channel in wanted]
+    grey = [index for index, (_, channel) in enumerate(split) if channel not in ("a", "alpha")]
+    if len(grey) == 1:
+        return grey * 3
+    raise InputError(
+        f"environment map {path} has the channels {', '.join(names)}: it must have R, G and B, or one grey channel"
+    )
+
+
+def _openimageio(path: Path):
+    try:
+        import OpenImageIO
+    except ImportError as error:
+        raise InputError(f"environment map {path} needs OpenImageIO: pip install openimageio") from error
+    OpenImageIO.attribute("threads", 1)  # no pool of threads beside torch's own
+    OpenImageIO.attribute("exr_threads", -1)
+    return OpenImageIO
+
+
+def _first_line(message: str) -> str:
+    return message.partition("\n")[0]
