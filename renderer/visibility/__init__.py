@@ -1,11 +1,14 @@
 """Which face covers each sample: two back ends, OpenGL and NumPy, under one contract.
 
-rasterise(points, faces, resolution) -> ids
+rasterise(points, faces, resolution, closed) -> ids
 
 points      (N, V, 3) float64, the vertices as N views project them: x right, y up, both in [-1, 1] across
             a square picture; z is depth, smaller is nearer, and surface outside [-1, 1) is clipped
-faces       (F, 3) integer; drawn from both sides
+faces       (F, 3) integer; drawn from both sides unless closed
 resolution  samples per side R; sample (i, j) sits at x = (2j + 1)/R - 1, y = 1 - (2i + 1)/R
+closed      promises a watertight mesh within the range of depths, its faces counter-clockwise seen from outside, and
+            leaves out the faces that wind clockwise in the picture: the same samples are covered, with the same ids
+            but where a face turned away is as near as the nearest within rounding, as along outlines
 ids         (N, R, R) int32, row 0 at the top: the nearest face's index, the lower one where depths tie, or -1
 
 Both back ends snap vertices to 1/256 of a sample, so faces that share an edge cover each sample once.
@@ -32,13 +35,12 @@ class Backend:
     name: str
     description: str
 
-    def rasterise(self, points: np.ndarray, faces: np.ndarray, resolution: int) -> np.ndarray:
+    def rasterise(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
         """Ids (N, R, R) int32 by the module's contract. ValueError: points that are not finite."""
         if not np.isfinite(points).all():
             raise ValueError("points hold NaN or infinity")
         reach = SPAN / resolution
-        faces = np.sort(faces, axis=1)  # one order of corners, so that duplicate faces have one depth and tie
-        return _RASTERISERS[self.name](np.clip(points, -reach, reach), faces, resolution)
+        return _RASTERISERS[self.name](np.clip(points, -reach, reach), faces, resolution, closed)
 
 
 def choose(backend: str = "auto") -> Backend:
@@ -62,6 +64,8 @@ def choose(backend: str = "auto") -> Backend:
     return Backend("opengl", f"opengl ({device})")
 
 
-def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int, backend: str = "auto") -> np.ndarray:
+def rasterise(
+    points: np.ndarray, faces: np.ndarray, resolution: int, backend: str = "auto", closed: bool = False
+) -> np.ndarray:
     """Ids (N, R, R) int32 by the module's contract. To draw more than once, `choose` a back end and keep it."""
-    return choose(backend).rasterise(points, faces, resolution)
+    return choose(backend).rasterise(points, faces, resolution, closed)

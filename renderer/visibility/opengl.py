@@ -2,13 +2,14 @@
 
 A context is made, used and released in one call, since one that is kept returns stale data in another thread.
 After a fork only the process that made a context first can make another: under Mesa a child hangs. Ids come from
-gl_VertexID, since some Mesa versions count gl_PrimitiveID wrongly.
+gl_VertexID, since some Mesa versions count gl_PrimitiveID wrongly. Triton and Mesa's llvmpipe each bring an LLVM of
+their own, and a process that loads Triton second crashes; so it is loaded here, where it is installed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,13 +39,13 @@ void main() {
 """
 
 
-def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int) -> np.ndarray:
+def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """Ids by the contract in `renderer.visibility`, for finite points.
 
     InputError: no EGL device, or a driver that renders wrong ids.
     """
     with _context() as context:
-        return _draw(context, points, faces, resolution)
+        return _draw(context, points, _in_one_order(faces, closed), resolution, closed)
 
 
 def device() -> str:
@@ -55,6 +56,8 @@ def device() -> str:
 
 @contextmanager
 def _context() -> Iterator[moderngl.Context]:
+    with suppress(ImportError):
+        import triton  # noqa: F401
     import moderngl
 
     try:
@@ -69,15 +72,24 @@ def _context() -> Iterator[moderngl.Context]:
 
 
 def _check(context: moderngl.Context) -> None:
-    """InputError unless a small triangle before a large one comes out right."""
+    """InputError unless a large triangle, first turned away and then not, and a small one before it come out right."""
     points = np.array([[[-1, -1, 0], [3, -1, 0], [-1, 3, 0], [-1, -0.2, -0.5], [0.2, 1, -0.5], [-1, 1, -0.5]]])
-    ids = _draw(context, points, np.array([[0, 1, 2], [3, 4, 5]]), 4)
-    if ids[0].tolist() != [[1, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]:
+    ids = _draw(context, points, np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]]), 4, closed=True)
+    if ids[0].tolist() != [[2, 2, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]]:
         name = context.info["GL_RENDERER"]
         raise InputError(f"the OpenGL driver {name} renders wrong face ids: set renderer.visibility=software")
 
 
-def _draw(context: moderngl.Context, points: np.ndarray, faces: np.ndarray, resolution: int) -> np.ndarray:
+def _in_one_order(faces: np.ndarray, closed: bool) -> np.ndarray:
+    """Sorted corners or, where the winding counts, the least first: duplicate faces have one depth, and tie."""
+    if not closed:
+        return np.sort(faces, axis=1)
+    return np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+
+
+def _draw(
+    context: moderngl.Context, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool
+) -> np.ndarray:
     import moderngl
 
     size = (resolution, resolution)
@@ -87,7 +99,8 @@ def _draw(context: moderngl.Context, points: np.ndarray, faces: np.ndarray, reso
     texture = context.texture(size, 1, dtype="i4")
     framebuffer = context.framebuffer([texture], context.depth_renderbuffer(size))
     framebuffer.use()
-    context.enable_only(moderngl.DEPTH_TEST)
+    context.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if closed else moderngl.NOTHING))
+    context.front_face = "cw"  # counter-clockwise in the picture, whose rows go down
     context.depth_func = "<"  # of equal depths the face drawn first stays, the one with the lower index
 
     ids = np.empty((len(points), *size), dtype=np.int32)

@@ -1,8 +1,13 @@
 """Both rasterisers against one contract, a brute-force oracle and each other."""
 
+import math
+import subprocess
+import sys
 import threading
 import tracemalloc
 from ctypes.util import find_library
+from fractions import Fraction
+from pathlib import Path
 
 import moderngl
 import numpy as np
@@ -13,11 +18,13 @@ from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
+from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.visibility import Backend, choose, opengl, rasterise
+from renderer.visibility import SPAN, Backend, choose, opengl, rasterise, software
 
 needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
 SNAP = 1 / 256  # of a sample: no corner moves further than that
+FAR = 2**24 - 1  # depth is a 24-bit key
 DEPTH_STEP = 2.0**-22  # of z in [-1, 1]: a 24-bit step is half that, and OpenGL interpolates in float32
 
 
@@ -61,10 +68,76 @@ def depth_tolerance(slopes: np.ndarray, resolution: int) -> np.ndarray:
     return np.linalg.norm(slopes, axis=-1) * 2 * SNAP * 2 / resolution + DEPTH_STEP
 
 
-def rotated_spheres(views: int) -> tuple[np.ndarray, np.ndarray]:
-    sphere = trimesh.creation.icosphere(subdivisions=4)
+def turned(mesh: trimesh.Trimesh, views: int) -> tuple[np.ndarray, np.ndarray]:
+    """Random views of a mesh with faces counter-clockwise outward, mirrored as by a camera: depth runs away from it."""
     turns = Rotation.random(views, rng=np.random.default_rng(3)).as_matrix()
-    return 0.9 * np.einsum("nij,vj->nvi", turns, sphere.vertices), sphere.faces
+    return np.einsum("nij,vj->nvi", turns, mesh.vertices) * [1, 1, -1], mesh.faces
+
+
+def rotated_spheres(views: int, subdivisions: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    return turned(trimesh.creation.icosphere(subdivisions, radius=0.9), views)
+
+
+def snapped(points: np.ndarray, resolution: int) -> list[tuple[int, int]]:
+    """x right, y down from the top left of (V, 2) in 1/256 sample; float32 before and after one multiply-add."""
+    half = Fraction(resolution, 2)
+
+    def snap(value: float) -> int:
+        return round(float(np.float32(float(half + half * Fraction(value)))) / SNAP)
+
+    return [(snap(x), snap(-y)) for x, y in points.astype(np.float32).tolist()]
+
+
+def doubled_area(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> int:
+    """Positive where a, b and c run clockwise, since y runs down."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def reference(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+    """(R, R) ids of one view (V, 3) by the contract's words: in Python's integers, each sample of each face in turn.
+
+    A sample is inside if every edge function is positive there or, where one is 0, a little to the right or, where it
+    stays 0, a little below. Depth is in float64, with the corners in the order of their indices.
+    """
+    points = np.clip(points, -SPAN / resolution, SPAN / resolution)
+    places, depths = snapped(points[:, :2], resolution), ((points[:, 2] + 1) / 2 * FAR).tolist()
+    ids, nearest = np.full((resolution, resolution), -1), np.full((resolution, resolution), FAR)
+    for index, face in enumerate(faces.tolist()):
+        if closed and doubled_area(*(places[corner] for corner in face)) > 0:
+            continue
+        (a, b, c), (depth_a, depth_b, depth_c) = (
+            [each[corner] for corner in sorted(face)] for each in (places, depths)
+        )
+        area = doubled_area(a, b, c)
+        sides = [(b, c), (c, a), (a, b)] if area > 0 else [(c, b), (a, c), (b, a)]
+        for row, column in np.ndindex(ids.shape):
+            sample = (column * 256 + 128, row * 256 + 128)
+            edges = [doubled_area(p, q, sample) for p, q in sides]
+            slopes = [(p[1] - q[1], q[0] - p[0]) for p, q in sides]
+            if area and all((edge, *slope) > (0, 0, 0) for edge, slope in zip(edges, slopes, strict=True)):
+                depth = round((edges[0] * depth_a + edges[1] * depth_b + edges[2] * depth_c) / abs(area))
+                if 0 <= depth < nearest[row, column]:
+                    ids[row, column], nearest[row, column] = index, depth
+    return ids
+
+
+@st.composite
+def scenes(draw) -> tuple[np.ndarray, np.ndarray, int]:
+    """Few corners for many faces: shared edges, duplicates, no area, slivers; tiny, huge and off-screen faces."""
+    resolution = draw(st.sampled_from([1, 2, 7, 33]))
+    centre_or_border = st.integers(-resolution, 3 * resolution).map(lambda index: index / resolution - 1)
+    a_little_off = st.integers(-3, 3).map(lambda steps: steps * SNAP / resolution)
+    far_away = st.sampled_from([-1e300, -1e4, -20.0, 20.0, 1e4, 1e300])
+    coordinate = st.one_of(
+        centre_or_border, st.builds(float.__add__, centre_or_border, a_little_off), st.floats(-1.5, 1.5), far_away
+    )
+    any_depth = st.one_of(st.integers(-5, 5).map(lambda index: index / 4), st.floats(-1.1, 1.1), far_away)
+    depth_within_rounding = st.integers(-8, 8).map(lambda steps: steps / FAR / 4)
+    depth = draw(st.sampled_from([any_depth, depth_within_rounding]))
+    points = draw(st.lists(st.tuples(coordinate, coordinate, depth), min_size=3, max_size=9))
+    corner = st.integers(0, len(points) - 1)
+    faces = draw(st.lists(st.tuples(corner, corner, corner), min_size=1, max_size=12))
+    return np.array([points]), np.array(faces), resolution
 
 
 def test_row_0_is_the_top_and_x_runs_right(backend):
@@ -136,6 +209,12 @@ def test_faces_are_drawn_from_both_sides(backend, order):
     assert (backend.rasterise(points, np.array([order]), 5) == 0).all()
 
 
+@pytest.mark.parametrize(("order", "expected"), [([0, 1, 2], 0), ([0, 2, 1], -1)])
+def test_of_a_closed_mesh_counter_clockwise_faces_are_drawn(backend, order, expected):
+    points, _ = triangle([-1, -1, 0], [3, -1, 0], [-1, 3, 0])
+    assert (backend.rasterise(points, np.array([order]), 5, closed=True) == expected).all()
+
+
 @pytest.mark.parametrize(("first", "second", "winner"), [(-0.5, 0.5, 0), (0.5, -0.5, 1)])
 def test_the_nearer_face_wins_in_either_order(backend, first, second, winner):
     points, faces = triangle(*rectangle(-1, 1, -1, 1, first), *rectangle(-1, 1, -1, 1, second))
@@ -154,6 +233,13 @@ def test_the_lower_index_wins_ties_between_duplicate_faces(backend, turn):
     duplicates = np.concatenate([faces, np.roll(faces, turn, axis=1), faces[:, ::-1]])
     ids = backend.rasterise(points, duplicates, 32)
     assert set(np.unique(ids)) == {-1, 0}
+
+
+@pytest.mark.parametrize("turn", range(3))
+def test_the_lower_index_wins_ties_between_duplicate_faces_of_a_closed_mesh(backend, turn):
+    points, face = triangle([-0.9, -0.7, 0.3], [0.8, -0.5, -0.4], [0.1, 0.9, 0.7])
+    duplicates = np.concatenate([face[:, ::-1], np.roll(face, turn, axis=1), face, np.roll(face, 1, axis=1)])
+    assert set(np.unique(backend.rasterise(points, duplicates, 32, closed=True))) == {-1, 1}
 
 
 def test_the_lower_index_wins_ties_within_a_plane(backend):
@@ -211,12 +297,118 @@ def test_points_that_are_not_finite_are_refused(backend, value):
         backend.rasterise(points, faces, 4)
 
 
+BOX = trimesh.creation.box(bounds=[[-0.6, -0.4, -0.2], [0.4, 0.6, 0.2]])
+BUMP = trimesh.creation.box(bounds=[[0.4, 0.0, 0.0], [0.8, 0.4, 0.4]])  # on the +x side, higher than the box
+# Rows of 10×10 samples, 0.2 apart from -0.9 to 0.9. X is the side towards +x, x the one towards -x, B the bump.
+PICTURES = {
+    "+x, right +y, up +z": (90, 0, {3: ".....BB...", 4: "...XXBBX..", 5: "...XXXXX.."}),
+    "-x, right -y, up +z": (90, 180, {3: "...BB.....", 4: "..xxxxx...", 5: "..xxxxx..."}),
+    "+y, right -x, up +z": (90, 90, {3: ".BB.......", 4: ".BBYYYYY..", 5: "...YYYYY.."}),
+    "-y, right +x, up +z": (90, -90, {3: ".......BB.", 4: "..yyyyyBB.", 5: "..yyyyy..."}),
+    "+z, right +y, up -x": (0, 0, dict.fromkeys(range(2, 7), "...ZZZZZ..") | dict.fromkeys((7, 8), ".....BB...")),
+    "-z, right +y, up +x": (180, 0, dict.fromkeys((1, 2), ".....BB...") | dict.fromkeys(range(3, 8), "...zzzzz..")),
+    "+x above, right +y, up (-1/2, 0, √3/2)": (
+        60, 0, {3: "...ZZZZZ..", 4: "...ZZBBZ..", 5: "...XXBBX..", 6: "...XXBBX.."},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize(("polar", "azimuth", "rows"), PICTURES.values(), ids=PICTURES)
+def test_a_labelled_box_with_a_bump_looks_from_each_side_as_drawn_by_hand(backend, closed, polar, azimuth, rows):
+    labels = ["xyzXYZ"[axis] for axis in np.argmax(np.hstack([-BOX.face_normals, BOX.face_normals]), axis=1)]
+    labels = np.array([*labels, *"B" * len(BUMP.faces), "."])  # an id of -1 takes the last
+    mesh = trimesh.util.concatenate([BOX, BUMP])
+    camera = OrthographicCamera(math.radians(polar), math.radians(azimuth), field_of_view=2.0)
+    ids = backend.rasterise(camera.project(mesh.vertices)[None], mesh.faces, 10, closed)[0]
+    picture = ["".join(row) for row in labels[ids]]
+    assert picture == [rows.get(row, "." * 10) for row in range(10)]
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(scene=scenes(), closed=st.booleans())
+def test_software_equals_the_reference_on_any_triangles(scene, closed):
+    points, faces, resolution = scene
+    ids = Backend("software", "").rasterise(points, faces, resolution, closed)
+    np.testing.assert_array_equal(ids[0], reference(points[0], faces, resolution, closed))
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize("resolution", [1, 2, 7, 33])
+def test_software_equals_the_reference_on_spheres(resolution, closed):
+    points, faces = rotated_spheres(views=1, subdivisions=1)
+    ids = rasterise(points, faces, resolution, "software", closed)
+    np.testing.assert_array_equal(ids[0], reference(points[0], faces, resolution, closed))
+
+
+def test_software_equals_the_reference_where_the_rounding_of_float64_decides():
+    """Huge faces, whose edge functions have more than 53 bits, at a depth halfway between two keys."""
+    points, faces = random_triangles(seed=5, count=40, reach=1e5, depth=0)
+    faces = np.concatenate([faces, np.roll(faces, 1, axis=1)[::-1]])
+    ids = rasterise(points, faces, 16, "software")
+    np.testing.assert_array_equal(ids[0], reference(points[0], faces, 16, closed=False))
+
+
+@pytest.mark.parametrize(("tiles", "faces_at_a_time"), [(1, 100), (7, 3), (100, 1)])
+def test_software_draws_the_same_however_little_at_a_time(monkeypatch, tiles, faces_at_a_time):
+    points, faces = random_triangles(seed=4, count=40, reach=1.3)
+    at_once = rasterise(points, faces, 16, "software")
+    monkeypatch.setattr(software, "TILES", tiles)
+    monkeypatch.setattr(software, "FACES", faces_at_a_time)
+    np.testing.assert_array_equal(rasterise(points, faces, 16, "software"), at_once)
+
+
+def outline_distance(mesh: trimesh.Trimesh, corners: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """(S,) from samples (S, 2) to the nearest edge between a face towards the camera and one that is not."""
+    (ax, ay), (bx, by), (cx, cy) = np.moveaxis(corners[mesh.faces, :2], 0, -1)
+    towards = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) > 0
+    outline = mesh.face_adjacency_edges[np.diff(towards[mesh.face_adjacency], axis=1)[:, 0]]
+    start, end = np.moveaxis(corners[outline, :2], 1, 0)
+    to_sample, along = samples[:, None] - start, end - start
+    share = ((to_sample * along).sum(-1) / (along**2).sum(-1)).clip(0, 1)
+    return np.linalg.norm(to_sample - share[..., None] * along, axis=-1).min(axis=1)
+
+
+def distances_of_changed_ids(
+    backend: Backend, mesh: trimesh.Trimesh, points: np.ndarray, resolution: int
+) -> np.ndarray:
+    """(S,) in samples, from the outline to where `closed` changes the id; that it changes no coverage is checked."""
+    both = backend.rasterise(points, mesh.faces, resolution)
+    front = backend.rasterise(points, mesh.faces, resolution, closed=True)
+    np.testing.assert_array_equal(front >= 0, both >= 0)
+    row, column = np.nonzero(front[0] != both[0])
+    return outline_distance(mesh, points[0], sample_centres(resolution)[row, column]) * resolution / 2
+
+
+@pytest.mark.parametrize("resolution", [17, 224])
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.creation.icosphere(subdivisions=4, radius=0.9),
+        trimesh.creation.torus(0.6, 0.3, major_sections=60, minor_sections=30),
+    ],
+    ids=["sphere", "torus"],
+)
+def test_culling_a_closed_mesh_changes_ids_only_within_rounding_of_an_outline(backend, mesh, resolution):
+    points, _ = turned(mesh, views=1)
+    assert (distances_of_changed_ids(backend, mesh, points, resolution) <= SNAP).all()
+
+
+def test_culling_a_closed_mesh_changes_ids_where_front_and_back_meet_on_a_sample(backend):
+    """A convex solid whose vertices, and some points of its outline, are sample centres of a picture of 17×17."""
+    mesh = trimesh.convex.convex_hull(np.random.default_rng(6).integers(-3, 4, (40, 3)) * 4 / 17)
+    distances = distances_of_changed_ids(backend, mesh, mesh.vertices[None] * [1, 1, -1], 17)
+    assert len(distances) > 0
+    np.testing.assert_allclose(distances, 0, atol=17 * np.finfo(float).eps)
+
+
 @needs_egl
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
 @pytest.mark.parametrize("resolution", [32, 224, 333])
-def test_the_back_ends_agree_on_spheres(resolution):
+def test_the_back_ends_agree_on_spheres(resolution, closed):
     """Coverage exactly; ids but for the rounding of depths, in 1 of 100,000 samples or fewer."""
     points, faces = rotated_spheres(views=4)
-    gpu, cpu = (rasterise(points, faces, resolution, name) for name in ("opengl", "software"))
+    gpu, cpu = (rasterise(points, faces, resolution, name, closed) for name in ("opengl", "software"))
     np.testing.assert_array_equal(gpu >= 0, cpu >= 0)
     assert (gpu != cpu).mean() < 2e-5
 
@@ -228,8 +420,9 @@ def test_the_back_ends_agree_on_spheres(resolution):
     count=st.integers(1, 40),
     resolution=st.integers(1, 70),
     lattice=st.sampled_from([None, 4, 64]),
+    closed=st.booleans(),
 )
-def test_the_back_ends_agree_on_any_triangles(seed, count, resolution, lattice):
+def test_the_back_ends_agree_on_any_triangles(seed, count, resolution, lattice, closed):
     """Coverage exactly; ids wherever the two faces' depths are not equal within rounding.
 
     Inside the picture, since Mesa's rasteriser cuts triangles at its border and snaps the new corners.
@@ -237,7 +430,7 @@ def test_the_back_ends_agree_on_any_triangles(seed, count, resolution, lattice):
     points, faces = random_triangles(seed, count)
     if lattice:
         points[..., :2] = np.round(points[..., :2] * lattice) / lattice
-    gpu, cpu = (rasterise(points, faces, resolution, name)[0] for name in ("opengl", "software"))
+    gpu, cpu = (rasterise(points, faces, resolution, name, closed)[0] for name in ("opengl", "software"))
     np.testing.assert_array_equal(gpu >= 0, cpu >= 0)
     row, column = np.nonzero(gpu != cpu)
     rivals = np.stack([gpu[row, column], cpu[row, column]], axis=1)
@@ -245,6 +438,16 @@ def test_the_back_ends_agree_on_any_triangles(seed, count, resolution, lattice):
     depth = (plane[..., :2] * sample_centres(resolution)[row, column][:, None]).sum(-1) + plane[..., 2]
     tolerance = depth_tolerance(plane[..., :2], resolution).sum(axis=1)
     assert (np.abs(depth[:, 0] - depth[:, 1]) <= tolerance).all()
+
+
+@needs_egl
+def test_torch_optimisers_work_after_opengl():
+    """They load Triton, whose LLVM must not meet Mesa's already there; in a process of its own, since that crashes."""
+    script = (
+        "from renderer import visibility; import torch; visibility.choose('opengl'); "
+        "torch.optim.SGD([torch.zeros(1, requires_grad=True)])"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2])
 
 
 @needs_egl
@@ -266,6 +469,18 @@ def test_a_face_of_a_million_samples_takes_bounded_memory():
     tracemalloc.stop()
     assert (ids >= 0).all()
     assert peak < 1024**2 * 5 * 8
+
+
+def test_a_million_faces_take_bounded_memory():
+    """Less than the faces themselves."""
+    points, _ = triangle([-1, -1, 0], [3, -1, 0], [-1, 3, 0])
+    faces = np.tile([0, 1, 2], (2**20, 1))
+    tracemalloc.start()
+    ids = rasterise(points, faces, 1, "software")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert ids.item() == 0
+    assert peak < faces.nbytes
 
 
 @pytest.mark.parametrize(
