@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from renderer.cache import OperatorCache
 from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
-from renderer.image import clamped, develop
+from renderer.image import PictureSettings, clamped, develop
 from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
-from renderer.transfer import COEFFICIENTS, DEGREE, Operator, PictureSettings, build_operators
+from renderer.transfer import COEFFICIENTS, DEGREE, Operator, apply_transfer
 from renderer.visibility import Backend
 
 
@@ -64,12 +65,17 @@ def count_views(examples: int, objects: int, backgrounds: int, views: int | None
 
 
 def build_objects(
-    objects: Sequence[ObjectSettings], views: int, field_of_view: float, settings: PictureSettings, backend: Backend
+    objects: Sequence[ObjectSettings],
+    views: int,
+    field_of_view: float,
+    settings: PictureSettings,
+    backend: Backend,
+    cache: OperatorCache | None = None,
 ) -> list[SceneObject]:
-    """Load, normalise and rasterise every mesh from a ring of views."""
-    cameras = ring(views, field_of_view)
+    """Load and normalise every mesh, and rasterise it from a ring of views where the cache does not have them."""
+    cache, cameras = cache or OperatorCache(), ring(views, field_of_view)
     return [
-        SceneObject(item.label, build_operators(_normalised(item), cameras, settings, backend, item.gain))
+        SceneObject(item.label, cache.operators(_normalised(item), cameras, settings, backend, item.gain))
         for item in objects
     ]
 
@@ -104,10 +110,10 @@ class Scene:
         self.settings = settings
         self.labels = [item.label for item in objects for _ in item.operators for _ in backgrounds]
         self.pixels = torch.cat([operator.pixels for operator in operators]).unique()
-        self.transfer, self.coverage = _stack(operators, self.pixels)
+        self.transfer, self.albedo, self.coverage = _stack(operators, self.pixels)
         self.backgrounds = torch.tensor(backgrounds, dtype=torch.float32)
         self._coefficients = _kept_coefficients()
-        for name in ("pixels", "transfer", "coverage", "backgrounds", "_coefficients"):
+        for name in ("pixels", "transfer", "albedo", "coverage", "backgrounds", "_coefficients"):
             setattr(self, name, getattr(self, name).to(device))
 
     def __len__(self) -> int:
@@ -144,10 +150,11 @@ class Scene:
         cell = row * per_operator + examples % per_operator
         kept = lights.index_select(1, self._coefficients)
         grid = kept.new_zeros(len(used) * per_operator, *kept.shape[1:]).index_copy(0, cell, kept)
-        transfer = self.transfer if len(used) == len(self.transfer) else self.transfer[used]
-        radiance = grid.unflatten(0, (len(used), per_operator)).permute(0, 3, 1, 2) @ transfer
+        everything = len(used) == len(self.transfer)
+        transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
+        radiance = apply_transfer(grid.unflatten(0, (len(used), per_operator)), transfer, albedo)
         return (
-            radiance.transpose(1, 2).flatten(0, 1).index_select(0, cell),
+            radiance.flatten(0, 1).index_select(0, cell),
             self.coverage[examples // per_operator],
             self.backgrounds[examples % per_operator].view(-1, 1, 1),
         )
@@ -160,12 +167,17 @@ def _kept_coefficients() -> Tensor:
     return torch.cat([live, torch.tensor([dead])])
 
 
-def _stack(operators: Sequence[Operator], pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Operators over a common set of pixels: transfer (O, 3, 32, P), coverage (O, 1, P), zero where uncovered."""
-    transfer = torch.zeros(len(operators), 3, len(_kept_coefficients()), len(pixels))
+def _stack(operators: Sequence[Operator], pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Operators over a common set of pixels: transfer (O, 3 or 1, 32, P), albedo (O, 3, P) and coverage (O, 1, P)."""
+    channels = max((len(operator.transfer) for operator in operators), default=1)
+    transfer = torch.zeros(len(operators), channels, len(_kept_coefficients()), len(pixels))
+    albedo = torch.ones(len(operators), 3, len(pixels))
     coverage = torch.zeros(len(operators), 1, len(pixels))
     for row, operator in enumerate(operators):
         columns = torch.searchsorted(pixels, operator.pixels)
-        transfer[row][:, :-1, columns] = operator.transfer.transpose(0, 1)
+        if channels == 1:
+            transfer[row][:, :-1, columns], albedo[row][:, columns] = operator.transfer, operator.albedo
+        else:
+            transfer[row][:, :-1, columns] = operator.transfer * operator.albedo[:, None]
         coverage[row, 0, columns] = operator.coverage
-    return transfer, coverage
+    return transfer, albedo, coverage

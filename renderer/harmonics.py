@@ -5,51 +5,141 @@ angles, so it stays exact at the poles, where the paper's (appendix B.1) derivat
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from renderer.errors import require_finite
+
 MAX_DEGREE = 20
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics of unit vectors.
+    """Real spherical harmonics of directions. Differentiable, by `basis_gradient`.
 
-    directions: (..., 3) unit vectors, floating point. Returns (..., (degree + 1)²) in the same dtype.
+    directions: (..., 3), finite and of any length, since only the direction counts; a zero vector, which has none,
+    gives finite values and a gradient of zero.
+    Returns (..., (degree + 1)²) in the same dtype, computed in float64 and rounded once. InputError: NaN.
     Source: the Legendre recurrences of the paper's appendix B.1 with sin^m θ taken out of P_l^m and put into
     Re and Im of (x + iy)^m.
     """
     _check_degree(degree)
-    x, y, z = directions.unbind(-1)
-    values = [torch.zeros_like(z)] * (degree + 1) ** 2
-    cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # Re and Im of (x + iy)^m
+    require_finite(directions=directions)
+    return _Basis.apply(directions, degree)
+
+
+def basis_gradient(directions: Tensor, degree: int) -> Tensor:
+    """∂Y/∂n for vectors n of any length, (..., (degree + 1)², 3): tangent to the sphere, as in the paper's
+    appendix D, divided by |n|; finite at the poles, zero for a zero vector.
+
+    Source: r^l Y_lm is a polynomial whose derivatives lie in band l - 1 (`gradient_matrices`); the radial part,
+    l Y_lm n, is taken off.
+    """
+    _check_degree(degree)
+    require_finite(directions=directions)
+    unit, length = unit_vectors(directions.double().movedim(-1, 0))
+    values = torch.stack(select_rows(unit, range((degree + 1) ** 2)), dim=-1)
+    solid = torch.einsum("...j,djk->...kd", values, gradient_matrices(degree).to(values))
+    radial = (values * bands(degree).to(values))[..., None] * unit.movedim(0, -1)[..., None, :]
+    tangential = (solid - radial) / torch.where(length > 0, length, torch.inf)[..., None, None]
+    return tangential.to(directions.dtype)
+
+
+class _Basis(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, directions: Tensor, degree: int) -> Tensor:
+        ctx.save_for_backward(directions)
+        ctx.degree = degree
+        unit, _ = unit_vectors(directions.double().movedim(-1, 0))
+        return torch.stack(select_rows(unit, range((degree + 1) ** 2)), dim=-1).to(directions.dtype)
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+        (directions,) = ctx.saved_tensors
+        gradient = basis_gradient(directions.double(), ctx.degree)
+        return torch.einsum("...k,...kd->...d", upstream.double(), gradient).to(directions.dtype), None
+
+
+def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
+    """The harmonics with these indices, (...) each, of unit vectors (3, ...): `basis` for inner loops, unchecked."""
+    x, y, z = unit
+    wanted = [(l := math.isqrt(index), index - l * l - l) for index in indices]
+    degree = max((l for l, _ in wanted), default=0)
+    rows = {}
+    cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # Re and Im of (x + iy)^m, times √2 where m > 0
     for m in range(degree + 1):
         for l, legendre in zip(range(m, degree + 1), _legendre(z, m, degree), strict=True):
-            if m == 0:
-                values[l * l + l] = legendre
-            else:
-                values[l * l + l + m] = math.sqrt(2) * legendre * cosine
-                values[l * l + l - m] = math.sqrt(2) * legendre * sine
-        cosine, sine = x * cosine - y * sine, x * sine + y * cosine
-    return torch.stack(values, dim=-1)
+            for order, circular in ((-m, sine), (m, cosine)):
+                if (l, order) in wanted:
+                    rows[l, order] = circular * legendre
+        if m == 0:
+            cosine = cosine * math.sqrt(2)
+        cosine, sine = (
+            torch.addcmul(x * cosine, y, sine, value=-1),
+            torch.addcmul(x * sine, y, cosine),
+        )
+    return [rows[key] for key in wanted]
 
 
-def _legendre(z: Tensor, m: int, degree: int) -> list[Tensor]:
+def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:
     """Orthonormal associated Legendre functions over sin^m θ, for l = m..degree, as polynomials in z."""
     start = math.sqrt(math.prod((2 * k + 1) / (2 * k) for k in range(1, m + 1)) / (4 * math.pi))
-    values = [torch.full_like(z, start)]
+    before, value = torch.zeros_like(z), torch.full_like(z, start)
+    yield value
     for l in range(m + 1, degree + 1):
         a = math.sqrt((4 * l * l - 1) / (l * l - m * m))
-        value = a * z * values[-1]
-        if l > m + 1:
-            b = math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
-            value = value - a * b * values[-2]
-        values.append(value)
-    return values
+        b = math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
+        before, value = value, torch.addcmul(before * (-a * b), z, value, value=a)
+        yield value
 
 
+@cache
+def gradient_matrices(degree: int) -> Tensor:
+    """(3, (degree + 1)², (degree + 1)²) float64: ∂(r^l Y_k)/∂x_d = Σ_j r^(l-1) Y_j [d, j, k], for k in band l.
+
+    Source: the ladder operators of solid harmonics, in real form and without the Condon-Shortley sign.
+    """
+    matrices = torch.zeros(3, (degree + 1) ** 2, (degree + 1) ** 2, dtype=torch.float64)
+    for l in range(1, degree + 1):
+        below, norm = (l - 1) * l, (2 * l + 1) / (2 * l - 1)  # `below`: the index of m = 0 in band l - 1
+        for m in range(l + 1):
+            down = math.sqrt(norm * (l + m) * (l + m - 1)) / 2 * (math.sqrt(2) if m == 1 else 1)
+            up = math.sqrt(norm * (l - m) * (l - m - 1)) / 2 * (math.sqrt(2) if m == 0 else 1)
+            cosine, sine = l * l + l + m, l * l + l - m
+            if m < l:
+                matrices[2, below + m, cosine] = matrices[2, below - m, sine] = math.sqrt(norm * (l * l - m * m))
+            if m + 1 < l:
+                matrices[0, below + m + 1, cosine] = matrices[1, below - m - 1, cosine] = -up
+            if m + 1 < l and m > 0:
+                matrices[0, below - m - 1, sine], matrices[1, below + m + 1, sine] = -up, up
+            if m > 0:
+                matrices[0, below + m - 1, cosine] = matrices[1, below + m - 1, sine] = down
+            if m > 1:
+                matrices[0, below - m + 1, sine], matrices[1, below - m + 1, cosine] = down, -down
+    return matrices
+
+
+def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """(unit vectors (3, ...), lengths (...)) of vectors (3, ...); a zero vector stays zero.
+
+    Nothing under- or overflows on the way. Components come first, since rows are what a processor adds fastest.
+    """
+    largest = vectors.abs().amax(0)
+    scaled = vectors / torch.where(largest > 0, largest, 1)
+    norm = scaled.square().sum(0).sqrt()
+    return scaled / torch.where(norm > 0, norm, 1), norm * largest
+
+
+@cache
+def bands(degree: int) -> Tensor:
+    """The band l of each coefficient, ((degree + 1)²,)."""
+    return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
+
+
+@cache
 def lambertian_factors(degree: int) -> Tensor:
     """What a diffuse surface keeps of each band: irradiance = Σ A_l U_lm Y_lm(n). (degree + 1,) float64.
 
@@ -64,10 +154,10 @@ def lambertian_factors(degree: int) -> Tensor:
     return factors
 
 
+@cache
 def live_coefficients(degree: int) -> Tensor:
     """Indices of the coefficients that can reach a diffuse surface: 31 of the 49 at degree 6."""
-    bands = torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
-    return torch.nonzero(lambertian_factors(degree)[bands]).squeeze(1)
+    return torch.nonzero(lambertian_factors(degree)[bands(degree)]).squeeze(1)
 
 
 def irradiance_basis(normals: Tensor, degree: int) -> Tensor:
@@ -76,8 +166,7 @@ def irradiance_basis(normals: Tensor, degree: int) -> Tensor:
     normals: (..., 3). Returns (..., K), K = len(live_coefficients(degree)).
     """
     live = live_coefficients(degree)
-    bands = live.to(torch.float64).sqrt().floor().long()
-    factors = lambertian_factors(degree)[bands].to(normals)
+    factors = lambertian_factors(degree)[bands(degree)[live]].to(normals)
     return basis(normals, degree)[..., live.to(normals.device)] * factors
 
 

@@ -1,11 +1,27 @@
 """Radiance to picture: background, clamp and encoding, in one place and last, since clamping is not linear."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from renderer.errors import InputError
 
 ENCODINGS = ("linear", "srgb")
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """Picture size in pixels, samples per pixel side, encoding. InputError: none of the first two, unknown encoding."""
+
+    size: int = 32
+    samples: int = 8
+    encoding: str = "linear"
+
+    def __post_init__(self):
+        if self.size < 1 or self.samples < 1:
+            raise InputError(f"renderer.samples={self.samples} and the size {self.size} must be at least 1")
+        check_encoding(self.encoding)
 
 
 def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -65,20 +66,18 @@ class Mesh:
         """(F,) areas in squared world units."""
         return np.linalg.norm(self._doubled_area_vectors(), axis=1) / 2
 
-    def colors(self, faces: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-        """(S, 3) float32 sRGB-encoded colour at S surface points: corner colour × texture.
-
-        faces (S,) holds face indices, barycentric (S, 3) the weights of their corners. Textures are
-        looked up bilinearly and repeat outside [0, 1].
-        """
-        weights = np.asarray(barycentric, dtype=np.float32)
-        result = np.einsum("sc,scd->sd", weights, self.corner_colors[faces])
-        texture_ids = self.texture_ids[faces]
-        for index, texture in enumerate(self.textures):
-            here = np.flatnonzero(texture_ids == index)
-            uvs = np.einsum("sc,scd->sd", weights[here], self.corner_uvs[faces[here]])
-            result[here] *= _sample_bilinear(texture, uvs)
-        return result
+    @cached_property
+    def closed(self) -> bool:
+        """Whether every part is watertight with its faces counter-clockwise from outside, so that none is ever seen
+        from behind: each edge is run through once in either direction, and each connected part's volume is positive."""
+        edges = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        forth = np.sort(edges @ np.array([len(self.vertices), 1]))
+        back = np.sort(edges @ np.array([1, len(self.vertices)]))
+        if (forth[1:] == forth[:-1]).any() or not np.array_equal(forth, back):
+            return False
+        part = trimesh.graph.connected_component_labels(edges, node_count=len(self.vertices))[self.faces[:, 0]]
+        a, b, c = (self.vertices[self.faces[:, corner]] - self.vertices.mean(axis=0) for corner in range(3))
+        return bool((np.bincount(part, np.einsum("fi,fi->f", a, np.cross(b, c)))[np.unique(part)] > 0).all())
 
     def _doubled_area_vectors(self) -> np.ndarray:
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
@@ -229,17 +228,3 @@ def _weld(mesh: Mesh) -> Mesh:
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     vertices, indices = np.unique(corners, axis=0, return_inverse=True)
     return replace(mesh, vertices=vertices, faces=indices.reshape(-1, 3))
-
-
-def _sample_bilinear(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
-    """(S, 3) float32 in [0, 1]; texel centres at half-integers, v = 0 at the bottom row's lower edge."""
-    height, width = texture.shape[:2]
-    x = uvs[:, 0].astype(np.float64) * width - 0.5
-    y = (1.0 - uvs[:, 1].astype(np.float64)) * height - 0.5
-    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    fx, fy = (x - column)[:, None], (y - row)[:, None]
-    left, right = column % width, (column + 1) % width
-    top, bottom = row % height, (row + 1) % height
-    upper = texture[top, left] * (1 - fx) + texture[top, right] * fx
-    lower = texture[bottom, left] * (1 - fx) + texture[bottom, right] * fx
-    return ((upper * (1 - fy) + lower * fy) / 255.0).astype(np.float32)

@@ -5,17 +5,19 @@ radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactl
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
-from renderer.errors import InputError
-from renderer.harmonics import irradiance_basis
-from renderer.image import decode
+from renderer.errors import InputError, require_finite
+from renderer.fragments import Fragments, build_fragments
+from renderer.harmonics import irradiance_basis, live_coefficients
+from renderer.image import PictureSettings
 from renderer.mesh import Mesh
+from renderer.normals import face_normals
 from renderer.visibility import Backend
 
 DEGREE = 6
@@ -23,123 +25,134 @@ COEFFICIENTS = (DEGREE + 1) ** 2
 
 
 @dataclass(frozen=True)
-class PictureSettings:
-    """How meshes become operators: picture size in pixels, samples per pixel side (InputError if none), encoding."""
-
-    size: int = 32
-    samples: int = 8
-    encoding: str = "linear"
-
-    def __post_init__(self):
-        if self.samples < 1:
-            raise InputError(f"renderer.samples={self.samples} must be at least 1")
-
-
-@dataclass(frozen=True)
 class Operator:
-    """What is kept of one (mesh, view). K = 31 live coefficients, P covered pixels.
+    """What is kept of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
 
-    transfer: (K, 3, P) float32, linear radiance per unit coefficient, weighted with coverage.
-    coverage: (P,) float32 in (0, 1], the share of a pixel's samples that the mesh covers.
+    transfer: (3, K, P), K = 31 live coefficients at degree 6 and P covered pixels; or (1, K, P), a third of the size
+    and the time, where no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
+    albedo: (3, P), what the one channel is multiplied with; ones where there are three.
+    coverage: (P,) in (0, 1], the share of a pixel's samples that the mesh covers.
     pixels: (P,) int64, row-major indices of the covered pixels; row 0 is the top of the picture.
+    degree: of the lights.
     """
 
     transfer: Tensor
+    albedo: Tensor
     coverage: Tensor
     pixels: Tensor
+    degree: int = DEGREE
+
+    def radiance(self, lights: Tensor) -> Tensor:
+        """Linear radiance (..., 3, P) under lights (..., (degree + 1)², 3); differentiable, by `light_gradient`.
+
+        Computed in the operator's dtype, returned in the lights'. InputError: NaN, or lights of another degree.
+        """
+        require_finite(lights=lights)
+        if lights.shape[-2:] != ((self.degree + 1) ** 2, 3):
+            raise InputError(f"lights of shape {tuple(lights.shape)} are not of the operator's degree {self.degree}")
+        return _Radiance.apply(lights, self)
+
+    def light_gradient(self, radiance_gradient: Tensor) -> Tensor:
+        """∂C/∂U (..., (degree + 1)², 3) = T ∂C/∂radiance (..., 3, P), without a graph.
+
+        Exactly zero for the coefficients of bands that cannot reach a diffuse surface.
+        """
+        upstream = radiance_gradient.to(self.transfer.dtype).reshape(
+            radiance_gradient.shape[:-2].numel(), 3, len(self.pixels)
+        )
+        product = _transposed_transfer(upstream, self.transfer, self.albedo)
+        gradient = product.new_zeros(len(product), (self.degree + 1) ** 2, 3)
+        gradient.index_copy_(1, live_coefficients(self.degree).to(product.device), product)
+        return gradient.reshape(*radiance_gradient.shape[:-2], *gradient.shape[1:]).to(radiance_gradient.dtype)
+
+    def to(self, device: torch.device | str) -> "Operator":
+        """The same on another device."""
+        return replace(self, **{name: part.to(device) for name, part in vars(self).items() if name != "degree"})
+
+
+class _Radiance(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, lights: Tensor, operator: Operator) -> Tensor:
+        ctx.operator = operator
+        live = live_coefficients(operator.degree).to(lights.device)
+        kept = lights.to(operator.transfer.dtype).reshape(-1, *lights.shape[-2:]).index_select(1, live)
+        product = apply_transfer(kept, operator.transfer, operator.albedo)
+        return product.reshape(*lights.shape[:-2], *product.shape[-2:]).to(lights.dtype)
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+        return ctx.operator.light_gradient(upstream), None
+
+
+def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
+    """Radiance (..., B, 3, P) of B lights (..., B, K, 3) under transfer (..., C, K, P), C = 3 or 1, and albedo
+    (..., 3, P). The light comes first in the product: on a CPU that is several times faster."""
+    if transfer.shape[-3] == 3:
+        return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
+    product = lights.mT.flatten(-3, -2) @ transfer.squeeze(-3)
+    return product.unflatten(-2, (-1, 3)) * albedo.unsqueeze(-3)
+
+
+def _transposed_transfer(upstream: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
+    """The gradient (B, K, 3) of `apply_transfer` by its lights, for upstream (B, 3, P)."""
+    if len(transfer) == 3:
+        return (upstream.transpose(0, 1) @ transfer.mT).permute(1, 2, 0)
+    product = (upstream * albedo).flatten(0, 1) @ transfer[0].T
+    return product.unflatten(0, (-1, 3)).mT
 
 
 def build_operators(
-    mesh: Mesh, cameras: Sequence[OrthographicCamera], settings: PictureSettings, backend: Backend, gain: float = 1.0
-) -> list[Operator]:
-    """One operator per camera. gain multiplies the albedo, for meshes whose texture is darker than the thing."""
-    points = np.stack([camera.project(mesh.vertices) for camera in cameras])
-    ids = backend.rasterise(points, mesh.faces, settings.size * settings.samples)
-    return [
-        _operator(mesh, camera, projected, face_ids, settings, gain)
-        for camera, projected, face_ids in zip(cameras, points, ids, strict=True)
-    ]
-
-
-def _operator(
     mesh: Mesh,
-    camera: OrthographicCamera,
-    projected: np.ndarray,
-    face_ids: np.ndarray,
+    cameras: Sequence[OrthographicCamera],
     settings: PictureSettings,
-    gain: float,
+    backend: Backend,
+    gain: float = 1.0,
+    degree: int = DEGREE,
+    dtype: torch.dtype = torch.float32,
+) -> list[Operator]:
+    """One operator per camera, for lights of one degree; computed in float64 and stored in `dtype`.
+
+    gain multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side that the
+    camera sees, with a normal per face.
+    """
+    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, backend, closed=mesh.closed)
+    return [build_operator(mesh, view, settings, gain, degree, dtype) for view in views]
+
+
+def build_operator(
+    mesh: Mesh, fragments: Fragments, settings: PictureSettings, gain: float, degree: int, dtype: torch.dtype
 ) -> Operator:
-    rows, columns = np.nonzero(face_ids >= 0)
-    faces = face_ids[rows, columns]
-    sample_pixels = (rows // settings.samples) * settings.size + columns // settings.samples
-    pixels, pixel_of_sample = np.unique(sample_pixels, return_inverse=True)
-    albedo = _albedo(mesh, projected, face_ids.shape[0], rows, columns, faces, settings.encoding) * gain
-    face_of_sample, live_faces = _compact(faces)
-    shading = irradiance_basis(torch.from_numpy(_facing_normals(mesh, live_faces, camera)), DEGREE)
-    weight = 1 / settings.samples**2
+    """The operator of one view that has been rasterised; see `build_operators`."""
+    albedo = surface_albedo(mesh, fragments, settings.encoding) * gain
+    normals = face_normals(torch.from_numpy(mesh.vertices), fragments.corners) * fragments.facing
+    shading = irradiance_basis(normals, degree)
+    factor = _pixel_albedo(fragments, albedo, dtype)
+    if factor is None:
+        factor = torch.ones(len(fragments.pixels), 3)
+    else:
+        albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
     return Operator(
-        transfer=_box_filter(shading, face_of_sample, albedo, pixel_of_sample, len(pixels)).mul_(weight).float(),
-        coverage=torch.from_numpy(np.bincount(pixel_of_sample, minlength=len(pixels)) * weight).float(),
-        pixels=torch.from_numpy(pixels),
+        transfer=_box_filter(fragments, shading, albedo).to(dtype),
+        albedo=factor.T.to(dtype).contiguous(),
+        coverage=fragments.coverage.to(dtype),
+        pixels=fragments.pixels,
+        degree=degree,
     )
 
 
-def _compact(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(index into the visible faces per sample, the visible faces): faces that no sample sees are not shaded."""
-    visible, index = np.unique(faces, return_inverse=True)
-    return index, visible
+def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:
+    """(P, 3) the albedo of each pixel, if all of its samples have the same to the dtype's rounding."""
+    by_pixel = albedo.new_zeros(len(fragments.pixels), 3).index_copy(0, fragments.pixel, albedo)
+    spread = (albedo - by_pixel[fragments.pixel]).abs()
+    return by_pixel if (spread <= torch.finfo(dtype).eps * albedo).all() else None
 
 
-def _facing_normals(mesh: Mesh, faces: np.ndarray, camera: OrthographicCamera) -> np.ndarray:
-    """Unit normals on the side that the camera sees, so that open or inside-out meshes are lit from that side."""
-    normals = mesh.face_normals()[faces]
-    facing = normals @ camera.axes()[2]
-    return normals * np.where(facing < 0, -1.0, 1.0)[:, None]
-
-
-def _albedo(
-    mesh: Mesh,
-    projected: np.ndarray,
-    resolution: int,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    faces: np.ndarray,
-    encoding: str,
-) -> Tensor:
-    """Albedo (S, 3) float64 at the samples, at the barycentric coordinates of their centres."""
-    x = (columns + 0.5) / resolution * 2 - 1
-    y = 1 - (rows + 0.5) / resolution * 2
-    corners = projected[mesh.faces[faces], :2]
-    barycentric = _barycentric(np.stack([x, y], axis=1), corners)
-    colors = torch.from_numpy(mesh.colors(faces, barycentric)).double()
-    return decode(colors.clamp(0, 1), encoding)
-
-
-def _barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(S, 3) of points (S, 2) in triangles (S, 3, 2), clipped into the triangle: the rasteriser snaps its corners."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    area = _cross(b - a, c - a)
-    weights = np.stack([_cross(b - points, c - points), _cross(c - points, a - points)], axis=1)
-    weights = weights / np.where(area == 0, 1.0, area)[:, None]
-    weights = np.concatenate([weights, 1 - weights.sum(axis=1, keepdims=True)], axis=1).clip(0, 1)
-    return weights / weights.sum(axis=1, keepdims=True)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _box_filter(
-    shading: Tensor, face_of_sample: np.ndarray, albedo: Tensor, pixel_of_sample: np.ndarray, pixels: int
-) -> Tensor:
-    """Sum over each pixel's samples of shading (faces, K) × albedo (S, 3): (K, 3, pixels) float64.
-
-    Samples of the same face in the same pixel share their normal, so their albedo is summed first.
-    """
-    cells, cell_of_sample = np.unique(pixel_of_sample * len(shading) + face_of_sample, return_inverse=True)
-    summed = torch.zeros(len(cells), 3, dtype=torch.float64)
-    summed.index_add_(0, torch.from_numpy(cell_of_sample), albedo)
-    pixel, face = (torch.from_numpy(part) for part in np.divmod(cells, max(len(shading), 1)))
-    transfer = torch.zeros(pixels, shading.shape[1] * 3, dtype=torch.float64)
-    transfer.index_add_(0, pixel, (shading[face][:, :, None] * summed[:, None, :]).flatten(1))
-    return transfer.T.reshape(shading.shape[1], 3, pixels).contiguous()
+def _box_filter(fragments: Fragments, shading: Tensor, albedo: Tensor) -> Tensor:
+    """Sum over each pixel's samples of shading (G, K) × albedo (S, C): (C, K, P) float64."""
+    pixel, face, weights = fragments.merge(albedo)
+    rows = shading.index_select(0, face)
+    channels = [
+        shading.new_zeros(len(fragments.pixels), shading.shape[1]).index_add_(0, pixel, rows * weight[:, None]).T
+        for weight in weights.unbind(1)
+    ]
+    return torch.stack(channels)

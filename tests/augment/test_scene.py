@@ -2,15 +2,18 @@ import numpy as np
 import pytest
 import torch
 
+from augment.attack import AttackSettings, descend
+from augment.phases import Phases
 from augment.scene import ObjectSettings, Scene, SceneObject, build_objects, count_views
+from renderer.cache import OperatorCache
 from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
-from renderer.image import ENCODINGS, develop
+from renderer.image import ENCODINGS, PictureSettings, develop
 from renderer.lights import ambient, probe
 from renderer.mesh import normalise
 from renderer.shapes import solid
-from renderer.transfer import Operator, PictureSettings, build_operators
+from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
@@ -27,7 +30,8 @@ def random_operator(seed: int, count: int) -> Operator:
     draws = torch.Generator().manual_seed(seed)
     coverage = 0.1 + 0.9 * torch.rand(count, generator=draws)
     return Operator(
-        transfer=0.2 * torch.rand(31, 3, count, generator=draws) * coverage,
+        transfer=0.2 * torch.rand(3, 31, count, generator=draws) * coverage,
+        albedo=torch.ones(3, count),
         coverage=coverage,
         pixels=torch.randperm(SIZE**2, generator=draws)[:count].sort().values,
     )
@@ -55,7 +59,7 @@ def composed(scene: Scene, lights: torch.Tensor) -> torch.Tensor:
     pictures = []
     for light, (operator, grey) in zip(lights, [(o, g) for o in operators for g in GREYS], strict=True):
         canvas = torch.full((3, SIZE**2), grey)
-        radiance = torch.einsum("kc,kcp->cp", light[LIVE], operator.transfer)
+        radiance = torch.einsum("kc,ckp->cp", light[LIVE], operator.transfer)
         behind = torch.full((1, 1), grey)
         canvas[:, operator.pixels] = develop(radiance, operator.coverage[None], behind, scene.settings.encoding)
         pictures.append(canvas.view(3, SIZE, SIZE))
@@ -108,17 +112,17 @@ def test_the_gradient_is_the_transfer_where_nothing_clamps():
     lights = ambient(torch.full((3,), 0.1)).expand(1, -1, -1).clone().requires_grad_(True)
     weights = torch.randn(1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
     (gradient,) = torch.autograd.grad(scene.render(lights), lights, weights)
-    expected = torch.einsum("kcp,cp->kc", operator.transfer, weights.view(3, -1)[:, operator.pixels])
+    expected = torch.einsum("ckp,cp->kc", operator.transfer, weights.view(3, -1)[:, operator.pixels])
     torch.testing.assert_close(gradient[0, LIVE], expected, rtol=0, atol=16 * EPS32)
 
 
 def test_the_clamped_share_counts_covered_values_alone():
     """Radiance ±L₀₀ at three pixels of coverage 1, 1/2 and 1; a second view covers a fourth pixel, always in range."""
-    unit = torch.zeros(31, 3, 3)
-    unit[0] = torch.tensor([1.0, 0.5, -1.0])
+    unit = torch.zeros(3, 31, 3)
+    unit[:, 0] = torch.tensor([1.0, 0.5, -1.0])
     views = [
-        Operator(unit, torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2])),
-        Operator(torch.zeros(31, 3, 1), torch.ones(1), torch.tensor([3])),
+        Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2])),
+        Operator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3])),
     ]
     scene = Scene([SceneObject("orange", views)], [0.0, 1.0], PictureSettings(size=2))
     lights = torch.zeros(4, 49, 3)
@@ -197,7 +201,8 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
     for built, foreshortening in ((upright, np.sqrt(3) / 2), (level, 0.5)):
         area = float(built.operators[1].coverage.sum()) / 64
         assert area == pytest.approx(2 * foreshortening, abs=6 / 64)
-    torch.testing.assert_close(bright.operators[1].transfer, 2 * upright.operators[1].transfer, rtol=2 * EPS32, atol=0)
+    torch.testing.assert_close(bright.operators[1].albedo, 2 * upright.operators[1].albedo, rtol=0, atol=0)
+    torch.testing.assert_close(bright.operators[1].transfer, upright.operators[1].transfer, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -220,6 +225,42 @@ def test_a_mesh_that_is_not_there_is_refused(spec, message):
 def test_a_gain_that_leaves_nothing_is_refused(gain):
     with pytest.raises(InputError, match="gain="):
         ObjectSettings("solid:orange", "orange", gain=gain)
+
+
+def test_a_lighting_attack_rasterises_nothing(rasterised):
+    """Each mesh is rasterised once, in all views; 30 steps on 24 examples that are never fooled add nothing."""
+    items = [ObjectSettings(f"solid:{name}", name) for name in ("plate", "cup")]
+    objects = build_objects(items, 4, 2, SETTINGS, BACKEND)
+    assert rasterised == [4, 4]
+    scene = Scene(objects, GREYS, SETTINGS)
+    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 3))
+    torch.nn.init.constant_(network[1].bias[0], 1000)
+    lights, labels = probe("grace").expand(24, -1, -1), torch.zeros(24, dtype=torch.int64)
+    result = descend(network, scene.render, lights, labels, AttackSettings(max_steps=30), Phases())
+    scene.clamped_share(result.parameters)
+    assert result.steps.eq(30).all() and rasterised == [4, 4]
+
+
+def test_a_scene_stores_no_background_pixel_and_no_backgrounds_or_dead_bands_of_a_view():
+    objects = build_objects([ObjectSettings("solid:bottle", "bottle")], 4, 2, SETTINGS, BACKEND)
+    scene = Scene(objects, GREYS, SETTINGS)
+    covered = set(np.concatenate([operator.pixels for operator in objects[0].operators]).tolist())
+    assert len(scene) == 12 and 0 < len(covered) < 64 / 2
+    # 31 live coefficients of 49, and the row of zeros that makes the product fast
+    assert scene.transfer.shape == (4, 3, 32, len(covered)) and not scene.transfer[:, :, 31].any()
+    assert scene.coverage.shape == (4, 1, len(covered)) and scene.pixels.tolist() == sorted(covered)
+
+
+def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterised):
+    items = [ObjectSettings("solid:plate", "plate"), ObjectSettings("solid:plate:1", "plate", gain=2.0)]
+    pictures = []
+    for calls in ([3, 3], [3, 3]):
+        cache = OperatorCache(tmp_path)
+        scene = Scene(build_objects(items, 3, 2, SETTINGS, BACKEND, cache), GREYS, SETTINGS)
+        pictures.append(scene.render(random_lights(18)))
+        assert rasterised == calls
+    assert (cache.tally.loaded, cache.tally.built) == (6, 0)
+    assert torch.equal(*pictures)
 
 
 def test_under_grace_a_plate_is_brighter_from_above_than_from_below():

@@ -4,13 +4,18 @@ import math
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
-from scipy.special import eval_legendre, gamma, sph_harm_y, spherical_in
+from scipy.special import eval_legendre, gamma, sph_harm_y, sph_harm_y_all, spherical_in
 
+from renderer import harmonics
 from renderer.harmonics import (
     MAX_DEGREE,
     basis,
+    basis_gradient,
+    gradient_matrices,
     irradiance_basis,
     lambertian_factors,
     live_coefficients,
@@ -20,6 +25,7 @@ from renderer.harmonics import (
 )
 
 EPS = np.finfo(np.float64).eps
+EQUATOR = [[1.0, 0.0, 0.0], [-1.0, 0.0, -0.0], [-0.0, 1.0, 0.0], [0.0, -1.0, -0.0], [-0.6, 0.8, 0.0], [-1.0, -0.0, 0.0]]
 POLES = [[0.0, 0.0, 1.0], [-0.0, 0.0, 1.0], [0.0, -0.0, -1.0], [-0.0, -0.0, -1.0]]
 
 
@@ -53,19 +59,135 @@ def scipy_basis(directions: torch.Tensor, degree: int) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
+def scipy_gradient(directions: torch.Tensor, degree: int) -> np.ndarray:
+    """scipy's derivatives by the polar angles times the angles' by the vector (the paper's appendix D): no poles."""
+    x, y, z = directions.double().numpy().T
+    rho = np.hypot(x, y)
+    by_angle = sph_harm_y_all(degree, degree, np.arctan2(rho, z), np.arctan2(y, x), diff_n=1)[1]
+    polar = np.stack([x * z, y * z, -(rho**2)]) / (rho * (rho**2 + z**2))
+    azimuth = np.stack([-y, x, 0 * x]) / rho**2
+    columns = []
+    for l in range(degree + 1):
+        for m in range(-l, l + 1):
+            slope = by_angle[l, abs(m), :, 0] * polar + by_angle[l, abs(m), :, 1] * azimuth
+            part = slope.real if m >= 0 else slope.imag
+            columns.append(part if m == 0 else math.sqrt(2) * (-1) ** m * part)
+    return np.stack(columns).transpose(2, 0, 1)
+
+
+def steepest(degree: int) -> np.ndarray:
+    """The largest derivative in the band of each coefficient: that of m = ±1 at the poles; 26 in band 20."""
+    l = bands(degree).numpy()
+    return np.sqrt(l * (l + 1) * (2 * l + 1) / (8 * np.pi))
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 6, 13, MAX_DEGREE])
 def test_the_basis_is_scipys_without_the_condon_shortley_sign(degree):
-    directions = torch.cat([random_directions(200), torch.tensor(POLES, dtype=torch.float64)])
+    directions = torch.cat([random_directions(200), torch.tensor(POLES + EQUATOR, dtype=torch.float64)])
     np.testing.assert_allclose(basis(directions, degree).numpy(), scipy_basis(directions, degree), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("degree", [2, 6, MAX_DEGREE])
-def test_float32_loses_a_few_ulps(degree):
-    """A rounding half an eps large at one degree grows linearly with those that follow, and there is one at each."""
-    directions = torch.cat([random_directions(2000).float(), torch.tensor(POLES)])
-    single, double = basis(directions, degree), basis(directions.double(), degree)
-    assert single.dtype == torch.float32
-    assert (single - double).abs().max() < degree**2 / 4 * torch.finfo(torch.float32).eps
+@pytest.mark.parametrize("length", [1.0, 1e-3, 1e9])
+@pytest.mark.parametrize("degree", [0, 1, 2, 6, 13, MAX_DEGREE])
+def test_the_gradient_is_scipys_through_the_polar_angles(degree, length):
+    """To 1e-13 of the band's steepest; the angles themselves lose 1 / sin θ of that towards the poles."""
+    directions = torch.cat([random_directions(200), torch.tensor(EQUATOR, dtype=torch.float64)]) * length
+    error = basis_gradient(directions, degree).numpy() - scipy_gradient(directions, degree)
+    sine = np.hypot(*directions.numpy().T[:2]) / length
+    assert (np.abs(error) * length * sine[:, None, None] <= 1e-13 * steepest(degree)[:, None]).all()
+
+
+def test_at_the_poles_only_m_1_has_a_gradient():
+    """sin θ e^(imφ) is x + iy for m = 1 and of higher order for others; P_l¹ / sin θ is l (l + 1) / 2 at the pole."""
+    gradient = basis_gradient(torch.tensor(POLES, dtype=torch.float64), MAX_DEGREE).numpy()
+    degrees = np.arange(1, MAX_DEGREE + 1)
+    expected = np.zeros_like(gradient)
+    for m, axis in ((1, 0), (-1, 1)):
+        expected[:, degrees**2 + degrees + m, axis] = steepest(MAX_DEGREE)[degrees**2]
+        expected[2:, degrees**2 + degrees + m, axis] *= (-1.0) ** (degrees + 1)
+    np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-13 * steepest(MAX_DEGREE)[-1])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 6, 13, MAX_DEGREE])
+def test_in_float32_basis_and_gradient_are_scipys_to_half_an_ulp(degree):
+    """And 1e-13 more, where a rounding falls the other way."""
+    directions = torch.cat([random_directions(200), torch.tensor(EQUATOR).double()]).float()
+    for ours, theirs, scale in (
+        (basis, scipy_basis, 1),
+        (basis_gradient, scipy_gradient, steepest(degree)[:, None] / directions[:, :2].norm(dim=1).numpy().min()),
+    ):
+        expected = theirs(directions, degree)
+        error = np.abs(ours(directions, degree).numpy() - expected)
+        assert (error <= np.spacing(np.abs(expected).astype(np.float32)) / 2 + 1e-13 * scale).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("degree", [0, 2, 6, MAX_DEGREE])
+def test_shorter_dtypes_are_float64_rounded_once(degree, dtype):
+    directions = torch.cat([random_directions(200), torch.tensor(POLES + EQUATOR).double()]).to(dtype)
+    for function in (basis, basis_gradient):
+        rounded = function(directions, degree)
+        assert rounded.dtype == dtype
+        assert torch.equal(rounded, function(directions.double(), degree).to(dtype))
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    direction=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda vector: max(map(abs, vector)) > 1e-3),
+    exponent=st.integers(-200, 90),
+)
+def test_the_sums_over_a_band_are_the_same_in_every_direction(direction, exponent):
+    """Σ Y² = (2l + 1) / 4π (Unsöld's theorem) and Σ |∇Y|² = l (l + 1) (2l + 1) / 4π, at any length of the vector."""
+    vector = torch.tensor(direction, dtype=torch.float64) * 2.0**exponent
+    values, gradient = basis(vector, MAX_DEGREE), basis_gradient(vector, MAX_DEGREE) * vector.norm()
+    l = torch.arange(MAX_DEGREE + 1, dtype=torch.float64)
+    by_band = torch.zeros(2, MAX_DEGREE + 1, dtype=torch.float64)
+    by_band.index_add_(1, bands(MAX_DEGREE), torch.stack([values**2, gradient.square().sum(1)]))
+    share = (2 * l + 1) / (4 * math.pi)
+    # Sums of 2l + 1 squares, each with a few dozen roundings of the recurrence in it.
+    torch.testing.assert_close(by_band[0], share, rtol=1e-13, atol=0)
+    torch.testing.assert_close(by_band[1], share * l * (l + 1), rtol=1e-13, atol=0)
+    assert ((gradient @ vector / vector.norm()).abs().numpy() <= 1e-13 * steepest(MAX_DEGREE)).all()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "smallest"), [(torch.float64, -1074), (torch.float32, -149), (torch.float16, -24), (torch.bfloat16, -133)]
+)
+def test_only_the_direction_of_a_vector_counts_down_to_denormal_ones(dtype, smallest):
+    vectors = torch.tensor([[1, 2, -2], [0, 0, 1], [-3, 4, 0], [1, 0, 0]], dtype=torch.float64)
+    for exponent in (smallest, smallest + 1, -3, 4):
+        scaled = (vectors * 2.0**exponent).to(dtype)
+        assert torch.equal(basis(scaled, 6), basis(vectors.to(dtype), 6))
+    halved = basis_gradient(2 * vectors.to(dtype), 6)
+    assert torch.equal(halved, (basis_gradient(vectors, 6) / 2).to(dtype))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16])
+def test_no_gradient_is_nan_however_short_the_vector(dtype):
+    """It is of the order of 1 / length, so that it may overflow."""
+    tiny = torch.finfo(dtype).smallest_normal
+    vectors = (torch.tensor([[1, 2, -3], [0, 0, 1], [1, -1, 0], [0, 0, 0]], dtype=torch.float64) * tiny / 16).to(dtype)
+    vectors = torch.cat([vectors, vectors * 64]).requires_grad_(True)
+    (gradient,) = torch.autograd.grad((basis(vectors, 6) * torch.linspace(-1, 1, 49)).sum(), vectors)
+    assert not gradient.isnan().any()
+    assert not basis_gradient(vectors, 6).isnan().any()
+
+
+def test_a_zero_vector_has_finite_values_and_a_gradient_of_zero():
+    zero = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
+    values = basis(zero, MAX_DEGREE)
+    (gradient,) = torch.autograd.grad(values.sum(), zero)
+    assert values.isfinite().all()
+    assert not gradient.any() and not basis_gradient(zero, MAX_DEGREE).any()
+
+
+def test_the_sign_of_zero_does_not_matter():
+    signs = torch.tensor(list(itertools.product([1.0, -1.0], repeat=3)), dtype=torch.float64)
+    for vector in ([0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.6, 0.8]):
+        vectors = torch.where(torch.tensor(vector) == 0, signs * 0.0, torch.tensor(vector, dtype=torch.float64))
+        for function in (basis, basis_gradient):
+            values = function(vectors, MAX_DEGREE)
+            assert (values == values[0]).all()
 
 
 def test_band_one_is_y_z_x():
@@ -88,10 +210,40 @@ def test_at_the_poles_only_m_0_is_left():
     np.testing.assert_allclose(values.numpy(), expected, rtol=0, atol=MAX_DEGREE**2 / 4 * EPS)  # as in float32, above
 
 
-def test_gradients_are_right_at_and_beside_the_poles():
-    """Where the derivatives in polar angles are not finite."""
-    directions = torch.cat([torch.tensor([*POLES, [1e-4, 0, 1]], dtype=torch.float64), random_directions(4)])
-    assert torch.autograd.gradcheck(lambda d: basis(d, 6), directions.requires_grad_(True))
+@pytest.mark.parametrize("degree", [0, 1, 6, MAX_DEGREE])
+def test_autograd_sees_the_gradient_at_and_beside_the_poles_on_the_equator_and_off_the_sphere(degree):
+    """Where the derivatives in polar angles are not finite, too."""
+    special = torch.tensor([*POLES, [1e-4, 0, 1], *EQUATOR[:2], [3e-2, -5e-2, 4e-2]], dtype=torch.float64)
+    directions = torch.cat([special, 7 * random_directions(2)]).requires_grad_(True)
+    assert torch.autograd.gradcheck(lambda d: basis(d, degree), directions, fast_mode=degree > 1)
+
+
+def test_second_derivatives_are_right():
+    directions = 2 * random_directions(3).requires_grad_(True)
+    assert torch.autograd.gradgradcheck(lambda d: basis(d, 3), directions)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 6, MAX_DEGREE])
+def test_the_gradient_matrices_are_the_derivatives_of_the_solid_harmonics(degree):
+    """By quadrature against scipy: ∂(r^l Y) at r = 1 is ∇Y + l Y n, and a harmonic polynomial of band l - 1."""
+    directions, weights = quadrature(2 * degree)
+    values = scipy_basis(directions, degree)
+    radial = (bands(degree).numpy() * values)[..., None] * directions.numpy()[:, None]
+    slopes = scipy_gradient(directions, degree) + radial
+    expected = [(weights.numpy()[:, None] * values).T @ slopes[..., axis] for axis in range(3)]
+    # Sums over 861 directions or fewer of products up to 3 × 30, whose weights add up to 4π.
+    np.testing.assert_allclose(gradient_matrices(degree), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "function", [harmonics.gradient_matrices, harmonics.bands, harmonics.lambertian_factors, live_coefficients]
+)
+def test_constants_first_asked_for_in_inference_mode_serve_training_later(function):
+    """They are kept, and autograd refuses to save tensors made in that mode."""
+    function.cache_clear()
+    with torch.inference_mode():
+        function(5)
+    assert not function(5).is_inference()
 
 
 @pytest.mark.parametrize("degree", [0, 1, 6, MAX_DEGREE])
@@ -168,12 +320,17 @@ def test_projection_of_an_exponential_has_its_closed_form():
     np.testing.assert_allclose(projected, expected, rtol=0, atol=1000 * EPS)
 
 
-@pytest.mark.parametrize("degree", [0, 2, 6])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("degree", [0, 2, 6, MAX_DEGREE])
+@pytest.mark.parametrize("seed", range(2))
 def test_rotated_light_at_a_turned_direction_is_the_light_at_the_direction(degree, seed):
-    coefficients, rotation, directions = random_coefficients(degree), random_rotation(seed), random_directions(20)
-    turned = basis(directions @ rotation.T, degree) @ rotate(coefficients, rotation)
-    torch.testing.assert_close(turned, basis(directions, degree) @ coefficients, rtol=0, atol=1e-13)
+    """And its gradient is turned. Errors are of the light's norm, 21 × √3 at most on average, and of band l's slope."""
+    coefficients, rotation, directions = random_coefficients(degree, seed), random_rotation(seed), random_directions(20)
+    rotated, turned = rotate(coefficients, rotation), directions @ rotation.T
+    values = basis(turned, degree) @ rotated
+    torch.testing.assert_close(values, basis(directions, degree) @ coefficients, rtol=0, atol=1e-13 * (degree + 1))
+    slopes = torch.einsum("nkd,kc->ncd", basis_gradient(turned, degree), rotated)
+    expected = torch.einsum("nkd,kc->ncd", basis_gradient(directions, degree), coefficients) @ rotation.T
+    torch.testing.assert_close(slopes, expected, rtol=0, atol=1e-13 * (degree + 1) * (1 + steepest(degree)[-1]))
 
 
 def test_rotations_compose():
@@ -193,6 +350,10 @@ def test_rotation_keeps_the_norm_of_each_band_and_the_precision_of_its_input():
 
 @pytest.mark.parametrize("degree", [-1, MAX_DEGREE + 1])
 def test_degrees_out_of_range_are_refused(degree):
-    for function in (lambda: basis(random_directions(1), degree), lambda: lambertian_factors(degree)):
+    for refused in (
+        lambda: basis(random_directions(1), degree),
+        lambda: basis_gradient(random_directions(1), degree),
+        lambda: lambertian_factors(degree),
+    ):
         with pytest.raises(ValueError, match=f"degree {degree}"):
-            function()
+            refused()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from renderer.errors import InputError
-from renderer.image import ENCODINGS, clamped, decode, develop, encode
+from renderer.image import ENCODINGS, PictureSettings, clamped, decode, develop, encode
 
 EPS = torch.finfo(torch.float64).eps
 
@@ -93,6 +93,45 @@ def test_the_gradient_through_srgb_is_its_derivative_and_finite_from_black_to_wh
     np.testing.assert_allclose(gradient, slopes, rtol=8 * EPS)
 
 
+def test_the_gradient_of_decoding_is_its_derivative_and_finite_outside_of_black_and_white_too():
+    values = [-1.0, -0.055, -0.01, 0.0, 0.04, 0.05, 0.5, 1.0, 1.5]
+    picture = torch.tensor(values, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(decode(picture, "srgb").sum(), picture)
+    slopes = [1 / 12.92 if value <= 0.04045 else 2.4 / 1.055 * ((value + 0.055) / 1.055) ** 1.4 for value in values]
+    np.testing.assert_allclose(gradient, slopes, rtol=8 * EPS)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_gradients_by_radiance_coverage_and_background_are_central_differences(encoding):
+    """Below, within and above the range, each at some distance from its ends, where the clamp has a kink."""
+    draws = torch.Generator().manual_seed(0)
+    radiance = torch.rand(2, 3, 20, generator=draws, dtype=torch.float64) * 3 - 1
+    coverage = torch.rand(2, 1, 20, generator=draws, dtype=torch.float64)
+    background = torch.rand(3, 1, generator=draws, dtype=torch.float64)
+    composite = radiance + (1 - coverage) * decode(background, encoding)
+    assert (composite < 0).any() and (composite > 1).any()
+    assert min(composite.abs().min(), (composite - 1).abs().min(), (composite - 0.0031308).abs().min()) > 1e-4
+    inputs = [tensor.requires_grad_(True) for tensor in (radiance, coverage, background)]
+    assert torch.autograd.gradcheck(lambda *scene: develop(*scene, encoding), inputs)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_shorter_dtypes_stay_what_they_are(encoding, dtype):
+    values = torch.linspace(-0.2, 1.2, 50, dtype=torch.float64).to(dtype)
+    scene = (
+        values.view(1, 50).expand(3, 50),
+        torch.full((1, 50), 0.5, dtype=dtype),
+        torch.full((1, 1), 0.25, dtype=dtype),
+    )
+    picture = develop(*scene, encoding)
+    assert picture.dtype == dtype
+    full = develop(*(tensor.double() for tensor in scene), encoding)
+    # Decoding, compositing and encoding round a few times; the encoding's slope is up to 12.92.
+    slack = 4 * (12.92 if encoding == "srgb" else 1) * torch.finfo(dtype).eps
+    torch.testing.assert_close(picture.double(), full, rtol=0, atol=slack)
+
+
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_clamped_values_are_those_without_a_gradient(encoding):
     radiance = pixel(-0.3, 0.2, 1.4).requires_grad_(True)
@@ -112,3 +151,17 @@ def test_black_and_white_themselves_are_not_clamped():
 def test_an_unknown_encoding_is_refused(function):
     with pytest.raises(InputError, match=r"renderer\.encoding=gamma: choose one of linear, srgb"):
         function(pixel(0, 0, 0), "gamma")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (dict(samples=0), r"renderer\.samples=0"),
+        (dict(size=0), r"size 0 must be at least 1"),
+        (dict(size=-3, samples=-1), r"renderer\.samples=-1 and the size -3"),
+        (dict(encoding="gamma"), r"renderer\.encoding=gamma: choose one of linear, srgb"),
+    ],
+)
+def test_settings_that_make_no_picture_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        PictureSettings(**settings)

@@ -1,6 +1,6 @@
-"""Meshes: geometry by closed form, textures against scipy, and files of every format that the test writes."""
+"""Meshes: geometry by closed form, and files of every format that the test writes."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,16 +8,19 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
-from scipy.ndimage import map_coordinates
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from renderer.albedo import surface_albedo
+from renderer.camera import ring
 from renderer.errors import InputError
+from renderer.fragments import build_fragments
+from renderer.image import PictureSettings
 from renderer.mesh import Mesh, concatenate, load_mesh, normalise
+from renderer.visibility import choose
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 WHITE = (1.0, 1.0, 1.0)
-LEVEL = 1 / 255  # of an 8-bit colour
 FLOAT32 = dict(rtol=1e-6, atol=1e-6)
 
 TRIANGLE_OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -102,50 +105,80 @@ def test_zero_area_faces_have_a_zero_normal():
     assert_array_equal(mesh.face_areas(), np.zeros(3))
 
 
-def test_vertex_colors_are_interpolated():
-    mesh = Mesh.plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], color=np.eye(3))
-    barycentric = np.random.default_rng(0).dirichlet(np.ones(3), 10)
-    colors = mesh.colors(np.zeros(10, dtype=np.int64), barycentric)
-    assert colors.dtype == np.float32
-    assert_allclose(colors, barycentric, **FLOAT32)
-
-
-@pytest.mark.parametrize(("corner", "texel"), [(0, (1, 0)), (1, (1, 1)), (2, (0, 0))])
-def test_v_starts_at_the_bottom_of_the_texture(corner, texel):
-    """Corners at the centres of texels of a 2×2 texture: bottom left, bottom right, top left."""
-    texture = random_texture(2, 2)
-    mesh = textured(texture, [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75]])
-    color = mesh.colors(np.array([0]), np.eye(3)[[corner]])[0]
-    assert_allclose(color, texture[texel] / 255, **FLOAT32)
-
-
-def test_texture_lookup_is_scipys_linear_interpolation_and_repeats():
-    texture = random_texture(5, 7)
-    uvs = np.array([[-1.3, -0.7], [2.1, 0.2], [0.4, 1.9]])
-    barycentric = np.random.default_rng(1).dirichlet(np.ones(3), 500)
-    u, v = (barycentric @ uvs).T
-    texels = np.stack([(1 - v) * 5 - 0.5, u * 7 - 0.5])
-    expected = [map_coordinates(texture[..., c] / 255, texels, order=1, mode="grid-wrap") for c in range(3)]
-    colors = textured(texture, uvs).colors(np.zeros(500, dtype=np.int64), barycentric)
-    assert_allclose(colors, np.stack(expected, axis=1), atol=1e-5)  # float32 uvs, 7 texels to a unit
-
-
-def test_texture_multiplies_the_corner_color():
-    mesh = textured(np.full((3, 3, 3), 51, dtype=np.uint8), np.zeros((3, 2)), color=(1, 0.5, 0))
-    assert_allclose(mesh.colors(np.array([0]), np.full((1, 3), 1 / 3)), [[0.2, 0.1, 0]], **FLOAT32)
-
-
-def test_concatenated_meshes_keep_their_surfaces_and_colors():
+def test_concatenated_meshes_keep_their_surfaces():
     red, blue = (np.full((2, 2, 3), rgb, dtype=np.uint8) for rgb in ([255, 0, 0], [0, 0, 255]))
     parts = [
         textured(red, np.zeros((3, 2))),
         Mesh.plain(np.eye(3) + 5, [[0, 1, 2]], (0, 1, 0)),
-        textured(blue, np.zeros((3, 2))),
+        textured(blue, np.ones((3, 2))),
     ]
     whole = concatenate(parts)
     assert_array_equal(corner_positions(whole), np.concatenate([corner_positions(part) for part in parts]))
-    assert_allclose(whole.colors(np.arange(3), np.full((3, 3), 1 / 3)), [[1, 0, 0], [0, 1, 0], [0, 0, 1]], **FLOAT32)
-    assert whole.texture_ids.dtype == np.int32
+    for name in ("corner_colors", "corner_uvs"):
+        assert_array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
+    assert whole.texture_ids.tolist() == [0, -1, 1] and whole.texture_ids.dtype == np.int32
+    assert [texture[0, 0].tolist() for texture in whole.textures] == [[255, 0, 0], [0, 0, 255]]
+
+
+# Closed or open
+
+BOX = trimesh.creation.box()
+SMALLER = BOX.vertices / 4
+AT_A_CORNER = SMALLER + 5 / 8  # a box of a quarter's width, whose lowest corner is the large one's highest
+INSIDE_OUT = BOX.faces[:, ::-1]
+
+
+def beside(*parts) -> Mesh:
+    """Boxes with corners and faces of their own."""
+    return concatenate([Mesh.plain(vertices, faces) for vertices, faces in parts])
+
+
+def welded(mesh: Mesh) -> Mesh:
+    vertices, ids = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    return Mesh.plain(vertices, ids.reshape(-1)[mesh.faces])
+
+
+def with_face(*face: int) -> Mesh:
+    return Mesh.plain(BOX.vertices, np.concatenate([BOX.faces, [face]]))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "closed"),
+    [
+        (Mesh.plain(BOX.vertices, BOX.faces), True),
+        (Mesh.plain(BOX.vertices + 100, BOX.faces), True),
+        (Mesh.plain(BOX.vertices, BOX.faces[:, [1, 2, 0]]), True),
+        (Mesh.plain(BOX.vertices, INSIDE_OUT), False),
+        (Mesh.plain(-BOX.vertices, BOX.faces), False),
+        (Mesh.plain(BOX.vertices, BOX.faces[1:]), False),
+        (Mesh.plain(BOX.vertices, np.concatenate([BOX.faces[:1, ::-1], BOX.faces[1:]])), False),
+        (Mesh.plain(BOX.vertices, np.concatenate([BOX.faces, BOX.faces])), False),
+        (Mesh.plain(BOX.vertices, np.concatenate([BOX.faces, INSIDE_OUT])), False),
+        (with_face(0, 0, 1), False),
+        (Mesh.plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), False),
+        (Mesh.plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 1]]), False),
+        (beside((BOX.vertices, BOX.faces), (SMALLER + 3, BOX.faces)), True),
+        (beside((BOX.vertices, BOX.faces), (BOX.vertices + 0.5, BOX.faces)), True),
+        (beside((BOX.vertices, BOX.faces), (SMALLER + 3, INSIDE_OUT)), False),
+        (beside((BOX.vertices, BOX.faces), (SMALLER, INSIDE_OUT)), False),
+        (welded(beside((BOX.vertices, BOX.faces), (AT_A_CORNER, BOX.faces))), True),
+        (welded(beside((BOX.vertices, BOX.faces), (AT_A_CORNER, INSIDE_OUT))), False),
+    ],
+    ids=[
+        "box", "box far away", "corners in another order", "inside out", "mirrored", "a face missing",
+        "a face turned round", "every face twice", "every face from both sides", "a face without area", "a triangle",
+        "a sheet of two sides", "two boxes", "two that overlap", "one of two inside out", "a hollow",
+        "two that touch at a corner", "one of two that touch is inside out",
+    ],
+)  # fmt: skip
+def test_a_mesh_is_closed_if_no_face_of_it_is_ever_seen_from_behind(mesh, closed):
+    assert mesh.closed is closed
+
+
+def test_whether_a_changed_mesh_is_closed_is_told_anew():
+    mesh = Mesh.plain(BOX.vertices, BOX.faces)
+    assert mesh.closed
+    assert not replace(mesh, vertices=-mesh.vertices).closed
 
 
 # Normalising
@@ -425,7 +458,9 @@ def test_the_shared_oranges_are_closed_around_their_centre_and_orange(name, face
     outward = (corner_positions(mesh).mean(axis=1) * mesh.face_normals()).sum(axis=1)
     fruit = np.arange(faces)[-960:] if name == "orange_leaf" else np.arange(faces)
     assert np.average(outward[fruit] > 0, weights=mesh.face_areas()[fruit]) > 0.95
-    red, green, blue = mesh.colors(fruit, np.full((len(fruit), 3), 1 / 3)).mean(axis=0)
+    [fragments] = build_fragments(mesh.vertices, mesh.faces, ring(1, 2.0), PictureSettings(32, 1), choose("software"))
+    albedo = surface_albedo(mesh, fragments, "linear").numpy()
+    red, green, blue = albedo[np.isin(fragments.faces[fragments.face], fruit)].mean(axis=0)
     assert red > 1.4 * green > 1.4 * 2 * blue
 
 

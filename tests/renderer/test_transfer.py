@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +11,14 @@ from scipy.special import eval_legendre, sph_harm_y
 
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
-from renderer.harmonics import live_coefficients
+from renderer.harmonics import MAX_DEGREE, lambertian_factors, live_coefficients
+from renderer.image import PictureSettings
 from renderer.lights import ambient, directional
 from renderer.mesh import Mesh, concatenate
-from renderer.transfer import Operator, PictureSettings, build_operators
+from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
 
-EPS32 = torch.finfo(torch.float32).eps
+EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 BACKEND = choose("software")
 LAMBERTIAN = [math.pi, 2 * math.pi / 3, math.pi / 4, 0, -math.pi / 24, 0, math.pi / 64]
 ABOVE = OrthographicCamera(0, 0, 2.0)  # right is +y, up is -x
@@ -26,7 +28,7 @@ CUBE = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
 def radiance(operator: Operator, light: torch.Tensor) -> np.ndarray:
     """(3, P) float64."""
     live = light[live_coefficients(6)].double()
-    return torch.einsum("kc,kcp->cp", live, operator.transfer.double()).numpy()
+    return torch.einsum("kc,ckp->cp", live, (operator.transfer * operator.albedo[:, None]).double()).numpy()
 
 
 def picture(operator: Operator, light: torch.Tensor, size: int) -> np.ndarray:
@@ -42,9 +44,13 @@ def coverage_map(operator: Operator, size: int) -> np.ndarray:
     return canvas.reshape(size, size)
 
 
+def draw(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
 def random_light(seed: int) -> torch.Tensor:
     """All 49 coefficients, the dead ones too."""
-    return torch.randn(49, 3, generator=torch.Generator().manual_seed(seed))
+    return draw(49, 3, seed=seed).float()
 
 
 def square(half: float, turn: float = 0.0, color=(1.0, 1.0, 1.0)) -> Mesh:
@@ -77,34 +83,39 @@ def patchwork() -> Mesh:
 
 
 def scipy_irradiance(light: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Σ A_l U_lm Y_lm(n), RGB, with scipy's complex harmonics."""
+    """Σ A_l U_lm Y_lm(n), RGB, with scipy's complex harmonics; A_l is proven in test_harmonics."""
     polar, azimuth = math.atan2(math.hypot(normal[0], normal[1]), normal[2]), math.atan2(normal[1], normal[0])
     total = np.zeros(3)
-    for l in range(7):
+    degree = math.isqrt(len(light)) - 1
+    for l, factor in enumerate(lambertian_factors(degree).tolist()):
         for m in range(-l, l + 1):
             value = complex(sph_harm_y(l, abs(m), polar, azimuth))
             real = value.real if m == 0 else math.sqrt(2) * (-1) ** m * (value.real if m > 0 else value.imag)
-            total += LAMBERTIAN[l] * light[l * l + l + m] * real
+            total += factor * light[l * l + l + m] * real
     return total
 
 
-def texel(texture: np.ndarray, u: float, v: float) -> np.ndarray:
+def linear(color: np.ndarray, encoding: str) -> np.ndarray:
+    """A colour as authored to linear albedo (IEC 61966-2-1)."""
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4) if encoding == "srgb" else color
+
+
+def texel(texture: np.ndarray, u: float, v: float, encoding: str) -> np.ndarray:
     height, width = texture.shape[:2]
     x, y = u * width - 0.5, (1 - v) * height - 0.5
     total = np.zeros(3)
     for column in (math.floor(x), math.floor(x) + 1):
         for row in (math.floor(y), math.floor(y) + 1):
             share = (1 - abs(x - column)) * (1 - abs(y - row))
-            total += share * texture[row % height, column % width] / 255
+            total += share * linear(texture[row % height, column % width] / 255, encoding)
     return total
 
 
 def albedo_at(mesh: Mesh, face: int, weights: np.ndarray, encoding: str) -> np.ndarray:
-    color = weights @ mesh.corner_colors[face].astype(float)
+    color = weights @ linear(mesh.corner_colors[face].astype(float), encoding)
     if mesh.texture_ids[face] >= 0:
-        color *= texel(mesh.textures[mesh.texture_ids[face]], *(weights @ mesh.corner_uvs[face].astype(float)))
-    if encoding == "srgb":
-        return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+        uv = weights @ mesh.corner_uvs[face].astype(float)
+        color *= texel(mesh.textures[mesh.texture_ids[face]], *uv, encoding)
     return color
 
 
@@ -138,7 +149,7 @@ def test_operators_are_what_shading_every_sample_gives(encoding):
     for camera, operator in zip(cameras, build_operators(mesh, cameras, settings, BACKEND), strict=True):
         for light in (random_light(0), random_light(1)):
             image, coverage = shade_slowly(mesh, camera, light, settings)
-            # Colours and texel positions are interpolated in float32, and transfer is stored in it.
+            # The transfer is stored in float32, and 31 terms are summed.
             tolerance = 8 * EPS32 * np.abs(image).max()
             np.testing.assert_allclose(picture(operator, light, settings.size), image, rtol=0, atol=tolerance)
             np.testing.assert_allclose(coverage_map(operator, settings.size), coverage, rtol=EPS32)
@@ -146,7 +157,7 @@ def test_operators_are_what_shading_every_sample_gives(encoding):
 
 def test_pixels_are_in_order_and_coverage_is_positive_up_to_1():
     (operator,) = build_operators(sphere(2), ring(1, 1.5), PictureSettings(size=8, samples=3), BACKEND)
-    assert operator.transfer.shape == (31, 3, len(operator.pixels))
+    assert operator.transfer.shape == (1, 31, len(operator.pixels))
     assert (operator.transfer.dtype, operator.coverage.dtype) == (torch.float32, torch.float32)
     assert (operator.pixels.diff() > 0).all()
     assert operator.coverage.min() > 0 and operator.coverage.max() == 1
@@ -264,14 +275,178 @@ def test_gain_multiplies_the_radiance_and_leaves_the_coverage():
 
 
 def test_a_mesh_outside_the_picture_leaves_an_empty_operator():
-    mesh = replace(square(0.1), vertices=square(0.1).vertices + np.array([0.8, 0, 0]))
-    (operator,) = build_operators(mesh, [OrthographicCamera(0, 0, 0.5)], PictureSettings(size=4, samples=2), BACKEND)
-    assert operator.transfer.shape == (31, 3, 0)
+    operator = empty_operator()
+    assert operator.transfer.shape == (1, 31, 0)
     assert len(operator.coverage) == len(operator.pixels) == 0
 
 
-def test_settings_that_make_no_picture_are_refused():
-    with pytest.raises(InputError, match=r"renderer\.samples=0"):
-        PictureSettings(samples=0)
+def test_an_unknown_encoding_is_refused():
     with pytest.raises(InputError, match=r"renderer\.encoding=gamma"):
         build_operators(square(0.5), [ABOVE], PictureSettings(size=4, samples=1, encoding="gamma"), BACKEND)
+
+
+# ---------------------------------------------------------------------------- light to pixels and back
+
+LAYOUTS = {  # mesh, samples, channels of the transfer
+    "one colour": (sphere(1, (0.8, 0.4, 0.1)), 3, 1),
+    "one sample per pixel": (patchwork(), 1, 1),
+    "mixed albedos": (patchwork(), 3, 3),
+}
+
+
+def operator_of(layout: str, dtype=torch.float64) -> Operator:
+    mesh, samples, channels = LAYOUTS[layout]
+    [operator] = build_operators(mesh, ring(1, 2.2), PictureSettings(6, samples), BACKEND, dtype=dtype)
+    assert operator.transfer.shape == (channels, 31, len(operator.pixels)) and operator.transfer.dtype == dtype
+    return operator
+
+
+def empty_operator() -> Operator:
+    mesh = replace(square(0.1), vertices=square(0.1).vertices + np.array([0.8, 0, 0]))
+    [operator] = build_operators(mesh, [OrthographicCamera(0, 0, 0.5)], PictureSettings(size=4, samples=2), BACKEND)
+    return operator
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 6, 13, MAX_DEGREE])
+def test_operators_of_any_degree_are_scipys_harmonics(degree):
+    box = trimesh.convex.convex_hull(CUBE)
+    mesh = Mesh.plain(Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).apply(box.vertices), box.faces, (0.5, 1.0, 0.25))
+    settings, camera = PictureSettings(size=4, samples=1), OrthographicCamera(1.0, 0.4, 1.5)
+    [operator] = build_operators(mesh, [camera], settings, BACKEND, degree=degree, dtype=torch.float64)
+    light = draw((degree + 1) ** 2, 3)
+    image, coverage = shade_slowly(mesh, camera, light, settings)
+    found = np.zeros((16, 3))
+    found[operator.pixels] = operator.radiance(light).T
+    assert operator.degree == degree and coverage.sum() > 8
+    # The harmonics are scipy's to 1e-13 and reach 2.6 in band 20; the factors are π at most.
+    np.testing.assert_allclose(found.reshape(4, 4, 3), image, rtol=0, atol=1e-13 * math.pi * (degree + 1))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("batch", [(), (1,), (4,), (2, 3), (0,)])
+def test_the_radiance_is_the_light_times_the_transfer_times_the_albedo(layout, batch):
+    operator = operator_of(layout)
+    lights = draw(*batch, 49, 3)
+    expected = torch.einsum(
+        "...kc,ckp,cp->...cp",
+        lights[..., live_coefficients(6), :],
+        operator.transfer.expand(3, -1, -1),
+        operator.albedo,
+    )
+    torch.testing.assert_close(operator.radiance(lights), expected, rtol=0, atol=64 * EPS)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_light_gradient_is_autograds_and_that_of_central_differences(layout):
+    operator = operator_of(layout)
+    light = draw(49, 3).requires_grad_(True)
+    assert torch.autograd.gradcheck(operator.radiance, light)
+    upstream = draw(3, len(operator.pixels), seed=1)
+    (gradient,) = torch.autograd.grad(operator.radiance(light), light, upstream)
+    assert torch.equal(operator.light_gradient(upstream), gradient)
+    # The radiance is linear: a step of any length gives the derivative, to the rounding of 31 terms of some 1.
+    step = draw(49, 3, seed=2)
+    change = (operator.radiance(light + step) - operator.radiance(light - step)) / 2
+    assert (gradient * step).sum().item() == pytest.approx((change * upstream).sum().item(), abs=1e-11)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_lights_in_a_batch_are_alone_there(layout):
+    operator = operator_of(layout)
+    lights, upstream = draw(2, 3, 49, 3), draw(2, 3, 3, len(operator.pixels), seed=1)
+    together = operator.radiance(lights), operator.light_gradient(upstream)
+    for index in np.ndindex(2, 3):
+        alone = operator.radiance(lights[index]), operator.light_gradient(upstream[index])
+        for found, expected in zip(together, alone, strict=True):
+            torch.testing.assert_close(found[index], expected, rtol=0, atol=64 * EPS * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_18_dead_coefficients_have_a_gradient_of_exactly_zero(layout):
+    gradient = operator_of(layout).light_gradient(draw(5, 3, len(operator_of(layout).pixels)))
+    dead = torch.ones(49, dtype=torch.bool).index_fill(0, live_coefficients(6), False)
+    assert dead.sum() == 18
+    assert not gradient[:, dead].any() and gradient[:, ~dead].all()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_lights_of_other_dtypes_are_computed_in_the_operators_and_come_back_in_their_own(layout, dtype):
+    operator = operator_of(layout, torch.float32)
+    lights = draw(2, 49, 3).to(dtype).requires_grad_(True)
+    radiance = operator.radiance(lights)
+    upstream = draw(*radiance.shape, seed=1).to(dtype)
+    (gradient,) = torch.autograd.grad(radiance, lights, upstream)
+    assert radiance.dtype == gradient.dtype == dtype
+    assert torch.equal(radiance, operator.radiance(lights.float()).to(dtype))
+    assert torch.equal(gradient, operator.light_gradient(upstream.float()).to(dtype))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_float32_operators_are_float64s_to_rounding(layout):
+    short, full = operator_of(layout, torch.float32), operator_of(layout)
+    light, upstream = draw(49, 3), draw(3, len(full.pixels), seed=1)
+    size = torch.einsum(
+        "kc,ckp,cp->cp", light[live_coefficients(6)].abs(), full.transfer.abs().expand(3, -1, -1), full.albedo
+    )
+    # Transfer, albedo, light and products round once each; the 31 terms are added up, in any order.
+    error = (short.radiance(light.float()) - full.radiance(light)).abs()
+    assert (error <= (4 + 31) * EPS32 / 2 * size).all()
+    size = torch.einsum("cp,ckp,cp->kc", upstream.abs(), full.transfer.abs().expand(3, -1, -1), full.albedo)
+    error = (short.light_gradient(upstream.float()) - full.light_gradient(upstream)).abs()[live_coefficients(6)]
+    assert (error <= (4 + len(full.pixels)) * EPS32 / 2 * size).all()
+
+
+def test_both_layouts_give_the_same_radiance():
+    """A red and a green square far apart; a third that is white and blue within a pixel makes three channels needed."""
+    tilted = replace(square(0.2), vertices=Rotation.from_euler("x", 0.3).apply(square(0.2).vertices))
+
+    def at(x: float, y: float, color) -> Mesh:
+        return replace(Mesh.plain(tilted.vertices, tilted.faces, color), vertices=np.array([x, y, 0]) + tilted.vertices)
+
+    plain = concatenate([at(0.6, 0.6, (1, 0.2, 0.1)), at(-0.6, -0.6, (0.1, 1, 0.3))])
+    mixed = at(0.6, -0.6, (1, 1, 1))
+    mixed.corner_colors[0] = (0, 0, 1)
+    settings = PictureSettings(8, 4)
+    [one], [three] = (
+        build_operators(mesh, [ABOVE], settings, BACKEND, dtype=torch.float64)
+        for mesh in (plain, concatenate([plain, mixed]))
+    )
+    assert (len(one.transfer), len(three.transfer)) == (1, 3)
+    shared = torch.isin(three.pixels, one.pixels)
+    assert torch.equal(three.pixels[shared], one.pixels) and not shared.all()
+    light = draw(49, 3)
+    torch.testing.assert_close(three.radiance(light)[:, shared], one.radiance(light), rtol=0, atol=64 * EPS)
+    upstream = draw(3, len(three.pixels), seed=1) * shared
+    torch.testing.assert_close(
+        three.light_gradient(upstream), one.light_gradient(upstream[:, shared]), rtol=0, atol=64 * EPS
+    )
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3), (0,)])
+def test_an_empty_view_has_no_radiance_and_a_gradient_of_zero(batch):
+    operator = empty_operator()
+    lights = torch.ones(*batch, 49, 3, requires_grad=True)
+    radiance = operator.radiance(lights)
+    assert radiance.shape == (*batch, 3, 0)
+    (gradient,) = torch.autograd.grad(radiance.sum(), lights)
+    assert torch.equal(gradient, torch.zeros(*batch, 49, 3))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_no_lights_have_no_gradient(layout):
+    """As when an attack has no examples left."""
+    operator = operator_of(layout)
+    assert operator.light_gradient(torch.zeros(0, 3, len(operator.pixels))).shape == (0, 49, 3)
+
+
+@pytest.mark.parametrize("shape", [(36, 3), (64, 3), (49, 1), (49,), (3, 49), (2, 31, 3), (0, 3)])
+def test_lights_of_another_degree_are_refused(shape):
+    with pytest.raises(InputError, match=rf"lights of shape {re.escape(str(shape))} .* degree 6"):
+        operator_of("one colour").radiance(torch.zeros(shape))
+
+
+def test_all_of_an_operator_moves_to_another_device():
+    operator = operator_of("one colour")
+    for name, value in vars(operator.to("meta")).items():
+        assert value.is_meta if isinstance(value, torch.Tensor) else value == getattr(operator, name)

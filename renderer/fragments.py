@@ -1,0 +1,135 @@
+"""What a view sees of a mesh: the covered samples of a picture, each with its pixel and its face.
+
+Rasterised once and then held fixed, while light, albedo or the positions of the vertices are differentiated.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer.camera import OrthographicCamera
+from renderer.errors import require_finite
+from renderer.image import PictureSettings
+from renderer.visibility import Backend
+
+
+@dataclass(frozen=True)
+class Fragments:
+    """S covered samples of a picture of size² pixels and samples² samples each; they see G faces in P pixels.
+
+    pixels: (P,) int64, row-major indices of the covered pixels, ascending; row 0 is the top of the picture.
+    coverage: (P,) float64 in (0, 1], the share of a pixel's samples that the mesh covers.
+    faces: (G,) int64, the mesh's faces that any sample sees, ascending; the others are neither shaded nor moved.
+    corners: (G, 3) int64, their vertices. facing: (G, 1) float64, -1 where the camera sees a face from behind.
+    outlines: (G, 3, 2) float64, their corners as projected, x right and y up in [-1, 1].
+    pixel, face: (S,) int64, indices into `pixels` and `faces`; samples of a pixel lie together.
+    sample: (S,) int64, their place in the picture: pixel by pixel, and row by row within a pixel.
+    """
+
+    size: int
+    samples: int
+    pixels: Tensor
+    coverage: Tensor
+    faces: Tensor
+    corners: Tensor
+    facing: Tensor
+    outlines: Tensor
+    pixel: Tensor
+    face: Tensor
+    sample: Tensor
+
+    def barycentric(self) -> Tensor:
+        """(S, 3) float64 weights of the faces' corners at the samples, clipped into the face: corners were snapped."""
+        a, b, c = self.outlines.index_select(0, self.face).unbind(1)
+        area = _cross(b - a, c - a)
+        at = self.positions()
+        weights = (
+            torch.stack([_cross(b - at, c - at), _cross(c - at, a - at)], dim=1)
+            / torch.where(area == 0, 1, area)[:, None]
+        )
+        weights = torch.cat([weights, 1 - weights.sum(1, keepdim=True)], dim=1).clamp(0, 1)
+        return weights / weights.sum(1, keepdim=True)
+
+    def positions(self) -> Tensor:
+        """(S, 2) float64 places of the samples, in the same coordinates as `outlines`."""
+        pixel, within = self.sample // self.samples**2, self.sample % self.samples**2
+        column = pixel % self.size * self.samples + within % self.samples
+        row = pixel // self.size * self.samples + within // self.samples
+        resolution = self.size * self.samples
+        return torch.stack([2 * column + 1, 2 * (resolution - row) - 1], dim=1).double() / resolution - 1
+
+    def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(pixel (R,), face (R,), albedo (R, C)): neighbouring samples of one face in one pixel as one, since they
+        share a normal, with the sum of their albedos (S, C) over samples². Differentiable in them."""
+        if self.samples == 1 or not len(self.pixel):
+            return self.pixel, self.face, albedo
+        starts = torch.ones_like(self.pixel, dtype=torch.bool)
+        starts[1:] = (self.pixel[1:] != self.pixel[:-1]) | (self.face[1:] != self.face[:-1])
+        run = starts.cumsum(0) - 1
+        summed = albedo.new_zeros(int(run[-1]) + 1, albedo.shape[1]).index_add(0, run, albedo / self.samples**2)
+        return self.pixel[starts], self.face[starts], summed
+
+    def to(self, device: torch.device | str) -> "Fragments":
+        """The same on another device."""
+        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **moved)
+
+
+def build_fragments(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: Sequence[OrthographicCamera],
+    settings: PictureSettings,
+    backend: Backend,
+    closed: bool = False,
+) -> list[Fragments]:
+    """Rasterise a mesh of vertices (V, 3) and faces (F, 3), once per camera.
+
+    closed: the mesh is watertight and its faces are counter-clockwise from outside (`Mesh.closed`), so that the ones
+    seen from behind need not be drawn, unless the near plane cuts the mesh open. A mesh outside the picture has no
+    fragments; that is no error. InputError: NaN.
+    """
+    require_finite(vertices=torch.from_numpy(vertices))
+    points = np.stack([camera.project(vertices) for camera in cameras])
+    closed = closed and bool((points[..., 2] >= -1).all())
+    ids = backend.rasterise(points, faces, settings.size * settings.samples, closed=closed)
+    return [_fragments(view, faces, view_ids, settings) for view, view_ids in zip(points, ids, strict=True)]
+
+
+def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settings: PictureSettings) -> Fragments:
+    size, samples = settings.size, settings.samples
+    by_pixel = ids.reshape(size, samples, size, samples).swapaxes(1, 2).reshape(-1)
+    hits = np.flatnonzero(by_pixel >= 0)
+    seen, face = _compact(by_pixel[hits], len(faces))
+    pixels, pixel = _compact(hits // samples**2, size**2)
+    counts = np.bincount(pixel, minlength=len(pixels))
+    corners = faces[seen]
+    outlines = torch.from_numpy(projected[corners, :2])
+    a, b, c = outlines.unbind(1)
+    return Fragments(
+        size=size,
+        samples=samples,
+        pixels=torch.from_numpy(pixels),
+        coverage=torch.from_numpy(counts / samples**2),
+        faces=torch.from_numpy(seen),
+        corners=torch.from_numpy(corners),
+        facing=torch.where(_cross(b - a, c - a) < 0, -1.0, 1.0).double()[:, None],
+        outlines=outlines,
+        pixel=torch.from_numpy(pixel),
+        face=torch.from_numpy(face),
+        sample=torch.from_numpy(hits),
+    )
+
+
+def _compact(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(the distinct values below `count`, ascending, and where in them each value is): np.unique without a sort."""
+    present = np.zeros(count, dtype=bool)
+    present[values] = True
+    return np.flatnonzero(present), (np.cumsum(present) - 1)[values]
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

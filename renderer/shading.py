@@ -1,0 +1,129 @@
+"""Diffuse shading of a view's fragments, differentiable in the vertices, the light and the albedo.
+
+Visibility and texture coordinates are held fixed (the paper's Section 3 and appendices B.3 and D), so the derivative
+sees how normals turn and not how outlines move. For the light alone, `renderer.transfer` is faster.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from renderer.errors import require_finite
+from renderer.fragments import Fragments
+from renderer.harmonics import (
+    bands,
+    gradient_matrices,
+    lambertian_factors,
+    live_coefficients,
+    select_rows,
+    unit_vectors,
+)
+from renderer.normals import face_normals, vertex_normals
+
+BLOCK = 2**15  # normals at a time
+
+
+def radiance(
+    fragments: Fragments, vertices: Tensor, light: Tensor, albedo: Tensor, smooth_faces: Tensor | None = None
+) -> Tensor:
+    """Linear radiance (3, P) of the covered pixels, weighted with coverage, in the dtype of `vertices`.
+
+    vertices: (V, 3). light: ((degree + 1)², 3) coefficients, any degree. albedo: (S, 3) linear, at the samples
+    (`renderer.albedo`). smooth_faces: all faces (F, 3) of the mesh, to shade with interpolated vertex normals; without
+    them each face has its own normal. InputError: NaN in any of them.
+    """
+    require_finite(albedo=albedo)
+    albedo = albedo.to(vertices.dtype)
+    if smooth_faces is None:
+        pixel, face, weights = fragments.merge(albedo)
+        normals = face_normals(vertices, fragments.corners) * fragments.facing.to(vertices)
+        shade = irradiance(normals, light).index_select(1, face)
+    else:
+        pixel, weights = fragments.pixel, albedo / fragments.samples**2
+        shade = irradiance(_smooth_normals(fragments, vertices, smooth_faces), light)
+    return shade.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, shade * weights.T)
+
+
+def irradiance(normals: Tensor, light: Tensor) -> Tensor:
+    """(3, N) irradiance on surfaces with normals (N, 3), of any length, under light ((degree + 1)², 3).
+
+    Differentiable in both, in the dtype of `normals`; half precision is computed in float32. The coefficients of
+    bands that cannot reach a diffuse surface have a gradient of exactly zero. InputError: NaN.
+    Source: the paper's equation for R in appendix B.2; its derivative by n in appendix D, here a polynomial too.
+    """
+    require_finite(normals=normals, light=light)
+    return _Irradiance.apply(normals, light.to(normals.dtype))
+
+
+class _Irradiance(torch.autograd.Function):
+    """Goes by blocks of normals and computes their harmonics again in the backward pass: what it keeps is the normals'
+    size, not 31 times that."""
+
+    @staticmethod
+    def forward(ctx, normals: Tensor, light: Tensor) -> Tensor:
+        unit, length = unit_vectors(_widened(normals).T.contiguous())
+        degree = math.isqrt(len(light)) - 1
+        live, weights = _live(degree, light.to(unit))
+        ctx.save_for_backward(unit, length, weights)
+        ctx.degree, ctx.dtype, ctx.light = degree, normals.dtype, light.shape
+        blocks = [weights.T @ _rows(block, live) for block in unit.split(BLOCK, dim=1)]
+        return torch.cat(blocks, dim=1).to(normals.dtype)
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        unit, length, weights = ctx.saved_tensors
+        by_normal = by_light = None
+        blocks = list(zip(unit.split(BLOCK, dim=1), upstream.to(unit).split(BLOCK, dim=1), strict=True))
+        if ctx.needs_input_grad[0]:
+            below, slopes = _slopes(ctx.degree, weights)
+            solid = [_contract(slopes, _rows(block, below), above) for block, above in blocks]
+            tangential = torch.cat(solid, dim=1)
+            tangential = tangential - unit * (unit * tangential).sum(0)
+            by_normal = (tangential / torch.where(length > 0, length, torch.inf)).T.to(ctx.dtype)
+        if ctx.needs_input_grad[1]:
+            live, factors = _live(ctx.degree, unit.new_ones(ctx.light))
+            by_weight = sum(_rows(block, live) @ above.T for block, above in blocks)
+            by_light = unit.new_zeros(ctx.light).index_copy_(0, live, by_weight * factors).to(ctx.dtype)
+        return by_normal, by_light
+
+
+def _widened(tensor: Tensor) -> Tensor:
+    """In the dtype that it is computed in: its own, or float32 for half precision."""
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def _live(degree: int, light: Tensor) -> tuple[Tensor, Tensor]:
+    """(indices (K,) of the coefficients that reach a surface, those of the light times A_l (K, 3))."""
+    live = live_coefficients(degree).to(light.device)
+    factors = lambertian_factors(degree)[bands(degree)].to(light)
+    return live, (light * factors[:, None])[live]
+
+
+def _slopes(degree: int, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """(indices (J,) of the harmonics that the irradiance's gradient consists of, their coefficients (3 axes, 3, J))."""
+    ladder = gradient_matrices(degree)[:, :, live_coefficients(degree)].to(weights)
+    below = torch.nonzero(ladder.abs().sum((0, 2))).squeeze(1)
+    return below, torch.einsum("djk,kc->dcj", ladder[:, below], weights)
+
+
+def _rows(unit: Tensor, indices: Tensor) -> Tensor:
+    """Some harmonics (len(indices), N) of unit vectors (3, N)."""
+    rows = select_rows(unit, indices.tolist())
+    return torch.stack(rows) if rows else unit.new_zeros(0, unit.shape[1])
+
+
+def _contract(slopes: Tensor, values: Tensor, upstream: Tensor) -> Tensor:
+    """Σ over channels of upstream (3, N) × gradients: (3 axes, N)."""
+    gradients = (slopes.flatten(0, 1) @ values).unflatten(0, (3, 3))
+    return (gradients * upstream).sum(1)
+
+
+def _smooth_normals(fragments: Fragments, vertices: Tensor, faces: Tensor) -> Tensor:
+    """(S, 3) vertex normals interpolated to the samples, on the side that the camera sees; not of unit length."""
+    near = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
+    near[fragments.corners.flatten()] = True
+    around = faces[near[faces].any(1)]  # the other faces touch no vertex that a sample sees
+    normals = vertex_normals(vertices, around)[fragments.corners] * fragments.facing.to(vertices)[:, None]
+    barycentric = fragments.barycentric().to(vertices)
+    return torch.einsum("sc,scd->sd", barycentric, normals.index_select(0, fragments.face))

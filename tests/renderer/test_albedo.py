@@ -1,0 +1,204 @@
+"""Albedo at the samples: textures against scipy, and derivatives by texel and by face."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.ndimage import map_coordinates
+
+from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.camera import OrthographicCamera
+from renderer.fragments import Fragments, build_fragments
+from renderer.image import ENCODINGS, PictureSettings
+from renderer.mesh import Mesh, concatenate
+from renderer.visibility import choose
+
+EPS = torch.finfo(torch.float64).eps
+ABOVE = OrthographicCamera(0, -math.pi / 2, 2.0)  # x is right, y is up
+ALL_OF_IT = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+UNIT_UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+HALVES = [[0, 1, 2], [0, 2, 3]]
+
+
+def view(mesh: Mesh, size: int, samples: int = 1, camera: OrthographicCamera = ABOVE) -> Fragments:
+    settings = PictureSettings(size, samples)
+    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("software"))
+    return fragments
+
+
+def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def poster(texture: np.ndarray, uvs=UNIT_UVS, color=(1.0, 1.0, 1.0)) -> Mesh:
+    """The whole picture, one texture on it."""
+    uvs = np.asarray(uvs, dtype=np.float32)[HALVES]
+    ids = np.zeros(2, dtype=np.int32)
+    return replace(Mesh.plain(ALL_OF_IT, HALVES, color), corner_uvs=uvs, texture_ids=ids, textures=(texture,))
+
+
+def draw(*shape: int) -> torch.Tensor:
+    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+
+def patchwork(seed: int = 0) -> Mesh:
+    """A dented sphere: two textures and bare faces, colours at all corners, UVs that wrap round."""
+    draws = np.random.default_rng(seed)
+    sphere = trimesh.creation.icosphere(subdivisions=1)
+    mesh = Mesh.plain(sphere.vertices * draws.uniform(0.7, 1.0, (len(sphere.vertices), 1)), sphere.faces)
+    count = len(mesh.faces)
+    return replace(
+        mesh,
+        corner_colors=draws.uniform(0.1, 1, (count, 3, 3)).astype(np.float32),
+        corner_uvs=draws.uniform(-1, 2, (count, 3, 2)).astype(np.float32),
+        texture_ids=draws.integers(-1, 2, count).astype(np.int32),
+        textures=(random_texture(5, 7), random_texture(4, 3)),
+    )
+
+
+def linear_of(colors: np.ndarray, encoding: str) -> np.ndarray:
+    """IEC 61966-2-1."""
+    if encoding == "linear":
+        return np.asarray(colors)
+    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+
+
+# ---------------------------------------------------------------------------- as the mesh has it
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_texture_over_the_picture_at_its_own_resolution_is_the_picture(encoding):
+    """Every sample is a texel's centre: v starts at the bottom and texels are decoded."""
+    texture = random_texture(16, 16)
+    mesh = poster(texture)
+    albedo = surface_albedo(mesh, view(mesh, 16), encoding)
+    assert albedo.dtype == torch.float64
+    # uvs of 1/32 and a few roundings in the powers.
+    np.testing.assert_allclose(albedo, linear_of(texture / 255, encoding).reshape(-1, 3), rtol=0, atol=32 * EPS)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repeats(encoding):
+    texture = random_texture(5, 7)
+    uvs = np.array([[-1.25, -0.75], [2.125, 0.25], [2.5, 2.0], [-0.875, 1.0]])  # a parallelogram, in float32 exactly
+    mesh = poster(texture, uvs)
+    fragments = view(mesh, 23)
+    x, y = (fragments.positions().numpy().T + 1) / 2
+    u, v = (uvs[0] + np.outer(x, uvs[1] - uvs[0]) + np.outer(y, uvs[3] - uvs[0])).T
+    at = np.stack([(1 - v) * 5 - 0.5, u * 7 - 0.5])
+    texels = linear_of(texture / 255, encoding)
+    expected = [map_coordinates(texels[..., c], at, order=1, mode="grid-wrap") for c in range(3)]
+    np.testing.assert_allclose(surface_albedo(mesh, fragments, encoding), np.stack(expected, axis=1), atol=64 * EPS)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_corner_colours_are_decoded_and_then_interpolated(encoding):
+    """Over a triangle whose corners are the picture's and two beyond it: weights are the coordinates."""
+    colors = np.array([[0.0, 0.5, 1.0], [1.0, 0.25, 0.5], [0.125, 0.0, 0.75]])
+    mesh = Mesh.plain([[-1, -1, 0], [3, -1, 0], [-1, 3, 0]], [[0, 1, 2]], colors)
+    fragments = view(mesh, 8)
+    x, y = (fragments.positions().numpy().T + 1) / 4
+    expected = np.stack([1 - x - y, x, y], axis=1) @ linear_of(colors, encoding)
+    np.testing.assert_allclose(surface_albedo(mesh, fragments, encoding), expected, rtol=0, atol=16 * EPS)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_texture_multiplies_the_corner_colour(encoding):
+    mesh = poster(np.full((3, 3, 3), 51, dtype=np.uint8), color=(1, 0.5, 0))
+    expected = linear_of(np.array(0.2), encoding) * linear_of(np.array([1, 0.5, 0]), encoding)
+    albedo = surface_albedo(mesh, view(mesh, 3), encoding)
+    np.testing.assert_allclose(albedo, np.tile(expected, (9, 1)), rtol=16 * EPS)
+
+
+def test_concatenated_meshes_keep_their_colours():
+    """A red, a green and a blue third side by side; the red and the blue are textures."""
+    red, blue = (np.full((2, 2, 3), rgb, dtype=np.uint8) for rgb in ([255, 0, 0], [0, 0, 255]))
+    thirds = [poster(red), Mesh.plain(ALL_OF_IT, HALVES, (0, 1, 0)), poster(blue)]
+    mesh = concatenate(
+        [
+            replace(part, vertices=part.vertices / [3, 1, 1] + [x, 0, 0])
+            for part, x in zip(thirds, (-2 / 3, 0, 2 / 3), strict=True)
+        ]
+    )
+    albedo = surface_albedo(mesh, view(mesh, 3), "linear")
+    np.testing.assert_allclose(albedo, np.tile(np.eye(3), (3, 1)), rtol=0, atol=4 * EPS)
+
+
+# ---------------------------------------------------------------------------- as a parameter
+
+TEXTURED = [(patchwork(), OrthographicCamera(1.0, 0.4, 1.7)), (poster(random_texture(3, 4)), ABOVE)]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize(("mesh", "camera"), TEXTURED)
+def test_the_meshs_own_textures_as_parameters_give_its_surface(mesh, camera, encoding):
+    fragments = view(mesh, 6, 3, camera)
+    textures = [torch.from_numpy(linear_of(texture / 255, encoding)) for texture in mesh.textures]
+    albedo = textured_albedo(mesh, fragments, textures, encoding)
+    torch.testing.assert_close(albedo, surface_albedo(mesh, fragments, encoding), rtol=0, atol=16 * EPS)
+
+
+@pytest.mark.parametrize(("mesh", "camera"), TEXTURED)
+def test_albedo_per_texel_has_the_derivative_of_central_differences(mesh, camera):
+    fragments = view(mesh, 3, 2, camera)
+    inputs = [draw(*texture.shape).requires_grad_(True) for texture in mesh.textures]
+    assert torch.autograd.gradcheck(lambda *given: textured_albedo(mesh, fragments, given, "srgb"), inputs)
+
+
+def test_texels_that_no_sample_sees_have_a_gradient_of_exactly_zero_and_the_others_share_the_corner_colour():
+    """Bilinear weights add up to one. The left half of the texture is on the picture; samples lie between texels."""
+    mesh = poster(np.zeros((8, 8, 3), dtype=np.uint8), UNIT_UVS * [0.5, 1], color=(0.5, 0.25, 1.0))
+    texture = draw(8, 8, 3).requires_grad_(True)
+    fragments = view(mesh, 3)
+    (gradient,) = torch.autograd.grad(textured_albedo(mesh, fragments, [texture], "linear").sum(), texture)
+    assert not gradient[:, 4:].any() and gradient[:, :4].any()
+    expected = 9 * torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(gradient.sum((0, 1)), expected, rtol=32 * EPS, atol=0)
+
+
+def test_textures_in_float32_have_gradients_in_float32():
+    mesh, camera = TEXTURED[0]
+    fragments = view(mesh, 6, 2, camera)
+    full = [draw(*texture.shape) for texture in mesh.textures]
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        textures = [texture.float().to(dtype).requires_grad_(True) for texture in full]
+        albedo = textured_albedo(mesh, fragments, textures, "linear")
+        results.append((albedo, *torch.autograd.grad(albedo.sum(), textures)))
+    for short, exact in zip(*results, strict=True):
+        torch.testing.assert_close(short.double(), exact, rtol=16 * torch.finfo(torch.float32).eps, atol=0)
+    assert [gradient.dtype for gradient in results[0][1:]] == [torch.float32] * 2
+
+
+def test_albedo_per_face_is_that_of_the_face_that_a_sample_sees_and_its_gradient_counts_the_samples():
+    mesh, camera = TEXTURED[0]
+    fragments = view(mesh, 6, 2, camera)
+    albedo = draw(len(mesh.faces), 3).requires_grad_(True)
+    at_samples = face_albedo(albedo, fragments)
+    seen = fragments.faces[fragments.face]
+    assert torch.equal(at_samples, albedo[seen])
+    upstream = draw(*at_samples.shape)
+    (gradient,) = torch.autograd.grad(at_samples, albedo, upstream)
+    expected = np.zeros((len(mesh.faces), 3))
+    np.add.at(expected, seen.numpy(), upstream.numpy())
+    np.testing.assert_allclose(gradient, expected, rtol=64 * EPS)
+    unseen = np.setdiff1d(np.arange(len(mesh.faces)), seen)
+    assert len(unseen) and not gradient[unseen].any()
+
+
+@pytest.mark.parametrize("mesh", [patchwork(), Mesh.plain(ALL_OF_IT, HALVES)])
+def test_outside_of_the_picture_there_is_no_albedo_and_a_gradient_of_zero(mesh):
+    fragments = view(replace(mesh, vertices=mesh.vertices + 9), 4, 2)
+    textures = [draw(*texture.shape).requires_grad_(True) for texture in mesh.textures]
+    by_face = draw(len(mesh.faces), 3).requires_grad_(True)
+    assert surface_albedo(mesh, fragments, "srgb").shape == (0, 3)
+    for albedo, inputs in (
+        (textured_albedo(mesh, fragments, textures, "srgb"), textures),
+        (face_albedo(by_face, fragments), [by_face]),
+    ):
+        assert albedo.shape == (0, 3)
+        if inputs:
+            assert not any(gradient.any() for gradient in torch.autograd.grad(albedo.sum(), inputs))

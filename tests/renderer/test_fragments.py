@@ -1,0 +1,168 @@
+"""What a view sees of a mesh, against loops over the rasterised picture."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from renderer.camera import OrthographicCamera, ring
+from renderer.fragments import Fragments, build_fragments
+from renderer.image import PictureSettings
+from renderer.visibility import choose
+
+EPS = torch.finfo(torch.float64).eps
+BACKEND = choose("software")
+CAMERA = OrthographicCamera(1.0, 0.4, 2.2)
+CAMERAS = [CAMERA, OrthographicCamera(2.5, -2.0, 1.6)]
+
+
+def dented_sphere() -> tuple[np.ndarray, np.ndarray]:
+    sphere = trimesh.creation.icosphere(subdivisions=1)
+    dents = np.random.default_rng(0).uniform(0.7, 1, (len(sphere.vertices), 1))
+    return sphere.vertices * dents, np.array(sphere.faces)
+
+
+def open_shell() -> tuple[np.ndarray, np.ndarray]:
+    """Two thirds of the dented sphere: some faces are seen from behind."""
+    vertices, faces = dented_sphere()
+    return vertices, faces[: 2 * len(faces) // 3]
+
+
+def fragments_of(
+    mesh, settings: PictureSettings, camera: OrthographicCamera = CAMERA, closed: bool = False
+) -> Fragments:
+    [fragments] = build_fragments(*mesh, [camera], settings, BACKEND, closed)
+    return fragments
+
+
+def assert_same(found: Fragments, expected: Fragments) -> None:
+    for field in fields(Fragments):
+        ours, theirs = (getattr(fragments, field.name) for fragments in (found, expected))
+        assert torch.equal(ours, theirs) if isinstance(ours, torch.Tensor) else ours == theirs
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize(("size", "samples"), [(9, 3), (20, 1), (1, 16)])
+def test_the_samples_are_those_of_the_picture_pixel_by_pixel(size, samples, camera):
+    vertices, faces = open_shell()
+    fragments = fragments_of((vertices, faces), PictureSettings(size, samples), camera)
+    points, resolution = camera.project(vertices), size * samples
+    ids = BACKEND.rasterise(points[None], faces, resolution)[0]
+    seen = sorted(set(ids[ids >= 0]))
+    expected = []
+    for pixel in range(size**2):
+        for row in range(pixel // size * samples, (pixel // size + 1) * samples):
+            for column in range(pixel % size * samples, (pixel % size + 1) * samples):
+                if ids[row, column] >= 0:
+                    x, y = (2 * column + 1) / resolution - 1, 1 - (2 * row + 1) / resolution
+                    expected.append((pixel, ids[row, column], x, y))
+    pixel, face, x, y = (np.array(column) for column in zip(*expected, strict=True))
+
+    assert fragments.faces.tolist() == seen
+    assert fragments.pixels.tolist() == sorted(set(pixel))
+    np.testing.assert_array_equal(fragments.pixels[fragments.pixel], pixel)
+    np.testing.assert_array_equal(fragments.faces[fragments.face], face)
+    np.testing.assert_allclose(fragments.positions(), np.stack([x, y], axis=1), rtol=0, atol=2 * EPS)
+    np.testing.assert_array_equal(fragments.coverage, [np.sum(pixel == p) / samples**2 for p in sorted(set(pixel))])
+    np.testing.assert_array_equal(fragments.corners, faces[seen])
+    np.testing.assert_array_equal(fragments.outlines, points[faces[seen], :2])
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_face_seen_from_behind_is_one_whose_normal_points_away(camera):
+    vertices, faces = open_shell()
+    fragments = fragments_of((vertices, faces), PictureSettings(16, 2), camera)
+    a, b, c = vertices[faces[fragments.faces]].transpose(1, 0, 2)
+    towards = np.sign(np.cross(b - a, c - a) @ camera.axes()[2])
+    assert set(towards) == {-1, 1}
+    np.testing.assert_array_equal(fragments.facing[:, 0], towards)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.05])
+def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(shift):
+    """Corners are snapped when they are drawn, so that a sample may lie just outside; here, some lie well outside."""
+    fragments = fragments_of(open_shell(), PictureSettings(8, 4))
+    fragments = replace(fragments, outlines=fragments.outlines + shift)
+    outside = 0
+    for weight, face, at in zip(fragments.barycentric(), fragments.face, fragments.positions(), strict=True):
+        corners = np.vstack([fragments.outlines[face].T, np.ones(3)])
+        solved = np.linalg.solve(corners, [*at, 1])
+        outside += solved.min() < 0
+        clipped = solved.clip(0, 1) / solved.clip(0, 1).sum()
+        np.testing.assert_allclose(weight, clipped, rtol=0, atol=8 * EPS * np.linalg.cond(corners))
+    assert (outside > 20) == (shift > 0)
+
+
+@pytest.mark.parametrize(
+    "flatten", [lambda o: 0 * o, lambda o: o[:, :1].expand(-1, 3, -1), lambda o: o[..., :1] * 1e-9]
+)
+def test_an_outline_without_area_has_finite_barycentric_weights(flatten):
+    fragments = fragments_of(open_shell(), PictureSettings(4, 1))
+    weights = replace(fragments, outlines=flatten(fragments.outlines).expand(-1, -1, 2)).barycentric()
+    assert (weights >= 0).all()
+    torch.testing.assert_close(weights.sum(1), torch.ones(len(weights), dtype=torch.float64), rtol=0, atol=4 * EPS)
+
+
+@pytest.mark.parametrize(("size", "samples"), [(5, 4), (20, 1)])
+def test_merging_adds_up_the_albedo_of_a_face_in_a_pixel(size, samples):
+    fragments = fragments_of(open_shell(), PictureSettings(size, samples))
+    albedo = torch.rand(len(fragments.pixel), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    expected = {}
+    for pixel, face, value in zip(fragments.pixel.tolist(), fragments.face.tolist(), albedo, strict=True):
+        expected[pixel, face] = expected.get((pixel, face), 0) + value / samples**2
+    found = {}
+    for pixel, face, value in zip(*fragments.merge(albedo), strict=True):
+        key = int(pixel), int(face)  # a face may come up more than once in a pixel
+        found[key] = found.get(key, 0) + value
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        torch.testing.assert_close(found[key], value, rtol=32 * EPS, atol=0)
+    merged = fragments.merge(albedo.requires_grad_(True))[2]
+    assert len(merged) < len(albedo) or samples == 1
+    (gradient,) = torch.autograd.grad(merged.sum(), albedo)
+    assert torch.equal(gradient, torch.full_like(albedo, 1 / samples**2))
+
+
+def test_each_view_is_what_it_is_alone():
+    mesh, settings, cameras = open_shell(), PictureSettings(6, 2), ring(3, 2.0)
+    for camera, view in zip(cameras, build_fragments(*mesh, cameras, settings, BACKEND), strict=True):
+        assert_same(view, fragments_of(mesh, settings, camera))
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(camera):
+    settings = PictureSettings(16, 4)
+    whole, culled = (fragments_of(dented_sphere(), settings, camera, closed) for closed in (False, True))
+    assert torch.equal(culled.pixels, whole.pixels) and torch.equal(culled.coverage, whole.coverage)
+    assert (culled.facing == 1).all()
+    # Only along the outline may a face turned away be as near as its neighbour.
+    assert (culled.faces[culled.face] != whole.faces[whole.face]).double().mean() < 0.01
+
+
+def test_a_closed_mesh_that_the_near_plane_cuts_open_shows_its_inside():
+    vertices, faces = dented_sphere()
+    mesh, settings = (3 * vertices, faces), PictureSettings(8, 2)
+    camera = OrthographicCamera(1.0, 0.4, 8.0)
+    inside = fragments_of(mesh, settings, camera, closed=True)
+    assert (inside.facing == -1).any()
+    assert_same(inside, fragments_of(mesh, settings, camera))
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_mesh_outside_the_picture_has_no_fragments(closed):
+    vertices, faces = dented_sphere()
+    fragments = fragments_of((9 + vertices, faces), PictureSettings(4, 2), OrthographicCamera(0, 0, 2.0), closed)
+    shapes = {name: tuple(value.shape) for name, value in vars(fragments).items() if isinstance(value, torch.Tensor)}
+    assert {shape[0] for shape in shapes.values()} == {0}
+    assert fragments.barycentric().shape == (0, 3) and fragments.positions().shape == (0, 2)
+    pixel, face, albedo = fragments.merge(torch.zeros(0, 3))
+    assert (len(pixel), len(face), albedo.shape) == (0, 0, (0, 3))
+
+
+def test_all_of_it_moves_to_another_device():
+    fragments = fragments_of(dented_sphere(), PictureSettings(4, 2))
+    moved = fragments.to("meta")
+    for name, value in vars(moved).items():
+        assert value.is_meta if isinstance(value, torch.Tensor) else value == getattr(fragments, name)

@@ -1,0 +1,266 @@
+"""Normals against exact arithmetic, and their derivatives against the paper's formula written out."""
+
+from fractions import Fraction
+from itertools import combinations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch.autograd.functional import jacobian
+
+from renderer.mesh import Mesh
+from renderer.normals import face_normals, vertex_normals
+
+EPS = torch.finfo(torch.float64).eps
+ONE = torch.tensor([[0, 1, 2]])
+DTYPES = [torch.float32, torch.float16, torch.bfloat16]
+
+
+def draw(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def shape(name: str = "icosahedron") -> tuple[torch.Tensor, torch.Tensor]:
+    """Dented."""
+    made = {"icosahedron": trimesh.creation.icosahedron, "torus": lambda: trimesh.creation.torus(1, 0.3, 6, 5)}[name]()
+    dents = np.random.default_rng(0).normal(scale=0.1, size=made.vertices.shape)
+    return torch.from_numpy(made.vertices + dents), torch.from_numpy(made.faces)
+
+
+def paper_jacobian(corners: np.ndarray) -> np.ndarray:
+    """∂n_a/∂v_b of the three corners (3 a, 3 corners, 3 b): -h nᵀ/|h|², h from the opposite edge to the corner."""
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    normal /= np.linalg.norm(normal)
+    blocks = []
+    for corner, first, second in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        along = corners[second] - corners[first]
+        up = corners[corner] - corners[first]
+        height = up - along * (up @ along) / (along @ along)
+        blocks.append(-np.outer(height, normal) / (height @ height))
+    return np.stack(blocks, axis=1)
+
+
+def exact_cross(corners: torch.Tensor) -> list[Fraction]:
+    a, b, c = ([Fraction(value) for value in corner] for corner in corners.double().tolist())
+    (ux, uy, uz), (vx, vy, vz) = ([p - q for p, q in zip(other, a, strict=True)] for other in (b, c))
+    return [uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx]
+
+
+def exact_normal(corners: torch.Tensor) -> np.ndarray:
+    """Zero where there is no area at all."""
+    cross = exact_cross(corners)
+    largest = max(map(abs, cross)) or 1
+    direction = np.array([float(value / largest) for value in cross])
+    return direction / (np.linalg.norm(direction) or 1)
+
+
+def sliver(height: float, edge: float = 1.0, seed: int = 0) -> torch.Tensor:
+    """A triangle with coordinates of order one, turned and moved, whose apex is a third along its edge."""
+    corners = np.array([[0, 0, 0], [edge, 0, 0], [edge / 3, height * edge, 0]])
+    draws = np.random.default_rng(seed)
+    return torch.from_numpy(Rotation.random(rng=draws).apply(corners) + draws.uniform(-1, 1, 3))
+
+
+def conditioning(corners: torch.Tensor) -> float:
+    """|e₁||e₂| / |e₁ × e₂|: by how much the cross product's relative error exceeds that of the edges."""
+    a, b, c = corners.double()
+    area = np.linalg.norm([float(value) for value in exact_cross(corners)])
+    return float((b - a).norm() * (c - a).norm()) / area if area else np.inf
+
+
+# ---------------------------------------------------------------------------- of faces
+
+
+def test_face_normals_are_the_meshs_and_outward():
+    vertices, faces = shape("torus")
+    mesh = Mesh.plain(vertices.numpy(), faces.numpy())
+    np.testing.assert_allclose(face_normals(vertices, faces), mesh.face_normals(), rtol=0, atol=16 * EPS)
+    box = trimesh.creation.box()
+    outward = face_normals(torch.from_numpy(box.vertices.copy()), torch.from_numpy(box.faces.copy()))
+    np.testing.assert_array_equal(outward, np.round(box.triangles_center * 2.1))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_derivative_is_the_papers_with_its_sign_put_right(seed):
+    corners = draw(3, 3, seed=seed)
+    ours = jacobian(lambda vertices: face_normals(vertices, ONE)[0], corners)
+    # Some 30 roundings, of edges and heights that are several times shorter than the coordinates.
+    torch.testing.assert_close(ours.numpy(), paper_jacobian(corners.numpy()), rtol=0, atol=500 * EPS)
+
+
+@pytest.mark.parametrize("function", [face_normals, vertex_normals])
+@pytest.mark.parametrize("name", ["icosahedron", "torus"])
+def test_derivatives_on_a_mesh_are_central_differences(function, name):
+    vertices, faces = shape(name)
+    assert torch.autograd.gradcheck(lambda v: function(v, faces), vertices.requires_grad_(True))
+
+
+@settings(deadline=None, max_examples=50)
+@given(height=st.floats(-12, 0), edge=st.floats(-6, 0), seed=st.integers(0, 2**20))
+def test_slivers_are_as_exact_as_their_conditioning_allows(height, edge, seed):
+    """Against exact arithmetic, down to a height of 1e-12 of the edge.
+
+    Differences, quotients, products and sums round by EPS / 2 each, 4 of them of either edge and 2 after: less than
+    4 EPS of |e₁||e₂| in each component of the cross product.
+    """
+    corners = sliver(10**height, 10**edge, seed)
+    tolerance = 4 * np.sqrt(3) * EPS * conditioning(corners) + 4 * EPS
+    normal = face_normals(corners, ONE)[0].numpy()
+    assert np.linalg.norm(normal - exact_normal(corners)) <= tolerance
+    rounded = face_normals(corners.float(), ONE)[0].numpy()
+    tolerance = 4 * np.sqrt(3) * EPS * conditioning(corners.float()) + np.finfo(np.float32).eps
+    assert np.linalg.norm(rounded - exact_normal(corners.float())) <= tolerance
+
+
+@pytest.mark.parametrize("height", [1e-3, 1e-6, 1e-9, 1e-12])
+def test_a_slivers_derivative_is_one_over_its_height(height):
+    corners = sliver(height)
+    normal, area = exact_normal(corners), float(np.linalg.norm([float(value) for value in exact_cross(corners)]))
+    ours = jacobian(lambda vertices: face_normals(vertices, ONE)[0], corners).numpy()
+    opposite = [float((corners[b] - corners[a]).norm()) for a, b in ((1, 2), (2, 0), (0, 1))]
+    for corner, edge in enumerate(opposite):
+        largest = np.linalg.norm(ours[:, corner], 2)
+        # The error of the normal and of the area, as above.
+        assert largest == pytest.approx(edge / area, rel=16 * EPS * conditioning(corners))
+        across = ours[:, corner] @ normal
+        assert np.linalg.norm(across) == pytest.approx(largest, rel=16 * EPS * conditioning(corners))
+
+
+@pytest.mark.parametrize("function", [face_normals, vertex_normals])
+@pytest.mark.parametrize("exponent", [-60, -20, 20, 60])  # 1e-18 to 1e18
+def test_the_size_of_a_mesh_changes_nothing_but_the_derivatives_size(function, exponent):
+    """Exactly, since the factor is a power of two."""
+    vertices, faces = shape()
+    upstream = draw(*function(vertices, faces).shape)
+    results = []
+    for scaled in (vertices, vertices * 2.0**exponent):
+        scaled.requires_grad_(True)
+        normals = function(scaled, faces)
+        (gradient,) = torch.autograd.grad(normals, scaled, upstream)
+        results.append((normals.detach(), gradient))
+    (normals, gradient), (scaled_normals, scaled_gradient) = results
+    assert torch.equal(scaled_normals, normals)
+    assert torch.equal(scaled_gradient * 2.0**exponent, gradient)
+
+
+@pytest.mark.parametrize("function", [face_normals, vertex_normals])
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**20), count=st.integers(3, 8))
+def test_normals_turn_with_the_mesh_and_ignore_where_it_is_and_how_large(function, seed, count):
+    """Soups of triangles that share vertices. So the gradient adds up to no shift, no growth and the turn that
+    upstream is."""
+    draws = np.random.default_rng(seed)
+    vertices = torch.from_numpy(draws.normal(size=(count, 3))).requires_grad_(True)
+    faces = draws.permuted(draws.permutation(list(combinations(range(count), 3)))[:5], axis=1)
+    faces = torch.from_numpy(faces)
+    normals = function(vertices, faces)
+    upstream = torch.from_numpy(draws.normal(size=normals.shape))
+    (gradient,) = torch.autograd.grad(normals, vertices, upstream)
+    # The steepest derivative, times a few dozen roundings of coordinates of up to 4 and as many of upstream.
+    slack = 2000 * EPS * (1 + float(jacobian(lambda v: function(v, faces), vertices.detach()).abs().max()))
+    assert gradient.sum(0).abs().max() <= slack
+    assert (gradient * vertices).sum().abs() <= slack
+    torques = torch.linalg.cross(vertices, gradient).sum(0) - torch.linalg.cross(normals, upstream).sum(0)
+    assert torques.abs().max() <= slack
+    turn = torch.from_numpy(Rotation.random(rng=draws).as_matrix())
+    torch.testing.assert_close(function(vertices @ turn.T, faces), normals @ turn.T, rtol=0, atol=slack)
+
+
+def test_faces_without_area_have_no_normal_and_no_gradient():
+    """One point, two points, three on a line; beside a face that shares their vertices."""
+    vertices = torch.tensor([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [0, 1, 0]], dtype=torch.float64, requires_grad=True)
+    flat = torch.tensor([[0, 0, 0], [1, 1, 2], [0, 1, 2]])
+    normals = face_normals(vertices, flat)
+    assert torch.equal(normals, torch.zeros(3, 3, dtype=torch.float64))
+    (gradient,) = torch.autograd.grad(normals.sum(), vertices)
+    assert torch.equal(gradient, torch.zeros(4, 3, dtype=torch.float64))
+
+    sound = torch.tensor([[0, 1, 3]])
+    for function in (face_normals, vertex_normals):
+        rows = slice(-1, None) if function is face_normals else slice(None)
+        results = []
+        for faces in (sound, torch.cat([flat, sound])):
+            kept = function(vertices, faces)[rows]
+            results.append((kept, *torch.autograd.grad(kept.sum(), vertices)))
+        assert all(torch.equal(alone, among) for alone, among in zip(*results, strict=True))
+
+
+def test_no_derivative_is_nan_however_small_the_mesh():
+    """It is of the order of 1 / size, so that it may overflow."""
+    for size in (1e-300, 1e-310, 5e-324):
+        vertices = (draw(4, 3).sign() * size).requires_grad_(True)
+        for function in (face_normals, vertex_normals):
+            normals = function(vertices, torch.tensor([[0, 1, 2], [0, 2, 3], [1, 2, 3]]))
+            (gradient,) = torch.autograd.grad(normals, vertices, draw(*normals.shape))
+            assert normals.isfinite().all() and not gradient.isnan().any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("function", [face_normals, vertex_normals])
+def test_in_shorter_dtypes_normals_are_float64_rounded_once(function, dtype):
+    vertices, faces = shape()
+    results = []
+    for given_as in (vertices.to(dtype), vertices.to(dtype).double()):
+        given_as.requires_grad_(True)
+        normals = function(given_as, faces)
+        upstream = draw(*normals.shape).to(dtype)
+        results.append((normals.detach(), *torch.autograd.grad(normals, given_as, upstream.to(normals))))
+    (normals, gradient), (full_normals, full_gradient) = results
+    assert normals.dtype == gradient.dtype == dtype
+    assert torch.equal(normals, full_normals.to(dtype))
+    # Those of the five or six faces around a vertex may be added up in the shorter dtype.
+    slack = 8 * torch.finfo(dtype).eps * float(full_gradient.abs().max())
+    torch.testing.assert_close(gradient.double(), full_gradient, rtol=0, atol=slack)
+
+
+def test_there_may_be_no_faces():
+    vertices = draw(4, 3).requires_grad_(True)
+    none = torch.zeros(0, 3, dtype=torch.int64)
+    assert face_normals(vertices, none).shape == (0, 3)
+    assert torch.equal(vertex_normals(vertices, none), torch.zeros(4, 3, dtype=torch.float64))
+    for function in (face_normals, vertex_normals):
+        (gradient,) = torch.autograd.grad(function(vertices, none).sum(), vertices)
+        assert not gradient.any()
+
+
+@pytest.mark.parametrize("function", [face_normals, vertex_normals])
+def test_second_derivatives_are_refused_rather_than_wrong(function):
+    vertices, faces = shape()
+    (gradient,) = torch.autograd.grad(
+        function(vertices.requires_grad_(True), faces).pow(2)[:, 0].sum(), vertices, create_graph=True
+    )
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        torch.autograd.grad(gradient.pow(2).sum(), vertices)
+
+
+# ---------------------------------------------------------------------------- of vertices
+
+
+def test_vertex_normals_of_an_octahedron_are_its_vertices():
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    faces = torch.from_numpy(trimesh.convex.convex_hull(axes.numpy()).faces)
+    hull = torch.from_numpy(trimesh.convex.convex_hull(axes.numpy()).vertices)
+    torch.testing.assert_close(vertex_normals(hull, faces), hull, rtol=0, atol=4 * EPS)
+
+
+def test_vertex_normals_are_the_sum_of_the_faces_areas():
+    vertices, faces = shape("torus")
+    mesh = Mesh.plain(vertices.numpy(), faces.numpy())
+    summed = np.zeros(vertices.shape)
+    for face, normal, area in zip(faces.numpy(), mesh.face_normals(), mesh.face_areas(), strict=True):
+        summed[face] += area * normal
+    expected = summed / np.linalg.norm(summed, axis=1, keepdims=True)
+    np.testing.assert_allclose(vertex_normals(vertices, faces), expected, rtol=0, atol=64 * EPS)
+
+
+@pytest.mark.parametrize("back", [[0, 2, 1], [2, 1, 0], [1, 0, 2]])
+def test_vertices_of_no_face_and_those_whose_faces_cancel_have_neither_normal_nor_gradient(back):
+    """As on a leaf of two sides: what rounding leaves of the sum has no direction."""
+    vertices = draw(4, 3).requires_grad_(True)
+    normals = vertex_normals(vertices, torch.tensor([[0, 1, 2], back]))
+    (gradient,) = torch.autograd.grad(normals.sum(), vertices)
+    assert not normals.any() and not gradient.any()
