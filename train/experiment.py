@@ -1,6 +1,7 @@
 """One run from its configuration: data, scene, network, training, scores on the test set and on photographs."""
 
 import platform
+import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict
@@ -15,9 +16,12 @@ from augment.phases import Phases
 from augment.scene import ObjectSettings, Scene, build_objects
 from augment.seeding import stream_seed
 from augment.service import AugmentationService
+from renderer.cache import OperatorCache, TensorCache, cache_folder
 from renderer.errors import InputError
+from renderer.harmonics import live_coefficients
+from renderer.image import PictureSettings
 from renderer.lights import load_light
-from renderer.transfer import PictureSettings
+from renderer.transfer import COEFFICIENTS, DEGREE
 from renderer.visibility import choose
 from train import checkpoint
 from train.classes import class_index
@@ -44,12 +48,13 @@ PHOTOGRAPHS = "photographs"
 
 def load_data(config: DictConfig) -> DataSet:
     """The data set that `config.data` names; InputError also for a fault elsewhere in the configuration."""
-    data = read_settings(ExperimentSettings, config).data
+    settings = read_settings(ExperimentSettings, config)
+    data, cache = settings.data, TensorCache(cache_folder(settings.renderer.cache))
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
         "folder": lambda: load_folder(data.path, data.size, data.test_share),
-        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed),
+        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed, cache),
     }
     if data.name not in loaders:
         raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")
@@ -61,7 +66,8 @@ def write_pictures(config: DictConfig, size: int) -> None:
     """Write the rendered held-out pictures that `data=shapes` is scored on, where the configuration asks for them."""
     if config.data.name == "shapes" and config.data.pictures:
         console.info("writing held-out renders in hard light (not photographs) to %s", config.data.pictures)
-        write_held_out(Path(config.data.pictures), size, config.data.seed)
+        cache = TensorCache(cache_folder(config.renderer.cache))
+        write_held_out(Path(config.data.pictures), size, config.data.seed, cache)
 
 
 def run(config: DictConfig, data: DataSet, folder: Path) -> None:
@@ -144,11 +150,34 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
     backend = choose(renderer.visibility)
     console.info("visibility: %s", backend.description)
     pictures = PictureSettings(data.size, renderer.samples, renderer.encoding)
-    return Scene(
-        build_objects(objects, settings.views, scene.field_of_view, pictures, backend),
-        scene.backgrounds,
-        pictures,
-        device,
+    cache, start = OperatorCache(cache_folder(renderer.cache)), time.perf_counter()
+    built = build_objects(objects, settings.views, scene.field_of_view, pictures, backend, cache)
+    scene = Scene(built, scene.backgrounds, pictures, device)
+    _log_skipped(scene, cache, time.perf_counter() - start)
+    return scene
+
+
+def _log_skipped(scene: Scene, cache: OperatorCache, seconds: float) -> None:
+    """Say what the examples share and what was left out of them."""
+    tally = cache.tally
+    console.info(
+        "operators: %d views for %d examples, %d from the cache, %d built (%.2f s)%s",
+        tally.views,
+        len(scene),
+        tally.loaded,
+        tally.built,
+        seconds,
+        f"; not kept: {cache.problem}" if cache.problem else "",
+    )
+    console.info(
+        "skipped: rasterisation in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background), "
+        "%.0f %% of the faces (seen by no sample), back faces in %d of %d views (closed meshes)",
+        COEFFICIENTS - len(live_coefficients(DEGREE)),
+        COEFFICIENTS,
+        100 * (1 - len(scene.pixels) / scene.settings.size**2),
+        100 * tally.unseen_faces / tally.faces,
+        tally.closed,
+        tally.views,
     )
 
 

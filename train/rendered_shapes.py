@@ -14,44 +14,53 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+import augment
 from augment.scene import Scene, SceneObject
 from augment.seeding import generator
+from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
+from renderer.image import PictureSettings
 from renderer.lights import ambient, directional
 from renderer.mesh import normalise
 from renderer.shapes import SOLIDS, solid
-from renderer.transfer import PictureSettings, build_operators
+from renderer.transfer import build_operators
 from renderer.visibility import Backend, choose
 from train.batches import to_bytes
 from train.data import DataSet, Split
+from train.logs import console
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = PictureSettings(samples=4)
 VIEWS, BACKGROUNDS = 5, 4  # pictures per individual: every view on every background, each in a light of its own
 HELD_OUT_PER_CLASS = 60
 SOURCE = "rendered, hard light"
+CODE = RENDERER + source_key(Path(augment.__file__).parent, Path(__file__).parent)
 
 Lights = Callable[[Tensor, torch.Generator], Tensor]
 
 
-def load_shapes(train: int, test: int, size: int, seed: int) -> DataSet:
-    """That many training and test pictures of every class, in even light; whole individuals (20 pictures) each."""
+def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
+    """That many training and test pictures of every class, in even light; whole individuals (20 pictures) each.
+
+    The cache keeps the pictures, not the operators: every one of those is used for four pictures and never again.
+    """
     if train < 1 or test < 1:
         raise InputError(
             f"data.train_per_class={train} and data.test_per_class={test} must be at least 1 picture per class"
         )
     settings = replace(SETTINGS, size=size)
     splits = [
-        _render_split(per_class, seed, part, even_light, settings)
+        _render_split(per_class, seed, part, even_light, settings, cache or TensorCache())
         for per_class, part in [(train, "train"), (test, "test")]
     ]
     return DataSet(CLASSES, *splits)
 
 
-def write_held_out(folder: Path, size: int, seed: int) -> None:
+def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None = None) -> None:
     """Class folders of PNG pictures in hard light, with a photos.csv that calls them rendered."""
-    split = _render_split(HELD_OUT_PER_CLASS, seed, "held out", hard_light, replace(SETTINGS, size=size))
+    settings = replace(SETTINGS, size=size)
+    split = _render_split(HELD_OUT_PER_CLASS, seed, "held out", hard_light, settings, cache or TensorCache())
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "photos.csv", "w", newline="") as file:
         rows = csv.writer(file)
@@ -79,15 +88,30 @@ def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
     return ambient(0.06 * tint) + directional(direction, strength * tint)
 
 
-def _render_split(per_class: int, seed: int, part: str, light: Lights, settings: PictureSettings) -> Split:
-    draws, backend = generator(seed, part), choose("software")
+def _render_split(
+    per_class: int, seed: int, part: str, light: Lights, settings: PictureSettings, cache: TensorCache
+) -> Split:
+    key = content_key(CODE, CLASSES, per_class, seed, part, light.__name__, settings)
+    kept = cache.read(key)
+    if kept is None:
+        kept = {"images": _render(per_class, generator(seed, part), light, settings)}
+        cache.write(key, kept)
+        source = f"rendered; not kept: {cache.problem}" if cache.problem else "rendered"
+    else:
+        source = "from the cache"
+    console.info("%s pictures: %d %s", part, len(kept["images"]), source)
+    return Split(kept["images"], torch.arange(len(CLASSES)).repeat_interleave(per_class))
+
+
+def _render(per_class: int, draws: torch.Generator, light: Lights, settings: PictureSettings) -> Tensor:
+    """Pictures of every class, in order: uint8 (classes × per_class, 3, size, size)."""
+    backend = choose("software")
     individuals = math.ceil(per_class / (VIEWS * BACKGROUNDS))
-    images, labels = [], []
-    for label, name in enumerate(CLASSES):
+    images = []
+    for name in CLASSES:
         pictures = [_portraits(name, light, settings, backend, draws) for _ in range(individuals)]
         images.append(torch.cat(pictures)[:per_class])
-        labels += [label] * per_class
-    return Split(torch.cat(images), torch.tensor(labels))
+    return torch.cat(images)
 
 
 def _portraits(name: str, light: Lights, settings: PictureSettings, backend: Backend, draws: torch.Generator) -> Tensor:

@@ -49,11 +49,15 @@ class SceneSettings:
 
 @dataclass
 class RendererSettings:
-    """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb."""
+    """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb.
+
+    cache: the folder of what is rendered once, auto or None; see `renderer.cache.cache_folder`.
+    """
 
     visibility: str = "auto"
     samples: int = 8
     encoding: str = "linear"
+    cache: str | None = "auto"
 
 
 @dataclass

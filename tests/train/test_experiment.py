@@ -1,12 +1,16 @@
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
@@ -264,6 +268,57 @@ def test_training_and_validation_pictures_are_apart(tiny, tmp_path, monkeypatch)
     assert seen["validation"].labels.bincount().tolist() == [2, 2, 2]
     both = torch.cat([seen["train"].images, seen["validation"].images])
     assert torch.equal(both.unique(dim=0), data.train.images.unique(dim=0))
+
+
+# ---------------------------------------------------------------------------------------- what is skipped
+
+
+def log_of_a_scene(config, folder: Path, caplog) -> dict[str, str]:
+    """What follows the colon on the two lines about what is skipped."""
+    caplog.clear()
+    with caplog.at_level("INFO", "train"):
+        prepare(config, load_data(config), folder)
+    lines = [line.partition(": ") for line in caplog.messages]
+    return {name: rest for name, _, rest in lines if name in ("operators", "skipped")}
+
+
+def test_the_log_says_what_is_shared_and_what_is_skipped(tiny, tmp_path, caplog, rasterised):
+    """A wall that hides another, both open, and a closed box, seen from the front and above; 1 view, 2 backgrounds.
+
+    The wall covers 15 of the picture's 16 rows, and the box no other. Unseen are 2 of the walls' 4 faces and 8 of the
+    box's 12.
+    """
+    wall, box = np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]]), trimesh.creation.box((1, 2, 1))
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    walls = trimesh.Trimesh(np.concatenate([wall, wall / 2 - [0.5, 0, 0]]), np.concatenate([faces, faces + 4]))
+    for name, mesh in (("walls", walls), ("box", box)):
+        mesh.export(tmp_path / f"{name}.ply")
+    meshes = f"scene.meshes=[{tmp_path}/walls.ply, {{mesh: {tmp_path}/box.ply, label: pear}}]"
+    skipped = (
+        "rasterisation in every epoch, 18 of 49 light coefficients, 6 % of the pixels (background), "
+        "62 % of the faces (seen by no sample), back faces in 1 of 2 views (closed meshes)"
+    )
+    for cache, loaded, built in [(f"{tmp_path}/kept", 0, 2), (f"{tmp_path}/kept", 2, 0), ("null", 0, 2)]:
+        rasterised.clear()
+        log = log_of_a_scene(tiny(meshes, f"renderer.cache={cache}"), tmp_path / "run", caplog)
+        shutil.rmtree(tmp_path / "run")
+        operators = rf"2 views for 4 examples, {loaded} from the cache, {built} built \(\d\.\d\d s\)"
+        assert re.fullmatch(operators, log["operators"]) and log["skipped"] == skipped
+        assert rasterised == [1] * built
+
+
+def test_a_run_whose_operators_are_on_disk_rasterises_nothing_and_trains_the_same(tiny, tmp_path, rasterised):
+    config = tiny(f"renderer.cache={tmp_path}/kept", "train.epochs=1")
+    for name, calls in [("first", [1, 1]), ("second", [1, 1])]:
+        run(config, load_data(config), tmp_path / name)
+        assert rasterised == calls
+    assert_same_weights(tmp_path / "second" / checkpoint.LAST, tmp_path / "first" / checkpoint.LAST)
+
+
+def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny, tmp_path, caplog):
+    (tmp_path / "file").touch()
+    log = log_of_a_scene(tiny(f"renderer.cache={tmp_path}/file"), tmp_path / "run", caplog)
+    assert re.search(rf"0 from the cache, 2 built .*; not kept: .*{tmp_path}/file", log["operators"])
 
 
 # ---------------------------------------------------------------------------------------- wrong input

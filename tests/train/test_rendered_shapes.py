@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from renderer.cache import TensorCache
 from renderer.errors import InputError
 from renderer.harmonics import irradiance_basis, live_coefficients
 from train import rendered_shapes
@@ -65,6 +66,35 @@ def test_pictures_are_a_function_of_the_seed():
         assert not torch.equal(getattr(first, part).images, getattr(other, part).images)
 
 
+def test_pictures_that_are_on_disk_are_not_rendered_again(tmp_path, individuals):
+    cache = TensorCache(tmp_path / "kept")
+    for folder, made in (("first", 9), ("second", 9)):
+        data = load_shapes(1, 2, SIZE, 0, cache)
+        write_held_out(tmp_path / folder, SIZE, 0, cache)
+        assert len(individuals) == made
+    fresh = load_shapes(1, 2, SIZE, 0)
+    for part in ("train", "test"):
+        assert torch.equal(getattr(data, part).images, getattr(fresh, part).images)
+        assert torch.equal(getattr(data, part).labels, getattr(fresh, part).labels)
+    for path in (tmp_path / "first").rglob("*.png"):
+        assert path.read_bytes() == (tmp_path / "second" / path.relative_to(tmp_path / "first")).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "splits"),
+    [({"train": 2}, 1), ({"test": 3}, 1), ({"size": 9}, 2), ({"seed": 1}, 2), ({"code": "other"}, 2), ({}, 0)],
+)
+def test_pictures_of_other_settings_or_other_code_are_rendered(change, splits, tmp_path, individuals, monkeypatch):
+    def load(code=rendered_shapes.CODE, **settings):
+        monkeypatch.setattr(rendered_shapes, "CODE", code)
+        load_shapes(**{"train": 1, "test": 2, "size": SIZE, "seed": 0} | settings, cache=TensorCache(tmp_path))
+
+    load()
+    individuals.clear()
+    load(**change)
+    assert len(individuals) == 3 * splits
+
+
 def test_held_out_pictures_are_a_folder_of_photographs_that_says_they_are_rendered(tmp_path):
     write_held_out(tmp_path, SIZE, seed=0)
     found = find_photographs(tmp_path, FEW, "orange")
@@ -73,9 +103,8 @@ def test_held_out_pictures_are_a_folder_of_photographs_that_says_they_are_render
     with open(tmp_path / "photos.csv", newline="") as file:
         assert {row["path"] for row in csv.DictReader(file)} == {str(item.path) for item in found}
     _, images, _ = load_photographs(tmp_path, found, SIZE)
-    split = rendered_shapes._render_split(
-        3, 0, "held out", hard_light, rendered_shapes.PictureSettings(SIZE, samples=1)
-    )
+    settings = rendered_shapes.PictureSettings(SIZE, samples=1)
+    split = rendered_shapes._render_split(3, 0, "held out", hard_light, settings, TensorCache())
     assert torch.equal(images, split.images)
 
 

@@ -1,0 +1,182 @@
+"""What was rendered once, kept on disk from run to run: each file under a hash of all that went into it.
+
+A file is a checksum and then the tensors in the safetensors format. It is parsed only if the checksum holds, so damage
+of any kind means that it is made anew, as does any change to the renderer's code.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from renderer.camera import OrthographicCamera
+from renderer.fragments import Fragments, build_fragments
+from renderer.image import PictureSettings
+from renderer.mesh import Mesh
+from renderer.transfer import DEGREE, Operator, build_operator
+from renderer.visibility import Backend
+
+TENSORS = ("transfer", "albedo", "coverage", "pixels")  # of an operator
+
+
+def cache_folder(choice: str | None) -> Path | None:
+    """The folder that `renderer.cache` chooses: "auto" is the user's (XDG_CACHE_HOME or ~/.cache), None is none.
+
+    None as well where "auto" finds no home.
+    """
+    if choice != "auto":
+        return Path(os.path.expanduser(choice)) if choice else None
+    caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(caches, "parametric-norm-balls") if os.path.isabs(caches) else None
+
+
+def content_key(*parts: object) -> str:
+    """SHA-256, in hexadecimal, of arrays (type, shape and bytes), plain values, and sequences and data classes of such.
+
+    TypeError for anything else, since a key that misses a change would be worse than none.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, parts)
+    return digest.hexdigest()
+
+
+def _feed(digest, part: object) -> None:
+    if is_dataclass(part):
+        part = (type(part).__name__, *(getattr(part, field.name) for field in fields(part)))
+    if isinstance(part, np.ndarray):
+        digest.update(f"{part.dtype.str}{part.shape};".encode())
+        digest.update(np.ascontiguousarray(part))
+    elif isinstance(part, tuple | list):
+        digest.update(f"{len(part)} parts;".encode())
+        for item in part:
+            _feed(digest, item)
+    elif isinstance(part, str | bytes | int | float | torch.dtype):
+        digest.update(f"{part!r};".encode())
+    else:
+        raise TypeError(f"a {type(part).__name__} has no content key")
+
+
+def source_key(*packages: Path) -> str:
+    """Hash of the Python files in folders, and of the versions of what they compute with."""
+    files = [(path.relative_to(folder).as_posix(), path) for folder in packages for path in folder.rglob("*.py")]
+    return content_key(torch.__version__, np.__version__, *((name, path.read_bytes()) for name, path in sorted(files)))
+
+
+RENDERER = source_key(Path(__file__).parent)  # on import, so that it is the code that runs
+
+
+class TensorCache:
+    """Named tensors in files of a folder, under keys that tell their contents. Processes may share the folder.
+
+    folder: made when first written to; None keeps nothing. problem: why nothing can be kept, None as long as it can;
+    that stops no run, since everything can be made again.
+    """
+
+    def __init__(self, folder: Path | None = None):
+        self.folder = folder
+        self.problem: str | None = None
+
+    def read(self, key: str) -> dict[str, Tensor] | None:
+        """What was written under the key; None where there is none, or where not every bit of it is as it was."""
+        if self.folder is None:
+            return None
+        try:
+            content = (self.folder / key).read_bytes()
+        except OSError:
+            return None
+        checksum, tensors = content[:32], content[32:]
+        return safetensors.torch.load(tensors) if checksum == _checksum(key, tensors) else None
+
+    def write(self, key: str, tensors: Mapping[str, Tensor]) -> None:
+        """Keep CPU tensors. Another process sees the old file or the new one, and `read` passes over a torn one."""
+        if self.folder is None or self.problem:
+            return
+        content = safetensors.torch.save(dict(tensors))
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=self.folder) as temporary:
+                file = Path(temporary) / key
+                file.write_bytes(_checksum(key, content) + content)
+                os.replace(file, self.folder / key)
+        except OSError as error:
+            self.problem = str(error)
+
+
+def _checksum(key: str, content: bytes) -> bytes:
+    digest = hashlib.sha256(key.encode())
+    digest.update(content)
+    return digest.digest()
+
+
+@dataclass
+class Tally:
+    """How many views came from disk and how many were built, and what was left out of them when they were.
+
+    faces and unseen_faces, which no sample sees, add up over the views; closed counts the views of closed meshes, whose
+    back faces are not drawn.
+    """
+
+    loaded: int = 0
+    built: int = 0
+    faces: int = 0
+    unseen_faces: int = 0
+    closed: int = 0
+
+    @property
+    def views(self) -> int:
+        return self.loaded + self.built
+
+    def add(self, built: int, views: Collection[Mapping[str, Tensor]]) -> None:
+        self.built += built
+        self.loaded += len(views) - built
+        for faces, unseen, closed in (view["counts"].tolist() for view in views):
+            self.faces += faces
+            self.unseen_faces += unseen
+            self.closed += closed
+
+
+class OperatorCache(TensorCache):
+    """Transfer operators, one file per mesh and view, so that 5 views find those that a run with 10 has built."""
+
+    def __init__(self, folder: Path | None = None):
+        super().__init__(folder)
+        self.tally = Tally()
+
+    def operators(
+        self,
+        mesh: Mesh,
+        cameras: Sequence[OrthographicCamera],
+        settings: PictureSettings,
+        backend: Backend,
+        gain: float = 1.0,
+        degree: int = DEGREE,
+        dtype: torch.dtype = torch.float32,
+    ) -> list[Operator]:
+        """`transfer.build_operators`, to the bit, but only the views that are not on disk are built."""
+        scene = content_key(RENDERER, mesh, settings, backend.name, float(gain), degree, dtype)
+        keys = {camera: content_key(scene, camera) for camera in cameras}
+        views = {camera: view for camera, key in keys.items() if (view := self.read(key)) is not None}
+        missing = [camera for camera in keys if camera not in views]
+        if missing:
+            fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, backend, closed=mesh.closed)
+            for camera, seen in zip(missing, fragments, strict=True):
+                views[camera] = _pack(mesh, seen, build_operator(mesh, seen, settings, gain, degree, dtype))
+                self.write(keys[camera], views[camera])
+        self.tally.add(built=len(missing), views=views.values())
+        return [_unpack(views[camera], degree) for camera in cameras]
+
+
+def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
+    counts = torch.tensor([len(mesh.faces), len(mesh.faces) - len(seen.faces), mesh.closed])
+    return {name: getattr(operator, name) for name in TENSORS} | {"counts": counts}
+
+
+def _unpack(view: Mapping[str, Tensor], degree: int) -> Operator:
+    return Operator(**{name: view[name] for name in TENSORS}, degree=degree)

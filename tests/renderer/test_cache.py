@@ -1,0 +1,357 @@
+"""The cache on disk: found where nothing has changed, missed where anything has, never trusted where it is damaged."""
+
+import errno
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+from renderer import cache as cache_module
+from renderer import visibility
+from renderer.cache import OperatorCache, TensorCache, cache_folder, content_key, source_key
+from renderer.camera import OrthographicCamera, ring
+from renderer.image import PictureSettings
+from renderer.mesh import Mesh, normalise
+from renderer.shapes import solid
+from renderer.transfer import Operator, build_operators
+from renderer.visibility import Backend, choose
+
+BACKEND = choose("software")
+SETTINGS = PictureSettings(size=8, samples=2)
+CAMERA = OrthographicCamera(1.0, 0.5, 2.0)
+PLATE = normalise(solid("plate"))
+KEY = "a key"
+TENSORS = {
+    "ratios": torch.tensor([[0.1, -0.0], [float("inf"), 1e-45]]),
+    "indices": torch.tensor([3, -1]),
+    "nothing": torch.zeros(3, 0),
+}
+
+
+def textured(texels: np.ndarray) -> Mesh:
+    """A triangle that looks up, under a texture."""
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    uvs = np.array([[[0, 0], [1, 0], [0.5, 1]]], dtype=np.float32)
+    mesh = Mesh.plain(corners, [[0, 1, 2]])
+    return replace(mesh, corner_uvs=uvs, texture_ids=np.zeros(1, np.int32), textures=(texels,))
+
+
+TEXELS = np.random.default_rng(0).integers(0, 256, (4, 4, 3), dtype=np.uint8)
+TEXTURED = textured(TEXELS)
+MESHES = {
+    "open, one colour": Mesh.plain([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], [[0, 1, 2]], color=(0.2, 0.5, 0.7)),
+    "closed, many colours": PLATE,
+    "textured": TEXTURED,
+    "out of the picture": replace(TEXTURED, vertices=TEXTURED.vertices + np.array([0, 0, 9])),
+}
+
+
+def same(first: list[Operator], second: list[Operator]) -> bool:
+    return all(
+        a.degree == b.degree
+        and all(torch.equal(getattr(a, name), getattr(b, name)) for name in cache_module.TENSORS)
+        and all(getattr(a, name).dtype == getattr(b, name).dtype for name in cache_module.TENSORS)
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+# ---------------------------------------------------------------------------------------- what is shared
+
+
+@pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
+def test_a_second_run_builds_nothing_and_has_the_same_operators_to_the_bit(mesh, tmp_path, rasterised):
+    cameras = ring(3, 2.0)
+    expected = build_operators(mesh, cameras, SETTINGS, BACKEND, 1.5)
+    rasterised.clear()
+    for built, calls in [(3, [3]), (0, [3]), (0, [3])]:
+        cache = OperatorCache(tmp_path)
+        assert same(cache.operators(mesh, cameras, SETTINGS, BACKEND, 1.5), expected)
+        assert (cache.tally.built, cache.tally.loaded, rasterised) == (built, 3 - built, calls)
+
+
+@pytest.mark.parametrize("options", [{"degree": 2}, {"dtype": torch.float64}])
+def test_operators_of_another_degree_or_dtype_come_back_as_such(options, tmp_path):
+    expected = build_operators(PLATE, [CAMERA], SETTINGS, BACKEND, **options)
+    for _ in range(2):
+        assert same(OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, BACKEND, **options), expected)
+
+
+def test_rings_share_the_views_that_they_have_in_common(tmp_path, rasterised):
+    """Every other view of 10 is one of 5; the order is that of the cameras."""
+    ten, five = ring(10, 2.0), ring(5, 2.0)
+    OperatorCache(tmp_path).operators(PLATE, five, SETTINGS, BACKEND)
+    cache = OperatorCache(tmp_path)
+    everything = cache.operators(PLATE, ten, SETTINGS, BACKEND)
+    assert rasterised == [5, 5] and (cache.tally.loaded, cache.tally.built) == (5, 5)
+    assert same(everything, build_operators(PLATE, ten, SETTINGS, BACKEND))
+    cache = OperatorCache(tmp_path)
+    assert same(cache.operators(PLATE, five, SETTINGS, BACKEND), everything[::2]) and cache.tally.built == 0
+
+
+def test_a_view_asked_for_twice_is_built_once(rasterised):
+    first, second = OperatorCache().operators(PLATE, [CAMERA, CAMERA], SETTINGS, BACKEND)
+    assert rasterised == [1] and same([first], [second])
+
+
+@pytest.mark.parametrize("folder", [True, False])
+def test_without_a_folder_every_run_builds(folder, tmp_path, monkeypatch, rasterised):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        OperatorCache(tmp_path / "kept" if folder else None).operators(PLATE, [CAMERA], SETTINGS, BACKEND)
+    assert rasterised == ([1] if folder else [1, 1])
+    assert [path.name for path in tmp_path.iterdir()] == (["kept"] if folder else [])
+
+
+@pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
+def test_the_tally_counts_faces_and_closed_meshes_alike_whether_built_or_loaded(mesh, tmp_path):
+    cameras = ring(4, 2.0)
+    points = np.stack([camera.project(mesh.vertices) for camera in cameras])
+    views = BACKEND.rasterise(points, mesh.faces, SETTINGS.size * SETTINGS.samples)
+    unseen = sum(len(set(range(len(mesh.faces))) - set(view.flat)) for view in views)
+    for built in (4, 0):
+        cache = OperatorCache(tmp_path)
+        cache.operators(mesh, cameras, SETTINGS, BACKEND)
+        assert cache.tally == cache_module.Tally(4 - built, built, 4 * len(mesh.faces), unseen, 4 * (mesh is PLATE))
+    assert cache.tally.views == 4
+
+
+# ---------------------------------------------------------------------------------------- what is not
+
+
+def moved(array: np.ndarray, index: tuple, by: float) -> np.ndarray:
+    array = array.copy()
+    array[index] += by
+    return array
+
+
+CHANGES = {
+    "a texel": {"mesh": textured(moved(TEXELS, (3, 1, 2), 1))},
+    "a texture's shape": {"mesh": textured(TEXELS.reshape(2, 8, 3))},
+    "a vertex, by one rounding": {"mesh": replace(TEXTURED, vertices=moved(TEXTURED.vertices, (2, 1), 2.0**-52))},
+    "a face": {"mesh": replace(TEXTURED, faces=TEXTURED.faces[:, [1, 2, 0]])},
+    "a corner's colour": {"mesh": replace(TEXTURED, corner_colors=moved(TEXTURED.corner_colors, (0, 0, 0), -0.1))},
+    "a corner's texel": {"mesh": replace(TEXTURED, corner_uvs=moved(TEXTURED.corner_uvs, (0, 0, 0), 0.1))},
+    "no texture": {"mesh": replace(TEXTURED, texture_ids=np.full(1, -1, np.int32))},
+    "another texture beside": {"mesh": replace(TEXTURED, textures=(TEXELS, TEXELS))},
+    "the polar angle": {"camera": replace(CAMERA, polar=np.nextafter(CAMERA.polar, 2))},
+    "the azimuth": {"camera": replace(CAMERA, azimuth=np.nextafter(CAMERA.azimuth, 1))},
+    "the field of view": {"camera": replace(CAMERA, field_of_view=2.1)},
+    "the size": {"settings": replace(SETTINGS, size=9)},
+    "the samples": {"settings": replace(SETTINGS, samples=3)},
+    "the encoding": {"settings": replace(SETTINGS, encoding="srgb")},
+    "the gain": {"gain": 1.1},
+    "the degree": {"degree": 2},
+    "the dtype": {"dtype": torch.float64},
+    "the back end": {"backend": Backend("other", BACKEND.description)},
+    "the renderer's code": {"code": "other"},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, tmp_path, monkeypatch):
+    monkeypatch.setitem(visibility._RASTERISERS, "other", visibility._RASTERISERS["software"])
+
+    def built(mesh=TEXTURED, camera=CAMERA, settings=SETTINGS, backend=BACKEND, code=cache_module.RENDERER, **options):
+        monkeypatch.setattr(cache_module, "RENDERER", code)
+        cache = OperatorCache(tmp_path)
+        cache.operators(mesh, [camera], settings, backend, **options)
+        return cache.tally.built
+
+    assert built() == 1
+    assert built(**change) == 1
+    assert built() == built(**change) == 0
+
+
+def test_equal_contents_are_one_key_wherever_they_lie(tmp_path):
+    cache = OperatorCache(tmp_path)
+    cache.operators(TEXTURED, [CAMERA], SETTINGS, BACKEND)
+    strided = replace(textured(np.asfortranarray(TEXELS)), vertices=TEXTURED.vertices.repeat(2, axis=0)[::2])
+    described = replace(BACKEND, description="on another machine")
+    cache.operators(strided, [replace(CAMERA)], replace(SETTINGS), described, gain=1)
+    assert (cache.tally.built, cache.tally.loaded) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (("ab", "c"), ("a", "bc")),
+        ((("a",), "b"), ("a", ("b",))),
+        (((), "a"), ("a", ())),
+        ((1,), (1.0,)),
+        ((1,), ("1",)),
+        (("a;'b",), ("a", "b")),
+        ((np.zeros((2, 3)),), (np.zeros((3, 2)),)),
+        ((np.zeros(2, np.int32),), (np.zeros(1, np.int64),)),
+        ((np.zeros(1), np.zeros(2)), (np.zeros(2), np.zeros(1))),
+        ((np.zeros((0, 3)),), (np.zeros((0, 2)),)),
+    ],
+)
+def test_keys_keep_apart_what_looks_alike_when_strung_together(first, second):
+    assert content_key(*first) != content_key(*second)
+    assert content_key(*first) == content_key(*first)
+
+
+@pytest.mark.parametrize("part", [torch.zeros(2), {"a": 1}, {1}, object(), None])
+def test_what_has_no_key_is_refused_rather_than_passed_over(part):
+    with pytest.raises(TypeError, match="has no content key"):
+        content_key(part)
+
+
+def test_any_change_of_the_sources_is_another_key(tmp_path):
+    package = tmp_path / "package"
+    shutil.copytree(Path(cache_module.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    assert source_key(package) == cache_module.RENDERER
+    keys = {source_key(package)}
+    module = package / "visibility" / "software.py"
+    module.write_text(module.read_text() + "\n")
+    keys.add(source_key(package))
+    module.rename(package / "software.py")
+    keys.add(source_key(package))
+    (package / "new.py").touch()
+    keys.add(source_key(package))
+    assert len(keys) == 4
+
+
+# ---------------------------------------------------------------------------------------- damage
+
+
+def damaged(content: bytes) -> dict[str, bytes]:
+    other = safetensors.torch.save({name: torch.zeros(5) for name in TENSORS})
+    return {
+        "empty": b"",
+        "one byte longer": content + b"\0",
+        "text": b"not a file of tensors" * 20,
+        "other tensors under its checksum": content[:32] + other,
+        "other tensors without a checksum": other,
+        "zeros": bytes(len(content)),
+    }
+
+
+@pytest.fixture
+def kept(tmp_path) -> tuple[TensorCache, Path]:
+    cache = TensorCache(tmp_path)
+    cache.write(KEY, TENSORS)
+    return cache, tmp_path / KEY
+
+
+def test_tensors_come_back_with_their_types_and_shapes_to_the_bit(kept):
+    cache, _ = kept
+    found = cache.read(KEY)
+    assert found.keys() == TENSORS.keys()
+    for name, tensor in TENSORS.items():
+        assert found[name].dtype == tensor.dtype and found[name].shape == tensor.shape
+        assert found[name].numpy().tobytes() == tensor.numpy().tobytes()
+
+
+def test_no_flipped_bit_and_no_cut_is_taken_for_the_file(kept):
+    """Every bit of every byte, header and checksum as well, and every length."""
+    cache, path = kept
+    content = path.read_bytes()
+    for position in range(len(content)):
+        path.write_bytes(content[:position])
+        assert cache.read(KEY) is None, position
+        for bit in range(8) if position % 16 == 0 else [position % 8]:
+            flipped = content[position] ^ 1 << bit
+            path.write_bytes(content[:position] + bytes([flipped]) + content[position + 1 :])
+            assert cache.read(KEY) is None, (position, bit)
+    path.write_bytes(content)
+    assert cache.read(KEY) is not None
+
+
+def test_a_file_under_another_key_is_not_taken_for_the_file(kept):
+    cache, path = kept
+    shutil.copy(path, path.with_name("another key"))
+    assert cache.read("another key") is None
+
+
+@pytest.mark.parametrize("kind", damaged(bytes(64)))
+def test_a_damaged_file_is_built_anew_and_written_over(kind, tmp_path):
+    expected = OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, BACKEND)
+    (path,) = tmp_path.iterdir()
+    content = path.read_bytes()
+    path.write_bytes(damaged(content)[kind])
+    for built in (1, 0):
+        cache = OperatorCache(tmp_path)
+        assert same(cache.operators(PLATE, [CAMERA], SETTINGS, BACKEND), expected)
+        assert (cache.tally.built, cache.problem) == (built, None)
+    assert path.read_bytes() == content
+
+
+def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(kept, monkeypatch):
+    cache, path = kept
+    before = path.read_bytes()
+
+    def interrupted(self, content):
+        with open(self, "wb") as file:
+            file.write(content[:40])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_bytes", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        cache.write(KEY, {"ratios": torch.zeros(9)})
+    assert list(path.parent.iterdir()) == [path] and path.read_bytes() == before
+
+
+# ---------------------------------------------------------------------------------------- folders
+
+
+def full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_stops_no_run_and_is_tried_once(tmp_path, monkeypatch):
+    tries = []
+    monkeypatch.setattr(Path, "write_bytes", lambda *arguments: tries.append(1) or full())
+    cache = OperatorCache(tmp_path)
+    operators = cache.operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND)
+    assert same(operators, build_operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND))
+    assert "No space left on device" in cache.problem and len(tries) == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("place", ["", "below", "below/that"])
+def test_a_folder_that_cannot_be_made_stops_no_run(place, tmp_path):
+    (tmp_path / "file").touch()
+    cache = OperatorCache(tmp_path / "file" / place)
+    operators = cache.operators(PLATE, [CAMERA], SETTINGS, BACKEND)
+    assert same(operators, build_operators(PLATE, [CAMERA], SETTINGS, BACKEND))
+    assert str(tmp_path / "file") in cache.problem
+
+
+def test_runs_may_share_a_folder_at_once(tmp_path):
+    cameras = ring(3, 2.0)
+
+    def run(_) -> list[Operator]:
+        return OperatorCache(tmp_path).operators(PLATE, cameras, SETTINGS, BACKEND)
+
+    with ThreadPoolExecutor(4) as pool:
+        runs = list(pool.map(run, range(8)))
+    assert all(same(runs[0], other) for other in runs)
+    cache = OperatorCache(tmp_path)
+    cache.operators(PLATE, cameras, SETTINGS, BACKEND)
+    assert cache.tally.loaded == 3 == len(list(tmp_path.iterdir()))
+
+
+@pytest.mark.parametrize(
+    ("choice", "environment", "folder"),
+    [
+        ("auto", {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"}, "/caches/parametric-norm-balls"),
+        ("auto", {"XDG_CACHE_HOME": "", "HOME": "/home/user"}, "/home/user/.cache/parametric-norm-balls"),
+        ("auto", {"HOME": "/home/user"}, "/home/user/.cache/parametric-norm-balls"),
+        ("auto", {"XDG_CACHE_HOME": "relative", "HOME": "/home/user"}, None),
+        ("here", {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"}, "here"),
+        ("~/here", {"HOME": "/home/user"}, "/home/user/here"),
+        (None, {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"}, None),
+    ],
+)
+def test_the_folder_is_the_users_cache_folder_unless_chosen(choice, environment, folder, monkeypatch):
+    for name in ("XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert cache_folder(choice) == (folder and Path(folder))
