@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from renderer.errors import require_finite
+from renderer.errors import require_bounded
 from renderer.fragments import Fragments
 from renderer.image import decode
 from renderer.mesh import Mesh
@@ -26,20 +26,22 @@ def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor]
     Differentiable in them. InputError: NaN.
     """
     for texture in textures:
-        require_finite(texture=texture)
+        require_bounded(texture=texture)
     return _albedo(mesh, fragments, textures, lambda texels: texels, encoding)
 
 
 def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
     """(S, 3) linear albedo at the samples, of one per face of the mesh (F, 3); differentiable. InputError: NaN."""
-    require_finite(albedo=albedo)
+    require_bounded(albedo=albedo)
     return albedo.index_select(0, fragments.faces).index_select(0, fragments.face)
 
 
 def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], linear: Linear, encoding: str) -> Tensor:
     """Corner colour × texture at the samples. `linear` turns texels (N, 3), as they are stored, into linear albedo."""
     faces = fragments.faces.cpu().numpy()
-    colors = decode(torch.from_numpy(mesh.corner_colors[faces]).to(fragments.coverage), encoding)
+    colors = torch.from_numpy(mesh.corner_colors[faces]).to(fragments.coverage)
+    require_bounded(corner_colors=colors)
+    colors = decode(colors, encoding)
     if not textures and _one_color_each(colors):
         return colors[:, 0].index_select(0, fragments.face)
     barycentric = fragments.barycentric()

@@ -13,7 +13,7 @@ class OrthographicCamera:
     """A parallel projection from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
 
     field_of_view: width of the square picture in world units; a normalised mesh spans at most [-1, 1] per axis.
-    InputError where it is not positive.
+    InputError where it is not positive, or an angle is not finite.
     """
 
     polar: float
@@ -21,8 +21,10 @@ class OrthographicCamera:
     field_of_view: float
 
     def __post_init__(self):
-        if not self.field_of_view > 0:
-            raise InputError(f"scene.field_of_view={self.field_of_view} must be positive")
+        if not 0 < self.field_of_view < math.inf:
+            raise InputError(f"scene.field_of_view={self.field_of_view} must be positive and finite")
+        if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
+            raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
 
     def axes(self) -> np.ndarray:
         """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""

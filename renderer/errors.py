@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-LARGEST = 1e30  # beyond it, sums and products of float32 values overflow, and infinity minus infinity is NaN
+LARGEST = 1e12  # products of three such float32 values do not overflow; infinity minus infinity would be NaN
 
 
 class InputError(ValueError):
@@ -14,8 +14,18 @@ class InputError(ValueError):
 
 
 def require_finite(**tensors: Tensor) -> None:
-    """InputError naming the first tensor that holds NaN, infinity or magnitudes beyond 1e30."""
+    """InputError naming the first tensor that holds NaN or infinity."""
     for name, tensor in tensors.items():
-        largest = tensor.detach().abs().max() if tensor.numel() else 0.0  # NaN wins any maximum
-        if not largest <= min(LARGEST, torch.finfo(tensor.dtype).max):
+        if not _largest(tensor) <= torch.finfo(tensor.dtype).max:
+            raise InputError(f"{name} holds NaN or infinity: give finite values")
+
+
+def require_bounded(**tensors: Tensor) -> None:
+    """InputError naming the first tensor that holds NaN, infinity or magnitudes beyond 1e12."""
+    for name, tensor in tensors.items():
+        if not _largest(tensor) <= LARGEST:
             raise InputError(f"{name} holds NaN, infinity or magnitudes beyond {LARGEST:g}: give finite values")
+
+
+def _largest(tensor: Tensor) -> Tensor | float:
+    return tensor.detach().abs().max() if tensor.numel() else 0.0  # NaN wins any maximum

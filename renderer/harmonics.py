@@ -12,9 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import require_finite
+from renderer.errors import InputError, require_finite
 
 MAX_DEGREE = 20
+
+
+def _constant(function: Callable[[int], Tensor]) -> Callable[[int], Tensor]:
+    """Computed once per degree, and usable in training even if it was first asked for in inference mode."""
+    return cache(torch.inference_mode(False)(function))
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
@@ -40,12 +45,23 @@ def basis_gradient(directions: Tensor, degree: int) -> Tensor:
     """
     _check_degree(degree)
     require_finite(directions=directions)
+    tangential, length = _tangential_gradient(directions, degree)
+    return _over(tangential, length[..., None, None], directions.dtype)
+
+
+def _tangential_gradient(directions: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """(∂Y/∂n at |n| = 1 (..., (degree + 1)², 3), the lengths (...)), float64."""
     unit, length = unit_vectors(directions.double().movedim(-1, 0))
     values = torch.stack(select_rows(unit, range((degree + 1) ** 2)), dim=-1)
     solid = torch.einsum("...j,djk->...kd", values, gradient_matrices(degree).to(values))
     radial = (values * bands(degree).to(values))[..., None] * unit.movedim(0, -1)[..., None, :]
-    tangential = (solid - radial) / torch.where(length > 0, length, torch.inf)[..., None, None]
-    return tangential.to(directions.dtype)
+    return solid - radial, length
+
+
+def _over(gradient: Tensor, length: Tensor, dtype: torch.dtype) -> Tensor:
+    """A gradient divided by a length: zero at length zero, and the dtype's largest number where it would overflow."""
+    largest = torch.finfo(dtype).max
+    return (gradient / torch.where(length > 0, length, torch.inf)).clamp(-largest, largest).to(dtype)
 
 
 class _Basis(torch.autograd.Function):
@@ -59,8 +75,9 @@ class _Basis(torch.autograd.Function):
     @staticmethod
     def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
         (directions,) = ctx.saved_tensors
-        gradient = basis_gradient(directions.double(), ctx.degree)
-        return torch.einsum("...k,...kd->...d", upstream.double(), gradient).to(directions.dtype), None
+        tangential, length = _tangential_gradient(directions, ctx.degree)
+        summed = torch.einsum("...k,...kd->...d", upstream.double(), tangential)
+        return _over(summed, length[..., None], directions.dtype), None
 
 
 def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
@@ -96,7 +113,7 @@ def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:
         yield value
 
 
-@cache
+@_constant
 def gradient_matrices(degree: int) -> Tensor:
     """(3, (degree + 1)², (degree + 1)²) float64: ∂(r^l Y_k)/∂x_d = Σ_j r^(l-1) Y_j [d, j, k], for k in band l.
 
@@ -133,13 +150,13 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     return scaled / torch.where(norm > 0, norm, 1), norm * largest
 
 
-@cache
+@_constant
 def bands(degree: int) -> Tensor:
     """The band l of each coefficient, ((degree + 1)²,)."""
     return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
 
 
-@cache
+@_constant
 def lambertian_factors(degree: int) -> Tensor:
     """What a diffuse surface keeps of each band: irradiance = Σ A_l U_lm Y_lm(n). (degree + 1,) float64.
 
@@ -154,7 +171,7 @@ def lambertian_factors(degree: int) -> Tensor:
     return factors
 
 
-@cache
+@_constant
 def live_coefficients(degree: int) -> Tensor:
     """Indices of the coefficients that can reach a diffuse surface: 31 of the 49 at degree 6."""
     return torch.nonzero(lambertian_factors(degree)[bands(degree)]).squeeze(1)
@@ -203,9 +220,16 @@ def project(radiance: Callable[[Tensor], Tensor] | Tensor, degree: int, quadratu
     radiance: a function of directions (N, 3) float64 → (N, C), integrated by `quadrature`, exactly where it is a
     polynomial of degree `quadrature_degree - degree`; or an environment map (H, W, C) laid out by `equirectangular`.
     """
-    if callable(radiance):
-        directions, weights = quadrature(quadrature_degree)
-        return basis(directions, degree).T @ (weights[:, None] * radiance(directions).to(torch.float64))
+    if not callable(radiance):
+        return _project_map(torch.as_tensor(radiance), degree)
+    directions, weights = quadrature(quadrature_degree)
+    values = radiance(directions).to(torch.float64)
+    require_finite(radiance=values)
+    return basis(directions, degree).T @ (weights[:, None] * values)
+
+
+def _project_map(radiance: Tensor, degree: int) -> Tensor:
+    require_finite(radiance=radiance)
     grid = zip(*equirectangular(*radiance.shape[:2]), radiance, strict=True)  # by rows: maps may have 10⁸ texels
     return sum(basis(row, degree).T @ (weights[:, None] * texels.to(row)) for row, weights, texels in grid)
 
@@ -214,10 +238,12 @@ def rotate(coefficients: Tensor, rotation: Tensor) -> Tensor:
     """Coefficients of the light turned by a rotation: u'(ω) = u(Rᵀω).
 
     coefficients: ((degree + 1)², C). rotation: (3, 3) orthonormal. Exact: the integrand is a polynomial.
+    InputError: NaN.
     """
+    require_finite(coefficients=coefficients, rotation=rotation)
     degree = math.isqrt(len(coefficients)) - 1
     turned = project(
-        lambda directions: basis(directions @ rotation.to(torch.float64), degree) @ coefficients.to(torch.float64),
+        lambda directions: basis(directions @ rotation.to(directions), degree) @ coefficients.to(directions),
         degree,
         quadrature_degree=2 * degree,
     )
@@ -226,4 +252,4 @@ def rotate(coefficients: Tensor, rotation: Tensor) -> Tensor:
 
 def _check_degree(degree: int) -> None:
     if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"harmonics of degree {degree}: degrees 0 to {MAX_DEGREE} are supported")
+        raise InputError(f"harmonics of degree {degree}: give a degree of 0 to {MAX_DEGREE}")

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_bounded
 
 ENCODINGS = ("linear", "srgb")
 
@@ -28,15 +29,32 @@ def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: st
     """Picture values in [0, 1] as a classifier sees them.
 
     radiance: (..., 3, P) linear, already weighted with coverage. coverage: (..., 1, P) in [0, 1].
-    background: (..., 3 or 1, 1) picture values behind the surface. Returns (..., 3, P).
+    background: (..., 3 or 1, 1 or P) picture values behind the surface. Returns (..., 3, P). InputError: NaN.
     """
-    return encode(_composite(radiance, coverage, background, encoding).clamp(0, 1), encoding)
+    require_bounded(radiance=radiance, coverage=coverage, background=background)
+    return encode(_Clamp.apply(_composite(radiance, coverage, background, encoding)), encoding)
 
 
 def clamped(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
     """Which picture values `develop` clamps, where the gradient is therefore zero. Boolean (..., 3, P)."""
     composite = _composite(radiance, coverage, background, encoding)
     return (composite < 0) | (composite > 1)
+
+
+class _Clamp(torch.autograd.Function):
+    """To [0, 1]. At the bounds themselves the gradient passes, so that a light of zero on black can grow: where
+    `clamped` is False, and unlike `torch.clamp`, whose versions differ there."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor) -> Tensor:
+        ctx.save_for_backward((values >= 0) & (values <= 1))
+        return values.clamp(0, 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor) -> Tensor:
+        (passing,) = ctx.saved_tensors
+        return upstream * passing
 
 
 def _composite(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str) -> Tensor:
@@ -58,7 +76,8 @@ def decode(picture: Tensor, encoding: str) -> Tensor:
     check_encoding(encoding)
     if encoding == "linear":
         return picture
-    return torch.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
+    curve = ((picture.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(picture <= 0.04045, picture / 12.92, curve)
 
 
 def check_encoding(encoding: str) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from renderer.environment import SUFFIXES, read_map
-from renderer.errors import InputError
+from renderer.errors import InputError, require_bounded
 from renderer.harmonics import basis, live_coefficients, project, rotate
 from renderer.transfer import COEFFICIENTS, DEGREE
 
@@ -80,6 +80,7 @@ def project_environment(radiance: Tensor) -> Tensor:
 
 def ambient(color: Tensor) -> Tensor:
     """Coefficients (49, 3) of the same radiance (3,) from everywhere: irradiance π × color."""
+    require_bounded(color=color)
     coefficients = torch.zeros(COEFFICIENTS, 3, dtype=color.dtype)
     coefficients[0] = math.sqrt(4 * math.pi) * color
     return coefficients
@@ -88,6 +89,7 @@ def ambient(color: Tensor) -> Tensor:
 def directional(direction: Tensor, color: Tensor) -> Tensor:
     """Coefficients (49, 3) of parallel light from a unit direction (3,), of irradiance color (3,) where it meets a
     surface head on. Truncated at degree 6, the irradiance is off by up to 0.043 of it."""
+    require_bounded(color=color)
     return basis(direction, DEGREE)[:, None] * color
 
 
@@ -97,6 +99,7 @@ def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, g
     Uniform in ±amplitude on every coefficient (the paper's random arm: 0.5). With a radius, the live coefficients'
     perturbation is scaled to that L2 norm and the dead ones, which reach no pixel, stay.
     """
+    require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
         live = torch.zeros(COEFFICIENTS, 1).index_fill_(0, live_coefficients(DEGREE), 1.0)

@@ -68,16 +68,20 @@ class Mesh:
 
     @cached_property
     def closed(self) -> bool:
-        """Whether every part is watertight with its faces counter-clockwise from outside, so that none is ever seen
-        from behind: each edge is run through once in either direction, and each connected part's volume is positive."""
+        """Whether no face is ever seen from behind: every part is watertight, and its faces counter-clockwise outside.
+
+        That is, each edge is run through once in either direction, and the volume within the faces that edges connect
+        is positive.
+        """
         edges = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        forth = np.sort(edges @ np.array([len(self.vertices), 1]))
-        back = np.sort(edges @ np.array([1, len(self.vertices)]))
-        if (forth[1:] == forth[:-1]).any() or not np.array_equal(forth, back):
+        forth, back = edges @ [len(self.vertices), 1], edges @ [1, len(self.vertices)]
+        by_forth, by_back = np.argsort(forth), np.argsort(back)
+        if (np.diff(forth[by_forth]) == 0).any() or not np.array_equal(forth[by_forth], back[by_back]):
             return False
-        part = trimesh.graph.connected_component_labels(edges, node_count=len(self.vertices))[self.faces[:, 0]]
+        neighbours = np.stack([by_forth, by_back], axis=1) // 3
+        part = trimesh.graph.connected_component_labels(neighbours, node_count=len(self.faces))
         a, b, c = (self.vertices[self.faces[:, corner]] - self.vertices.mean(axis=0) for corner in range(3))
-        return bool((np.bincount(part, np.einsum("fi,fi->f", a, np.cross(b, c)))[np.unique(part)] > 0).all())
+        return bool((np.bincount(part, np.einsum("fi,fi->f", a, np.cross(b, c))) > 0).all())
 
     def _doubled_area_vectors(self) -> np.ndarray:
         a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))

@@ -8,8 +8,9 @@ import math
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from renderer.errors import require_finite
+from renderer.errors import InputError, require_bounded, require_finite
 from renderer.fragments import Fragments
 from renderer.harmonics import (
     bands,
@@ -33,27 +34,35 @@ def radiance(
     (`renderer.albedo`). smooth_faces: all faces (F, 3) of the mesh, to shade with interpolated vertex normals; without
     them each face has its own normal. InputError: NaN in any of them.
     """
-    require_finite(albedo=albedo)
-    albedo = albedo.to(vertices.dtype)
+    require_finite(vertices=vertices)
+    require_bounded(light=light, albedo=albedo)
+    wide = _computed_in(vertices.dtype)
+    positions, albedo = vertices.to(wide), albedo.to(wide)
     if smooth_faces is None:
         pixel, face, weights = fragments.merge(albedo)
-        normals = face_normals(vertices, fragments.corners) * fragments.facing.to(vertices)
+        normals = face_normals(positions, fragments.corners) * fragments.facing.to(positions)
         shade = irradiance(normals, light).index_select(1, face)
     else:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
-        shade = irradiance(_smooth_normals(fragments, vertices, smooth_faces), light)
-    return shade.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, shade * weights.T)
+        shade = irradiance(_smooth_normals(fragments, positions, smooth_faces), light)
+    seen = shade.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, shade * weights.T)
+    return seen.to(vertices.dtype)
 
 
 def irradiance(normals: Tensor, light: Tensor) -> Tensor:
     """(3, N) irradiance on surfaces with normals (N, 3), of any length, under light ((degree + 1)², 3).
 
     Differentiable in both, in the dtype of `normals`; half precision is computed in float32. The coefficients of
-    bands that cannot reach a diffuse surface have a gradient of exactly zero. InputError: NaN.
+    bands that cannot reach a diffuse surface have a gradient of exactly zero.
+    InputError: NaN, or a light that is not of whole bands and three channels.
     Source: the paper's equation for R in appendix B.2; its derivative by n in appendix D, here a polynomial too.
     """
-    require_finite(normals=normals, light=light)
-    return _Irradiance.apply(normals, light.to(normals.dtype))
+    require_finite(normals=normals)
+    require_bounded(light=light)
+    if light.ndim != 2 or light.shape[1] != 3 or math.isqrt(len(light)) ** 2 != len(light) or not len(light):
+        raise InputError(f"light has shape {tuple(light.shape)}: give ((degree + 1)², 3) coefficients")
+    wide = _computed_in(normals.dtype)
+    return _Irradiance.apply(normals.to(wide), light.to(wide)).to(normals.dtype)
 
 
 class _Irradiance(torch.autograd.Function):
@@ -62,35 +71,36 @@ class _Irradiance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, normals: Tensor, light: Tensor) -> Tensor:
-        unit, length = unit_vectors(_widened(normals).T.contiguous())
+        unit, length = unit_vectors(normals.T.contiguous())
         degree = math.isqrt(len(light)) - 1
-        live, weights = _live(degree, light.to(unit))
+        live, weights = _live(degree, light)
         ctx.save_for_backward(unit, length, weights)
-        ctx.degree, ctx.dtype, ctx.light = degree, normals.dtype, light.shape
+        ctx.degree, ctx.light = degree, light.shape
         blocks = [weights.T @ _rows(block, live) for block in unit.split(BLOCK, dim=1)]
-        return torch.cat(blocks, dim=1).to(normals.dtype)
+        return torch.cat(blocks, dim=1)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
         unit, length, weights = ctx.saved_tensors
         by_normal = by_light = None
-        blocks = list(zip(unit.split(BLOCK, dim=1), upstream.to(unit).split(BLOCK, dim=1), strict=True))
+        blocks = list(zip(unit.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True))
         if ctx.needs_input_grad[0]:
             below, slopes = _slopes(ctx.degree, weights)
             solid = [_contract(slopes, _rows(block, below), above) for block, above in blocks]
             tangential = torch.cat(solid, dim=1)
             tangential = tangential - unit * (unit * tangential).sum(0)
-            by_normal = (tangential / torch.where(length > 0, length, torch.inf)).T.to(ctx.dtype)
+            by_normal = (tangential / torch.where(length > 0, length, torch.inf)).T
         if ctx.needs_input_grad[1]:
             live, factors = _live(ctx.degree, unit.new_ones(ctx.light))
             by_weight = sum(_rows(block, live) @ above.T for block, above in blocks)
-            by_light = unit.new_zeros(ctx.light).index_copy_(0, live, by_weight * factors).to(ctx.dtype)
+            by_light = unit.new_zeros(ctx.light).index_copy_(0, live, by_weight * factors)
         return by_normal, by_light
 
 
-def _widened(tensor: Tensor) -> Tensor:
-    """In the dtype that it is computed in: its own, or float32 for half precision."""
-    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+def _computed_in(dtype: torch.dtype) -> torch.dtype:
+    """The dtype itself, or float32 for half precision."""
+    return torch.promote_types(dtype, torch.float32)
 
 
 def _live(degree: int, light: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
-from renderer.errors import InputError, require_finite
+from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import irradiance_basis, live_coefficients
 from renderer.image import PictureSettings
@@ -22,6 +23,7 @@ from renderer.visibility import Backend
 
 DEGREE = 6
 COEFFICIENTS = (DEGREE + 1) ** 2
+BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Operator:
 
         Computed in the operator's dtype, returned in the lights'. InputError: NaN, or lights of another degree.
         """
-        require_finite(lights=lights)
+        require_bounded(lights=lights)
         if lights.shape[-2:] != ((self.degree + 1) ** 2, 3):
             raise InputError(f"lights of shape {tuple(lights.shape)} are not of the operator's degree {self.degree}")
         return _Radiance.apply(lights, self)
@@ -55,8 +57,9 @@ class Operator:
     def light_gradient(self, radiance_gradient: Tensor) -> Tensor:
         """∂C/∂U (..., (degree + 1)², 3) = T ∂C/∂radiance (..., 3, P), without a graph.
 
-        Exactly zero for the coefficients of bands that cannot reach a diffuse surface.
+        Exactly zero for the coefficients of bands that cannot reach a diffuse surface. InputError: NaN.
         """
+        require_bounded(radiance_gradient=radiance_gradient)
         upstream = radiance_gradient.to(self.transfer.dtype).reshape(
             radiance_gradient.shape[:-2].numel(), 3, len(self.pixels)
         )
@@ -80,6 +83,7 @@ class _Radiance(torch.autograd.Function):
         return product.reshape(*lights.shape[:-2], *product.shape[-2:]).to(lights.dtype)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
         return ctx.operator.light_gradient(upstream), None
 
@@ -123,6 +127,7 @@ def build_operator(
     mesh: Mesh, fragments: Fragments, settings: PictureSettings, gain: float, degree: int, dtype: torch.dtype
 ) -> Operator:
     """The operator of one view that has been rasterised; see `build_operators`."""
+    require_bounded(gain=torch.tensor(gain))
     albedo = surface_albedo(mesh, fragments, settings.encoding) * gain
     normals = face_normals(torch.from_numpy(mesh.vertices), fragments.corners) * fragments.facing
     shading = irradiance_basis(normals, degree)
@@ -132,7 +137,7 @@ def build_operator(
     else:
         albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
     return Operator(
-        transfer=_box_filter(fragments, shading, albedo).to(dtype),
+        transfer=_box_filter(fragments, shading, albedo, dtype),
         albedo=factor.T.to(dtype).contiguous(),
         coverage=fragments.coverage.to(dtype),
         pixels=fragments.pixels,
@@ -147,12 +152,16 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     return by_pixel if (spread <= torch.finfo(dtype).eps * albedo).all() else None
 
 
-def _box_filter(fragments: Fragments, shading: Tensor, albedo: Tensor) -> Tensor:
-    """Sum over each pixel's samples of shading (G, K) × albedo (S, C): (C, K, P) float64."""
+def _box_filter(fragments: Fragments, shading: Tensor, albedo: Tensor, dtype: torch.dtype) -> Tensor:
+    """Sum over each pixel's samples of shading (G, K) × albedo (S, C): (C, K, P), by blocks of pixels in float64."""
     pixel, face, weights = fragments.merge(albedo)
-    rows = shading.index_select(0, face)
-    channels = [
-        shading.new_zeros(len(fragments.pixels), shading.shape[1]).index_add_(0, pixel, rows * weight[:, None]).T
-        for weight in weights.unbind(1)
-    ]
-    return torch.stack(channels)
+    starts = torch.arange(0, len(fragments.pixels), BLOCK)
+    ends = torch.searchsorted(pixel, starts + BLOCK).tolist()
+    filtered = torch.empty(weights.shape[1], shading.shape[1], len(fragments.pixels), dtype=dtype)
+    for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
+        rows = shading.index_select(0, face[begin:end])
+        block = filtered[..., first : first + BLOCK]
+        for channel, weight in zip(block, weights[begin:end].T, strict=True):
+            summed = shading.new_zeros(channel.shape[::-1])
+            channel.copy_(summed.index_add_(0, pixel[begin:end] - first, rows * weight[:, None]).T)
+    return filtered
