@@ -41,8 +41,10 @@ def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], linear
     faces = fragments.faces.cpu().numpy()
     colors = torch.from_numpy(mesh.corner_colors[faces]).to(fragments.coverage)
     require_bounded(corner_colors=colors)
+    if not textures and (colors == colors[:1, :1]).all():  # one colour for all that is seen
+        return decode(colors.flatten(0, 1)[:1], encoding).expand(len(fragments.face), 3)
     colors = decode(colors, encoding)
-    if not textures and _one_color_each(colors):
+    if not textures and (colors == colors[:, :1]).all():  # one colour per face
         return colors[:, 0].index_select(0, fragments.face)
     barycentric = fragments.barycentric()
     albedo = _interpolate(barycentric, colors, fragments.face)
@@ -53,10 +55,6 @@ def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], linear
         value = _bilinear(texture, linear, _interpolate(barycentric[here], uvs, fragments.face[here]))
         albedo = albedo.index_copy(0, here, albedo[here] * value)
     return albedo
-
-
-def _one_color_each(colors: Tensor) -> bool:
-    return bool((colors == colors[:, :1]).all())
 
 
 def _interpolate(barycentric: Tensor, corners: Tensor, face: Tensor) -> Tensor:

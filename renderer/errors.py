@@ -27,5 +27,5 @@ def require_bounded(**tensors: Tensor) -> None:
             raise InputError(f"{name} holds NaN, infinity or magnitudes beyond {LARGEST:g}: give finite values")
 
 
-def _largest(tensor: Tensor) -> Tensor | float:
-    return tensor.detach().abs().max() if tensor.numel() else 0.0  # NaN wins any maximum
+def _largest(tensor: Tensor) -> float:
+    return tensor.detach().abs().max().item() if tensor.numel() else 0.0  # NaN wins any maximum

@@ -7,6 +7,7 @@ angles, so it stays exact at the poles, where the paper's (appendix B.1) derivat
 import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,9 +16,10 @@ from torch import Tensor
 from renderer.errors import InputError, require_finite
 
 MAX_DEGREE = 20
+Constant = TypeVar("Constant")
 
 
-def _constant(function: Callable[[int], Tensor]) -> Callable[[int], Tensor]:
+def per_degree(function: Callable[[int], Constant]) -> Callable[[int], Constant]:
     """Computed once per degree, and usable in training even if it was first asked for in inference mode."""
     return cache(torch.inference_mode(False)(function))
 
@@ -83,22 +85,21 @@ class _Basis(torch.autograd.Function):
 def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
     """The harmonics with these indices, (...) each, of unit vectors (3, ...): `basis` for inner loops, unchecked."""
     x, y, z = unit
-    wanted = [(l := math.isqrt(index), index - l * l - l) for index in indices]
-    degree = max((l for l, _ in wanted), default=0)
-    rows = {}
+    rows = dict.fromkeys(indices)
+    degree = math.isqrt(max(rows, default=0))
     cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # Re and Im of (x + iy)^m, times √2 where m > 0
     for m in range(degree + 1):
         for l, legendre in zip(range(m, degree + 1), _legendre(z, m, degree), strict=True):
-            for order, circular in ((-m, sine), (m, cosine)):
-                if (l, order) in wanted:
-                    rows[l, order] = circular * legendre
+            for index, circular in ((l * l + l - m, sine), (l * l + l + m, cosine)):
+                if index in rows:
+                    rows[index] = circular * legendre
         if m == 0:
             cosine = cosine * math.sqrt(2)
         cosine, sine = (
             torch.addcmul(x * cosine, y, sine, value=-1),
             torch.addcmul(x * sine, y, cosine),
         )
-    return [rows[key] for key in wanted]
+    return list(rows.values())
 
 
 def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:
@@ -113,7 +114,7 @@ def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:
         yield value
 
 
-@_constant
+@per_degree
 def gradient_matrices(degree: int) -> Tensor:
     """(3, (degree + 1)², (degree + 1)²) float64: ∂(r^l Y_k)/∂x_d = Σ_j r^(l-1) Y_j [d, j, k], for k in band l.
 
@@ -150,13 +151,13 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     return scaled / torch.where(norm > 0, norm, 1), norm * largest
 
 
-@_constant
+@per_degree
 def bands(degree: int) -> Tensor:
     """The band l of each coefficient, ((degree + 1)²,)."""
     return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
 
 
-@_constant
+@per_degree
 def lambertian_factors(degree: int) -> Tensor:
     """What a diffuse surface keeps of each band: irradiance = Σ A_l U_lm Y_lm(n). (degree + 1,) float64.
 
@@ -171,7 +172,7 @@ def lambertian_factors(degree: int) -> Tensor:
     return factors
 
 
-@_constant
+@per_degree
 def live_coefficients(degree: int) -> Tensor:
     """Indices of the coefficients that can reach a diffuse surface: 31 of the 49 at degree 6."""
     return torch.nonzero(lambertian_factors(degree)[bands(degree)]).squeeze(1)

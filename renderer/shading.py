@@ -5,6 +5,7 @@ sees how normals turn and not how outlines move. For the light alone, `renderer.
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from renderer.harmonics import (
     gradient_matrices,
     lambertian_factors,
     live_coefficients,
+    per_degree,
     select_rows,
     unit_vectors,
 )
@@ -45,7 +47,9 @@ def radiance(
     else:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
         shade = irradiance(_smooth_normals(fragments, positions, smooth_faces), light)
-    seen = shade.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, shade * weights.T)
+    seen = shade * weights.T
+    if fragments.samples > 1:  # a sample is a pixel otherwise
+        seen = seen.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, seen)
     return seen.to(vertices.dtype)
 
 
@@ -72,30 +76,49 @@ class _Irradiance(torch.autograd.Function):
     @staticmethod
     def forward(ctx, normals: Tensor, light: Tensor) -> Tensor:
         unit, length = unit_vectors(normals.T.contiguous())
-        degree = math.isqrt(len(light)) - 1
-        live, weights = _live(degree, light)
+        bands = _bands(math.isqrt(len(light)) - 1)
+        weights = light[list(bands.live)] * bands.factors.to(light)
         ctx.save_for_backward(unit, length, weights)
-        ctx.degree, ctx.light = degree, light.shape
-        blocks = [weights.T @ _rows(block, live) for block in unit.split(BLOCK, dim=1)]
+        ctx.bands, ctx.light = bands, light.shape
+        blocks = [weights.T @ _rows(block, bands.live) for block in unit.split(BLOCK, dim=1)]
         return torch.cat(blocks, dim=1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
         unit, length, weights = ctx.saved_tensors
-        by_normal = by_light = None
+        bands, by_normal, by_light = ctx.bands, None, None
         blocks = list(zip(unit.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True))
         if ctx.needs_input_grad[0]:
-            below, slopes = _slopes(ctx.degree, weights)
-            solid = [_contract(slopes, _rows(block, below), above) for block, above in blocks]
-            tangential = torch.cat(solid, dim=1)
-            tangential = tangential - unit * (unit * tangential).sum(0)
-            by_normal = (tangential / torch.where(length > 0, length, torch.inf)).T
+            slopes = torch.einsum("djk,kc->dcj", bands.ladder.to(weights), weights)
+            solid = torch.cat([_contract(slopes, _rows(block, bands.below), above) for block, above in blocks], dim=1)
+            tangential = solid - unit * (unit * solid).sum(0)
+            by_normal = (tangential / length.masked_fill(length == 0, torch.inf)).T
         if ctx.needs_input_grad[1]:
-            live, factors = _live(ctx.degree, unit.new_ones(ctx.light))
-            by_weight = sum(_rows(block, live) @ above.T for block, above in blocks)
-            by_light = unit.new_zeros(ctx.light).index_copy_(0, live, by_weight * factors)
+            by_weight = sum(_rows(block, bands.live) @ above.T for block, above in blocks)
+            by_light = unit.new_zeros(ctx.light)
+            by_light[list(bands.live)] = by_weight * bands.factors.to(unit)
         return by_normal, by_light
+
+
+@dataclass(frozen=True)
+class _Bands:
+    """Of the harmonics to some degree: the K that reach a surface, with A_l (K, 1), and the J of which the gradients of
+    those consist, with what they take of each (3 axes, J, K)."""
+
+    live: tuple[int, ...]
+    factors: Tensor
+    below: tuple[int, ...]
+    ladder: Tensor
+
+
+@per_degree
+def _bands(degree: int) -> _Bands:
+    live = live_coefficients(degree)
+    ladder = gradient_matrices(degree)[:, :, live]
+    below = torch.nonzero(ladder.abs().sum((0, 2))).squeeze(1)
+    factors = lambertian_factors(degree)[bands(degree)[live]]
+    return _Bands(tuple(live.tolist()), factors[:, None], tuple(below.tolist()), ladder[:, below])
 
 
 def _computed_in(dtype: torch.dtype) -> torch.dtype:
@@ -103,23 +126,9 @@ def _computed_in(dtype: torch.dtype) -> torch.dtype:
     return torch.promote_types(dtype, torch.float32)
 
 
-def _live(degree: int, light: Tensor) -> tuple[Tensor, Tensor]:
-    """(indices (K,) of the coefficients that reach a surface, those of the light times A_l (K, 3))."""
-    live = live_coefficients(degree).to(light.device)
-    factors = lambertian_factors(degree)[bands(degree)].to(light)
-    return live, (light * factors[:, None])[live]
-
-
-def _slopes(degree: int, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """(indices (J,) of the harmonics that the irradiance's gradient consists of, their coefficients (3 axes, 3, J))."""
-    ladder = gradient_matrices(degree)[:, :, live_coefficients(degree)].to(weights)
-    below = torch.nonzero(ladder.abs().sum((0, 2))).squeeze(1)
-    return below, torch.einsum("djk,kc->dcj", ladder[:, below], weights)
-
-
-def _rows(unit: Tensor, indices: Tensor) -> Tensor:
+def _rows(unit: Tensor, indices: tuple[int, ...]) -> Tensor:
     """Some harmonics (len(indices), N) of unit vectors (3, N)."""
-    rows = select_rows(unit, indices.tolist())
+    rows = select_rows(unit, indices)
     return torch.stack(rows) if rows else unit.new_zeros(0, unit.shape[1])
 
 

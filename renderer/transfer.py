@@ -52,7 +52,9 @@ class Operator:
         require_bounded(lights=lights)
         if lights.shape[-2:] != ((self.degree + 1) ** 2, 3):
             raise InputError(f"lights of shape {tuple(lights.shape)} are not of the operator's degree {self.degree}")
-        return _Radiance.apply(lights, self)
+        if torch.is_grad_enabled() and lights.requires_grad:
+            return _Radiance.apply(lights, self)
+        return _radiance(self, lights)
 
     def light_gradient(self, radiance_gradient: Tensor) -> Tensor:
         """∂C/∂U (..., (degree + 1)², 3) = T ∂C/∂radiance (..., 3, P), without a graph.
@@ -77,15 +79,20 @@ class _Radiance(torch.autograd.Function):
     @staticmethod
     def forward(ctx, lights: Tensor, operator: Operator) -> Tensor:
         ctx.operator = operator
-        live = live_coefficients(operator.degree).to(lights.device)
-        kept = lights.to(operator.transfer.dtype).reshape(-1, *lights.shape[-2:]).index_select(1, live)
-        product = apply_transfer(kept, operator.transfer, operator.albedo)
-        return product.reshape(*lights.shape[:-2], *product.shape[-2:]).to(lights.dtype)
+        return _radiance(operator, lights)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
         return ctx.operator.light_gradient(upstream), None
+
+
+def _radiance(operator: Operator, lights: Tensor) -> Tensor:
+    live = live_coefficients(operator.degree).to(lights.device)
+    kept = lights.index_select(-2, live).to(operator.transfer.dtype)
+    flat = kept.reshape(lights.shape[:-2].numel(), *kept.shape[-2:])
+    product = apply_transfer(flat, operator.transfer, operator.albedo)
+    return product.reshape(*lights.shape[:-2], *product.shape[-2:]).to(lights.dtype)
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
