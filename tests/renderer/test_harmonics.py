@@ -134,12 +134,13 @@ def test_shorter_dtypes_are_float64_rounded_once(degree, dtype):
 @settings(deadline=None, max_examples=25)
 @given(
     direction=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda vector: max(map(abs, vector)) > 1e-3),
-    exponent=st.integers(-200, 90),
+    exponent=st.integers(-1000, 1000),
 )
 def test_the_sums_over_a_band_are_the_same_in_every_direction(direction, exponent):
     """Σ Y² = (2l + 1) / 4π (Unsöld's theorem) and Σ |∇Y|² = l (l + 1) (2l + 1) / 4π, at any length of the vector."""
-    vector = torch.tensor(direction, dtype=torch.float64) * 2.0**exponent
-    values, gradient = basis(vector, MAX_DEGREE), basis_gradient(vector, MAX_DEGREE) * vector.norm()
+    vector = torch.tensor(direction, dtype=torch.float64)
+    values = basis(vector * 2.0**exponent, MAX_DEGREE)
+    gradient = basis_gradient(vector * 2.0**exponent, MAX_DEGREE) * 2.0**exponent * vector.norm()
     l = torch.arange(MAX_DEGREE + 1, dtype=torch.float64)
     by_band = torch.zeros(2, MAX_DEGREE + 1, dtype=torch.float64)
     by_band.index_add_(1, bands(MAX_DEGREE), torch.stack([values**2, gradient.square().sum(1)]))
@@ -163,14 +164,14 @@ def test_only_the_direction_of_a_vector_counts_down_to_denormal_ones(dtype, smal
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16])
-def test_no_gradient_is_nan_however_short_the_vector(dtype):
-    """It is of the order of 1 / length, so that it may overflow."""
+def test_every_gradient_is_finite_however_short_the_vector(dtype):
+    """It is of the order of 1 / length, and the dtype's largest number where that would overflow."""
     tiny = torch.finfo(dtype).smallest_normal
     vectors = (torch.tensor([[1, 2, -3], [0, 0, 1], [1, -1, 0], [0, 0, 0]], dtype=torch.float64) * tiny / 16).to(dtype)
     vectors = torch.cat([vectors, vectors * 64]).requires_grad_(True)
     (gradient,) = torch.autograd.grad((basis(vectors, 6) * torch.linspace(-1, 1, 49)).sum(), vectors)
-    assert not gradient.isnan().any()
-    assert not basis_gradient(vectors, 6).isnan().any()
+    assert gradient.isfinite().all() and gradient.any()
+    assert basis_gradient(vectors, 6).isfinite().all()
 
 
 def test_a_zero_vector_has_finite_values_and_a_gradient_of_zero():

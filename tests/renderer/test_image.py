@@ -143,8 +143,24 @@ def test_clamped_values_are_those_without_a_gradient(encoding):
     assert clamped(radiance, share(0.5), grey(0.0), encoding).flatten().tolist() == [True, False, True]
 
 
-def test_black_and_white_themselves_are_not_clamped():
-    assert not clamped(pixel(0, 0.5, 1), share(1.0), grey(math.pi / 4)).any()
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_black_and_white_themselves_are_not_clamped(encoding):
+    """So that a light of zero can grow."""
+    radiance = pixel(0, 0.5, 1).requires_grad_(True)
+    scene = (radiance, share(1.0), grey(math.pi / 4))
+    assert not clamped(*scene, encoding).any()
+    (gradient,) = torch.autograd.grad(develop(*scene, encoding).sum(), radiance)
+    slopes = [12.92, 1.055 / 2.4 * 0.5 ** (1 / 2.4 - 1), 1.055 / 2.4] if encoding == "srgb" else [1, 1, 1]
+    np.testing.assert_allclose(gradient[:, 0], slopes, rtol=8 * EPS)
+
+
+def test_a_background_may_be_a_picture():
+    draws = torch.Generator().manual_seed(1)
+    scene = [torch.rand(*shape, generator=draws, dtype=torch.float64) for shape in ((2, 3, 7), (1, 7), (3, 7))]
+    pictures = develop(*scene, "srgb")
+    for at in range(7):
+        alone = develop(*(part[..., at : at + 1] for part in scene), "srgb")
+        torch.testing.assert_close(pictures[..., at : at + 1], alone, rtol=4 * EPS, atol=0)
 
 
 @pytest.mark.parametrize("function", [encode, decode, lambda x, encoding: develop(x, share(1), grey(0), encoding)])

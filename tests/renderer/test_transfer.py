@@ -423,6 +423,19 @@ def test_both_layouts_give_the_same_radiance():
     )
 
 
+@pytest.mark.parametrize(("step", "channels"), [(0, 1), (1, 1), (16, 3)])
+def test_one_channel_is_taken_for_albedos_that_are_the_same_to_float32s_rounding(step, channels):
+    """Two halves of a square, apart by some of float32's steps."""
+    colors = np.full((2, 3, 3), 0.75, dtype=np.float32)
+    colors[1] += step * np.spacing(colors[1])
+    mesh = replace(square(0.5), corner_colors=colors)
+    [operator] = build_operators(mesh, [ABOVE], PictureSettings(4, 4), BACKEND)
+    assert len(operator.transfer) == channels
+    [exact] = build_operators(mesh, [ABOVE], PictureSettings(4, 4), BACKEND, dtype=torch.float64)
+    light = random_light(0)
+    torch.testing.assert_close(operator.radiance(light), exact.radiance(light), rtol=0, atol=16 * EPS32)
+
+
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3), (0,)])
 def test_an_empty_view_has_no_radiance_and_a_gradient_of_zero(batch):
     operator = empty_operator()

@@ -1,0 +1,106 @@
+"""No NaN goes into the renderer: every function that takes numbers names the tensor that holds something else."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.camera import OrthographicCamera
+from renderer.errors import LARGEST, InputError, require_bounded, require_finite
+from renderer.fragments import build_fragments
+from renderer.harmonics import basis, basis_gradient, project, rotate
+from renderer.image import PictureSettings, develop
+from renderer.mesh import Mesh
+from renderer.normals import face_normals, vertex_normals
+from renderer.shading import irradiance, radiance
+from renderer.transfer import build_operators
+from renderer.visibility import choose
+
+MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+CAMERA, SETTINGS, BACKEND = OrthographicCamera(0, 0, 2.0), PictureSettings(2, 2), choose("software")
+[FRAGMENTS] = build_fragments(MESH.vertices, MESH.faces, [CAMERA], SETTINGS, BACKEND)
+[OPERATOR] = build_operators(MESH, [CAMERA], SETTINGS, BACKEND)
+FACES = torch.from_numpy(MESH.faces)
+GOOD = {
+    "vertices": torch.from_numpy(MESH.vertices),
+    "light": torch.ones(49, 3),
+    "albedo": surface_albedo(MESH, FRAGMENTS, "linear"),
+}
+
+
+def lit(smooth_faces: torch.Tensor | None, name: str, spoiled: torch.Tensor) -> torch.Tensor:
+    return radiance(FRAGMENTS, **{**GOOD, name: spoiled}, smooth_faces=smooth_faces)
+
+
+def painted(corner_colors: torch.Tensor) -> Mesh:
+    return replace(MESH, corner_colors=corner_colors.numpy())
+
+
+FINITE = [  # the tensor's name, a good one, who takes it: positions and directions may be of any size
+    ("directions", torch.ones(2, 3), lambda x: basis(x, 6)),
+    ("directions", torch.ones(2, 3), lambda x: basis_gradient(x, 6)),
+    ("radiance", torch.ones(4, 8, 3), lambda x: project(x, 2)),
+    ("radiance", torch.ones(28, 3), lambda x: project(lambda _: x, 2, quadrature_degree=6)),
+    ("coefficients", torch.ones(9, 3), lambda x: rotate(x, torch.eye(3))),
+    ("rotation", torch.eye(3), lambda x: rotate(torch.ones(9, 3), x)),
+    ("vertices", torch.ones(4, 3), lambda x: face_normals(x, FACES)),
+    ("vertices", torch.ones(4, 3), lambda x: vertex_normals(x, FACES)),
+    ("vertices", torch.ones(4, 3), lambda x: build_fragments(x.numpy(), MESH.faces, [CAMERA], SETTINGS, BACKEND)),
+    ("vertices", GOOD["vertices"], lambda x: lit(None, "vertices", x)),
+    ("vertices", GOOD["vertices"], lambda x: lit(FACES, "vertices", x)),
+    ("normals", torch.ones(2, 3), lambda x: irradiance(x, torch.ones(9, 3))),
+]  # fmt: skip
+BOUNDED = [  # what is multiplied with each other
+    ("texture", torch.ones(2, 2, 3), lambda x: textured_albedo(MESH, FRAGMENTS, [torch.ones(3, 3, 3), x], "linear")),
+    ("albedo", torch.ones(2, 3), lambda x: face_albedo(x, FRAGMENTS)),
+    ("corner_colors", torch.ones(2, 3, 3), lambda x: surface_albedo(painted(x), FRAGMENTS, "srgb")),
+    ("light", torch.ones(9, 3), lambda x: irradiance(torch.ones(2, 3), x)),
+    ("light", GOOD["light"], lambda x: lit(None, "light", x)),
+    ("albedo", GOOD["albedo"], lambda x: lit(None, "albedo", x)),
+    ("albedo", GOOD["albedo"], lambda x: lit(FACES, "albedo", x)),
+    ("gain", torch.ones(1), lambda x: build_operators(MESH, [CAMERA], SETTINGS, BACKEND, gain=x.item())),
+    ("lights", torch.ones(2, 49, 3), OPERATOR.radiance),
+    ("radiance_gradient", torch.ones(2, 3, 4), OPERATOR.light_gradient),
+    ("radiance", torch.ones(3, 4), lambda x: develop(x, torch.ones(1, 4), torch.ones(3, 1))),
+    ("coverage", torch.ones(1, 4), lambda x: develop(torch.ones(3, 4), x, torch.ones(3, 1))),
+    ("background", torch.ones(3, 1), lambda x: develop(torch.ones(3, 4), torch.ones(1, 4), x)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "good", "take"), FINITE + BOUNDED)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_refused_in_one_sentence_that_names_its_tensor(name, good, take, bad):
+    good = good.clone()
+    take(good)
+    for at in (0, -1):
+        spoiled = good.clone()
+        spoiled.view(-1)[at] = bad
+        with pytest.raises(InputError, match=f"^{name} holds NaN.* infinity.*: give finite values$"):
+            take(spoiled)
+
+
+@pytest.mark.parametrize(("name", "good", "take"), BOUNDED)
+def test_what_would_overflow_is_refused_by_its_name(name, good, take):
+    take(good * LARGEST * 0.99)
+    with pytest.raises(InputError, match=f"^{name} holds .* magnitudes beyond 1e\\+12: give finite values$"):
+        take(good * LARGEST * 1.01)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16, torch.bfloat16])
+def test_all_that_is_finite_passes_in_every_dtype(dtype):
+    limits = torch.finfo(dtype)
+    values = torch.tensor([limits.max, limits.min, 0.0, -0.0, limits.smallest_normal / 4], dtype=dtype)
+    require_finite(values=values.requires_grad_(True), nothing=values[:0])
+    require_bounded(
+        values=values.detach().double().clamp(-0.99 * LARGEST, 0.99 * LARGEST).to(dtype), nothing=values[:0]
+    )
+
+
+@pytest.mark.parametrize("require", [require_finite, require_bounded])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16, torch.bfloat16])
+def test_the_first_tensor_that_is_not_finite_is_named(dtype, require):
+    good, bad = torch.ones(3, dtype=dtype), torch.tensor([1, math.inf, math.nan], dtype=dtype)
+    with pytest.raises(InputError, match=r"^second holds"):
+        require(first=good, second=bad, third=bad)

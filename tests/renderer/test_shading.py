@@ -1,0 +1,601 @@
+"""Irradiance against scipy, and derivatives of whole pictures against central differences with visibility held fixed.
+
+A picture is everything from vertices, light and albedo to what a classifier sees: shading, box filter, background,
+clamp and encoding, and the pixels around the mesh.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y_all
+
+from renderer import shading
+from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.camera import OrthographicCamera
+from renderer.errors import LARGEST, InputError
+from renderer.fragments import Fragments, build_fragments
+from renderer.harmonics import MAX_DEGREE, lambertian_factors, live_coefficients, rotate
+from renderer.image import PictureSettings, clamped, develop
+from renderer.mesh import Mesh
+from renderer.shading import irradiance, radiance
+from renderer.transfer import build_operators
+from renderer.visibility import choose
+
+EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+BACKEND = choose("software")
+DEGREES = [0, 1, 2, 3, 6, 13, MAX_DEGREE]
+SPECIAL = [[0.0, 0.0, 1.0], [-0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-1.0, -0.0, 0.0], [0.0, -1.0, -0.0], [1e-9, 0.0, 1.0]]
+
+
+def draw(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def some_normals(count: int) -> torch.Tensor:
+    """Of unit length or not; poles and the equator, too."""
+    return torch.cat([3 * draw(count, 3), torch.tensor(SPECIAL, dtype=torch.float64)])
+
+
+def scipy_irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """(3, N) Σ A_l U_lm Y_lm(n), with scipy's complex harmonics; A_l is proven in test_harmonics."""
+    degree = math.isqrt(len(light)) - 1
+    x, y, z = normals.T
+    values = sph_harm_y_all(degree, degree, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x))
+    total = np.zeros((3, len(normals)))
+    for l, factor in enumerate(lambertian_factors(degree).tolist()):
+        for m in range(-l, l + 1):
+            part = values[l, abs(m)].real if m >= 0 else values[l, abs(m)].imag
+            real = part if m == 0 else math.sqrt(2) * (-1) ** m * part
+            total += factor * np.outer(light[l * l + l + m], real)
+    return total
+
+
+def brightest(light: torch.Tensor) -> float:
+    """What no irradiance exceeds: Σ A_l √((2l + 1) / 4π) |U_l|, since the squares of a band add up to (2l + 1) / 4π."""
+    l = torch.arange(math.isqrt(len(light)), dtype=torch.float64)
+    norms = torch.stack([band.norm(dim=0).max() for band in light.detach().double().split((2 * l + 1).long().tolist())])
+    return float((lambertian_factors(len(l) - 1).abs() * ((2 * l + 1) / (4 * math.pi)).sqrt() * norms).sum())
+
+
+# ---------------------------------------------------------------------------- irradiance
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_irradiance_is_scipys(degree):
+    normals, light = some_normals(100), draw((degree + 1) ** 2, 3)
+    expected = scipy_irradiance(normals.numpy(), light.numpy())
+    np.testing.assert_allclose(irradiance(normals, light), expected, rtol=0, atol=1e-13 * brightest(light))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 6, MAX_DEGREE])
+def test_derivatives_of_irradiance_are_central_differences(degree):
+    inputs = [tensor.requires_grad_(True) for tensor in (some_normals(4), draw((degree + 1) ** 2, 3, seed=1))]
+    assert torch.autograd.gradcheck(irradiance, inputs, fast_mode=degree > 6)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_float32_is_float64_to_rounding(degree):
+    """The direction rounds, which band l's slope makes l times of, and so do the recurrences and the sum."""
+    inputs = [tensor.float() for tensor in (some_normals(1000), draw((degree + 1) ** 2, 3, seed=1))]
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        normals, light = (tensor.to(dtype).requires_grad_(True) for tensor in inputs)
+        lit = irradiance(normals, light)
+        by_normal, by_light = torch.autograd.grad(lit, (normals, light), draw(*lit.shape, seed=2).to(dtype))
+        results.append((lit, by_normal * normals.norm(dim=1, keepdim=True), by_light))
+    slack = (4 + degree) * EPS32 * brightest(inputs[1])
+    # A normal's gradient adds up three channels of slope l; a coefficient's, a thousand normals, whose roundings and
+    # sizes both have either sign.
+    for short, full, limit in zip(*results, (slack, 8 * (1 + degree) * slack, 5000 * EPS32), strict=True):
+        assert short.dtype == torch.float32
+        torch.testing.assert_close(short.double(), full, rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_float32_rounded_once(dtype):
+    results = []
+    for wide in (dtype, torch.float32):
+        normals, light = (tensor.to(dtype).to(wide).requires_grad_(True) for tensor in (some_normals(50), draw(49, 3)))
+        lit = irradiance(normals, light)
+        results.append((lit, *torch.autograd.grad(lit, (normals, light), draw(*lit.shape).to(dtype).to(wide))))
+    for short, full in zip(*results, strict=True):
+        assert short.dtype == dtype and torch.equal(short, full.to(dtype))
+
+
+def test_bands_that_reach_no_surface_have_a_gradient_of_exactly_zero():
+    for degree, dead in ((6, 18), (MAX_DEGREE, sum(2 * l + 1 for l in range(3, MAX_DEGREE, 2)))):
+        light = draw((degree + 1) ** 2, 3).requires_grad_(True)
+        (gradient,) = torch.autograd.grad(irradiance(some_normals(20), light).sum(), light)
+        mask = torch.ones(len(light), dtype=torch.bool).index_fill(0, live_coefficients(degree), False)
+        assert mask.sum() == dead
+        assert not gradient[mask].any() and gradient[~mask].any(dim=1).all()
+
+
+def test_the_irradiance_of_short_and_of_zero_normals_is_finite_and_no_gradient_is_nan():
+    """It is of the order of 1 / length, so that it may overflow; a zero vector's is zero."""
+    for dtype in (torch.float64, torch.float32, torch.float16):
+        tiny = torch.finfo(dtype).smallest_normal
+        lengths = torch.tensor([1, 64, 1 / 16, 0]).repeat_interleave(len(SPECIAL))[:, None]
+        normals = (torch.tensor(SPECIAL).repeat(4, 1) * lengths).to(dtype).mul(tiny).requires_grad_(True)
+        lit = irradiance(normals, draw(49, 3).to(dtype))
+        (gradient,) = torch.autograd.grad(lit.sum(), normals)
+        assert lit.isfinite().all() and not gradient.isnan().any() and not gradient[-len(SPECIAL) :].any()
+
+
+def test_the_blocks_are_of_no_consequence(monkeypatch):
+    inputs = [tensor.requires_grad_(True) for tensor in (some_normals(40), draw(49, 3))]
+    results = []
+    for block in (shading.BLOCK, 7):
+        monkeypatch.setattr(shading, "BLOCK", block)
+        lit = irradiance(*inputs)
+        results.append((lit, *torch.autograd.grad(lit, inputs, draw(*lit.shape))))
+    for whole, pieced in zip(*results, strict=True):
+        torch.testing.assert_close(pieced, whole, rtol=0, atol=64 * EPS * whole.abs().max().item())
+
+
+def test_what_is_kept_for_the_backward_pass_is_as_large_as_the_normals():
+    kept = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda tensor: kept.append(tensor.numel()), lambda _: None):
+        irradiance(draw(1000, 3).requires_grad_(True), draw(49, 3).requires_grad_(True))
+    assert sum(kept) <= 1000 * 4 + 49 * 3
+
+
+@pytest.mark.parametrize("shape", [(10, 3), (49, 1), (49,), (3, 49)])
+def test_a_light_that_is_not_of_whole_bands_and_three_channels_is_refused(shape):
+    with pytest.raises(InputError, match="light"):
+        irradiance(draw(2, 3), torch.zeros(shape, dtype=torch.float64))
+
+
+def test_second_derivatives_are_refused_rather_than_wrong():
+    light = draw(49, 3).requires_grad_(True)
+    normals = draw(5, 3).requires_grad_(True)
+    (gradient,) = torch.autograd.grad(irradiance(normals, light).pow(2).sum(), normals, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
+# ---------------------------------------------------------------------------- scenes
+
+
+def solid(seed: int = 0, closed: bool = True) -> Mesh:
+    """A dented icosahedron with two textures and bare faces, vertex colours on all; or two thirds of it."""
+    draws = np.random.default_rng(seed)
+    shape = trimesh.creation.icosahedron()
+    faces = shape.faces[: 20 if closed else 13]
+    mesh = Mesh.plain(shape.vertices * draws.uniform(0.7, 1, (12, 1)), faces)
+    return replace(
+        mesh,
+        corner_colors=draws.uniform(0.1, 1, (len(faces), 3, 3)).astype(np.float32),
+        corner_uvs=draws.uniform(-1, 2, (len(faces), 3, 2)).astype(np.float32),
+        texture_ids=(np.arange(len(faces), dtype=np.int32) % 3) - 1,
+        textures=tuple(
+            draws.integers(0, 256, (height, width, 3), dtype=np.uint8) for height, width in [(3, 4), (2, 3)]
+        ),
+    )
+
+
+def with_faces(mesh: Mesh, rows) -> Mesh:
+    """The faces of these indices, which may come up again."""
+    per_face = {name: getattr(mesh, name)[rows] for name in ("faces", "corner_colors", "corner_uvs", "texture_ids")}
+    return replace(mesh, **per_face)
+
+
+def turned_round(mesh: Mesh) -> Mesh:
+    """Clockwise faces."""
+    per_corner = {name: getattr(mesh, name)[:, ::-1].copy() for name in ("faces", "corner_colors", "corner_uvs")}
+    return replace(mesh, **per_corner)
+
+
+def spoiled(mesh: Mesh) -> Mesh:
+    """With three more faces that have no area, each in its own way, and every face a second time."""
+    count = len(mesh.faces)
+    mesh = with_faces(mesh, [*range(count), 0, 1, 2, *range(count)])
+    mesh.faces[count : count + 3] = [[0, 0, 0], [1, 1, 2], [3, 4, 4]]
+    return mesh
+
+
+IN_FRONT, BEHIND = OrthographicCamera(1.0, 0.4, 2.2), OrthographicCamera(math.pi - 1.0, 0.4 + math.pi, 2.2)
+
+
+@dataclass(frozen=True)
+class Scene:
+    mesh: Mesh
+    camera: OrthographicCamera = IN_FRONT
+    size: int = 5
+    samples: int = 3
+
+    @cached_property
+    def fragments(self) -> Fragments:
+        settings = PictureSettings(self.size, self.samples)
+        [fragments] = build_fragments(self.mesh.vertices, self.mesh.faces, [self.camera], settings, BACKEND)
+        return fragments
+
+    def vertices(self) -> torch.Tensor:
+        return torch.from_numpy(self.mesh.vertices.copy())
+
+    def all_faces(self, smooth: bool) -> torch.Tensor | None:
+        return torch.from_numpy(self.mesh.faces) if smooth else None
+
+
+SCENES = {
+    "solid": Scene(solid()),
+    "open, from in front": Scene(solid(closed=False)),
+    "open, from behind": Scene(solid(closed=False), BEHIND),
+    "wound the other way": Scene(turned_round(solid())),
+    "spoiled": Scene(spoiled(solid())),
+    "one sample per pixel": Scene(solid(), size=9, samples=1),
+}
+OUTSIDE = Scene(replace(solid(), vertices=solid().vertices + 9))
+each_scene = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+flat_and_smooth = pytest.mark.parametrize("smooth", [False, True], ids=["flat", "smooth"])
+
+
+def test_the_scenes_are_what_they_are_called():
+    facing = {name: scene.fragments.facing for name, scene in SCENES.items()}
+    in_front = {name for name, signs in facing.items() if (signs == 1).all()}
+    assert in_front == {"solid", "spoiled", "one sample per pixel"}
+    assert (facing["wound the other way"] == -1).all()
+    assert {sign for sign in facing["open, from behind"].flatten().tolist()} == {-1, 1}
+    for scene in SCENES.values():
+        fragments = scene.fragments
+        assert 0 < len(fragments.pixels) < scene.size**2
+        seen = scene.mesh.texture_ids[fragments.faces]
+        assert set(seen) == {-1, 0, 1}
+    assert len(np.unique(SCENES["solid"].fragments.corners)) < 12
+    assert len(OUTSIDE.fragments.pixels) == 0
+
+
+# ---------------------------------------------------------------------------- pictures
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A scene as a function of vertices (V, 3), light (49, 3) and textures: (3, size²) picture values."""
+
+    scene: Scene
+    encoding: str
+    smooth: bool
+
+    def inputs(self) -> list[torch.Tensor]:
+        """A light that leaves some values below black, some above white and most between."""
+        light = 1.5 * draw(49, 3, seed=1)
+        light[0] = 1.0
+        textures = [torch.from_numpy(texture / 255) for texture in self.scene.mesh.textures]
+        return [tensor.requires_grad_(True) for tensor in (self.scene.vertices(), light, *textures)]
+
+    def parts(self, vertices, light, *textures) -> tuple[Fragments, tuple]:
+        """What `develop` takes."""
+        fragments = self.scene.fragments
+        albedo = textured_albedo(self.scene.mesh, fragments, textures, self.encoding)
+        lit = radiance(fragments, vertices, light, albedo, self.scene.all_faces(self.smooth))
+        background = torch.tensor([[0.3], [0.6], [0.1]], dtype=lit.dtype)
+        return fragments, (lit, fragments.coverage[None].to(lit), background, self.encoding)
+
+    def __call__(self, *inputs) -> torch.Tensor:
+        fragments, parts = self.parts(*inputs)
+        canvas = parts[2].expand(3, self.scene.size**2)
+        return canvas.index_copy(1, fragments.pixels, develop(*parts))
+
+    def clamped(self, *inputs) -> torch.Tensor:
+        return clamped(*self.parts(*inputs)[1])
+
+
+def slope(function, inputs, steps, length: float = 1e-5) -> torch.Tensor:
+    """Derivative of a function along steps, to the fourth order in their length."""
+
+    def at(distance: float) -> torch.Tensor:
+        return function(*(tensor + distance * step for tensor, step in zip(inputs, steps, strict=True)))
+
+    with torch.no_grad():
+        return (8 * (at(length) - at(-length)) - (at(2 * length) - at(-2 * length))) / (12 * length)
+
+
+@each_scene
+@flat_and_smooth
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+def test_derivatives_of_pictures_are_central_differences(scene, smooth, encoding):
+    """By vertices, light and texels each alone, and by all of them at once."""
+    picture = Picture(scene, encoding, smooth)
+    inputs = picture.inputs()
+    upstream = draw(3, scene.size**2, seed=2)
+    gradients = torch.autograd.grad(picture(*inputs), inputs, upstream)
+    directions = [draw(*tensor.shape, seed=3 + index) for index, tensor in enumerate(inputs)]
+    for moved in ([0], [1], [2], [3], range(4)):
+        steps = [direction * (index in moved) for index, direction in enumerate(directions)]
+        for distance in (2e-5, -2e-5):  # no value comes to the clamp on the way
+            nudged = [tensor.detach() + distance * step for tensor, step in zip(inputs, steps, strict=True)]
+            assert torch.equal(picture.clamped(*nudged), picture.clamped(*inputs))
+        expected = (slope(picture, inputs, steps) * upstream).sum()
+        found = sum((gradient * step).sum() for gradient, step in zip(gradients, steps, strict=True))
+        # What is left out is of the order of length⁴; a few hundred values round by 1e-16 / length.
+        assert found.item() == pytest.approx(expected.item(), rel=1e-8, abs=1e-8)
+
+
+@flat_and_smooth
+def test_each_entry_of_a_pictures_jacobian_is_a_central_difference(smooth):
+    picture = Picture(replace(SCENES["open, from behind"], size=3, samples=2), "linear", smooth)
+    inputs = picture.inputs()
+    assert torch.autograd.gradcheck(picture, inputs)
+    share = picture.clamped(*inputs).double().mean()
+    assert 0 < share < 0.5
+
+
+@flat_and_smooth
+def test_albedo_per_face_has_the_derivative_of_central_differences(smooth):
+    scene = SCENES["solid"]
+    fragments, vertices, light = scene.fragments, scene.vertices(), draw(49, 3)
+
+    def lit(albedo: torch.Tensor) -> torch.Tensor:
+        return radiance(fragments, vertices, light, face_albedo(albedo, fragments), scene.all_faces(smooth))
+
+    albedo = draw(len(scene.mesh.faces), 3).requires_grad_(True)
+    assert torch.autograd.gradcheck(lit, albedo)
+    (gradient,) = torch.autograd.grad(lit(albedo).sum(), albedo)
+    unseen = np.setdiff1d(np.arange(len(albedo)), fragments.faces)
+    assert len(unseen) and not gradient[unseen].any()
+
+
+# ---------------------------------------------------------------------------- zeros
+
+
+@each_scene
+@flat_and_smooth
+def test_what_no_sample_sees_has_a_gradient_of_exactly_zero(scene, smooth):
+    """Coefficients of the dead bands, vertices of no seen face (nor of a neighbour's, where normals are smooth)."""
+    picture = Picture(scene, "linear", smooth)
+    inputs = picture.inputs()
+    fragments = scene.fragments
+    by_vertex, by_light, *_ = torch.autograd.grad(picture(*inputs), inputs, draw(3, scene.size**2))
+    dead = torch.ones(49, dtype=torch.bool).index_fill(0, live_coefficients(6), False)
+    assert not by_light[dead].any() and by_light[~dead].all()
+    moving = np.unique(fragments.corners)
+    if smooth:
+        moving = np.unique(scene.mesh.faces[np.isin(scene.mesh.faces, moving).any(axis=1)])
+    still = np.setdiff1d(np.arange(len(by_vertex)), moving)
+    assert not by_vertex[still].any() and by_vertex[moving].any(dim=1).all()
+
+
+@each_scene
+@flat_and_smooth
+def test_background_and_clamped_pixels_have_a_gradient_of_exactly_zero(scene, smooth):
+    picture = Picture(scene, "srgb", smooth)
+    inputs = picture.inputs()
+    values = picture(*inputs)
+    fragments = scene.fragments
+    around = torch.ones(3, scene.size**2).index_fill(1, fragments.pixels, 0)
+    at_an_end = torch.zeros_like(around).index_copy(1, fragments.pixels, picture.clamped(*inputs).float())
+    assert at_an_end.any()
+    for upstream in (around, at_an_end):
+        gradients = torch.autograd.grad(values, inputs, upstream.double(), retain_graph=True)
+        assert not any(gradient.any() for gradient in gradients)
+
+
+@flat_and_smooth
+def test_an_empty_view_has_gradients_and_they_are_zero(smooth):
+    picture = Picture(OUTSIDE, "srgb", smooth)
+    inputs = picture.inputs()
+    values = picture(*inputs)
+    assert torch.equal(values[:, 0], torch.tensor([0.3, 0.6, 0.1], dtype=torch.float64)) and values.shape == (3, 25)
+    lit = picture.parts(*inputs)[1][0]
+    assert lit.shape == (3, 0)
+    for output in (values, lit):
+        gradients = torch.autograd.grad(output.sum(), inputs, retain_graph=True)
+        assert [gradient.shape for gradient in gradients] == [tensor.shape for tensor in inputs]
+        assert not any(gradient.any() for gradient in gradients)
+
+
+# ---------------------------------------------------------------------------- radiance
+
+
+def lit_and_gradients(scene: Scene, smooth: bool, dtype=torch.float64) -> tuple[torch.Tensor, ...]:
+    """Radiance and its gradients by vertices, light and albedo."""
+    albedo = surface_albedo(scene.mesh, scene.fragments, "linear")
+    inputs = [tensor.to(dtype).requires_grad_(True) for tensor in (scene.vertices(), draw(49, 3), albedo)]
+    lit = radiance(scene.fragments, *inputs, scene.all_faces(smooth))
+    upstream = draw(*lit.shape, seed=1).to(dtype)
+    return lit.detach(), *torch.autograd.grad(lit, inputs, upstream)
+
+
+@each_scene
+@pytest.mark.parametrize("color", [None, (0.9, 0.5, 0.2)], ids=["its own colours", "one colour"])
+def test_flat_radiance_is_the_operators(scene, color):
+    mesh = scene.mesh if color is None else Mesh.plain(scene.mesh.vertices, scene.mesh.faces, color)
+    scene = replace(scene, mesh=mesh)
+    settings = PictureSettings(scene.size, scene.samples)
+    [operator] = build_operators(mesh, [scene.camera], settings, BACKEND, dtype=torch.float64)
+    assert len(operator.transfer) == (3 if color is None and scene.samples > 1 else 1)
+    lit, _, by_light, _ = lit_and_gradients(scene, smooth=False)
+    light = draw(49, 3)
+    torch.testing.assert_close(lit, operator.radiance(light), rtol=0, atol=16 * EPS * brightest(light))
+    by_operator = operator.light_gradient(draw(*lit.shape, seed=1))
+    torch.testing.assert_close(by_light, by_operator, rtol=0, atol=64 * EPS * float(by_operator.abs().max()))
+
+
+def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surface():
+    """Its vertex normals are its corners, and so the normal at a sample is the point there itself."""
+    hull = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))
+    scene = Scene(Mesh.plain(hull.vertices, hull.faces), size=24, samples=1)
+    fragments, light = scene.fragments, draw(49, 3)
+    lit, *_ = lit_and_gradients(scene, smooth=True)
+    right, up, back = scene.camera.axes()
+    across = fragments.positions().numpy() * scene.camera.field_of_view / 2
+    # The faces' planes are n · p = 1.
+    normals = np.sign(scene.mesh.vertices[fragments.corners[fragments.face]].sum(axis=1))
+    foot = across @ np.stack([right, up])
+    points = foot + ((1 - (normals * foot).sum(axis=1)) / (normals @ back))[:, None] * back
+    expected = scipy_irradiance(points, light.numpy())
+    inside = (np.sign(points) == normals).all(axis=1)  # corners are snapped to 1/256 of a sample
+    assert inside.mean() > 0.95 and len(inside) > 100
+    np.testing.assert_allclose(lit[:, inside], expected[:, inside], rtol=0, atol=64 * EPS * brightest(light))
+
+
+@each_scene
+@flat_and_smooth
+def test_a_pixel_is_the_mean_of_its_samples_each_shaded_as_a_pixel_of_its_own(scene, smooth):
+    size, samples = scene.size, scene.samples
+    fine = replace(scene, size=size * samples, samples=1)
+    canvases = []
+    for view in (scene, fine):
+        lit, *_ = lit_and_gradients(view, smooth)
+        canvas = torch.zeros(3, view.size**2, dtype=torch.float64).index_copy(1, view.fragments.pixels, lit)
+        canvases.append(canvas.view(3, view.size, view.size))
+    mean = canvases[1].view(3, size, samples, size, samples).mean((2, 4))
+    torch.testing.assert_close(canvases[0], mean, rtol=0, atol=16 * EPS * brightest(draw(49, 3)))
+
+
+@flat_and_smooth
+def test_winding_does_not_matter(smooth):
+    plain, turned = (lit_and_gradients(SCENES[name], smooth) for name in ("solid", "wound the other way"))
+    for found, expected in zip(turned[:3], plain[:3], strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=64 * EPS * float(expected.abs().max()))
+
+
+def test_faces_without_area_and_second_copies_of_faces_change_nothing():
+    for found, expected in zip(*(lit_and_gradients(SCENES[name], False) for name in ("spoiled", "solid")), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_faces_without_area_change_nothing_in_smooth_shading_either():
+    """Second copies double every area, which rounds nothing; albedo comes from the first copies."""
+    for found, expected in zip(*(lit_and_gradients(SCENES[name], True) for name in ("spoiled", "solid")), strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=64 * EPS * float(expected.abs().max()))
+
+
+@each_scene
+@flat_and_smooth
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
+def test_shorter_dtypes_go_in_and_come_out_and_are_float64_to_rounding(scene, smooth, dtype):
+    """Normals round, which the light's slope makes six times of, and so do albedos and results; gradients round twice
+    as often, and the heights that they are divided by are at least a third of the mesh's size."""
+    scene = replace(scene, mesh=replace(scene.mesh, vertices=scene.vertices().to(dtype).double().numpy()))
+    short, full = (lit_and_gradients(scene, smooth, dtype=kind) for kind in (dtype, torch.float64))
+    slack = (6 + 2) * torch.finfo(dtype).eps
+    torch.testing.assert_close(short[0].double(), full[0], rtol=0, atol=slack * brightest(draw(49, 3)))
+    for found, expected in zip(short[1:], full[1:], strict=True):
+        assert found.dtype == dtype
+        torch.testing.assert_close(found.double(), expected, rtol=0, atol=2 * slack * float(expected.abs().max()))
+
+
+@flat_and_smooth
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16, torch.bfloat16])
+@pytest.mark.parametrize(
+    ("light", "albedo", "size"),
+    [("largest", 1, 1), (1, "largest", 1), ("largest", "largest", 1), ("largest", 0, 1), (1, 1, 1e-18), (1, 1, 5e17)],
+)
+def test_no_nan_comes_out_whatever_finite_goes_in(light, albedo, size, dtype, smooth):
+    """Some of the radiance is negative, so that overflow on the way would be infinity less infinity."""
+    scene = SCENES["open, from behind"]
+    fragments = scene.fragments
+    largest = min(0.99 * LARGEST, torch.finfo(dtype).max)
+    light, albedo = (largest if value == "largest" else value for value in (light, albedo))
+    vertices = (scene.vertices() * size).clamp(-torch.finfo(dtype).max, torch.finfo(dtype).max)
+    inputs = vertices, draw(49, 3).sign() * light, torch.ones(len(fragments.pixel), 3) * albedo
+    inputs = [tensor.to(dtype).requires_grad_(True) for tensor in inputs]
+    lit = radiance(fragments, *inputs, scene.all_faces(smooth))
+    for tensor in (lit, *torch.autograd.grad(lit.sum(), inputs)):
+        assert not tensor.isnan().any()
+
+
+def test_a_light_too_bright_for_half_precision_gives_no_nan():
+    """It is finite in its own dtype, and where it is added up."""
+    lit = irradiance(draw(20, 3).half(), draw(49, 3).float() * 1e5)
+    assert not lit.isnan().any()
+
+
+# ---------------------------------------------------------------------------- generated meshes and lights
+
+
+@dataclass(frozen=True)
+class Generated:
+    """A random mesh, from the fragments of one view, with a light and an albedo."""
+
+    scene: Scene
+    light: torch.Tensor
+    smooth: bool
+    scale: float
+
+    def inputs(self) -> list[torch.Tensor]:
+        albedo = surface_albedo(self.scene.mesh, self.scene.fragments, "linear")
+        return [self.scene.vertices(), self.light, albedo]
+
+    def lit(self, vertices, light, albedo) -> torch.Tensor:
+        return radiance(self.scene.fragments, vertices, light, albedo, self.scene.all_faces(self.smooth))
+
+
+@st.composite
+def generated(draw_from) -> Generated:
+    """Dented icosahedra and tori, turned and flattened, without some of their faces and with others wound round.
+
+    Only all or none are where normals are smooth: those that cancel around a vertex have no derivative.
+    """
+    draws = np.random.default_rng(draw_from(st.integers(0, 2**32 - 1)))
+    make = draw_from(st.sampled_from([trimesh.creation.icosahedron, lambda: trimesh.creation.torus(0.7, 0.3, 5, 4)]))
+    smooth, flatness = draw_from(st.booleans()), draw_from(st.sampled_from([1, 0.3]))
+    share_turned = draw_from(st.sampled_from([0, 1] if smooth else [0, 0.5, 1]))
+    shape = make()
+    dents = draws.uniform(-1, 1, shape.vertices.shape) * draw_from(st.sampled_from([0, 0.05, 0.15]))
+    vertices = Rotation.random(rng=draws).apply((shape.vertices + dents) * [1, 1, flatness])
+    faces = draws.permutation(shape.faces)[draw_from(st.integers(0, 10)) :]
+    faces = np.where(draws.random((len(faces), 1)) < share_turned, faces[:, ::-1], faces)
+    camera = OrthographicCamera(draws.uniform(0, math.pi), draws.uniform(-4, 4), 2.2)
+    scene = Scene(Mesh.plain(vertices, faces, draws.uniform(0, 1, vertices.shape)), camera, 4, 2)
+    light = torch.from_numpy(draws.normal(size=((draw_from(st.integers(0, 8)) + 1) ** 2, 3)))
+    return Generated(scene, light, smooth, 2.0 ** draw_from(st.integers(-500, 500)))
+
+
+@settings(deadline=None, max_examples=60)
+@given(generated(), st.integers(0, 2**20))
+def test_derivatives_on_generated_meshes_are_central_differences(case, seed):
+    """Heights are a fifteenth of a mesh's size or more, so that the fifth derivatives are below 30⁵."""
+    inputs = [tensor.requires_grad_(True) for tensor in case.inputs()]
+    lit = case.lit(*inputs)
+    upstream = draw(*lit.shape, seed=seed)
+    gradients = torch.autograd.grad(lit, inputs, upstream)
+    steps = [draw(*tensor.shape, seed=seed + 1) for tensor in inputs]
+    expected = (slope(case.lit, inputs, steps) * upstream).sum().item()
+    found = sum((gradient * step).sum() for gradient, step in zip(gradients, steps, strict=True)).item()
+    size = sum((gradient * step).abs().sum() for gradient, step in zip(gradients, steps, strict=True)).item()
+    assert found == pytest.approx(expected, abs=1e-7 * (size + brightest(case.light)))
+
+
+@settings(deadline=None, max_examples=40)
+@given(generated(), st.integers(0, 2**20))
+def test_radiance_stays_when_mesh_and_light_turn_together_and_the_mesh_moves_and_grows(case, seed):
+    """Of the fragments, which are held fixed. The gradients turn along and shrink."""
+    vertices, light, albedo = case.inputs()
+    turn = torch.from_numpy(Rotation.random(rng=np.random.default_rng(seed)).as_matrix())
+    moved = case.scale * (vertices @ turn.T + draw(3, seed=seed))
+    results = []
+    for placed, shining in ((vertices, light), (moved, rotate(light, turn))):
+        placed.requires_grad_(True)
+        lit = case.lit(placed, shining, albedo)
+        results.append((lit, torch.autograd.grad(lit, placed, draw(*lit.shape, seed=seed))[0]))
+    (lit, gradient), (turned_lit, turned_gradient) = results
+    # Moved vertices round anew; heights are a fifteenth of a mesh's size or more, and the light's slope is its degree.
+    slack = 3e3 * EPS * (1 + math.sqrt(len(light))) * brightest(light)
+    torch.testing.assert_close(turned_lit, lit, rtol=0, atol=slack)
+    limit = 100 * slack * (1 + len(case.light)) * len(lit.T)
+    torch.testing.assert_close(turned_gradient * case.scale, gradient @ turn.T, rtol=0, atol=limit)
+
+
+@settings(deadline=None, max_examples=20)
+@given(generated())
+def test_radiance_is_linear_in_the_light_and_in_the_albedo(case):
+    vertices, light, albedo = case.inputs()
+    other = draw(*light.shape), draw(*albedo.shape).abs()
+    plain = case.lit(vertices, light, albedo)
+    slack = (
+        64 * EPS * (brightest(light) + brightest(other[0])) * float(albedo.max() + other[1].max() if len(albedo) else 1)
+    )
+    added = case.lit(vertices, light + 2 * other[0], albedo) - 2 * case.lit(vertices, other[0], albedo)
+    torch.testing.assert_close(added, plain, rtol=0, atol=slack)
+    added = case.lit(vertices, light, albedo + other[1]) - case.lit(vertices, light, other[1])
+    torch.testing.assert_close(added, plain, rtol=0, atol=slack)
