@@ -104,8 +104,11 @@ def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settin
     by_pixel = ids.reshape(size, samples, size, samples).swapaxes(1, 2).reshape(-1)
     hits = np.flatnonzero(by_pixel >= 0)
     seen, face = _compact(by_pixel[hits], len(faces))
-    pixels, pixel = _compact(hits // samples**2, size**2)
-    counts = np.bincount(pixel, minlength=len(pixels))
+    if samples == 1:  # a sample is a pixel
+        pixels, pixel, counts = hits, np.arange(len(hits)), np.ones(len(hits))
+    else:
+        pixels, pixel = _compact(hits // samples**2, size**2)
+        counts = np.bincount(pixel, minlength=len(pixels))
     corners = faces[seen]
     outlines = torch.from_numpy(projected[corners, :2])
     a, b, c = outlines.unbind(1)

@@ -1,0 +1,84 @@
+"""The slow, readable shading beside `renderer.shading`: plain torch operations, which autograd differentiates.
+
+Each sample is shaded on its own, in the dtype of its inputs, with the harmonics by the Legendre recurrences of the
+paper's appendix B.1. In float64 it is what the fast paths are tested against; in float32, what they are timed against.
+"""
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from renderer.fragments import Fragments
+
+
+def radiance(
+    fragments: Fragments, vertices: Tensor, light: Tensor, albedo: Tensor, smooth_faces: Tensor | None = None
+) -> Tensor:
+    """Linear radiance (3, P), weighted with coverage; arguments as for `renderer.shading.radiance`.
+
+    A face of no area, where `renderer.shading` takes a gradient of zero, makes the gradient NaN.
+    """
+    corners = vertices[fragments.corners]
+    if smooth_faces is None:
+        at_samples = unit(doubled_area_vectors(corners))[fragments.face]
+    else:
+        at_corners = vertex_normals(vertices, smooth_faces)[fragments.corners[fragments.face]]
+        at_samples = unit((fragments.barycentric().to(vertices)[:, :, None] * at_corners).sum(1))
+    normals = at_samples * fragments.facing.to(vertices)[fragments.face]
+    shade = irradiance(normals, light) * albedo / fragments.samples**2
+    return shade.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel, shade).T
+
+
+def irradiance(normals: Tensor, light: Tensor) -> Tensor:
+    """Σ A_l U_lm Y_lm(n), (N, 3), at unit normals (N, 3) under light ((degree + 1)², 3)."""
+    rows, weights = [], []
+    for index, harmonic in harmonics(normals, math.isqrt(len(light)) - 1):
+        factor = clamped_cosine(math.isqrt(index))
+        if factor:
+            rows.append(harmonic)
+            weights.append(factor * light[index])
+    return torch.stack(rows, dim=1) @ torch.stack(weights)
+
+
+def harmonics(unit_normals: Tensor, degree: int) -> Iterator[tuple[int, Tensor]]:
+    """(index, Y_lm) of all harmonics to a degree, (N,) each, at unit normals (N, 3)."""
+    x, y, z = unit_normals.unbind(1)
+    cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # sin^m θ times cos mφ and sin mφ
+    for m in range(degree + 1):
+        # P_l^m over sin^m θ, from l = m upwards.
+        before, legendre = torch.zeros_like(z), torch.full_like(z, float(math.prod(range(1, 2 * m, 2))))
+        for l in range(m, degree + 1):
+            ratio = math.factorial(l - m) / math.factorial(l + m)
+            norm = math.sqrt((2 if m else 1) * (2 * l + 1) / (4 * math.pi) * ratio)
+            yield l * l + l + m, norm * legendre * cosine
+            if m:
+                yield l * l + l - m, norm * legendre * sine
+            before, legendre = legendre, ((2 * l + 1) * z * legendre - (l + m) * before) / (l + 1 - m)
+        cosine, sine = x * cosine - y * sine, x * sine + y * cosine
+
+
+def clamped_cosine(l: int) -> float:
+    """A_l = 2π ∫₀¹ t P_l(t) dt of band l (Ramamoorthi and Hanrahan 2001): zero for odd bands from 3 on."""
+    if l % 2:
+        return 2 * math.pi / 3 if l == 1 else 0.0
+    sign = (-1) ** (l // 2 + 1)
+    return sign * 2 * math.pi * math.comb(l, l // 2) / ((l + 2) * (l - 1) * 2**l)
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """(V, 3) unit normals: the mean of those of the faces around a vertex, weighted with their areas."""
+    weighted = doubled_area_vectors(vertices[faces]).repeat_interleave(3, dim=0)
+    return unit(torch.zeros_like(vertices).index_add(0, faces.flatten(), weighted))
+
+
+def doubled_area_vectors(corners: Tensor) -> Tensor:
+    """(F, 3) from corners (F, 3 corners, 3): normal to each face, outward for counter-clockwise ones."""
+    first, second, third = corners.unbind(1)
+    return torch.linalg.cross(second - first, third - first)
+
+
+def unit(vectors: Tensor) -> Tensor:
+    """Vectors (..., 3) over their lengths; NaN for zero ones."""
+    return vectors / vectors.norm(dim=-1, keepdim=True)

@@ -1,0 +1,122 @@
+"""Side by side on one scene: this renderer, plain autograd through its shading, and other differentiable renderers."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.errors import Exact
+from benchmarks.panels import SAMPLES, Bench, Entries
+from benchmarks.results import Row
+from benchmarks.scenes import ALBEDO, CAMERA, View, coefficients
+from benchmarks.steps import shade_by_face, vertex_step
+from renderer import reference, shading
+from renderer.errors import InputError
+from renderer.transfer import DEGREE, Operator
+
+DIRECT, AUTOGRAD, WHOLE = "operator, direct", "operator, autograd", "operator, direct, whole pictures in and out"
+ANALYTIC, BY_FACE, BY_SAMPLE = "analytic", "plain autograd, face by face", "plain autograd, sample by sample"
+KEPT, REFRESHED = "visibility kept", "re-rasterised"
+MITSUBA, PYTORCH3D = "Mitsuba 3", "PyTorch3D"
+SAMPLES_OF = {MITSUBA: 16, PYTORCH3D: 1}  # per pixel
+
+FINER = 4  # samples per side, as many in all as Mitsuba has
+SHADINGS = {ANALYTIC: shading.radiance, BY_FACE: shade_by_face, BY_SAMPLE: reference.radiance}
+
+Peers = Mapping[str, Callable]  # makers by name
+
+
+def installed_peers() -> tuple[dict[str, Callable], list[str]]:
+    """(the peers that start here, by name, and a sentence about each that does not)."""
+    from peers.mitsuba_peer import MitsubaPeer
+    from peers.pytorch3d_peer import PyTorch3DPeer
+
+    peers, absent = {}, []
+    for name, make in {MITSUBA: MitsubaPeer, PYTORCH3D: PyTorch3DPeer}.items():
+        triangle = np.eye(3), np.array([[0, 1, 2]])
+        try:
+            make(*triangle, np.array(ALBEDO), np.zeros((49, 3)), CAMERA, 4, SAMPLES_OF[name])
+        except InputError as error:
+            absent.append(f"{name} was not timed: {error}.")
+        else:
+            peers[name] = make
+    return peers, absent
+
+
+def by_light(bench: Bench, size: int, peers: Peers) -> list[Row]:
+    """Radiance of a light of degree 6, and the gradient of a scalar loss on it by the light."""
+
+    def entries() -> Entries:
+        view, light = bench.view(bench.plan.mesh, size), bench.light()
+        operator, exact = view.operator(SAMPLES), Exact(view, _irradiance)
+        row = _row(f"gradient by the light, {size}²", view, samples=SAMPLES**2, **exact.light_errors(operator, light))
+        for name, call in _light_gradients(view, operator, light).items():
+            yield replace(row, setting=name), call
+        for name, peer in _set_up(view, peers):
+            call = partial(peer.light_gradient, view.image_gradient.cpu().float().numpy())
+            errors = exact.errors(
+                torch.from_numpy(peer.picture()), torch.from_numpy(call()), exact.by_light[: len(light)]
+            )
+            yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
+
+    return bench.timed(entries())
+
+
+def _light_gradients(view: View, operator: Operator, light: Tensor) -> dict[str, Callable[[], Tensor]]:
+    upstream, image_gradient = view.upstream(operator.pixels), view.image_gradient.flatten(1).float()
+
+    def direct() -> Tensor:
+        operator.radiance(light)
+        return operator.light_gradient(upstream)
+
+    def autograd() -> Tensor:
+        variable = light.clone().requires_grad_()
+        return torch.autograd.grad((operator.radiance(variable) * upstream).sum(), variable)[0]
+
+    def whole() -> Tensor:
+        view.canvas(operator.radiance(light), operator.pixels)
+        return operator.light_gradient(image_gradient.index_select(1, operator.pixels))
+
+    return {DIRECT: direct, AUTOGRAD: autograd, WHOLE: whole}
+
+
+def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
+    """A picture, and the gradient of a scalar loss on it by the vertices."""
+
+    def entries() -> Entries:
+        view, light = bench.view(bench.plan.mesh, size), bench.light()
+        exact = Exact(view, _irradiance)
+        row = _row(f"gradient by the vertices, {size}²", view)
+        for name, shade in SHADINGS.items():
+            errors = exact.vertex_errors(view, 1, light, shade)
+            for visibility in (KEPT, REFRESHED):
+                call = vertex_step(view, 1, light, kept=visibility == KEPT, shade=shade)
+                yield replace(row, setting=f"{name}, {visibility}", samples=1, **errors), call
+        errors = exact.vertex_errors(view, FINER, light)
+        finer = replace(row, setting=f"{ANALYTIC}, {REFRESHED}, {FINER}² samples", samples=FINER**2, **errors)
+        yield finer, vertex_step(view, FINER, light)
+        for name, peer in _set_up(view, peers):
+            call = partial(peer.vertex_gradient, view.image_gradient.cpu().float().numpy())
+            errors = exact.errors(torch.from_numpy(peer.picture()), torch.from_numpy(call()), exact.by_vertices)
+            yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
+
+    return bench.timed(entries())
+
+
+def _irradiance(normals: Tensor) -> Tensor:
+    """Of the light as the peers are given it, cut off after degree 6."""
+    return reference.irradiance(normals, coefficients(DEGREE))
+
+
+def _set_up(view: View, peers: Peers) -> Iterator[tuple[str, object]]:
+    light = coefficients(DEGREE).float().numpy()
+    for name, make in peers.items():
+        mesh = view.mesh
+        yield name, make(mesh.vertices, mesh.faces, np.array(ALBEDO), light, CAMERA, view.size, SAMPLES_OF[name])
+
+
+def _row(panel: str, view: View, **found) -> Row:
+    return Row(panel=panel, setting="", degree=DEGREE, dtype="float32", **view.axes(), **found)

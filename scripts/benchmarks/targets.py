@@ -1,0 +1,106 @@
+"""The targets, each with what this run measured."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from benchmarks.comparison import ANALYTIC, BY_FACE, BY_SAMPLE, DIRECT, KEPT, MITSUBA, PYTORCH3D, REFRESHED
+from benchmarks.panels import SAMPLES, Bench
+from benchmarks.results import Row, shown
+from benchmarks.skipping import build_operators
+from benchmarks.steps import light_step, vertex_step
+from renderer.cache import OperatorCache
+from renderer.mesh import Mesh
+
+QUOTED = {32: 1.3, 224: 13.0}  # ms, PyTorch3D with its fragments kept, measured once on another machine
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is asked, what this run found, and whether that is enough: None where it could not be measured."""
+
+    what: str
+    asked: str
+    found: str
+    passed: bool | None
+
+
+def compared(panels: Sequence[Sequence[Row]]) -> list[Target]:
+    """Of the panels of `comparison`: light at the small size, light at the large one, vertices at the large one."""
+    small, large, vertices = ({row.setting: row for row in rows} for rows in panels)
+    analytic = f"{ANALYTIC}, {REFRESHED}"
+    return [
+        *(_faster(rows, DIRECT, PYTORCH3D, least) for rows, least in ((large, 10), (small, 30))),
+        *(_faster(rows, DIRECT, MITSUBA, least) for rows, least in ((large, 300), (small, 400))),
+        _faster(vertices, analytic, MITSUBA, 30),
+        *(_faster(vertices, analytic, f"{peer}, {REFRESHED}", 3) for peer in (BY_SAMPLE, BY_FACE)),
+    ]
+
+
+def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Target:
+    """Beside the ratio, for other renderers: no larger an error of the picture and of the gradient."""
+    own, other = rows[ours], rows.get(theirs)
+    what, asked = f"{own.panel}: {ours}, against {theirs}", f"at least {least}× faster"
+    if other is None:
+        return _unmeasured(own, what, asked, theirs)
+    ratio, found = other.time_ms / own.time_ms, f"{shown(other.time_ms / own.time_ms)}×"
+    if theirs not in (MITSUBA, PYTORCH3D):
+        return Target(what, asked, found, ratio >= least)
+    accurate = own.image_error <= other.image_error and own.gradient_error <= other.gradient_error
+    errors = f"errors of picture and gradient {_errors(own)} against {_errors(other)}"
+    return Target(what, f"{asked}, error no larger", f"{found}, {errors}", ratio >= least and accurate)
+
+
+def _unmeasured(own: Row, what: str, asked: str, theirs: str) -> Target:
+    if theirs != PYTORCH3D or own.size not in QUOTED:
+        return Target(what, asked, "not measured", None)
+    quoted = QUOTED[own.size]
+    found = f"not measured here; {shown(quoted / own.time_ms)}× against {quoted} ms on another machine"
+    return Target(what, asked, found, None)
+
+
+def _errors(row: Row) -> str:
+    return f"{shown(row.image_error)} and {shown(row.gradient_error)}"
+
+
+def measured(bench: Bench, meshes: Sequence[Mesh]) -> list[Target]:
+    """Those that need timings of their own. meshes: of the scene whose operators are built."""
+    return [_any_mesh(bench), *_geometry(bench), _building(bench, meshes)]
+
+
+def _any_mesh(bench: Bench) -> Target:
+    counts = bench.plan.mesh, bench.plan.vertices[-1]
+    views = {count: bench.view(count, bench.plan.large) for count in counts}
+    steps = {
+        count: light_step(view, view.operator(bench.plan.workload_samples), bench.light())
+        for count, view in views.items()
+    }
+    times = bench.clock.medians(steps, 3 * bench.clock.rounds)
+    ratio = times[counts[1]] / times[counts[0]]
+    what = f"light step, {bench.plan.large}²: {counts[1]:,} vertices against {counts[0]:,}"
+    return Target(what, "within 10 %", f"{100 * (ratio - 1):+.1f} %", abs(ratio - 1) <= 0.1)
+
+
+def _geometry(bench: Bench) -> list[Target]:
+    view, light = bench.view(bench.plan.mesh, bench.plan.large), bench.light()
+    steps = {
+        "light": light_step(view, view.operator(1), light),
+        KEPT: vertex_step(view, 1, light, kept=True),
+        REFRESHED: vertex_step(view, 1, light),
+    }
+    times = bench.clock.medians(steps, 3 * bench.clock.rounds)
+    targets = []
+    for visibility, most in ((KEPT, 8), (REFRESHED, 14)):
+        ratio = times[visibility] / times["light"]
+        found = f"{shown(ratio)}×, {shown(times[visibility])} ms against {shown(times['light'])} ms"
+        what = f"vertex step against light step, {view.size}², {visibility}"
+        targets.append(Target(what, f"at most {most}×", found, ratio <= most))
+    return targets
+
+
+def _building(bench: Bench, meshes: Sequence[Mesh]) -> Target:
+    rounds = max(1, bench.clock.rounds // 3)
+    times = bench.clock.medians({"build": lambda: build_operators(bench, meshes, OperatorCache())}, rounds)
+    faces, seconds = " and ".join(f"{len(mesh.faces):,}" for mesh in meshes), times["build"] / 1e3
+    views, size = len(meshes) * bench.plan.views, bench.plan.small
+    what = f"operators of {views} views, {size}², {SAMPLES}² samples, meshes of {faces} faces"
+    return Target(what, "under 1.5 s", f"{shown(seconds)} s", seconds < 1.5)
