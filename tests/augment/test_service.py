@@ -9,8 +9,8 @@ from augment.phases import Phases
 from augment.scene import ObjectSettings, Scene, build_objects
 from augment.service import AugmentationService, AugmentationSettings, RandomLights
 from renderer.errors import InputError
-from renderer.lights import probe
 from renderer.image import PictureSettings
+from renderer.lights import probe
 from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
