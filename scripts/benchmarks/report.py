@@ -52,6 +52,16 @@ class Findings:
         return [*self.choices, self.descent, *self.comparisons]
 
 
+WHY_NOT = """\
+What stands in the way. At 32² one light's picture and gradient are some twenty operations on a few thousand numbers,
+whose cost is Python's and torch's for each operation and not the arithmetic; a light among 100 costs a fraction of it
+([Light step by lights](#light-step-by-lights-32)). Rasterising anew takes more than half of a vertex step and is the same
+work for plain autograd, whose ratio is therefore that of the rows with visibility kept only where it is kept
+([Gradient by the vertices](#gradient-by-the-vertices-224)). Mitsuba draws its samples from the surface's reflection here,
+which has a fifth of the noise of drawing them from the light at the same time per sample.
+"""
+
+
 def page(findings: Findings, command: str, machine: str) -> str:
     """The whole page, in Markdown."""
     samples, size, uncertainty = findings.reference
@@ -67,6 +77,7 @@ def page(findings: Findings, command: str, machine: str) -> str:
         *(f"{note}\n" for note in findings.notes),
         "## Targets\n",
         _targets(findings.targets),
+        WHY_NOT,
         "## Choices\n",
         "The error that counts is the larger of the two. All settings, not only the fronts, are in "
         "[renderer_pareto.csv](renderer_pareto.csv).\n",
