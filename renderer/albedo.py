@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,13 +39,12 @@ def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
 
 def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], linear: Linear, encoding: str) -> Tensor:
     """Corner colour × texture at the samples. `linear` turns texels (N, 3), as they are stored, into linear albedo."""
+    if mesh.one_color is not None:
+        color = _linear_colors(mesh.one_color, fragments, encoding)
+        return color.expand(len(fragments.face), 3)
     faces = fragments.faces.cpu().numpy()
-    colors = torch.from_numpy(mesh.corner_colors[faces]).to(fragments.coverage)
-    require_bounded(corner_colors=colors)
-    if not textures and (colors == colors[:1, :1]).all():  # one colour for all that is seen
-        return decode(colors.flatten(0, 1)[:1], encoding).expand(len(fragments.face), 3)
-    colors = decode(colors, encoding)
-    if not textures and (colors == colors[:, :1]).all():  # one colour per face
+    colors = _linear_colors(mesh.corner_colors[faces], fragments, encoding)
+    if not textures and (colors == colors[:, :1]).all():  # one for each face
         return colors[:, 0].index_select(0, fragments.face)
     barycentric = fragments.barycentric()
     albedo = _interpolate(barycentric, colors, fragments.face)
@@ -55,6 +55,13 @@ def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], linear
         value = _bilinear(texture, linear, _interpolate(barycentric[here], uvs, fragments.face[here]))
         albedo = albedo.index_copy(0, here, albedo[here] * value)
     return albedo
+
+
+def _linear_colors(colors: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:
+    """Colours as authored to linear albedo, float64 on the fragments' device."""
+    corner_colors = torch.from_numpy(colors).to(fragments.coverage)
+    require_bounded(corner_colors=corner_colors)
+    return decode(corner_colors, encoding)
 
 
 def _interpolate(barycentric: Tensor, corners: Tensor, face: Tensor) -> Tensor:

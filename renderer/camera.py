@@ -40,9 +40,8 @@ class OrthographicCamera:
         The picture is [-1, 1]² in x and y. Depth is smaller where nearer and in [-1, 1] within 2 world units of the
         origin, which every normalised mesh (radius at most √3) is.
         """
-        right, up, towards = (points @ self.axes().T).T
-        half = self.field_of_view / 2
-        return np.stack([right / half, up / half, -towards / 2], axis=1)
+        scale = np.array([2 / self.field_of_view, 2 / self.field_of_view, -1 / 2])
+        return points @ (self.axes() * scale[:, None]).T
 
 
 def ring(views: int, field_of_view: float, polar: float = math.pi / 3) -> list[OrthographicCamera]:

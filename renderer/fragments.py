@@ -109,8 +109,8 @@ def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settin
     else:
         pixels, pixel = _compact(hits // samples**2, size**2)
         counts = np.bincount(pixel, minlength=len(pixels))
-    corners = faces[seen]
-    outlines = torch.from_numpy(projected[corners, :2])
+    corners = faces.take(seen, axis=0)
+    outlines = torch.from_numpy(projected[:, :2].take(corners, axis=0))
     a, b, c = outlines.unbind(1)
     return Fragments(
         size=size,

@@ -67,6 +67,12 @@ class Mesh:
         return np.linalg.norm(self._doubled_area_vectors(), axis=1) / 2
 
     @cached_property
+    def one_color(self) -> np.ndarray | None:
+        """(3,) float32 sRGB-encoded, where the whole mesh has the same colour and no texture."""
+        alike = len(self.faces) > 0 and not self.textures and (self.corner_colors == self.corner_colors[:1, :1]).all()
+        return self.corner_colors[0, 0] if alike else None
+
+    @cached_property
     def closed(self) -> bool:
         """Whether no face is ever seen from behind: every part is watertight, and its faces counter-clockwise outside.
 
