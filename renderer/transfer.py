@@ -15,7 +15,7 @@ from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
-from renderer.harmonics import irradiance_basis, live_coefficients
+from renderer.harmonics import irradiance_basis, live_coefficients, per_degree
 from renderer.image import PictureSettings
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
@@ -62,13 +62,12 @@ class Operator:
         Exactly zero for the coefficients of bands that cannot reach a diffuse surface. InputError: NaN.
         """
         require_bounded(radiance_gradient=radiance_gradient)
-        upstream = radiance_gradient.to(self.transfer.dtype).reshape(
-            radiance_gradient.shape[:-2].numel(), 3, len(self.pixels)
-        )
-        product = _transposed_transfer(upstream, self.transfer, self.albedo)
-        gradient = product.new_zeros(len(product), (self.degree + 1) ** 2, 3)
-        gradient.index_copy_(1, live_coefficients(self.degree).to(product.device), product)
-        return gradient.reshape(*radiance_gradient.shape[:-2], *gradient.shape[1:]).to(radiance_gradient.dtype)
+        upstream = radiance_gradient.to(self.transfer.dtype)
+        if len(self.transfer) == 1:
+            product = (upstream * self.albedo) @ self.transfer[0].T
+        else:
+            product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
+        return (_spread(self.degree).to(product) @ product.mT).to(radiance_gradient.dtype)
 
     def to(self, device: torch.device | str) -> "Operator":
         """The same on another device."""
@@ -90,9 +89,17 @@ class _Radiance(torch.autograd.Function):
 def _radiance(operator: Operator, lights: Tensor) -> Tensor:
     live = live_coefficients(operator.degree).to(lights.device)
     kept = lights.index_select(-2, live).to(operator.transfer.dtype)
-    flat = kept.reshape(lights.shape[:-2].numel(), *kept.shape[-2:])
-    product = apply_transfer(flat, operator.transfer, operator.albedo)
-    return product.reshape(*lights.shape[:-2], *product.shape[-2:]).to(lights.dtype)
+    if len(operator.transfer) == 1:
+        product = kept.mT @ operator.transfer[0] * operator.albedo
+    else:
+        product = torch.einsum("...kc,ckp->...cp", kept, operator.transfer)
+    return product.to(lights.dtype)
+
+
+@per_degree
+def _spread(degree: int) -> Tensor:
+    """((degree + 1)², K) float32: puts the live coefficients in their places, with exact zeros in the others."""
+    return torch.eye((degree + 1) ** 2)[:, live_coefficients(degree)]
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
@@ -102,14 +109,6 @@ def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
         return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
     product = lights.mT.flatten(-3, -2) @ transfer.squeeze(-3)
     return product.unflatten(-2, (-1, 3)) * albedo.unsqueeze(-3)
-
-
-def _transposed_transfer(upstream: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
-    """The gradient (B, K, 3) of `apply_transfer` by its lights, for upstream (B, 3, P)."""
-    if len(transfer) == 3:
-        return (upstream.transpose(0, 1) @ transfer.mT).permute(1, 2, 0)
-    product = (upstream * albedo).flatten(0, 1) @ transfer[0].T
-    return product.unflatten(0, (-1, 3)).mT
 
 
 def build_operators(
