@@ -9,20 +9,27 @@ from torch.autograd.function import once_differentiable
 from renderer.errors import InputError, require_bounded
 
 ENCODINGS = ("linear", "srgb")
+NORMALS = ("flat", "smooth")
 
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """Picture size in pixels, samples per pixel side, encoding. InputError: none of the first two, unknown encoding."""
+    """Picture size in pixels, samples per pixel side, encoding, and a normal per face or interpolated vertex normals.
+
+    InputError: none of the first two, an unknown choice.
+    """
 
     size: int = 32
     samples: int = 8
     encoding: str = "linear"
+    normals: str = "flat"
 
     def __post_init__(self):
         if self.size < 1 or self.samples < 1:
             raise InputError(f"renderer.samples={self.samples} and the size {self.size} must be at least 1")
         check_encoding(self.encoding)
+        if self.normals not in NORMALS:
+            raise InputError(f"renderer.normals={self.normals}: choose one of {', '.join(NORMALS)}")
 
 
 def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:

@@ -108,17 +108,17 @@ def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, g
     return light + offsets.to(light)
 
 
-def _mean_luminance(coefficients: Tensor) -> float:
+def mean_luminance(coefficients: Tensor) -> float:
     return float(coefficients[0].double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64))
 
 
 def _read_light_map(path: Path) -> Tensor:
     """Coefficients (49, 3) float64 of a map, at the grace probe's mean luminance."""
     coefficients = project_environment(read_map(path))
-    luminance = _mean_luminance(coefficients)
+    luminance = mean_luminance(coefficients)
     if not luminance > 0:
         raise InputError(f"environment map {path} has a mean luminance of {luminance:g}: give a map with light in it")
-    return coefficients * (_mean_luminance(probe("grace")) / luminance)
+    return coefficients * (mean_luminance(probe("grace")) / luminance)
 
 
 def _read_coefficients(path: Path) -> Tensor:

@@ -46,7 +46,7 @@ def radiance(
         shade = irradiance(normals, light).index_select(1, face)
     else:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
-        shade = irradiance(_smooth_normals(fragments, positions, smooth_faces), light)
+        shade = irradiance(smooth_normals(fragments, positions, smooth_faces), light)
     seen = shade * weights.T
     if fragments.samples > 1:  # a sample is a pixel otherwise
         seen = seen.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, seen)
@@ -138,7 +138,7 @@ def _contract(slopes: Tensor, values: Tensor, upstream: Tensor) -> Tensor:
     return (gradients * upstream).sum(1)
 
 
-def _smooth_normals(fragments: Fragments, vertices: Tensor, faces: Tensor) -> Tensor:
+def smooth_normals(fragments: Fragments, vertices: Tensor, faces: Tensor) -> Tensor:
     """(S, 3) vertex normals interpolated to the samples, on the side that the camera sees; not of unit length."""
     near = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
     near[fragments.corners.flatten()] = True

@@ -4,7 +4,7 @@ Before clamping, every pixel of a diffuse mesh is linear in the lighting coeffic
 radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,6 +19,7 @@ from renderer.harmonics import irradiance_basis, live_coefficients, per_degree
 from renderer.image import PictureSettings
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
+from renderer.shading import smooth_normals
 from renderer.visibility import Backend
 
 DEGREE = 6
@@ -123,7 +124,7 @@ def build_operators(
     """One operator per camera, for lights of one degree; computed in float64 and stored in `dtype`.
 
     gain multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side that the
-    camera sees, with a normal per face.
+    camera sees, with normals as the settings say.
     """
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, backend, closed=mesh.closed)
     return [build_operator(mesh, view, settings, gain, degree, dtype) for view in views]
@@ -135,15 +136,13 @@ def build_operator(
     """The operator of one view that has been rasterised; see `build_operators`."""
     require_bounded(gain=torch.tensor(gain))
     albedo = surface_albedo(mesh, fragments, settings.encoding) * gain
-    normals = face_normals(torch.from_numpy(mesh.vertices), fragments.corners) * fragments.facing
-    shading = irradiance_basis(normals, degree)
     factor = _pixel_albedo(fragments, albedo, dtype)
     if factor is None:
         factor = torch.ones(len(fragments.pixels), 3)
     else:
         albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
     return Operator(
-        transfer=_box_filter(fragments, shading, albedo, dtype),
+        transfer=_box_filter(_shades(mesh, fragments, albedo, settings, degree), len(fragments.pixels), dtype),
         albedo=factor.T.to(dtype).contiguous(),
         coverage=fragments.coverage.to(dtype),
         pixels=fragments.pixels,
@@ -158,16 +157,36 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     return by_pixel if (spread <= torch.finfo(dtype).eps * albedo).all() else None
 
 
-def _box_filter(fragments: Fragments, shading: Tensor, albedo: Tensor, dtype: torch.dtype) -> Tensor:
-    """Sum over each pixel's samples of shading (G, K) × albedo (S, C): (C, K, P), by blocks of pixels in float64."""
+@dataclass(frozen=True)
+class _Shades:
+    """R contributions to pixels (R,), weights (R, C) each; basis: some of them → their A_l Y_lm(n) (..., K)."""
+
+    pixel: Tensor
+    weights: Tensor
+    basis: Callable[[slice], Tensor]
+
+
+def _shades(mesh: Mesh, fragments: Fragments, albedo: Tensor, settings: PictureSettings, degree: int) -> _Shades:
+    vertices = torch.from_numpy(mesh.vertices)
+    if settings.normals == "smooth":
+        normals = smooth_normals(fragments, vertices, torch.from_numpy(mesh.faces))
+        weights = albedo / fragments.samples**2
+        return _Shades(fragments.pixel, weights, lambda some: irradiance_basis(normals[some], degree))
+    shading = irradiance_basis(face_normals(vertices, fragments.corners) * fragments.facing, degree)
     pixel, face, weights = fragments.merge(albedo)
-    starts = torch.arange(0, len(fragments.pixels), BLOCK)
-    ends = torch.searchsorted(pixel, starts + BLOCK).tolist()
-    filtered = torch.empty(weights.shape[1], shading.shape[1], len(fragments.pixels), dtype=dtype)
+    return _Shades(pixel, weights, lambda some: shading.index_select(0, face[some]))
+
+
+def _box_filter(shades: _Shades, pixels: int, dtype: torch.dtype) -> Tensor:
+    """Sum over each pixel's contributions of basis × weights: (C, K, P), by blocks of pixels in float64."""
+    starts = torch.arange(0, pixels, BLOCK)
+    ends = torch.searchsorted(shades.pixel, starts + BLOCK).tolist()
+    functions = shades.basis(slice(0)).shape[1]
+    filtered = torch.empty(shades.weights.shape[1], functions, pixels, dtype=dtype)
     for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
-        rows = shading.index_select(0, face[begin:end])
+        rows, pixel = shades.basis(slice(begin, end)), shades.pixel[begin:end] - first
         block = filtered[..., first : first + BLOCK]
-        for channel, weight in zip(block, weights[begin:end].T, strict=True):
-            summed = shading.new_zeros(channel.shape[::-1])
-            channel.copy_(summed.index_add_(0, pixel[begin:end] - first, rows * weight[:, None]).T)
+        for channel, weight in zip(block, shades.weights[begin:end].T, strict=True):
+            summed = rows.new_zeros(channel.shape[::-1])
+            channel.copy_(summed.index_add_(0, pixel, rows * weight[:, None]).T)
     return filtered

@@ -9,12 +9,15 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre, sph_harm_y
 
+from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
+from renderer.fragments import build_fragments
 from renderer.harmonics import MAX_DEGREE, lambertian_factors, live_coefficients
 from renderer.image import PictureSettings
 from renderer.lights import ambient, directional
 from renderer.mesh import Mesh, concatenate
+from renderer.shading import radiance as shade
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
 
@@ -283,6 +286,28 @@ def test_a_mesh_outside_the_picture_leaves_an_empty_operator():
 def test_an_unknown_encoding_is_refused():
     with pytest.raises(InputError, match=r"renderer\.encoding=gamma"):
         build_operators(square(0.5), [ABOVE], PictureSettings(size=4, samples=1, encoding="gamma"), BACKEND)
+
+
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+@pytest.mark.parametrize("shape", [patchwork, lambda: sphere(2, (0.8, 0.4, 0.1))], ids=["patchwork", "one colour"])
+def test_smooth_operators_are_what_shading_with_vertex_normals_gives(shape, encoding):
+    mesh, light, cameras = shape(), draw(49, 3), ring(2, 2.2)
+    settings = PictureSettings(12, samples=3, encoding=encoding, normals="smooth")
+    operators = build_operators(mesh, cameras, settings, BACKEND, dtype=torch.float64)
+    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, BACKEND, closed=mesh.closed)
+    vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
+    flat = build_operators(mesh, cameras, replace(settings, normals="flat"), BACKEND, dtype=torch.float64)
+    for operator, view, faceted in zip(operators, views, flat, strict=True):
+        expected = shade(view, vertices, light, surface_albedo(mesh, view, encoding), smooth_faces=faces)
+        # 31 coefficients of some 1, whose terms are added in another order.
+        torch.testing.assert_close(operator.radiance(light), expected, rtol=0, atol=256 * EPS)
+        assert torch.equal(operator.pixels, view.pixels) and torch.equal(operator.coverage, view.coverage.double())
+        assert (operator.radiance(light) - faceted.radiance(light)).abs().max() > 1e-3
+
+
+def test_unknown_normals_are_refused():
+    with pytest.raises(InputError, match=r"renderer\.normals=round: choose one of flat, smooth"):
+        PictureSettings(normals="round")
 
 
 # ---------------------------------------------------------------------------- light to pixels and back

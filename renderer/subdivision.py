@@ -1,0 +1,44 @@
+"""Finer meshes of the same shape, so that an attack on the vertices has more of them to move."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from renderer.mesh import Mesh
+
+_EDGES = ((0, 1), (1, 2), (2, 0))
+_QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and the middles of the edges as 3 to 5
+
+
+def subdivide(mesh: Mesh, vertices: int) -> Mesh:
+    """The same surface with more than so many vertices: each face becomes four, as often as it takes.
+
+    New vertices are the middles of edges, shared by the faces that share the edge, so that a closed mesh stays closed;
+    colours (as they are stored, sRGB-encoded) and texture coordinates are interpolated. The old vertices keep their
+    indices, and the quarters of face f are the faces 4f to 4f + 3. A mesh with enough vertices comes back as it is.
+    """
+    while len(mesh.vertices) <= vertices:
+        mesh = _quartered(mesh)
+    return mesh
+
+
+def _quartered(mesh: Mesh) -> Mesh:
+    count = len(mesh.vertices)
+    ends = np.sort(mesh.faces[:, _EDGES].reshape(-1, 2), axis=1)
+    edges, edge = np.unique(ends @ [count, 1], return_inverse=True)  # one number is sorted faster than a pair
+    middles = mesh.vertices[np.stack(np.divmod(edges, count), axis=1)].mean(axis=1)
+    around = np.concatenate([mesh.faces, count + edge.reshape(-1, 3)], axis=1)
+    return replace(
+        mesh,
+        vertices=np.concatenate([mesh.vertices, middles]),
+        faces=around[:, _QUARTERS].reshape(-1, 3),
+        corner_colors=_interpolated(mesh.corner_colors),
+        corner_uvs=_interpolated(mesh.corner_uvs),
+        texture_ids=mesh.texture_ids.repeat(4),
+    )
+
+
+def _interpolated(corners: np.ndarray) -> np.ndarray:
+    """Values (4F, 3, D) at the corners of the quarters, of values (F, 3, D) at the corners of the faces."""
+    middles = corners[:, _EDGES].mean(axis=2)
+    return np.concatenate([corners, middles], axis=1)[:, _QUARTERS].reshape(-1, *corners.shape[1:])

@@ -1,0 +1,202 @@
+"""Subdivision: closed forms, trimesh's own, and the renderer's pictures before and after."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from renderer.albedo import surface_albedo
+from renderer.camera import OrthographicCamera, ring
+from renderer.fragments import Fragments, build_fragments
+from renderer.image import PictureSettings
+from renderer.mesh import Mesh, concatenate
+from renderer.shading import radiance
+from renderer.shapes import solid
+from renderer.subdivision import subdivide
+from renderer.visibility import choose
+
+EPS, EPS32 = np.finfo(np.float64).eps, np.finfo(np.float32).eps
+SNAP = 2**-9  # px: the rasteriser rounds corners to 1/256 px
+
+
+def plain(geometry: trimesh.Trimesh) -> Mesh:
+    return Mesh.plain(geometry.vertices, geometry.faces)
+
+
+def once(mesh: Mesh) -> Mesh:
+    return subdivide(mesh, len(mesh.vertices))
+
+
+def corners(mesh: Mesh) -> np.ndarray:
+    return mesh.vertices[mesh.faces]
+
+
+def euler_number(mesh: Mesh) -> int:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).euler_number
+
+
+def height_field(cells: int = 16) -> Mesh:
+    """A rough surface over [-1, 1]², whose corners' x and y are multiples of 2 / cells; colours and uvs with seams."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(*[np.linspace(-1, 1, cells + 1)] * 2, indexing="ij")
+    index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
+    a, b, c, d = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    vertices = np.stack([x.ravel(), y.ravel(), rng.uniform(-0.3, 0.3, x.size)], axis=1)
+    return replace(
+        Mesh.plain(vertices, faces),
+        corner_colors=rng.random((len(faces), 3, 3), dtype=np.float32),
+        corner_uvs=rng.random((len(faces), 3, 2), dtype=np.float32),
+        texture_ids=rng.integers(-1, 2, len(faces)).astype(np.int32),
+        textures=tuple(rng.integers(0, 256, (4, side, 3), dtype=np.uint8) for side in (4, 8)),
+    )
+
+
+SHEET = height_field(3)
+MESHES = {
+    "box": plain(trimesh.creation.box()),
+    "torus": plain(trimesh.creation.torus(1, 0.3, major_sections=8, minor_sections=6)),
+    "cup": solid("cup"),
+    "two that touch": concatenate([plain(trimesh.creation.box()), plain(trimesh.creation.icosphere(subdivisions=1))]),
+    "open": SHEET,
+    "a triangle": Mesh.plain(np.eye(3), [[0, 1, 2]]),
+}
+every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"), [(0, 12), (11, 12), (12, 42), (41, 42), (42, 162), (5000, 10242), (10_000, 10_242)]
+)
+def test_an_icosahedron_is_subdivided_until_it_has_more_vertices_than_asked(asked, found):
+    mesh = subdivide(plain(trimesh.creation.icosahedron()), asked)
+    assert (len(mesh.vertices), len(mesh.faces)) == (found, 2 * found - 4)
+
+
+def test_a_mesh_with_enough_vertices_comes_back_as_it_is():
+    assert subdivide(SHEET, len(SHEET.vertices) - 1) is SHEET
+
+
+@every_mesh
+def test_faces_are_cut_as_trimesh_cuts_them(mesh):
+    vertices, faces = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
+    found, expected = (np.sort(cut.reshape(-1, 9), axis=0) for cut in (corners(once(mesh)), vertices[faces]))
+    assert_array_equal(found, expected)
+    assert len(once(mesh).vertices) == len(vertices)
+
+
+@every_mesh
+def test_the_old_vertices_stay_and_the_new_ones_are_the_middles_of_the_edges(mesh):
+    finer = once(mesh)
+    assert_array_equal(finer.vertices[: len(mesh.vertices)], mesh.vertices)
+    a, b, c = corners(mesh).swapaxes(0, 1)
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    quarters = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
+    assert_array_equal(corners(finer).reshape(-1, 4, 3, 3), quarters.transpose(2, 0, 1, 3))
+
+
+@every_mesh
+def test_shape_and_topology_are_kept(mesh):
+    """Corners are rounded once each and coordinates are below 2: areas are off by a few EPS."""
+    finer = subdivide(mesh, 16 * len(mesh.vertices))
+    quarters = len(finer.faces) // len(mesh.faces)
+    assert_allclose(finer.face_areas().reshape(-1, quarters).sum(axis=1), mesh.face_areas(), rtol=0, atol=16 * EPS)
+    volumes = [np.linalg.det(corners(each)).sum() / 6 for each in (mesh, finer)]
+    assert volumes[1] == pytest.approx(volumes[0], abs=16 * EPS * len(mesh.faces))
+    assert finer.closed is mesh.closed
+    assert euler_number(finer) == euler_number(mesh)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=12), st.integers(0, 2**32 - 1))
+def test_any_faces_keep_their_area_and_every_edge_its_number_of_faces(faces, seed):
+    """Also edges of more than two faces, faces with a corner twice, and faces that occur twice."""
+    vertices = np.random.default_rng(seed).uniform(-1, 1, (6, 3))
+    mesh = Mesh.plain(vertices, faces)
+    finer = once(mesh)
+    assert_allclose(finer.face_areas().reshape(-1, 4), mesh.face_areas()[:, None].repeat(4, 1) / 4, atol=8 * EPS)
+    edges = [each.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2) for each in (mesh, finer)]
+    around = [np.unique(np.sort(ends, axis=1), axis=0, return_counts=True) for ends in edges]
+    outer = (around[1][0] < len(vertices)).any(axis=1)  # the others lie within a face
+    distinct = around[0][0][:, 0] < around[0][0][:, 1]
+    expected = [around[0][1][distinct].repeat(2), 2 * around[0][1][~distinct]]  # an edge of no length has one half
+    assert_array_equal(np.sort(around[1][1][outer]), np.sort(np.concatenate(expected)))
+
+
+def test_colours_and_uvs_are_the_faces_linear_functions_at_the_new_corners():
+    """Values that are linear in a face's plane, another function for each face; rounded to float32 at each round."""
+    rng = np.random.default_rng(1)
+    slopes = rng.uniform(-0.2, 0.2, (len(SHEET.faces), 3, 5))
+
+    def values(mesh: Mesh) -> np.ndarray:
+        quarters = len(mesh.faces) // len(SHEET.faces)
+        return 0.5 + np.einsum("fcd,fde->fce", corners(mesh), slopes.repeat(quarters, axis=0))
+
+    colors, uvs = np.split(values(SHEET).astype(np.float32), [3], axis=-1)
+    finer = subdivide(replace(SHEET, corner_colors=colors, corner_uvs=uvs), 150)
+    assert len(finer.faces) == 16 * len(SHEET.faces)
+    assert_allclose(np.concatenate([finer.corner_colors, finer.corner_uvs], -1), values(finer), rtol=0, atol=2 * EPS32)
+    assert_array_equal(finer.texture_ids, SHEET.texture_ids.repeat(16))
+    assert finer.textures is SHEET.textures
+
+
+def test_the_fields_keep_their_types():
+    finer = once(SHEET)
+    for name in ("vertices", "faces", "corner_colors", "corner_uvs", "texture_ids"):
+        assert getattr(finer, name).dtype == getattr(SHEET, name).dtype
+
+
+def fragments_of(mesh: Mesh, camera: OrthographicCamera, size: int) -> Fragments:
+    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], PictureSettings(size, 4), choose("software"))
+    return fragments
+
+
+def test_a_picture_is_unchanged_where_the_new_corners_lie_on_the_rasterisers_grid():
+    """Corners at whole samples before and after. In two rounds, uvs are off by EPS32, which is 8 of that in texels; so
+    is then the albedo, whose texels and colours differ by up to 1, and so are the radiances in their proportion."""
+    mesh, camera = height_field(), OrthographicCamera(0.0, 0.0, 2.0)
+    finer = subdivide(mesh, 2000)
+    before, after = (fragments_of(each, camera, 16) for each in (mesh, finer))
+    assert torch.equal(after.sample, before.sample)
+    assert torch.equal(after.faces[after.face] // 16, before.faces[before.face])
+    light = torch.randn(49, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    pictures = [
+        radiance(fragments, torch.from_numpy(each.vertices), light, surface_albedo(each, fragments, "linear"))
+        for each, fragments in ((mesh, before), (finer, after))
+    ]
+    assert pictures[0].std() > 0.1
+    torch.testing.assert_close(pictures[1], pictures[0], rtol=0, atol=16 * EPS32 * float(pictures[0].abs().max()))
+
+
+def edge_distance(outlines: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """(S,) from points (S, 2) to the nearest edge of their triangles (S, 3, 2)."""
+    along = outlines.roll(-1, 1) - outlines
+    offset = points[:, None] - outlines
+    share = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-300)).clamp(0, 1)
+    return (offset - share[..., None] * along).norm(dim=-1).amin(1)
+
+
+@pytest.mark.parametrize("name", ["sweet_pepper", "table", "pear"])
+def test_a_sample_sees_the_same_face_unless_rounded_corners_moved_an_edge_over_it(name):
+    mesh, size = solid(name), 32
+    finer = subdivide(mesh, 4 * len(mesh.vertices))
+    quarters = len(finer.faces) // len(mesh.faces)
+    seen, near = [], []
+    for each, parent in ((mesh, 1), (finer, quarters)):
+        fragments = fragments_of(each, ring(1, 2.5)[0], size)
+        ids = torch.full(((4 * size) ** 2,), -1)
+        ids[fragments.sample] = fragments.faces[fragments.face] // parent
+        samples_per_unit = 4 * size / 2
+        distance = torch.full(ids.shape, torch.inf, dtype=torch.float64)
+        distance[fragments.sample] = samples_per_unit * edge_distance(
+            fragments.outlines[fragments.face], fragments.positions()
+        )
+        seen.append(ids)
+        near.append(distance < 2 * np.sqrt(2) * SNAP)
+    assert (seen[0] >= 0).sum() > 1000
+    changed = seen[0] != seen[1]
+    assert changed.any() and (near[0] | near[1])[changed].all()
