@@ -1,10 +1,10 @@
-"""Descent on the adversarial cost over any parameters that render differentiably, until the classifier is fooled."""
+"""Descent on the adversarial cost over anything that renders differentiably, until the classifier is fooled."""
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment.cost import adversarial_cost
@@ -12,113 +12,182 @@ from augment.model_state import as_found
 from augment.phases import Phases
 from renderer.errors import InputError
 
-STEPS = ("unit", "raw", "sign")
-
 
 @dataclass
-class AttackSettings:
-    """The paper's appendix C: 0.05 along the gradient's direction, at most 30 steps.
+class DescentSettings:
+    """How long a descent lasts.
 
-    step: what "along the direction" means: the gradient at unit L2 norm per example, as it is, or its sign.
-    batch_size: examples per pass through the classifier.
+    max_steps: renders after the first; the paper's appendix C has 30. shorten: a step after which the cost has not
+    fallen is taken back and tried at half its length, since the gradient of geometry holds visibility fixed.
+    batch_size: pictures per pass through the classifier.
     """
 
-    step: str = "unit"
-    step_size: float = 0.05
     max_steps: int = 30
+    shorten: bool = False
     batch_size: int = 128
 
     def __post_init__(self):
-        if self.step not in STEPS:
-            raise InputError(f"augment.attack.step={self.step}: choose one of {', '.join(STEPS)}")
-        if not self.step_size > 0 or self.max_steps < 0 or self.batch_size < 1:
+        if self.max_steps < 0 or self.batch_size < 1:
             raise InputError(
-                f"augment.attack: step_size={self.step_size}, max_steps={self.max_steps} and "
-                f"batch_size={self.batch_size} must be positive"
+                f"attack: max_steps={self.max_steps} must not be negative and batch_size={self.batch_size} at least 1"
             )
+
+
+class Problem(Protocol):
+    """What is attacked: E examples of V views each, whose pictures follow from values (E, D); `start` is where they
+    begin."""
+
+    start: Tensor
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        """Pictures (A, V, 3, H, W) in [0, 1] of the values (A, D) of examples (A,)."""
+
+    def step(self, gradient: Tensor) -> Tensor:
+        """How far to go down a gradient (A, D)."""
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        """Values (A, D) moved to where they may be."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Per example and view, the class whose confidence falls and, where there is a target, the one whose rises.
+
+    decrease: (E, V) int64. increase: the same, or None for an attack that takes any error. An example is fooled where
+    every view is given its target, or without one, anything but `decrease`.
+    """
+
+    decrease: Tensor
+    increase: Tensor | None = None
+
+    def of(self, examples: Tensor) -> "Goal":
+        """The same for some of the examples."""
+        return Goal(self.decrease[examples], None if self.increase is None else self.increase[examples])
+
+    def reached(self, predicted: Tensor) -> Tensor:
+        """(E,) bool, for predicted classes (E, V)."""
+        return (predicted != self.decrease if self.increase is None else predicted == self.increase).all(1)
 
 
 @dataclass(frozen=True)
 class AttackResult:
-    """What an attack did, per example; all tensors have E rows and lie on the parameters' device.
+    """What an attack did, per example; all tensors have E rows and lie on the values' device.
 
-    parameters, images: where the descent ended. steps: int64, taken. fooled_before, fooled: bool.
-    loss_before, loss: cross entropy of the true class. zero_gradient: bool, the first gradient was exactly zero.
+    values, images (E, V, 3, H, W): where the descent ended. steps: int64, taken. fooled_before, fooled: bool.
+    cost_before, cost: the paper's cost, summed over views. predicted: (E, V) int64, the last classes. zero_gradient:
+    bool, the first gradient was exactly zero.
     """
 
-    parameters: Tensor
+    values: Tensor
     images: Tensor
     steps: Tensor
     fooled_before: Tensor
     fooled: Tensor
-    loss_before: Tensor
-    loss: Tensor
+    cost_before: Tensor
+    cost: Tensor
+    predicted: Tensor
     zero_gradient: Tensor
 
 
-@torch.enable_grad()
-def descend(
-    model: nn.Module,
-    render: Callable[[Tensor, Tensor], Tensor],
-    start: Tensor,
-    labels: Tensor,
-    settings: AttackSettings,
-    phases: Phases,
-) -> AttackResult:
-    """Step each example's parameters down the cost until the classifier errs; fooled examples leave the batch.
+@dataclass(frozen=True)
+class _Pass:
+    """What a classifier makes of A examples: the cost's gradient is by their pictures (A, V, 3, H, W)."""
 
-    model: (N, 3, H, W) in [0, 1] → logits; used in eval mode and left as it was found. render: parameters (A, ...) of
-    the examples with indices (A,) → images (A, 3, H, W). start: (E, ...). labels: (E,) int64, the true classes. The
-    forward pass that yields the gradient also tells who is fooled, and only examples that go on are rendered.
+    cost: Tensor
+    predicted: Tensor
+    gradient: Tensor
+
+
+@dataclass(frozen=True)
+class Restart:
+    """Some examples (A,) of a problem, from other starts (A, D)."""
+
+    problem: Problem
+    examples: Tensor
+    start: Tensor
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        return self.problem.render(values, self.examples[examples])
+
+    def step(self, gradient: Tensor) -> Tensor:
+        return self.problem.step(gradient)
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        return self.problem.project(values, self.examples[examples])
+
+
+def descend_repeatedly(
+    model: nn.Module, problem: Problem, goal: Goal, settings: DescentSettings, phases: Phases, starts: Iterable[Tensor]
+) -> AttackResult:
+    """`descend`, and again from other starts (E, D) for the examples that no descent has fooled yet.
+
+    What a later descent reaches counts where it fools; steps add up.
     """
-    parameters = start.detach().clone()
-    active = torch.arange(len(labels), device=labels.device)
-    steps, fooled = torch.zeros_like(labels), torch.zeros_like(labels, dtype=torch.bool)
-    loss = start.new_zeros(len(labels))
+    best = descend(model, problem, goal, settings, phases)
+    for start in starts:
+        left = torch.nonzero(~best.fooled).squeeze(1)
+        if not len(left):
+            break
+        again = descend(model, Restart(problem, left, start[left]), goal.of(left), settings, phases)
+        best.steps[left] += again.steps
+        better = left[again.fooled]
+        for name in ("values", "images", "fooled", "cost", "predicted"):
+            getattr(best, name)[better] = getattr(again, name)[again.fooled]
+    return best
+
+
+@torch.enable_grad()
+def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSettings, phases: Phases) -> AttackResult:
+    """Step each example's values down the cost, summed over its views, until the goal is reached.
+
+    model: (N, 3, H, W) in [0, 1] → logits; used in eval mode and left as it was found. The forward pass that yields the
+    gradient also tells who is fooled, and only examples that go on are rendered.
+    """
+    values = problem.start.detach().clone()
+    active = torch.arange(len(values), device=values.device)
+    steps, fooled = torch.zeros_like(active), torch.zeros_like(active, dtype=torch.bool)
+    cost, length = values.new_full((len(values),), torch.inf), values.new_ones(len(values), 1)
+    candidate, slope = values.clone(), torch.zeros_like(values)
+    predicted = torch.zeros_like(goal.decrease)
     with as_found(model):
         for step in range(settings.max_steps + 1):
-            chosen = parameters[active].requires_grad_(True)
-            rendered = render(chosen, active)
+            chosen = candidate[active].requires_grad_(True)
+            rendered = problem.render(chosen, active)
             with phases("attack_classifier"):
-                passed = _classifier_pass(model, rendered.detach(), labels[active], settings.batch_size)
-            loss[active], fooled[active], pixel_gradient = passed
-            (gradient,) = torch.autograd.grad(rendered, chosen, pixel_gradient)
+                seen = _classifier_pass(model, rendered.detach(), goal.of(active), settings.batch_size)
+            (gradient,) = torch.autograd.grad(rendered, chosen, seen.gradient)
+            reached = goal.of(active).reached(seen.predicted)
             if step == 0:
-                images = rendered.detach().clone()
-                fooled_before, loss_before = fooled.clone(), loss.clone()
-                zero_gradient = gradient.flatten(1).abs().amax(1) == 0
-            images[active] = rendered.detach()
-            going = ~fooled[active]
-            active = active[going]
+                images, cost_before, fooled_before = rendered.detach().clone(), seen.cost, reached
+                zero_gradient = gradient.abs().amax(1) == 0
+            better = reached | (seen.cost < cost[active]) if settings.shorten else torch.ones_like(reached)
+            kept = active[better]
+            values[kept], images[kept], slope[kept] = candidate[kept], rendered.detach()[better], gradient[better]
+            cost[kept], predicted[kept], fooled[kept] = seen.cost[better], seen.predicted[better], reached[better]
+            length[active[~better]] /= 2
+            active = active[~reached]
             if step == settings.max_steps or not len(active):
                 break
-            parameters[active] -= settings.step_size * _direction(gradient[going], settings.step)
+            moved = values[active] - length[active] * problem.step(slope[active])
+            candidate[active] = problem.project(moved, active)
             steps[active] += 1
-    return AttackResult(parameters, images, steps, fooled_before, fooled, loss_before, loss, zero_gradient)
+    return AttackResult(values, images, steps, fooled_before, fooled, cost_before, cost, predicted, zero_gradient)
 
 
-def _classifier_pass(
-    model: nn.Module, images: Tensor, labels: Tensor, batch_size: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Cross entropy (A,), misclassified (A,) and the cost's gradient (A, 3, H, W) for images (A, 3, H, W)."""
-    losses, errs, gradients = [], [], []
-    for batch, truth in zip(images.split(batch_size), labels.split(batch_size), strict=True):
-        pictures = batch.detach().requires_grad_(True)
-        logits = model(pictures)
-        cost = adversarial_cost(logits, truth)
-        gradients += torch.autograd.grad(cost.sum(), pictures)
-        losses.append(-cost.detach())
-        errs.append(logits.detach().argmax(1) != truth)
-    return torch.cat(losses), torch.cat(errs), torch.cat(gradients)
-
-
-def _direction(gradient: Tensor, step: str) -> Tensor:
-    """The gradient (A, ...) as a step: unit L2 norm per example (a zero gradient stays zero), raw, or its sign."""
-    if step == "raw":
-        return gradient
-    if step == "sign":
-        return gradient.sign()
-    # Scaling by the largest entry first keeps tiny gradients from underflowing when squared.
-    flat = gradient.flatten(1)
-    scaled = flat / flat.abs().amax(1, keepdim=True).clamp(min=torch.finfo(flat.dtype).tiny)
-    return F.normalize(scaled, eps=torch.finfo(flat.dtype).tiny).view_as(gradient)
+def _classifier_pass(model: nn.Module, pictures: Tensor, goal: Goal, batch_size: int) -> _Pass:
+    views = pictures.shape[1]
+    decrease, increase = goal.decrease.flatten(), None if goal.increase is None else goal.increase.flatten()
+    flat, costs, predicted, gradients = pictures.flatten(0, 1), [], [], []
+    for begin in range(0, len(flat), batch_size):
+        part = slice(begin, begin + batch_size)
+        batch = flat[part].detach().requires_grad_(True)
+        logits = model(batch)
+        cost = adversarial_cost(logits, decrease[part], None if increase is None else increase[part])
+        gradients += torch.autograd.grad(cost.sum(), batch)
+        costs.append(cost.detach())
+        predicted.append(logits.detach().argmax(1))
+    return _Pass(
+        torch.cat(costs).unflatten(0, (-1, views)).sum(1),
+        torch.cat(predicted).unflatten(0, (-1, views)),
+        torch.cat(gradients).unflatten(0, (-1, views)),
+    )

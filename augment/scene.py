@@ -75,12 +75,13 @@ def build_objects(
     """Load and normalise every mesh, and rasterise it from a ring of views where the cache does not have them."""
     cache, cameras = cache or OperatorCache(), ring(views, field_of_view)
     return [
-        SceneObject(item.label, cache.operators(_normalised(item), cameras, settings, backend, item.gain))
+        SceneObject(item.label, cache.operators(load_object(item), cameras, settings, backend, item.gain))
         for item in objects
     ]
 
 
-def _normalised(item: ObjectSettings) -> Mesh:
+def load_object(item: ObjectSettings) -> Mesh:
+    """The mesh, normalised. InputError: as `load_mesh` and `solid`."""
     kind, _, name = item.mesh.partition(":")
     if kind != "solid":
         return normalise(load_mesh(item.mesh, up=item.up))

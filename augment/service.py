@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from augment.attack import AttackResult, AttackSettings, descend
+from augment.attack import AttackResult, DescentSettings, Goal, descend
 from augment.model_state import as_found
+from augment.parameters.kind import check_step, direction
 from augment.phases import Phases
 from augment.scene import Scene
 from augment.seeding import generator
@@ -34,6 +35,28 @@ class RandomLights:
 
 
 @dataclass
+class LightAttackSettings:
+    """The paper's appendix C: 0.05 along the gradient's direction, at most 30 steps.
+
+    step: what "along the direction" means: the gradient at unit L2 norm per example, as it is, or its sign.
+    batch_size: examples per pass through the classifier.
+    """
+
+    step: str = "unit"
+    step_size: float = 0.05
+    max_steps: int = 30
+    batch_size: int = 128
+
+    def __post_init__(self):
+        check_step(self.step, self.step_size, "augment.attack.")
+        self.descent()
+
+    def descent(self) -> DescentSettings:
+        """How long it lasts."""
+        return DescentSettings(self.max_steps, batch_size=self.batch_size)
+
+
+@dataclass
 class AugmentationSettings:
     """What is regenerated each epoch.
 
@@ -46,7 +69,7 @@ class AugmentationSettings:
     start: str = "light"
     lights: str = "restart"
     random: RandomLights = field(default_factory=RandomLights)
-    attack: AttackSettings = field(default_factory=AttackSettings)
+    attack: LightAttackSettings = field(default_factory=LightAttackSettings)
 
     def __post_init__(self):
         for name, value, choices in [
@@ -136,12 +159,14 @@ class AugmentationService:
         return Renders(images, self._labels, diagnostics | self._light_diagnostics(lights))
 
     def _adversarial(self, model: nn.Module, epoch: int) -> Renders:
-        start = self._starting_lights(epoch)
-        result = descend(model, self._scene.render, start, self._labels, self.settings.attack, self._phases)
+        attack, goal = self.settings.attack, Goal(self._labels[:, None])
+        problem = _SceneLights(self._scene, self._starting_lights(epoch), attack)
+        result = descend(model, problem, goal, attack.descent(), self._phases)
+        lights = result.values.unflatten(1, (-1, 3))
         if self.settings.lights == "continue":
-            self._continued = result.parameters
-        diagnostics = self._attack_diagnostics(result) | self._light_diagnostics(result.parameters)
-        return Renders(result.images, self._labels, diagnostics)
+            self._continued = lights
+        diagnostics = self._attack_diagnostics(result) | self._light_diagnostics(lights)
+        return Renders(result.images.flatten(0, 1), self._labels, diagnostics)
 
     def _starting_lights(self, epoch: int) -> Tensor:
         if self._continued is not None:
@@ -161,8 +186,8 @@ class AugmentationService:
             "fooled": _mean(result.fooled),
             "steps": _mean(result.steps),
             "used_all_steps": _mean(result.steps == self.settings.attack.max_steps),
-            "loss_before": _mean(result.loss_before),
-            "loss": _mean(result.loss),
+            "loss_before": -_mean(result.cost_before),
+            "loss": -_mean(result.cost),
             "zero_gradient": _mean(result.zero_gradient),
         }
 
@@ -171,6 +196,23 @@ class AugmentationService:
             "light_change": _mean((lights - self._light).flatten(1).norm(dim=1)),
             "clamped": _mean(self._scene.clamped_share(lights)),
         }
+
+
+class _SceneLights:
+    """A light of its own for each example of a scene. See `augment.attack.Problem`."""
+
+    def __init__(self, scene: Scene, start: Tensor, settings: LightAttackSettings):
+        """start: (E, 49, 3)."""
+        self.start, self._scene, self._settings = start.flatten(1), scene, settings
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        return self._scene.render(values.unflatten(1, (-1, 3)), examples)[:, None]
+
+    def step(self, gradient: Tensor) -> Tensor:
+        return self._settings.step_size * direction(gradient, self._settings.step)
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        return values
 
 
 def _mean(values: Tensor) -> float:

@@ -13,7 +13,7 @@ import torchvision
 from omegaconf import DictConfig, OmegaConf
 
 from augment.phases import Phases
-from augment.scene import ObjectSettings, Scene, build_objects
+from augment.scene import Scene, build_objects
 from augment.seeding import stream_seed
 from augment.service import AugmentationService
 from renderer.cache import OperatorCache, TensorCache, cache_folder
@@ -39,7 +39,7 @@ from train.logs import RunLog, console
 from train.photographs import evaluate_photographs, find_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
-from train.settings import ExperimentSettings, read_settings
+from train.settings import ExperimentSettings, read_object, read_settings
 from train.wideresnet import WideResNet
 
 CONFIG = "config.yaml"
@@ -144,12 +144,12 @@ def _build_service(
 
 def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
     scene, renderer = settings.scene, settings.renderer
-    objects = [_read_object(item, settings.label, index) for index, item in enumerate(scene.meshes)]
+    objects = [read_object(item, settings.label, index) for index, item in enumerate(scene.meshes)]
     for index, item in enumerate(objects):
         class_index(data.classes, item.label, f"label of scene.meshes[{index}]")
     backend = choose(renderer.visibility)
     console.info("visibility: %s", backend.description)
-    pictures = PictureSettings(data.size, renderer.samples, renderer.encoding)
+    pictures = PictureSettings(data.size, renderer.samples, renderer.encoding, renderer.normals)
     cache, start = OperatorCache(cache_folder(renderer.cache)), time.perf_counter()
     built = build_objects(objects, settings.views, scene.field_of_view, pictures, backend, cache)
     scene = Scene(built, scene.backgrounds, pictures, device)
@@ -179,11 +179,6 @@ def _log_skipped(scene: Scene, cache: OperatorCache, seconds: float) -> None:
         tally.closed,
         tally.views,
     )
-
-
-def _read_object(item: str | dict, label: str, index: int) -> ObjectSettings:
-    keys = item if isinstance(item, dict) else {"mesh": item}
-    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"scene.meshes[{index}]")
 
 
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:

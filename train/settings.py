@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from augment.scene import count_views
+from augment.scene import ObjectSettings, count_views
 from augment.service import AugmentationSettings
 from renderer.errors import InputError
 from train.fit import TrainSettings
@@ -49,7 +49,7 @@ class SceneSettings:
 
 @dataclass
 class RendererSettings:
-    """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb.
+    """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb. normals: flat or smooth.
 
     cache: the folder of what is rendered once, auto or None; see `renderer.cache.cache_folder`.
     """
@@ -57,6 +57,7 @@ class RendererSettings:
     visibility: str = "auto"
     samples: int = 8
     encoding: str = "linear"
+    normals: str = "flat"
     cache: str | None = "auto"
 
 
@@ -115,3 +116,9 @@ def read_settings(kind: type, config: DictConfig, parent: str = ""):
     except OmegaConfBaseException as error:
         key = ".".join(filter(None, (parent, error.full_key)))
         raise InputError(": ".join(filter(None, (key, str(error.msg).splitlines()[0])))) from error
+
+
+def read_object(item: str | dict, label: str, index: int) -> ObjectSettings:
+    """An entry of scene.meshes: a file or solid of the class `label`, or a mapping that may name its own."""
+    keys = item if isinstance(item, dict) else {"mesh": item}
+    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"scene.meshes[{index}]")

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from augment.attack import AttackSettings, descend
 from augment.phases import Phases
 from augment.scene import ObjectSettings, Scene, SceneObject, build_objects, count_views
+from augment.service import AugmentationService, AugmentationSettings, LightAttackSettings
 from renderer.cache import OperatorCache
 from renderer.camera import ring
 from renderer.errors import InputError
@@ -235,10 +235,9 @@ def test_a_lighting_attack_rasterises_nothing(rasterised):
     scene = Scene(objects, GREYS, SETTINGS)
     network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 3))
     torch.nn.init.constant_(network[1].bias[0], 1000)
-    lights, labels = probe("grace").expand(24, -1, -1), torch.zeros(24, dtype=torch.int64)
-    result = descend(network, scene.render, lights, labels, AttackSettings(max_steps=30), Phases())
-    scene.clamped_share(result.parameters)
-    assert result.steps.eq(30).all() and rasterised == [4, 4]
+    settings = AugmentationSettings(attack=LightAttackSettings(max_steps=30))
+    service = AugmentationService(settings, scene, torch.zeros(24, dtype=torch.int64), probe("grace"), 0, Phases())
+    assert service.regenerate(network, epoch=0).diagnostics["steps"] == 30 and rasterised == [4, 4]
 
 
 def test_a_scene_stores_no_background_pixel_and_no_backgrounds_or_dead_bands_of_a_view():

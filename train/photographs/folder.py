@@ -125,13 +125,13 @@ def load_photographs(
 
 def _try_read(path: Path, size: int) -> np.ndarray | Exception:
     try:
-        return _read(path, size)
+        return read_square(path, size)
     except Exception as error:  # Pillow's decoders raise almost anything at a broken file
         return error
 
 
-def _read(path: Path, size: int) -> np.ndarray:
-    """One picture as (size, size, 3) uint8."""
+def read_square(path: Path, size: int) -> np.ndarray:
+    """The centre square of a picture as (size, size, 3) uint8. Raises whatever Pillow does at a broken file."""
     with Image.open(path) as image:
         # A large JPEG is decoded at 1/2, 1/4 or 1/8 of its size, several times faster.
         image.draft(None, (DECODED_SIZES * size, DECODED_SIZES * size))

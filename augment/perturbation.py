@@ -1,0 +1,60 @@
+"""Several kinds of parameters of one scene as the one problem that an attack descends on."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from augment.mesh_scene import Conditions, MeshScene
+from augment.parameters.kind import Kind
+
+
+class Perturbation:
+    """Kinds side by side: values (E, D) are theirs, one after the other. See `augment.attack.Problem`."""
+
+    def __init__(self, scene: MeshScene, kinds: Sequence[Kind]):
+        self.scene, self.kinds = scene, kinds
+        self.start = torch.cat([kind.start.to(scene.light) for kind in kinds], dim=1)
+        self._sizes = [kind.start.shape[1] for kind in kinds]
+
+    def conditions(self, values: Tensor, examples: Tensor) -> Conditions:
+        """What values (A, D) make of the scene of examples (A,)."""
+        conditions = self.scene.conditions(examples)
+        for kind, part in zip(self.kinds, self.split(values), strict=True):
+            conditions = kind.apply(part, conditions)
+        return conditions
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        return self.scene.render(self.conditions(values, examples), examples)
+
+    def step(self, gradient: Tensor) -> Tensor:
+        parts = zip(self.kinds, self.split(gradient), strict=True)
+        return torch.cat([kind.step(part) for kind, part in parts], dim=1)
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        parts = zip(self.kinds, self.split(values), strict=True)
+        return torch.cat([kind.project(part, examples) for kind, part in parts], dim=1)
+
+    def sample(self, generator: torch.Generator) -> Tensor:
+        """Uniform draws (E, D) from every kind's ball around its start, within its domain."""
+        examples = torch.arange(len(self.scene))
+        drawn = [kind.project(kind.ball.sample(kind.start, generator), examples) for kind in self.kinds]
+        return torch.cat(drawn, dim=1).to(self.start)
+
+    def sample_as_far(self, values: Tensor, generator: torch.Generator) -> Tensor:
+        """Draws (E, D) as far as values went: uniform in a kind's ball where it has a radius, else in a random
+        direction at the values' own L2 distance from the start."""
+        examples, drawn = torch.arange(len(self.scene)), []
+        for kind, part in zip(self.kinds, self.split(values), strict=True):
+            if kind.ball.radius is None:
+                start = kind.start.to(part)
+                offset = torch.randn(part.shape, generator=generator).to(part)
+                reach = (part - start).norm(dim=1, keepdim=True)
+                drawn.append(kind.within_domain(start + offset * reach / offset.norm(dim=1, keepdim=True)))
+            else:
+                drawn.append(kind.project(kind.ball.sample(kind.start, generator), examples))
+        return torch.cat([part.to(self.start) for part in drawn], dim=1)
+
+    def split(self, values: Tensor) -> tuple[Tensor, ...]:
+        """Each kind's part (A, D_k) of values (A, D)."""
+        return values.split(self._sizes, dim=1)

@@ -1,0 +1,184 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from augment.mesh_scene import Conditions, MeshScene
+from renderer.errors import InputError
+from renderer.image import ENCODINGS, decode, develop, encode
+from renderer.transfer import build_operators
+from renderer.visibility import choose
+
+EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+BACKEND = choose("software")
+EVERY = torch.arange(3)
+# Sums of 31 products below 1 in another order, and the slope of 12.92 of the sRGB curve near black.
+ROUNDING = 13 * 8 * EPS
+
+
+def own_lights(scene: MeshScene, seed: int = 0) -> Tensor:
+    """(E, 49, 3), a light for each example."""
+    draws = torch.Generator().manual_seed(seed)
+    return scene.light + 0.01 * torch.randn(len(scene), 49, 3, generator=draws).to(scene.light)
+
+
+def composed(scene: MeshScene, lights: Tensor) -> Tensor:
+    """Every example and view by itself, from operators made for this: (E, V, 3, size, size)."""
+    pictures = []
+    for light, cameras, behind in zip(lights, scene.cameras, scene.backgrounds, strict=True):
+        operators = build_operators(scene.mesh, cameras, scene.settings, BACKEND, scene.gain, dtype=lights.dtype)
+        for operator in operators:
+            canvas, seen = behind.clone(), operator.radiance(light)
+            canvas[:, operator.pixels] = develop(
+                seen, operator.coverage[None], behind[:, operator.pixels], scene.settings.encoding
+            )
+            pictures.append(canvas.unflatten(1, (scene.settings.size, -1)))
+    return torch.stack(pictures).unflatten(0, (len(scene), scene.views))
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize(("dtype", "rounding"), [(torch.float32, ROUNDING * EPS32 / EPS), (torch.float64, ROUNDING)])
+def test_under_light_alone_pictures_are_those_of_the_views_one_by_one(make_scene, dtype, rounding, encoding):
+    """In the dtype of the light, whatever the backgrounds have."""
+    scene = make_scene(dtype=dtype, encoding=encoding, gain=1.2)
+    lights = own_lights(scene)
+    pictures = scene.render(Conditions(lights), EVERY)
+    assert pictures.shape == (3, 2, 3, 6, 6) and pictures.dtype == dtype
+    assert pictures.min() > 0 and pictures.max() < 1  # nothing clamps here
+    torch.testing.assert_close(pictures, composed(scene, lights), rtol=0, atol=rounding)
+
+
+@pytest.mark.parametrize("part", ["light", "vertices", "albedo", "pixels"])
+def test_any_examples_in_any_order_are_rendered_as_all_are(make_scene, part):
+    scene, draws = make_scene(), torch.Generator().manual_seed(1)
+    shape = {"vertices": scene.vertices.shape, "albedo": (20, 3), "pixels": (2, 3, 6, 6)}
+    change = {} if part == "light" else {part: 0.05 * torch.randn(3, *shape[part], generator=draws).double()}
+    if part == "vertices":
+        change[part] += scene.vertices
+    conditions = Conditions(own_lights(scene), **change)
+    everything = scene.render(conditions, EVERY)
+    for examples in ([1], [2, 0], [0, 2, 2, 1, 0]):
+        chosen = torch.tensor(examples)
+        some = Conditions(conditions.light[chosen], **{name: value[chosen] for name, value in change.items()})
+        torch.testing.assert_close(scene.render(some, chosen), everything[chosen], rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_nothing_changes_where_the_other_conditions_are_the_scenes_own(make_scene, encoding):
+    """By operators and by shading, which share no code between the albedo and the picture."""
+    scene = make_scene(encoding=encoding, gain=1.2)
+    light = scene.conditions(EVERY).light
+    assert torch.equal(light, scene.light.expand(3, -1, -1))
+    plain = scene.render(scene.conditions(EVERY), EVERY)
+    for change in (
+        {"vertices": scene.vertices.expand(3, -1, -1)},
+        {"albedo": torch.zeros(3, 20, 3, dtype=torch.float64)},
+        {"pixels": torch.zeros(3, 2, 3, 6, 6, dtype=torch.float64)},
+    ):
+        torch.testing.assert_close(scene.render(Conditions(light, **change), EVERY), plain, rtol=0, atol=ROUNDING)
+
+
+def test_moved_vertices_are_seen_as_another_mesh_would_be(make_scene, stone):
+    """Its outline too: half of the pixels change at least a little."""
+    scene, draws = make_scene(), np.random.default_rng(0)
+    moved = stone.vertices + 0.1 * draws.normal(size=(3, *stone.vertices.shape))
+    pictures = scene.render(Conditions(own_lights(scene), vertices=torch.from_numpy(moved)), EVERY)
+    for row in range(3):
+        other = make_scene(mesh=replace(stone, vertices=moved[row]))
+        expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
+        torch.testing.assert_close(pictures[row], expected, rtol=0, atol=ROUNDING)
+    assert ((pictures - scene.render(Conditions(own_lights(scene)), EVERY)).abs() > 1e-3).double().mean() > 0.3
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_change_of_albedo_is_seen_as_another_paint_would_be(make_scene, stone, encoding):
+    """The linear albedo changes, whatever the encoding, and keeps to [0, 1]."""
+    scene = make_scene(encoding=encoding)
+    offset = torch.rand(3, 20, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
+    pictures = scene.render(Conditions(own_lights(scene), albedo=offset), EVERY)
+    own = decode(torch.from_numpy(stone.corner_colors).double(), encoding)
+    assert ((own + offset[:, :, None]) < 0).any()
+    for row in range(3):
+        paint = encode((own + offset[row][:, None]).clamp(0, 1), encoding)
+        other = make_scene(mesh=replace(stone, corner_colors=paint.float().numpy()), encoding=encoding)
+        expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
+        # The paint is stored in float32.
+        torch.testing.assert_close(pictures[row], expected, rtol=0, atol=13 * 4 * EPS32)
+
+
+def test_a_gain_may_lift_the_albedo_above_one_and_a_change_lifts_it_no_further(make_scene):
+    scene = make_scene(gain=2.0)
+    lifted = scene.render(Conditions(0.4 * own_lights(scene), albedo=torch.ones(3, 20, 3).double()), EVERY)
+    own = scene.render(Conditions(0.4 * own_lights(scene)), EVERY)
+    brightest = torch.from_numpy(scene.mesh.corner_colors).double() * 2
+    assert (brightest > 1).any() and (brightest < 1).any()
+    painted = replace(scene.mesh, corner_colors=(brightest.clamp(min=1) / 2).float().numpy())
+    other = make_scene(mesh=painted, gain=2.0).render(Conditions(0.4 * own_lights(scene)), EVERY)
+    torch.testing.assert_close(lifted, other, rtol=0, atol=4 * EPS32)
+    assert (lifted >= own - 4 * EPS32).all()
+
+
+def test_changes_of_pixels_come_last_and_are_clamped(make_scene):
+    scene = make_scene()
+    change = 2 * torch.rand(3, 2, 3, 6, 6, generator=torch.Generator().manual_seed(0)).double() - 1
+    plain = scene.render(scene.conditions(EVERY), EVERY)
+    pictures = scene.render(replace(scene.conditions(EVERY), pixels=change), EVERY)
+    assert torch.equal(pictures, (plain + change).clamp(0, 1))
+    assert (pictures == 0).any() and (pictures == 1).any()
+
+
+def test_black_and_white_pixels_and_paints_have_the_gradients_of_others(make_scene, stone):
+    """At the bounds of a clamp, where `torch.clamp` has none or half of one, an attack would start in a dead corner."""
+    backgrounds = torch.zeros(3, 3, 6, 6)
+    backgrounds[1:] = 1
+    scene = make_scene(backgrounds=backgrounds)
+    pixels = torch.zeros(3, 2, 3, 6, 6, dtype=torch.float64, requires_grad=True)
+    pictures = scene.render(replace(scene.conditions(EVERY), pixels=pixels), EVERY)
+    assert (pictures == 0).any() and (pictures == 1).any()
+    assert torch.equal(torch.autograd.grad(pictures.sum(), pixels)[0], torch.ones_like(pixels))
+
+    sums = []
+    for paint in (0.0, 0.5, 1.0):
+        painted = replace(stone, corner_colors=np.full_like(stone.corner_colors, paint))
+        scene = make_scene(mesh=painted)
+        albedo = torch.zeros(3, 20, 3, dtype=torch.float64, requires_grad=True)
+        pictures = scene.render(replace(scene.conditions(EVERY), albedo=albedo), EVERY)
+        sums.append(torch.autograd.grad(pictures.sum(), albedo)[0])
+    torch.testing.assert_close(sums[0], sums[1], rtol=0, atol=ROUNDING)
+    torch.testing.assert_close(sums[2], sums[1], rtol=0, atol=ROUNDING)
+
+
+def test_a_camera_is_rasterised_once_and_moved_vertices_once_per_view(make_scene, rasterised):
+    """Three cameras in six views of three examples."""
+    scene = make_scene()
+    for _ in range(3):
+        scene.render(Conditions(own_lights(scene)), EVERY)
+    assert rasterised == [1] * 3
+    for _ in range(3):
+        scene.render(replace(scene.conditions(EVERY), albedo=torch.zeros(3, 20, 3).double()), EVERY)
+    assert rasterised == [1] * 6
+    moved = replace(scene.conditions(EVERY[:2]), vertices=scene.vertices.expand(2, -1, -1))
+    for calls in (10, 14):
+        scene.render(moved, EVERY[:2])
+        assert rasterised == [1] * calls
+
+
+def test_a_mesh_outside_the_picture_leaves_the_backgrounds_and_a_gradient_of_zero(make_scene, stone):
+    scene = make_scene(mesh=replace(stone, vertices=stone.vertices + 10))
+    for part, value in (("light", scene.light), ("vertices", scene.vertices), ("albedo", torch.zeros(20, 3).double())):
+        values = value.expand(3, -1, -1).clone().requires_grad_(True)
+        pictures = scene.render(replace(scene.conditions(EVERY), **{part: values}), EVERY)
+        behind = scene.backgrounds.view(3, 1, 3, 6, 6).expand_as(pictures)
+        torch.testing.assert_close(pictures.detach(), behind, rtol=0, atol=0)
+        assert not torch.autograd.grad(pictures.sum(), values)[0].any()
+
+
+@pytest.mark.parametrize("part", ["light", "vertices", "albedo"])
+def test_a_condition_that_is_not_finite_is_refused_by_name(make_scene, part):
+    scene = make_scene()
+    shape = {"light": (49, 3), "vertices": (12, 3), "albedo": (20, 3)}[part]
+    broken = torch.full((3, *shape), float("nan"), dtype=torch.float64)
+    with pytest.raises(InputError, match=f"{part}s? holds NaN"):
+        scene.render(replace(scene.conditions(EVERY), **{part: broken}), EVERY)

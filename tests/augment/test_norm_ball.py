@@ -1,0 +1,103 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy import stats
+from torch import Tensor
+
+from augment.norm_ball import NORMS, NormBall
+from renderer.errors import InputError
+
+DTYPES = [torch.float32, torch.float64]
+COORDINATES = st.floats(-100, 100).map(lambda value: round(value, 6))  # squares of smaller ones vanish in float32
+RADII = st.one_of(st.just(0.0), st.floats(1e-3, 100))
+DRAWS = 4000
+
+
+def norm(offset: Tensor, name: str) -> Tensor:
+    return offset.norm(dim=1) if name == "l2" else offset.abs().amax(1)
+
+
+def dual_norm(offset: Tensor, name: str) -> Tensor:
+    return offset.norm(dim=1) if name == "l2" else offset.abs().sum(1)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", NORMS)
+@given(pair=arrays(np.float64, (2, 4, 6), elements=COORDINATES), radius=RADII)
+@settings(max_examples=60, deadline=None)
+def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radius):
+    """p is nearest to v exactly when it lies in the ball and (v - p)·(q - p) ≤ 0 for all of its points q; the largest
+    of these products is (v - p)·(c - p) + radius × the dual norm of v - p."""
+    values, centre = torch.from_numpy(pair).to(dtype)
+    nearest = NormBall(name, radius).project(values, centre)
+    assert nearest.dtype == dtype
+    moved, inward = (values - nearest).double(), (centre - nearest).double()
+    rounding = 16 * torch.finfo(dtype).eps * 200  # of differences of numbers up to 200
+    assert (norm(inward, name) <= radius + rounding).all()
+    products = (moved * inward).sum(1) + radius * dual_norm(moved, name)
+    assert (products <= rounding * (1 + dual_norm(moved, name))).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", NORMS)
+@given(pair=arrays(np.float64, (2, 4, 6), elements=COORDINATES), radius=RADII)
+@settings(max_examples=60, deadline=None)
+def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
+    values, centre = torch.from_numpy(pair).to(dtype)
+    nearest = NormBall(name, radius).project(values, centre)
+    inside = norm((values - centre).double(), name) <= radius * (1 - 1e-6)  # clear of the rounding at the surface
+    assert torch.equal(nearest[inside], values[inside])
+    assert torch.equal(NormBall(name, 0.0).project(values, centre), centre)
+    assert torch.equal(NormBall(name, None).project(values, centre), values)
+
+
+def test_a_corner_is_reached_exactly():
+    """Also where centre plus offset rounds."""
+    draws = torch.Generator().manual_seed(0)
+    centre, signs = torch.randn(50, 7, generator=draws), torch.randn(50, 7, generator=draws).sign()
+    corner = NormBall("linf", 0.1).project(centre + 3 * signs, centre)
+    assert torch.equal(corner, torch.where(signs > 0, centre + 0.1, centre - 0.1))
+
+
+@pytest.mark.parametrize("dimensions", [1, 3, 12])
+@pytest.mark.parametrize("name", NORMS)
+def test_draws_are_uniform_in_the_ball(name, dimensions):
+    """(norm / radius)^D is uniform in [0, 1], and no direction is preferred: the means vanish and the covariances are
+    those of the ball, r²/3 along each axis of a cube and r²/(D + 2) of a sphere, to five standard errors."""
+    radius, centre = 0.3, torch.linspace(-1, 1, dimensions, dtype=torch.float64).expand(DRAWS, -1)
+    offset = (NormBall(name, radius).sample(centre, torch.Generator().manual_seed(1)) - centre) / radius
+    assert norm(offset, name).max() <= 1 + 1e-6  # draws have float32's digits
+    assert stats.kstest(norm(offset, name).numpy() ** dimensions, "uniform").pvalue > 0.01
+    variance = 1 / 3 if name == "linf" else 1 / (dimensions + 2)
+    assert offset.mean(0).abs().max() < 5 * math.sqrt(variance / DRAWS)
+    products = offset.T @ offset / DRAWS
+    # The variance of a product or a square of two coordinates is at most 2 × variance².
+    assert (products - variance * torch.eye(dimensions)).abs().max() < 5 * variance * math.sqrt(2 / DRAWS)
+
+
+@pytest.mark.parametrize("name", NORMS)
+def test_draws_repeat_with_the_generator_and_leave_the_global_one(name):
+    centre, state = torch.zeros(5, 9), torch.random.get_rng_state()
+    first, again = (NormBall(name, 1.0).sample(centre, torch.Generator().manual_seed(3)) for _ in range(2))
+    assert torch.equal(first, again) and len(first.unique(dim=0)) == 5
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert torch.equal(NormBall(name, 0.0).sample(centre, torch.Generator()), centre)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: NormBall("l1", 1.0), "norm=l1: choose one of linf, l2"),
+        (lambda: NormBall("l2", -0.1), "radius=-0.1 must not be below zero"),
+        (lambda: NormBall("linf", math.nan), "radius=nan"),
+        (lambda: NormBall().sample(torch.zeros(1, 2), torch.Generator()), "radius=null has no uniform draw"),
+    ],
+)
+def test_balls_and_draws_that_make_no_sense_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

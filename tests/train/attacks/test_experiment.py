@@ -1,0 +1,318 @@
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from PIL import Image
+from torch import Tensor
+
+from augment.attack import DescentSettings, descend_repeatedly
+from augment.classifiers import Classifier
+from augment.cost import adversarial_cost
+from augment.parameters import KINDS
+from renderer.camera import ring
+from renderer.errors import InputError
+from renderer.lights import probe
+from train.attacks import experiment
+from train.attacks.checks import Checks, check
+from train.attacks.experiment import Attacked, attack_mesh, background
+from train.attacks.settings import AttackExperimentSettings
+from train.attacks.text import format_attack
+from train.settings import read_object, read_settings
+
+CPU = torch.device("cpu")
+CLASSES = ("orange", "lime", "sky", "night")
+SIZE = 8
+
+
+def mean_colour(images: Tensor) -> Tensor:
+    """Orange is red, lime is green, sky is blue, night is dark."""
+    means = 30 * images.mean((2, 3))
+    return torch.cat([means, 12 - means.sum(1, keepdim=True)], dim=1)
+
+
+def by_colour(classes: Sequence[str] = CLASSES) -> Classifier:
+    return Classifier(mean_colour, SIZE, classes, "by_colour")
+
+
+def configured(*overrides: str) -> AttackExperimentSettings:
+    """The real configuration; arguments are further overrides."""
+    small = ["renderer.visibility=software", "renderer.cache=null", "attack.checks=false", "attack.max_steps=8"]
+    with initialize_config_module("conf", version_base="1.3"):
+        return read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
+
+
+def attacked(*overrides: str, classifier: Classifier | None = None) -> Attacked:
+    settings = configured(*overrides)
+    (mesh,) = settings.scene.meshes
+    return attack_mesh(read_object(mesh, settings.label, 0), settings, classifier or by_colour(), CPU)
+
+
+# ---------------------------------------------------------------------------------------- what is attacked
+
+
+@pytest.mark.parametrize("kinds", [*KINDS, "lighting,geometry,pixels"])
+def test_every_kind_alone_and_with_others_lowers_the_cost_of_its_own_pictures(kinds):
+    """The numbers are those of the pictures: the cost and the answers follow from the logits."""
+    done = attacked(f"attack=[{kinds}]", "attack.max_steps=3", "scene.backgrounds=[0.4,0.5]")
+    assert [kind.name for kind in done.problem.kinds] == kinds.split(",")
+    assert done.result.images.shape == (2, 1, 3, SIZE, SIZE)
+    assert (done.result.cost < done.result.cost_before).all() and (done.result.steps > 0).all()
+    for images, logits, cost in [
+        (done.images_before, done.logits_before, done.result.cost_before),
+        (done.result.images, done.logits, done.result.cost),
+    ]:
+        assert torch.equal(logits[:, 0], mean_colour(images[:, 0]))
+        # Sums of 64 pixels in another order differ by rounding.
+        torch.testing.assert_close(cost, adversarial_cost(logits[:, 0], done.goal.decrease[:, 0]), rtol=0, atol=1e-4)
+    assert torch.equal(done.logits.argmax(2) != 0, done.result.fooled[:, None])
+    everything = torch.arange(2)
+    again = done.problem.render(done.result.values, everything)
+    torch.testing.assert_close(again.detach(), done.result.images, rtol=0, atol=1e-6)
+
+
+def test_examples_are_all_views_before_each_background_at_equal_azimuths():
+    done = attacked("scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "attack.max_steps=0")
+    cameras = ring(3, 2.0, math.pi / 2)
+    assert done.problem.scene.cameras == [[camera] for camera in cameras] * 2
+    assert done.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(grey)] * 3 for grey in [0.2] * 3 + [0.6] * 3]
+    assert torch.equal(done.problem.scene.light, probe("grace"))
+
+
+def test_shared_views_are_one_example_with_one_light():
+    done = attacked("scene.views=3", "attack.shared=true")
+    assert (len(done.problem.scene), done.problem.scene.views) == (1, 3)
+    assert done.result.values.shape == (1, 147)
+    each = adversarial_cost(done.logits_before[0], done.goal.decrease[0])
+    assert done.result.cost_before.item() == pytest.approx(each.sum().item(), abs=1e-4)
+
+
+def test_exposure_multiplies_the_light_and_gain_the_surface():
+    brighter = attacked("attack.max_steps=0", "scene.exposure=1.5", "attack.force=true")
+    item = "scene.meshes=[{mesh: 'solid:orange:0', gain: 1.5}]"
+    whiter = attacked("attack.max_steps=0", item, "attack.force=true")
+    torch.testing.assert_close(brighter.images_before, whiter.images_before, rtol=0, atol=1e-6)
+    assert not torch.equal(brighter.images_before, attacked("attack.max_steps=0").images_before)
+
+
+def test_subdivision_gives_more_vertices_than_asked_for():
+    before = len(attacked("attack.max_steps=0").problem.scene.vertices)
+    after = len(attacked("attack.max_steps=0", f"scene.vertices={before}").problem.scene.vertices)
+    assert after > before
+
+
+@pytest.mark.parametrize("kinds", ["lighting", "geometry"])
+def test_the_same_seed_gives_the_same_result(kinds):
+    """Nothing reaches `sky`, so that a restart is drawn."""
+    overrides = [f"attack=[{kinds}]", "target=sky", "attack.restarts=1", f"attack.{kinds}.radius=0.02"]
+    first, second = (attacked(*overrides, "attack.max_steps=2") for _ in range(2))
+    for name, value in vars(first.result).items():
+        assert torch.equal(value, getattr(second.result, name)), name
+    assert first.result.steps.item() == 4 and not first.result.fooled.any()
+
+
+def test_restarts_are_within_the_ball_and_follow_from_the_seed(monkeypatch):
+    def starts(seed: int) -> Tensor:
+        drawn = []
+
+        def recorded(*arguments):
+            *rest, each = arguments
+            drawn.extend(each)
+            return descend_repeatedly(*rest, drawn)
+
+        monkeypatch.setattr(experiment, "descend_repeatedly", recorded)
+        done = attacked(f"seed={seed}", "attack.restarts=2", "attack.lighting.radius=0.02", "attack.max_steps=0")
+        return torch.stack(drawn) - done.problem.start
+
+    offsets = starts(0)
+    assert offsets.shape == (2, 1, 147) and 0.01 < offsets.abs().max() <= 0.02 + 1e-6  # float32 around a light of 1
+    assert torch.equal(starts(0), offsets) and not torch.equal(offsets[0], offsets[1])
+    assert not torch.equal(starts(1), offsets)
+
+
+# ---------------------------------------------------------------------------------------- targets
+
+
+def test_least_likely_is_each_views_own_least_confidence():
+    done = attacked("target=least_likely", "scene.views=2", "attack.shared=true")
+    assert torch.equal(done.goal.increase, done.logits_before.argmin(2))
+
+
+@pytest.mark.parametrize(
+    ("target", "wanted"), [("null", None), ("lime", [1, 1]), ("[sky,lime]", [2, 1]), ("[night,night]", [3, 3])]
+)
+def test_targets_are_one_for_all_views_or_one_each(target, wanted):
+    done = attacked(
+        f"target={target}", "scene.views=2", "attack.shared=true", "attack.max_steps=1", "scene.backgrounds=[0.4,0.5]"
+    )
+    found = done.goal.increase
+    assert found is None if wanted is None else found.tolist() == [wanted] * 2
+    assert done.goal.decrease.tolist() == [[0, 0]] * 2
+
+
+def test_a_target_is_reached():
+    done = attacked("target=lime", "attack.max_steps=30")
+    assert done.result.fooled.all() and done.logits.argmax(2).item() == CLASSES.index("lime")
+
+
+def test_a_class_whose_name_is_a_number_is_a_target():
+    done = attacked("target=7", "attack.max_steps=1", classifier=by_colour(("orange", "7", "8", "9")))
+    assert done.goal.increase.tolist() == [[1]]
+
+
+# ---------------------------------------------------------------------------------------- backgrounds
+
+
+def test_a_background_is_grey_or_a_pictures_centre_square(tmp_path):
+    assert torch.equal(background(0.25, 4), torch.full((3, 4, 4), 0.25))
+    assert torch.equal(background("0.25", 4), background(0.25, 4))
+    pixels = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "wide.png")
+    square = torch.from_numpy(pixels[:, 1:5]).permute(2, 0, 1) / 255
+    assert torch.equal(background(str(tmp_path / "wide.png"), 4), square)
+
+
+@pytest.mark.parametrize("choice", [-0.1, 1.1, math.nan, None, [0.5]])
+def test_greys_outside_0_to_1_and_what_is_no_background_are_refused(choice):
+    with pytest.raises(InputError, match=r"scene.backgrounds=.*give grey values in \[0, 1\] or picture files"):
+        background(choice, 4)
+
+
+def test_an_unreadable_background_is_named(tmp_path):
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no picture")
+    for path in (broken, tmp_path / "absent.png", tmp_path):
+        with pytest.raises(InputError, match=f"scene.backgrounds: {path} cannot be read .*: give grey values"):
+            background(str(path), 4)
+
+
+# ---------------------------------------------------------------------------------------- bad input
+
+
+REFUSED = [
+    (["attack=[lighting,skylight]"], r"attack: lighting and skylight both set the light: choose one of them"),
+    (["attack.lighting.radius=-1"], r"attack: radius=-1.0 must not be below zero"),
+    (["attack.lighting.norm=l3"], r"attack: norm=l3: choose one of linf, l2"),
+    (["attack.lighting.step=long"], r"step=long: choose one of unit, raw, sign"),
+    (["attack.lighting.step_size=0"], r"step_size=0.0 must be positive"),
+    (["attack.restarts=2"], r"attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0"),
+    (["attack.restarts=-1"], r"attack.restarts=-1 must not be negative"),
+    (["attack.max_steps=-1"], r"attack: max_steps=-1 must not be negative"),
+    (["attack.batch_size=0"], r"batch_size=0 at least 1"),
+    (["scene.views=0"], r"scene.views=0 must be at least 1"),
+    (["scene.exposure=0"], r"scene.exposure=0.0 must be positive"),
+    (["scene.exposure=inf"], r"scene.exposure=inf must be positive"),
+    (["scene.meshes=[]"], r"scene.meshes and scene.backgrounds must not be empty"),
+    (["scene.backgrounds=[]"], r"scene.meshes and scene.backgrounds must not be empty"),
+    (["seed=-1"], r"seed=-1 must not be negative"),
+    (["attack.max_steps=many"], r"attack.max_steps: Value 'many' of type 'str' could not be converted to Integer"),
+    (["label=mango"], r"classifier=by_colour has no class 'mango': choose one, such as "),
+    (["target=mango"], r"classifier=by_colour has no class 'mango': choose one, such as "),
+    (["target=[lime,sky]"], r"target=\['lime', 'sky'\] names 2 classes for 1 views .*: give as many, and"),
+    (["target=[lime,sky]", "scene.views=2"], r"names 2 classes for 1 views"),
+    (["target=[lime]", "scene.views=2", "attack.shared=true"], r"names 1 classes for 2 views"),
+    (["target=[lime,mango]", "scene.views=2", "attack.shared=true"], r"has no class 'mango'"),
+    (["renderer.normals=round"], r"renderer.normals=round: choose one of flat, smooth"),
+    (["scene.meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"scene.meshes\[0\]"),
+    (["scene.meshes=[absent.glb]"], r"absent.glb"),
+    (["scene.light=moon"], r"light 'moon' is not known"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=[" ".join(row[0]) for row in REFUSED])
+def test_bad_input_is_refused_in_one_sentence(overrides, message):
+    with pytest.raises(InputError, match=message) as refused:
+        attacked(*overrides)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_attack_on_nothing_is_refused():
+    with pytest.raises(InputError, match="attack: name what to change, such as attack=lighting; there are lighting, "):
+        configured("attack=[]").attack.require_kinds()
+
+
+def test_a_mesh_may_name_its_own_class():
+    item = read_object({"mesh": "solid:orange:0", "label": "lime", "gain": 2.0}, "orange", 0)
+    assert (item.mesh, item.label, item.gain) == ("solid:orange:0", "lime", 2.0)
+    assert read_object("solid:orange:0", "sky", 0).label == "sky"
+
+
+@pytest.mark.parametrize("item", [{"label": "orange"}, {"mesh": "solid:orange", "wight": 1}, None, ["a"]])
+def test_a_mesh_that_is_none_is_refused_by_its_place(item):
+    with pytest.raises(InputError, match=r"scene\.meshes\[3\]"):
+        read_object(item, "orange", 3)
+
+
+def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_forced():
+    """Of six classes the five best are told, best first, with their shares."""
+    bias = torch.tensor([0.0, 5, 4, 3, 2, 1])
+    deaf = Classifier(lambda images: images.sum() * 0 + bias.expand(len(images), -1), SIZE, ("orange", *"abcde"))
+    shares = bias.softmax(0)
+    best = ", ".join(f"{name} {share:.1%}" for name, share in zip("abcde", shares[1:].tolist(), strict=True))
+    with pytest.raises(InputError) as refused:
+        attacked("scene.views=2", classifier=deaf)
+    assert str(refused.value) == (
+        f"2 of 2 pictures of solid:orange:0 are not recognised as 'orange' before any attack (the first: {best}): "
+        "change the scene, or set attack.force=true"
+    )
+    done = attacked("scene.views=2", "attack.force=true", classifier=deaf)
+    assert done.result.fooled_before.all() and not done.result.steps.any()
+    assert done.result.zero_gradient.all()
+
+
+# ---------------------------------------------------------------------------------------- checks
+
+
+def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
+    settings = DescentSettings(3)
+    done = attacked("attack.max_steps=3", "scene.backgrounds=[0.3,0.5,0.7]", "attack.lighting.step_size=0.1")
+    found = check(done, settings, 0)
+    assert found.cost_before == pytest.approx(float(done.result.cost_before.mean()))
+    assert found.cost == pytest.approx(float(done.result.cost.mean())) and found.cost < found.cost_before
+    assert found.cost_fell == 1 and found.zero_gradient == 0 and 0 <= found.random_search <= 1
+    shares = list(found.success_by_steps.values())
+    assert list(found.success_by_steps) == [3, 9, 30]
+    # A longer descent repeats the shorter one: nothing here is drawn.
+    assert shares == sorted(shares) and shares[0] == found.success < shares[-1] == 1
+    assert found == check(done, settings, 0)
+
+
+def test_random_search_that_does_as_well_is_a_warning():
+    """Any change fools a classifier that knows no picture but one of almost exactly this brightness."""
+    brightness, width = attacked("attack.max_steps=0").images_before.mean(), 1e-4
+
+    def narrow(images: Tensor) -> Tensor:
+        margin = width - (images.mean((1, 2, 3)) - brightness - width / 2).abs()
+        return torch.stack([margin, 0 * margin], dim=1)
+
+    done = attacked("attack.lighting.radius=0.1", classifier=Classifier(narrow, SIZE, CLASSES[:2]))
+    found = check(done, DescentSettings(8), 0)
+    assert not done.result.fooled_before.any() and found.success == found.random_search == 1
+    assert found.warnings == ["random search does as well or better"]
+
+
+NOTHING_TO_SAY = Checks(2.0, -1.0, 1.0, 0.0, 0.8, 0.5, {3: 0.8, 9: 0.9, 30: 1.0})
+
+
+@pytest.mark.parametrize(
+    ("changes", "warning"),
+    [
+        ({}, None),
+        ({"random_search": 0.8}, "random search does as well or better"),
+        ({"random_search": 0.9}, "random search does as well or better"),
+        ({"random_search": 0.0, "success": 0.0}, None),
+        ({"cost_fell": 0.9}, "the cost rose in some examples"),
+        ({"zero_gradient": 0.1}, "some first gradients are exactly zero"),
+    ],
+)
+def test_warnings_follow_from_the_numbers_and_are_printed(changes, warning):
+    found = replace(NOTHING_TO_SAY, **changes)
+    assert found.warnings == ([warning] if warning else [])
+    done = attacked("attack.max_steps=1")
+    text = format_attack("mesh", done, found)
+    assert [line for line in text.splitlines() if "warning" in line] == ([f"warning: {warning}"] if warning else [])
+    assert "80% in 3, 90% in 9, 100% in 30 steps" in text
+    assert len(format_attack("mesh", done, None).splitlines()) == 1

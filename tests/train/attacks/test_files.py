@@ -1,0 +1,91 @@
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from PIL import Image
+
+from augment.attack import DescentSettings
+from augment.classifiers import Classifier
+from renderer.environment import read_map, to_map
+from renderer.lights import load_light
+from renderer.mesh import load_mesh
+from renderer.mesh_damage import mesh_damage
+from train.attacks.checks import check
+from train.attacks.experiment import Attacked, attack_mesh
+from train.attacks.files import LINES, MAP_HEIGHT, write_files
+from train.attacks.settings import AttackExperimentSettings
+from train.settings import read_object, read_settings
+
+CLASSES = ("orange", "lime", "sky")
+
+
+def attacked(*overrides: str) -> Attacked:
+    small = ["renderer.visibility=software", "renderer.cache=null", "attack.max_steps=2", "attack.force=true"]
+    with initialize_config_module("conf", version_base="1.3"):
+        settings = read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
+    by_colour = Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES, "by_colour")
+    return attack_mesh(read_object("solid:orange:0", "orange", 0), settings, by_colour, torch.device("cpu"))
+
+
+def written(done: Attacked, folder: Path) -> list[dict]:
+    """The lines."""
+    write_files(done, None, folder)
+    return [json.loads(line) for line in (folder / LINES).read_text().splitlines()]
+
+
+def test_each_example_has_a_line_and_a_last_one_holds_the_checks(tmp_path):
+    done = attacked("scene.backgrounds=[0.4,0.6]", "target=lime")
+    checks = check(done, DescentSettings(2), 0)
+    write_files(done, checks, tmp_path)
+    *lines, last = [json.loads(line) for line in (tmp_path / LINES).read_text().splitlines()]
+    by_steps = {str(steps): share for steps, share in checks.success_by_steps.items()}
+    assert last == {"checks": asdict(checks) | {"success_by_steps": by_steps}, "warnings": checks.warnings}
+    assert [line["example"] for line in lines] == [0, 1]
+    shares = done.logits.softmax(2)
+    for example, line in enumerate(lines):
+        for name in ("fooled", "fooled_before", "steps", "cost", "cost_before"):
+            assert line[name] == getattr(done.result, name)[example].item()
+        assert line["label"] == ["orange"]
+        assert line["answer"] == [CLASSES[done.logits[example, 0].argmax()]]
+        assert line["confidence"] == [pytest.approx(shares[example].max().item())]
+        change = (done.result.values[example] - done.problem.start[example]).abs().max().item()
+        assert line["largest_change"] == {"lighting": change} and change > 0
+
+
+def test_the_light_is_read_back_to_the_bit_and_as_a_map_to_its_precision(tmp_path):
+    done = attacked("scene.backgrounds=[0.4,0.6]")
+    written(done, tmp_path)
+    for example in range(2):
+        stem, light = f"example_{example:03d}", done.result.values[example].unflatten(0, (49, 3))
+        assert torch.equal(load_light(str(tmp_path / f"{stem}_light.json")), light)
+        expected = to_map(light, MAP_HEIGHT).double()
+        found = read_map(tmp_path / f"{stem}_light.hdr").double()
+        # A channel has 8 bits of the texel's largest; what is below zero cannot be told.
+        step = expected.clamp(min=0).amax(2, keepdim=True) / 128
+        positive = expected.clamp(min=0)
+        assert found.shape == (MAP_HEIGHT, 2 * MAP_HEIGHT, 3)
+        assert ((found - positive).abs() <= step + 1e-6).all()
+        with Image.open(tmp_path / f"{stem}.png") as sheet:
+            assert min(sheet.size) > 100
+
+
+@pytest.mark.parametrize(("suffix", "up"), [(".glb", "auto"), (".ply", "z")])
+def test_the_shape_is_read_back_where_the_attack_left_it(tmp_path, suffix, up):
+    done = attacked("attack=[geometry]")
+    (line,) = written(done, tmp_path)
+    mesh = done.problem.scene.mesh
+    moved = mesh.vertices + done.result.values[0].unflatten(0, (-1, 3)).double().numpy()
+    found = load_mesh(tmp_path / f"example_000_shape{suffix}", up=up)
+    # Half of float32's step below 1, and the file's axes are turned exactly.
+    np.testing.assert_allclose(found.vertices[found.faces], moved[mesh.faces], rtol=0, atol=2**-23)
+    damage = mesh_damage(mesh.vertices, moved, mesh.faces)
+    assert line["shape"] == {
+        "flipped": damage.flipped,
+        "degenerate": damage.degenerate,
+        "displacement": [pytest.approx(each, abs=2**-23) for each in damage.displacement],
+    }
+    assert 0 < max(line["shape"]["displacement"]) <= 0.002 + 2**-23

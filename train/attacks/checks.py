@@ -1,0 +1,86 @@
+"""Guards against fooling oneself: does the cost fall, does random search do as well, do more steps fool more?"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from augment.attack import DescentSettings, descend
+from augment.phases import Phases
+from augment.seeding import generator
+from train.attacks.experiment import Attacked, logits_of
+
+GROWTH = (1, 3, 10)
+
+
+@dataclass(frozen=True)
+class Checks:
+    """Shares of the examples, in [0, 1], and mean costs.
+
+    cost_fell: of those that were not fooled to begin with. random_search: fooled by any of as many draws as the attack
+    had passes, each as far from the start as the attack may go or went. success_by_steps: fooled within the steps, ×3
+    and ×10.
+    """
+
+    cost_before: float
+    cost: float
+    cost_fell: float
+    zero_gradient: float
+    success: float
+    random_search: float
+    success_by_steps: dict[int, float]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a reader must know before believing the attack."""
+        found = {
+            "random search does as well or better": self.success > 0 and self.random_search >= self.success,
+            "the cost rose in some examples": self.cost_fell < 1,
+            "some first gradients are exactly zero": self.zero_gradient > 0,
+        }
+        return [warning for warning, holds in found.items() if holds]
+
+
+def check(attacked: Attacked, descent: DescentSettings, seed: int) -> Checks:
+    """Search at random and descend for ten times as long, beside an attack that is done."""
+    result = attacked.result
+    open_cases = ~result.fooled_before
+    fell = (result.cost < result.cost_before) | result.fooled
+    return Checks(
+        cost_before=float(result.cost_before.mean()),
+        cost=float(result.cost.mean()),
+        cost_fell=_share(fell[open_cases]) if open_cases.any() else 1.0,
+        zero_gradient=_share(result.zero_gradient),
+        success=_share(result.fooled),
+        random_search=_share(_random_search(attacked, descent, seed)),
+        success_by_steps=_success_by_steps(attacked, descent),
+    )
+
+
+def _random_search(attacked: Attacked, descent: DescentSettings, seed: int) -> Tensor:
+    """(E,) whether any draw fools."""
+    problem, result = attacked.problem, attacked.result
+    draws, fooled = generator(seed, "random search"), result.fooled_before.clone()
+    for _ in range(descent.max_steps):
+        left = torch.nonzero(~fooled).squeeze(1)
+        if not len(left):
+            break
+        drawn = problem.sample_as_far(result.values, draws)
+        with torch.no_grad():
+            images = problem.render(drawn[left], left)
+        predicted = logits_of(attacked.classifier, images, descent.batch_size).argmax(2)
+        fooled[left] = attacked.goal.of(left).reached(predicted)
+    return fooled
+
+
+def _success_by_steps(attacked: Attacked, descent: DescentSettings) -> dict[int, float]:
+    longest = replace(descent, max_steps=descent.max_steps * max(GROWTH))
+    result = descend(
+        attacked.classifier, attacked.problem, attacked.goal, longest, Phases(attacked.problem.start.device)
+    )
+    limits = [descent.max_steps * factor for factor in GROWTH]
+    return {limit: _share(result.fooled & (result.steps <= limit)) for limit in limits}
+
+
+def _share(values: Tensor) -> float:
+    return float(values.double().mean())

@@ -1,0 +1,95 @@
+"""What an attack leaves behind: pictures, lights, shapes, and all numbers as JSON lines."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from augment.mesh_scene import Conditions
+from renderer.environment import to_map, write_map
+from renderer.light_sphere import light_sphere
+from renderer.lights import save_light
+from renderer.mesh_damage import mesh_damage
+from renderer.mesh_export import export_mesh
+from train.attacks.checks import Checks
+from train.attacks.experiment import Attacked
+from train.attacks.report_picture import Exhibit, answer_caption, report_picture
+
+LINES = "attack.jsonl"  # a line per example, and a last one with the checks
+MAP_HEIGHT = 256
+SPHERE = 192
+
+
+def write_files(attacked: Attacked, checks: Checks | None, folder: Path) -> None:
+    """Write a folder: attack.jsonl, and for each example a picture and the light and shape that it ended with."""
+    folder.mkdir(parents=True, exist_ok=True)
+    everything = torch.arange(len(attacked.problem.scene), device=attacked.result.values.device)
+    before = attacked.problem.conditions(attacked.problem.start, everything)
+    after = attacked.problem.conditions(attacked.result.values, everything)
+    with open(folder / LINES, "w") as file:
+        for example in range(len(everything)):
+            stem = folder / f"example_{example:03d}"
+            _write_picture(attacked, before, after, example, stem.with_suffix(".png"))
+            numbers = _numbers(attacked, example) | dict(_write_conditions(attacked, after, example, stem))
+            file.write(json.dumps({"example": example, **numbers}) + "\n")
+        if checks is not None:
+            file.write(json.dumps({"checks": asdict(checks), "warnings": checks.warnings}) + "\n")
+
+
+def _write_picture(attacked: Attacked, before: Conditions, after: Conditions, example: int, path: Path) -> None:
+    sides = [
+        (attacked.images_before, attacked.logits_before, before),
+        (attacked.result.images, attacked.logits, after),
+    ]
+    report_picture(*(_exhibit(attacked, *side, example) for side in sides), path)
+
+
+def _exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Conditions, example: int) -> Exhibit:
+    scene, classes = attacked.problem.scene, attacked.classifier.classes
+    labels = attacked.goal.decrease[example].tolist()
+    captions = [
+        answer_caption(view.softmax(0), classes, classes[label])
+        for view, label in zip(logits[example], labels, strict=True)
+    ]
+    spheres = [light_sphere(conditions.light[example], SPHERE, camera) for camera in scene.cameras[example]]
+    return Exhibit(images[example], captions, torch.stack(spheres))
+
+
+def _numbers(attacked: Attacked, example: int) -> dict:
+    result, classes = attacked.result, attacked.classifier.classes
+    confidences = attacked.logits[example].softmax(1)
+    return {
+        "fooled_before": bool(result.fooled_before[example]),
+        "fooled": bool(result.fooled[example]),
+        "steps": int(result.steps[example]),
+        "cost_before": float(result.cost_before[example]),
+        "cost": float(result.cost[example]),
+        "label": [classes[index] for index in attacked.goal.decrease[example].tolist()],
+        "answer": [classes[index] for index in confidences.argmax(1).tolist()],
+        "confidence": confidences.amax(1).tolist(),
+        "largest_change": {
+            kind.name: float((part - start).abs().max())
+            for kind, part, start in zip(
+                attacked.problem.kinds,
+                attacked.problem.split(result.values[example : example + 1]),
+                attacked.problem.split(attacked.problem.start[example : example + 1]),
+                strict=True,
+            )
+        },
+    }
+
+
+def _write_conditions(attacked: Attacked, after: Conditions, example: int, stem: Path) -> Iterator[tuple[str, object]]:
+    """What can be used elsewhere: the light, if it was attacked, and the shape."""
+    scene, light = attacked.problem.scene, after.light[example].detach().cpu()
+    if not torch.equal(light, scene.light.cpu()):
+        save_light(stem.with_name(stem.name + "_light.json"), light)
+        write_map(stem.with_name(stem.name + "_light.hdr"), to_map(light, MAP_HEIGHT))
+    if after.vertices is not None:
+        vertices = after.vertices[example].detach().cpu().double().numpy()
+        for suffix in (".glb", ".ply"):
+            export_mesh(replace(scene.mesh, vertices=vertices), stem.with_name(stem.name + "_shape" + suffix))
+        yield "shape", asdict(mesh_damage(scene.mesh.vertices, vertices, scene.mesh.faces))

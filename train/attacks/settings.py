@@ -1,0 +1,102 @@
+"""conf/attack.yaml as dataclasses: the types, ranges and keys that an attack accepts."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from augment.attack import DescentSettings
+from augment.parameters import KINDS, StepSettings
+from renderer.errors import InputError
+from train.settings import RendererSettings
+
+
+@dataclass
+class SkylightSettings(StepSettings):
+    """Where the sky begins: zenith and azimuth in degrees, turbidity."""
+
+    zenith: float = 45.0
+    azimuth: float = 0.0
+    turbidity: float = 3.0
+
+
+@dataclass
+class AttackSettings:
+    """What is changed, by which steps, and for how long; None for what stays as it is. See conf/attack.yaml."""
+
+    lighting: StepSettings | None = None
+    skylight: SkylightSettings | None = None
+    geometry: StepSettings | None = None
+    albedo: StepSettings | None = None
+    pixels: StepSettings | None = None
+    max_steps: int = 30
+    shorten: bool = False
+    restarts: int = 0
+    shared: bool = False
+    batch_size: int = 32
+    force: bool = False
+    checks: bool = True
+
+    def __post_init__(self):
+        if self.lighting and self.skylight:
+            raise InputError("attack: lighting and skylight both set the light: choose one of them")
+        if self.restarts < 0:
+            raise InputError(f"attack.restarts={self.restarts} must not be negative")
+        if self.restarts and any(settings.radius is None for settings in self.kinds.values()):
+            raise InputError("attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0")
+        self.descent()
+
+    @property
+    def kinds(self) -> dict[str, StepSettings]:
+        """The settings of what is changed, by name."""
+        return {name: settings for name in KINDS if (settings := getattr(self, name)) is not None}
+
+    def require_kinds(self) -> None:
+        """InputError where nothing is to be changed."""
+        if not self.kinds:
+            raise InputError(f"attack: name what to change, such as attack=lighting; there are {', '.join(KINDS)}")
+
+    def descent(self) -> DescentSettings:
+        """How long a descent lasts."""
+        return DescentSettings(self.max_steps, self.shorten, self.batch_size)
+
+
+@dataclass
+class AttackSceneSettings:
+    """What is rendered. meshes: as in training. polar: degrees. vertices: subdivide until there are more."""
+
+    meshes: list = field(default_factory=lambda: ["solid:orange:0"])
+    backgrounds: list = field(default_factory=lambda: [0.5])
+    views: int = 1
+    polar: float = 60.0
+    field_of_view: float = 2.0
+    vertices: int = 0
+    light: str = "grace"
+    exposure: float = 1.0
+
+    def __post_init__(self):
+        if not self.meshes or not self.backgrounds:
+            raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
+        if self.views < 1:
+            raise InputError(f"scene.views={self.views} must be at least 1")
+        if not 0 < self.exposure < math.inf:
+            raise InputError(f"scene.exposure={self.exposure} must be positive")
+
+
+@dataclass
+class AttackExperimentSettings:
+    """One attack on one classifier. target: None, a class, least_likely, or a class per view."""
+
+    classifier: str = "efficientnet_lite0"
+    weights: str | None = None
+    label: str = "orange"
+    target: Any = None
+    seed: int = 0
+    out: str = ""
+    device: str = "auto"
+    attack: AttackSettings = field(default_factory=AttackSettings)
+    scene: AttackSceneSettings = field(default_factory=AttackSceneSettings)
+    renderer: RendererSettings = field(default_factory=RendererSettings)
+
+    def __post_init__(self):
+        if self.seed < 0:
+            raise InputError(f"seed={self.seed} must not be negative")

@@ -1,0 +1,27 @@
+"""An attack's outcome as text for the terminal."""
+
+from train.attacks.checks import Checks
+from train.attacks.experiment import Attacked
+
+
+def format_attack(mesh: str, attacked: Attacked, checks: Checks | None) -> str:
+    """A paragraph on one mesh's attack, without a newline at the end."""
+    result = attacked.result
+    total, already = len(result.fooled), int(result.fooled_before.sum())
+    kinds = "+".join(kind.name for kind in attacked.problem.kinds)
+    steps = result.steps[result.fooled & ~result.fooled_before].double()
+    lines = [
+        f"{mesh}: {kinds} against {attacked.classifier.name}: {int(result.fooled.sum())} of {total} examples fooled"
+        + (f", {already} of them before any step" if already else "")
+        + (f"; median of {steps.median():.0f} steps" if len(steps) else "")
+        + f" ({attacked.seconds['attack']:.1f} s)",
+    ]
+    if checks is not None:
+        by_steps = ", ".join(f"{share:.0%} in {steps}" for steps, share in checks.success_by_steps.items())
+        lines += [
+            f"cost {checks.cost_before:.2f} before and {checks.cost:.2f} after; it fell in {checks.cost_fell:.0%}; "
+            f"first gradients that are zero: {checks.zero_gradient:.0%}",
+            f"fooled by as many random draws: {checks.random_search:.0%}; by longer attacks: {by_steps} steps",
+            *(f"warning: {warning}" for warning in checks.warnings),
+        ]
+    return "\n".join(lines)
