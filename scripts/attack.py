@@ -1,0 +1,57 @@
+"""Attack a classifier through a mesh's light, shape, colour or pixels: python scripts/attack.py attack=lighting ..."""
+
+import re
+import sys
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from augment.parameters import KINDS
+from renderer.errors import InputError
+from train.attacks.checks import check
+from train.attacks.experiment import attack_mesh
+from train.attacks.files import write_files
+from train.attacks.settings import AttackExperimentSettings
+from train.attacks.text import format_attack
+from train.cli import one_sentence_errors, with_suggestions
+from train.device import choose_device
+from train.run_classifier import load_classifier
+from train.settings import read_object, read_settings
+
+
+@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="attack")
+@one_sentence_errors
+def main(config: DictConfig) -> None:
+    config = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    settings = read_settings(AttackExperimentSettings, config)
+    settings.attack.require_kinds()
+    device = choose_device(settings.device)
+    classifier = load_classifier(settings.classifier, settings.weights).to(device)
+    out = Path(settings.out)
+    for index, item in enumerate(settings.scene.meshes):
+        named = read_object(item, settings.label, index)
+        attacked = attack_mesh(named, settings, classifier, device)
+        checks = check(attacked, settings.attack.descent(), settings.seed) if settings.attack.checks else None
+        folder = out / f"{index}_{Path(named.mesh.replace(':', '_')).stem}"
+        write_files(attacked, checks, folder)
+        print(format_attack(named.mesh, attacked, checks))
+        print(f"pictures, lights, shapes and numbers: {folder}\n")
+    OmegaConf.save(config, out / "config.yaml")
+
+
+@one_sentence_errors
+def _several_kinds(argument: str) -> str:
+    """Hydra's form, attack=[lighting,geometry], of attack=lighting+geometry."""
+    key, _, kinds = argument.partition("=")
+    if key != "attack":
+        return argument
+    names = [name for name in re.split(r"[+,\s]+", kinds.strip("[]")) if name]
+    if unknown := [name for name in names if name not in KINDS]:
+        raise InputError(f"attack={unknown[0]} is not known: choose from {', '.join(KINDS)}, several joined by +")
+    return f"attack=[{','.join(names)}]"
+
+
+if __name__ == "__main__":
+    sys.argv[1:] = [_several_kinds(argument) for argument in sys.argv[1:]]
+    with_suggestions(main, "attack")

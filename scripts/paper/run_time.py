@@ -1,0 +1,386 @@
+"""What an iteration of an attack costs, and how many it takes (the paper's Section 4.2, "Runtime").
+
+PYTHONPATH=. python scripts/paper/run_time.py --meshes FILE FILE:GAIN
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from common import (
+    GREYS,
+    Subject,
+    arguments,
+    command,
+    recognised_scene,
+    scene_of,
+    subjects,
+    table,
+    versions,
+    write_section,
+)
+from torch import Tensor, nn
+
+from augment.attack import DescentSettings, Goal, descend
+from augment.cost import adversarial_cost
+from augment.mesh_scene import MeshScene
+from augment.parameters import Geometry, Lighting, StepSettings
+from augment.perturbation import Perturbation
+from augment.scene import ObjectSettings, Scene, SceneObject, load_object
+from augment.service import AugmentationService, AugmentationSettings, LightAttackSettings
+from renderer.camera import OrthographicCamera, ring
+from renderer.image import PictureSettings
+from renderer.lights import load_light
+from renderer.subdivision import subdivide
+from renderer.transfer import build_operators
+from renderer.visibility import choose
+from train.photographs.shares import share
+from train.run_classifier import load_classifier
+
+POLAR = np.pi / 3
+VERTICES = 10_000
+FIELDS = (2.0, 2.8, 4.0, 5.7, 8.0)  # each halves the pixels of the one before
+KINDS = {
+    "lighting": (Lighting, StepSettings("linf", None, "unit", 0.05)),
+    "geometry": (Geometry, StepSettings("linf", 0.002, "sign", 0.0005)),
+}
+TARGETS = {"lighting": 1.05, "geometry": 1.3}
+TRAINING, TRAINING_TARGET = "the training's, 100 examples, 32², WideResNet-16-4", 1.03
+PRETRAINED = Path(__file__).parents[2] / "pretrained" / "none"
+SOLID = ObjectSettings("solid:orange", "orange")
+TRAINING_EXAMPLES = 100
+FEWER = 10  # iterations, the paper's
+SHARES = {"quartile": 0.25, "median": 0.5, "third quartile": 0.75, "90 %": 0.9, "most": 1.0}
+ITERATION_COLUMNS = ["attack", "pixels", "classifier, ms", "renderer, ms", "iteration, ms"]
+RATIO_COLUMNS = ["attack", "on", "classifier's pass, ms", "iteration, ms", "ratio", "target"]
+ATTACK_COLUMNS = ["mesh", "attacks", "fooled", *(f"{unit}, {name}" for unit in ("steps", "s") for name in SHARES)]
+COLOURS = ("#a9b8d8", "#e8743b")  # classifier, renderer
+
+TEXT = """
+One CPU thread, process time, medians; what is compared is measured in turns within one run, and the intervals are the
+quartiles of the turns. An iteration is all that an attack does for one step: render, ask the classifier, differentiate
+both, step, project.
+
+### An iteration against the pixels that need derivatives
+
+One picture of {size}², {classifier}, the mesh {mesh} with {vertices:,} vertices, its texture, smooth normals and 2×2
+samples a pixel; the field of view sets how many pixels it covers. Lighting keeps what it rasterised; geometry
+rasterises anew at every step.
+
+![Milliseconds per iteration](paper/run_time.png)
+
+{iterations}
+
+The paper's inset plots the time per iteration, which grows with the pixels that need derivatives, and prints no figure.
+Ours grows with them too. The classifier, whose cost does not depend on them, takes {classifier_share} of the time with
+light and {geometry_share} with shape at {most:,} pixels. The paper differentiates in Python on a Xeon of 3.5 GHz and
+rasterises by OpenGL on a GTX 1080, for ResNet-101, which is about twenty times as much work as {classifier}.
+
+### Against the classifier's own forward and input-gradient pass
+
+{ratios}
+
+At 32² a step is that of the training's attack: 100 examples (two meshes, 10 views, 5 backgrounds), WideResNet-16-4 as
+in `pretrained/none`, with its bias for the label raised so that no example leaves the batch.
+
+### How many iterations, how many seconds
+
+An attack on the light of {examples} pictures that {classifier} recognises, one after the other: steps of 0.05 along the
+gradient at unit length, at most {max_steps}, no limit to the norm. Seconds include what is rendered once per picture.
+
+{distribution}
+
+{finding}
+
+{command}
+
+{versions}
+"""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a single picture shows, and how it is drawn."""
+
+    name: str
+    subject: Subject
+    samples: int
+    normals: str
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """Milliseconds per iteration at one number of pixels. (turns,) each."""
+
+    setup: str
+    kind: str
+    pixels: int
+    bare: tuple[float, ...]  # the classifier's forward and input-gradient pass alone
+    whole: tuple[float, ...]  # an iteration of the attack
+    inside: tuple[float, ...]  # its part in the classifier
+
+    @property
+    def ratio(self) -> np.ndarray:
+        return np.divide(self.whole, self.bare)
+
+    @property
+    def renderer(self) -> np.ndarray:
+        return np.subtract(self.whole, self.inside)
+
+
+@dataclass(frozen=True)
+class Attack:
+    """One picture's attack. prepared: seconds spent on what is rendered once."""
+
+    mesh: str
+    fooled: bool
+    steps: int
+    seconds: float
+    prepared: float
+
+
+class Stopwatch:
+    """Adds up the process time of a descent's passes through the classifier; see `augment.phases.Phases`."""
+
+    def __init__(self):
+        self.seconds = 0.0
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        start = time.process_time()
+        yield
+        self.seconds += (time.process_time() - start) * (name == "attack_classifier")
+
+
+def seconds(run: Callable[[], object]) -> float:
+    start = time.process_time()
+    run()
+    return time.process_time() - start
+
+
+def classifier_pass(model: nn.Module, images: Tensor, labels: Tensor) -> None:
+    """Pictures' logits and the gradient of their cost."""
+    pictures = images.requires_grad_(True)
+    torch.autograd.grad(adversarial_cost(model(pictures), labels).sum(), pictures)
+
+
+def iteration(
+    setup: str,
+    kind: str,
+    pixels: int,
+    model: nn.Module,
+    images: Tensor,
+    labels: Tensor,
+    attack: Callable,
+    passes: int,
+    turns: int,
+) -> Iteration:
+    """attack: a descent of so many passes, given a stopwatch. The first turn is a rehearsal."""
+    rows = []
+    for _ in range(turns + 1):
+        watch = Stopwatch()
+        whole = seconds(lambda watch=watch: attack(watch))
+        bare = seconds(lambda: [classifier_pass(model, images, labels) for _ in range(passes)])
+        rows.append([1000 * value / passes for value in (bare, whole, watch.seconds)])
+    return Iteration(setup, kind, pixels, *(tuple(column) for column in zip(*rows[1:], strict=True)))
+
+
+def single_picture(
+    setup: Setup, kind: str, classifier: nn.Module, field: float, options: argparse.Namespace
+) -> Iteration:
+    """An attack on one picture that never succeeds, since its target is the least likely class."""
+    camera, size, subject = OrthographicCamera(POLAR, 0.0, field), classifier.size, setup.subject
+    picture = PictureSettings(size, setup.samples, normals=setup.normals)
+    behind, light = torch.full((1, 3, size, size), 0.5), load_light(options.light)
+    scene = MeshScene(subject.mesh, [[camera]], behind, light, picture, choose(), subject.gain)
+    make, settings = KINDS[kind]
+    problem, examples = Perturbation(scene, [make(scene, settings)]), torch.arange(1)
+    images = problem.render(problem.start, examples).detach()[0]
+    label = torch.tensor([[classifier.label(subject.label)]])
+    goal = Goal(label, classifier(images).argmin(1, keepdim=True))
+    descent = DescentSettings(options.passes - 1, shorten=kind == "geometry")
+    pixels = len(scene.operator(camera).pixels)
+    return iteration(
+        setup.name,
+        kind,
+        pixels,
+        classifier,
+        images,
+        label[0],
+        lambda watch: descend(classifier, problem, goal, descent, watch),
+        options.passes,
+        options.turns,
+    )
+
+
+def training_step(chosen: Sequence[Subject], options: argparse.Namespace) -> Iteration:
+    """The training's attack at 32² on 100 examples of two meshes."""
+    classifier = load_classifier(f"run:{PRETRAINED}")
+    label, views = classifier.label(options.label), TRAINING_EXAMPLES // len(chosen) // len(GREYS)
+    settings = PictureSettings(classifier.size)
+    objects = [
+        SceneObject(item.label, build_operators(item.mesh, ring(views, 2.0), settings, choose(), item.gain))
+        for item in chosen
+    ]
+    scene, light = Scene(objects, GREYS, settings), load_light(options.light)
+    with torch.no_grad():
+        classifier.function.head.bias[label] += 100
+    labels = torch.full((len(scene),), label)
+    attack = AugmentationSettings(
+        examples=len(scene), attack=LightAttackSettings(max_steps=options.passes - 1, batch_size=len(scene))
+    )
+
+    def regenerate(watch: Stopwatch) -> None:
+        AugmentationService(attack, scene, labels, light, options.seed, watch).regenerate(classifier, 0)
+
+    images = scene.render(light.expand(len(scene), -1, -1))
+    return iteration(
+        TRAINING,
+        "lighting",
+        len(scene.pixels),
+        classifier,
+        images,
+        labels,
+        regenerate,
+        options.passes,
+        options.turns // 2,
+    )
+
+
+def fine(subject: Subject) -> Subject:
+    return replace(subject, mesh=subdivide(subject.mesh, VERTICES))
+
+
+def attacks(subject: Subject, classifier: nn.Module, options: argparse.Namespace) -> Iterator[Attack]:
+    """Attack the light of recognised pictures, each on its own."""
+    scene = recognised_scene(subject, classifier, options.light, options.examples, options.seed)
+    goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
+    for example in range(len(scene)):
+        one = scene_of(subject, classifier, options.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0])
+        prepared = seconds(lambda one=one: one.operator(one.cameras[0][0]))
+        problem = Perturbation(one, [Lighting(one, KINDS["lighting"][1])])
+        start = time.process_time()
+        result = descend(classifier, problem, goal, DescentSettings(options.max_steps), Stopwatch())
+        spent = time.process_time() - start
+        yield Attack(subject.name, bool(result.fooled), int(result.steps), prepared + spent, prepared)
+
+
+def quartiles(values: Sequence[float], digits: int) -> str:
+    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
+    return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def one_digit(values: Sequence[float]) -> str:
+    return quartiles(values, 1)
+
+
+def iteration_rows(measured: Sequence[Iteration]) -> list[list[str]]:
+    return [
+        [each.kind, f"{each.pixels:,}", *map(one_digit, (each.inside, each.renderer, each.whole))] for each in measured
+    ]
+
+
+def ratio_row(each: Iteration) -> list[str]:
+    ratio = float(np.median(each.ratio))
+    target = TRAINING_TARGET if each.setup == TRAINING else TARGETS[each.kind]
+    met = "met" if ratio <= target else "not met"
+    return [
+        each.kind,
+        each.setup,
+        *map(one_digit, (each.bare, each.whole)),
+        quartiles(each.ratio, 3),
+        f"{target}: {met}",
+    ]
+
+
+def distribution_rows(done: Sequence[Attack], names: Sequence[str]) -> Iterator[list[str]]:
+    """A row per mesh, and one for all of them where there are several."""
+    groups = {name: [each for each in done if each.mesh == name] for name in names}
+    for name, group in (groups | ({"all": done} if len(groups) > 1 else {})).items():
+        fooled = [each for each in group if each.fooled]
+        rate = share(len(fooled), len(group))
+        steps, spent = [each.steps for each in fooled], [each.seconds for each in fooled]
+        yield [
+            name,
+            str(len(group)),
+            f"{rate['value']:.2f} [{rate['low']:.2f}, {rate['high']:.2f}]",
+            *(f"{np.quantile(steps, q):.0f}" if steps else "-" for q in SHARES.values()),
+            *(f"{np.quantile(spent, q):.2f}" if spent else "-" for q in SHARES.values()),
+        ]
+
+
+def finding(done: Sequence[Attack]) -> str:
+    """Whether "fewer than 10 iterations, a few seconds" holds, failures counted as attacks that never end."""
+    steps = [each.steps if each.fooled else np.inf for each in done]
+    few = share(sum(value < FEWER for value in steps), len(steps))
+    median, spent = np.median(steps), np.median([each.seconds for each in done])
+    return (
+        f"The paper: an adversary normally takes fewer than {FEWER} iterations, thus a few seconds. Here "
+        f"{few['value']:.0%} [{few['low']:.0%}, {few['high']:.0%}] take fewer; the median attack, failures counted as "
+        f"endless, takes {median:.0f} iterations and {spent:.2f} s: {'met' if median < FEWER else 'not met'}."
+    )
+
+
+def draw(measured: Sequence[Iteration], path: Path) -> None:
+    """A panel per kind: the classifier's share below the renderer's, against pixels."""
+    figure, panels = plt.subplots(1, len(KINDS), figsize=(8, 2.9), sharey=True)
+    for panel, kind in zip(panels, KINDS, strict=True):
+        rows = sorted((each for each in measured if each.kind == kind), key=lambda each: each.pixels)
+        parts = [[np.median(each.inside) for each in rows], [np.median(each.renderer) for each in rows]]
+        panel.stackplot([each.pixels for each in rows], parts, labels=["classifier", "renderer"], colors=COLOURS)
+        panel.set(title=kind, xlabel="pixels that need derivatives", xticks=range(0, 40_000, 10_000))
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("ms per iteration")
+    panels[0].set_ylim(0, 1.05 * max(np.median(each.whole) for each in measured))
+    panels[0].legend(loc="upper left", frameon=False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    options = arguments(__doc__, examples=50, max_steps=30, passes=5, turns=20).parse_args()
+    matplotlib.use("Agg")
+    torch.set_num_threads(1)
+    chosen, classifier = subjects(options), load_classifier(options.classifier, options.weights)
+    setups = (
+        Setup(f"{chosen[0].name}, textured, smooth, 2×2 samples", fine(chosen[0]), 2, "smooth"),
+        Setup("solid:orange, flat, 1 sample", fine(Subject("solid", load_object(SOLID), options.label)), 1, "flat"),
+    )
+    measured = [single_picture(setups[0], kind, classifier, field, options) for kind in KINDS for field in FIELDS]
+    largest = {kind: next(each for each in measured if each.kind == kind) for kind in KINDS}
+    plain = [single_picture(setups[1], kind, classifier, FIELDS[0], options) for kind in KINDS]
+    training = training_step(chosen, options)
+    done = [each for subject in chosen for each in attacks(subject, classifier, options)]
+    share_of = {kind: np.median(np.divide(each.inside, each.whole)) for kind, each in largest.items()}
+    text = TEXT.format(
+        size=classifier.size,
+        classifier=classifier.name,
+        mesh=chosen[0].name,
+        vertices=len(setups[0].subject.mesh.vertices),
+        iterations=table(ITERATION_COLUMNS, iteration_rows(measured)),
+        most=largest["lighting"].pixels,
+        classifier_share=f"{share_of['lighting']:.0%}",
+        geometry_share=f"{share_of['geometry']:.0%}",
+        ratios=table(RATIO_COLUMNS, map(ratio_row, (training, *plain, *largest.values()))),
+        examples=len(done),
+        max_steps=options.max_steps,
+        distribution=table(ATTACK_COLUMNS, distribution_rows(done, [subject.name for subject in chosen])),
+        finding=finding(done),
+        command=command(),
+        versions=versions(),
+    )
+    records = [asdict(each) for each in (*measured, *plain, training, *done)]
+    write_section(options.out, "run_time", "Run time", text, records)
+    draw(measured, options.out / "paper" / "run_time.png")
+
+
+if __name__ == "__main__":
+    main()
