@@ -44,7 +44,8 @@ class Subject:
 def arguments(description: str, **defaults: int) -> argparse.ArgumentParser:
     """The options that all scripts have, and whole numbers of their own."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--meshes", nargs="+", required=True, help="files, FILE:GAIN for textures that are too dark, or solid:NAME:SEED")
+    help_meshes = "files, FILE:GAIN for textures that are too dark, or solid:NAME:SEED"
+    parser.add_argument("--meshes", nargs="+", required=True, help=help_meshes)
     parser.add_argument("--label", default="orange", help="the class that the meshes show")
     parser.add_argument("--classifier", default="efficientnet_lite0")
     parser.add_argument("--weights", default=None, help="the classifier's local weights file")
@@ -127,8 +128,8 @@ def write_section(out: Path, name: str, title: str, text: str, records: Iterable
     (folder / f"{name}.md").write_text(f"## {title}\n\n{text.strip()}\n")
     there = [folder / f"{section}.md" for section in SECTIONS if (folder / f"{section}.md").is_file()]
     head = (
-        "# The paper's tables and figures\n\nEach section is written by the script that it names; do not edit. Renders of "
-        'orange_sketchfab show "An Orange" by thisisepic, Sketchfab, CC BY-SA 4.0.\n'
+        "# The paper's tables and figures\n\nEach section is written by the script that it names; do not edit. "
+        'Renders of orange_sketchfab show "An Orange" by thisisepic, Sketchfab, CC BY-SA 4.0.\n'
     )
     (out / "paper.md").write_text("\n".join([head, *(path.read_text() for path in there)]))
 
