@@ -13,7 +13,7 @@ from renderer.albedo import face_albedo, surface_albedo
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import PictureSettings, develop
+from renderer.image import PictureSettings, clamp, develop
 from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.transfer import Operator
@@ -77,7 +77,7 @@ class MeshScene:
         only_light = conditions.vertices is None and conditions.albedo is None
         pictures = (self._relight if only_light else self._reshade)(conditions, examples.tolist())
         pictures = pictures.unflatten(-1, (self.settings.size, self.settings.size))
-        return pictures if conditions.pixels is None else _clamp(pictures + conditions.pixels, 1.0)
+        return pictures if conditions.pixels is None else clamp(pictures + conditions.pixels)
 
     def _relight(self, conditions: Conditions, examples: list[int]) -> Tensor:
         """By one product per camera."""
@@ -117,7 +117,7 @@ class MeshScene:
             fragments, albedo = self._fragments(camera, vertices.detach().cpu().double().numpy())
         if conditions.albedo is not None:
             offset = face_albedo(conditions.albedo[row], fragments)
-            albedo = _clamp(albedo + offset, albedo.clamp(min=1))
+            albedo = clamp(albedo + offset, albedo.clamp(min=1))
         smooth_faces = self.faces if self.settings.normals == "smooth" else None
         seen = radiance(fragments, vertices, conditions.light[row], albedo, smooth_faces)
         return self._develop(seen, fragments.coverage.to(seen), self.backgrounds[example], fragments.pixels)
@@ -143,8 +143,3 @@ class MeshScene:
         )
         albedo = surface_albedo(self.mesh, fragments, self.settings.encoding) * self.gain
         return fragments.to(self.light.device), albedo.to(self.light)
-
-
-def _clamp(values: Tensor, ceiling: Tensor | float) -> Tensor:
-    """To [0, ceiling]. At the bounds themselves the gradient passes, unlike `torch.clamp`'s, so that black can grow."""
-    return torch.where(values < 0, 0, torch.where(values > ceiling, ceiling, values))

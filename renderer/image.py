@@ -39,7 +39,7 @@ def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: st
     background: (..., 3 or 1, 1 or P) picture values behind the surface. Returns (..., 3, P). InputError: NaN.
     """
     require_bounded(radiance=radiance, coverage=coverage, background=background)
-    return encode(_Clamp.apply(_composite(radiance, coverage, background, encoding)), encoding)
+    return encode(clamp(_composite(radiance, coverage, background, encoding)), encoding)
 
 
 def clamped(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
@@ -48,20 +48,26 @@ def clamped(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: st
     return (composite < 0) | (composite > 1)
 
 
-class _Clamp(torch.autograd.Function):
-    """To [0, 1]. At the bounds themselves the gradient passes, so that a light of zero on black can grow: where
-    `clamped` is False, and unlike `torch.clamp`, whose versions differ there."""
+def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
+    """To [0, ceiling]; differentiable in the values.
 
+    At the bounds themselves the gradient passes, so that a light of zero on black can grow: where `clamped` is False,
+    and unlike `torch.clamp`, whose versions differ there.
+    """
+    return _Clamp.apply(values, ceiling)
+
+
+class _Clamp(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, values: Tensor) -> Tensor:
-        ctx.save_for_backward((values >= 0) & (values <= 1))
-        return values.clamp(0, 1)
+    def forward(ctx, values: Tensor, ceiling: Tensor | float) -> Tensor:
+        ctx.save_for_backward((values >= 0) & (values <= ceiling))
+        return values.clamp(min=0).clamp(max=ceiling)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> Tensor:
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
         (passing,) = ctx.saved_tensors
-        return upstream * passing
+        return upstream * passing, None
 
 
 def _composite(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str) -> Tensor:
