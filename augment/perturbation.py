@@ -38,8 +38,8 @@ class Perturbation:
     def sample(self, generator: torch.Generator) -> Tensor:
         """Uniform draws (E, D) from every kind's ball around its start, within its domain."""
         examples = torch.arange(len(self.scene))
-        drawn = [kind.project(kind.ball.sample(kind.start, generator), examples) for kind in self.kinds]
-        return torch.cat(drawn, dim=1).to(self.start)
+        drawn = [kind.sample(generator, examples).to(self.start) for kind in self.kinds]
+        return torch.cat(drawn, dim=1)
 
     def sample_as_far(self, values: Tensor, generator: torch.Generator) -> Tensor:
         """Draws (E, D) as far as values went: uniform in a kind's ball where it has a radius, else in a random
@@ -52,7 +52,7 @@ class Perturbation:
                 reach = (part - start).norm(dim=1, keepdim=True)
                 drawn.append(kind.within_domain(start + offset * reach / offset.norm(dim=1, keepdim=True)))
             else:
-                drawn.append(kind.project(kind.ball.sample(kind.start, generator), examples))
+                drawn.append(kind.sample(generator, examples))
         return torch.cat([part.to(self.start) for part in drawn], dim=1)
 
     def split(self, values: Tensor) -> tuple[Tensor, ...]:

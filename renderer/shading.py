@@ -36,8 +36,7 @@ def radiance(
     (`renderer.albedo`). smooth_faces: all faces (F, 3) of the mesh, to shade with interpolated vertex normals; without
     them each face has its own normal. InputError: NaN in any of them.
     """
-    require_finite(vertices=vertices)
-    require_bounded(light=light, albedo=albedo)
+    require_bounded(albedo=albedo)  # the normals and the irradiance check the rest
     wide = _computed_in(vertices.dtype)
     positions, albedo = vertices.to(wide), albedo.to(wide)
     if smooth_faces is None:

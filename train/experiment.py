@@ -19,7 +19,6 @@ from augment.service import AugmentationService
 from renderer.cache import OperatorCache, TensorCache, cache_folder
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
-from renderer.image import PictureSettings
 from renderer.lights import load_light
 from renderer.transfer import COEFFICIENTS, DEGREE
 from renderer.visibility import choose
@@ -149,7 +148,7 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         class_index(data.classes, item.label, f"label of scene.meshes[{index}]")
     backend = choose(renderer.visibility)
     console.info("visibility: %s", backend.description)
-    pictures = PictureSettings(data.size, renderer.samples, renderer.encoding, renderer.normals)
+    pictures = renderer.pictures(data.size)
     cache, start = OperatorCache(cache_folder(renderer.cache)), time.perf_counter()
     built = build_objects(objects, settings.views, scene.field_of_view, pictures, backend, cache)
     scene = Scene(built, scene.backgrounds, pictures, device)

@@ -9,6 +9,7 @@ from omegaconf.errors import OmegaConfBaseException
 from augment.scene import ObjectSettings, count_views
 from augment.service import AugmentationSettings
 from renderer.errors import InputError
+from renderer.image import PictureSettings
 from train.fit import TrainSettings
 
 
@@ -59,6 +60,10 @@ class RendererSettings:
     encoding: str = "linear"
     normals: str = "flat"
     cache: str | None = "auto"
+
+    def pictures(self, size: int) -> PictureSettings:
+        """Of pictures with `size` pixels per side."""
+        return PictureSettings(size, self.samples, self.encoding, self.normals)
 
 
 @dataclass

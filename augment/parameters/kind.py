@@ -67,6 +67,10 @@ class Kind(ABC):
         """Values (A, D) of the examples (A,) moved into the norm-ball and into what is physically possible."""
         return self.ball.project(self.within_domain(values), self.start[examples])
 
+    def sample(self, generator: torch.Generator, examples: Tensor) -> Tensor:
+        """Uniform draws (A, D) from the balls of the examples (A,), within the domain."""
+        return self.project(self.ball.sample(self.start[examples], generator), examples)
+
     def within_domain(self, values: Tensor) -> Tensor:
         """Values (A, D) moved into their domain; by default there is no bound."""
         return values

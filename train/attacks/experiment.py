@@ -20,7 +20,6 @@ from augment.seeding import generator
 from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import ring
 from renderer.errors import InputError
-from renderer.image import PictureSettings
 from renderer.lights import load_light
 from renderer.subdivision import subdivide
 from renderer.visibility import choose
@@ -76,16 +75,15 @@ def attack_mesh(
 def build_scene(item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device) -> MeshScene:
     """Backgrounds × views, as an example each or, where the views share what is attacked, an example per background."""
     scene, renderer = settings.scene, settings.renderer
-    mesh = subdivide(load_object(item), scene.vertices) if scene.vertices else load_object(item)
     cameras = ring(scene.views, scene.field_of_view, math.radians(scene.polar))
     views = [cameras] if settings.attack.shared else [[camera] for camera in cameras]
     behind = torch.stack([background(choice, size) for choice in scene.backgrounds])
     return MeshScene(
-        mesh,
+        subdivide(load_object(item), scene.vertices),
         [each for _ in behind for each in views],
         behind.repeat_interleave(len(views), dim=0).to(device),
         (load_light(scene.light) * scene.exposure).to(device),
-        PictureSettings(size, renderer.samples, renderer.encoding, renderer.normals),
+        renderer.pictures(size),
         choose(renderer.visibility),
         item.gain,
         OperatorCache(cache_folder(renderer.cache)),
