@@ -1,12 +1,13 @@
 """Descent on the adversarial cost over anything that renders differentiably, until the classifier is fooled."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
+from augment import processes
 from augment.cost import adversarial_cost
 from augment.model_state import as_found
 from augment.phases import Phases
@@ -88,6 +89,11 @@ class AttackResult:
     predicted: Tensor
     zero_gradient: Tensor
 
+    def merged(self, examples: Tensor, total: int) -> "AttackResult":
+        """The result of all `total` examples, where this one is of the process's own (A,); see `processes.merged`."""
+        rows = {item.name: processes.merged(getattr(self, item.name), examples, total) for item in fields(self)}
+        return AttackResult(**rows)
+
 
 @dataclass(frozen=True)
 class _Pass:
@@ -99,8 +105,8 @@ class _Pass:
 
 
 @dataclass(frozen=True)
-class Restart:
-    """Some examples (A,) of a problem, from other starts (A, D)."""
+class Part:
+    """Some examples (A,) of a problem, from starts (A, D) of their own."""
 
     problem: Problem
     examples: Tensor
@@ -128,7 +134,7 @@ def descend_repeatedly(
         left = torch.nonzero(~best.fooled).squeeze(1)
         if not len(left):
             break
-        again = descend(model, Restart(problem, left, start[left]), goal.of(left), settings, phases)
+        again = descend(model, Part(problem, left, start[left]), goal.of(left), settings, phases)
         best.steps[left] += again.steps
         better = left[again.fooled]
         for name in ("values", "images", "fooled", "cost", "predicted"):

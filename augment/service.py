@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from augment.attack import AttackResult, DescentSettings, Goal, descend
+from augment import processes
+from augment.attack import AttackResult, DescentSettings, Goal, Part, descend
 from augment.model_state import as_found
 from augment.parameters.kind import check_step, direction
 from augment.phases import Phases
@@ -98,7 +99,10 @@ class Renders:
 
 
 class AugmentationService:
-    """Holds the scene and, where lights continue, the adversaries' lights from epoch to epoch."""
+    """Holds the scene and, where lights continue, the adversaries' lights from epoch to epoch.
+
+    Where several processes train together, each attacks its share of the examples, and all get all renders.
+    """
 
     def __init__(
         self,
@@ -161,7 +165,10 @@ class AugmentationService:
     def _adversarial(self, model: nn.Module, epoch: int) -> Renders:
         attack, goal = self.settings.attack, Goal(self._labels[:, None])
         problem = _SceneLights(self._scene, self._starting_lights(epoch), attack)
-        result = descend(model, problem, goal, attack.descent(), self._phases)
+        mine = processes.share(len(self._scene)).to(self._light.device)
+        part = Part(problem, mine, problem.start[mine])
+        result = descend(model, part, goal.of(mine), attack.descent(), self._phases)
+        result = result.merged(mine, len(self._scene))
         lights = result.values.unflatten(1, (-1, 3))
         if self.settings.lights == "continue":
             self._continued = lights

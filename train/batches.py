@@ -1,13 +1,17 @@
-"""The input pipeline: uint8 pictures that live on the device, cropped and flipped a batch at a time by indexing."""
+"""The input pipeline: uint8 pictures that live on the device, cropped and flipped there for many batches at once."""
 
+import math
 from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
+from augment import processes
 from augment.seeding import generator
 
 PADDING = 4
+CHUNK_BYTES = 2**28  # holds a whole epoch of CIFAR-100; larger data sets are cropped in several chunks
+FLIPS = ("random", "alternating")
 
 
 def to_unit(images: Tensor) -> Tensor:
@@ -20,19 +24,47 @@ def to_bytes(images: Tensor) -> Tensor:
     return (images * 255).round().to(torch.uint8)
 
 
-def training_batches(images: Tensor, labels: Tensor, batch_size: int, seed: int, epoch: int) -> Iterator:
-    """One shuffled epoch of (images (B, 3, H, W) float32 in [0, 1], labels (B,)); the last batch may be short.
+def batch_count(pictures: int, batch_size: int) -> int:
+    """Batches in an epoch."""
+    return math.ceil(pictures / batch_size)
 
-    Reflect-pads by 4 and crops, then flips half of the pictures. All draws are made once, on the CPU, so that they
-    are the same on every device, and moved over once.
+
+def training_batches(
+    images: Tensor, labels: Tensor, batch_size: int, seed: int, epoch: int, flips: str = "random", first: int = 0
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """One shuffled epoch of (images (B, 3, H, W) uint8, labels (B,)): this process's share of every batch.
+
+    Reflect-pads by 4 and crops, then flips half of the pictures: "random" ones, or "alternating", each picture in every
+    other epoch. All batches have one shape, as the device's graphs need; the last one is filled up with the epoch's
+    first pictures. All draws are made on the CPU and moved over once, so that they are the same on every device and for
+    any number of processes. first: the batch to begin with.
     """
-    count, draws = len(images), generator(seed, epoch, "batches")
-    order = torch.randperm(count, generator=draws).to(images.device)
-    shifts = torch.randint(-PADDING, PADDING + 1, (2, count), generator=draws).to(images.device)
-    flips = torch.randint(0, 2, (count,), generator=draws, dtype=torch.bool).to(images.device)
-    for start in range(0, count, batch_size):
-        rows = slice(start, start + batch_size)
-        yield to_unit(crop_and_flip(images, order[rows], shifts[:, rows], flips[rows])), labels[order[rows]]
+    order = _order(len(images), batch_size, generator(seed, epoch, "batches"))
+    shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, epoch, "shifts"))
+    flipped = _flipped(order, len(images), seed, epoch, flips)
+    share = batch_size // processes.count()
+    mine = slice(processes.index() * share, (processes.index() + 1) * share)
+    order, shifts, flipped = (draws[..., first:, mine].to(images.device) for draws in (order, shifts, flipped))
+    batches_at_once = max(1, CHUNK_BYTES // (share * images[0].numel()))
+    for begin in range(0, len(order), batches_at_once):
+        rows = slice(begin, begin + batches_at_once)
+        chosen = order[rows].flatten()
+        cropped = crop_and_flip(images, chosen, shifts[:, rows].flatten(1), flipped[rows].flatten())
+        yield from zip(cropped.split(share), labels[chosen].split(share), strict=True)
+
+
+def _order(pictures: int, batch_size: int, draws: torch.Generator) -> Tensor:
+    """Pictures in random order, (batches, batch_size), beginning again where they run out."""
+    order = torch.randperm(pictures, generator=draws)
+    places = torch.arange(batch_count(pictures, batch_size) * batch_size) % pictures
+    return order[places].view(-1, batch_size)
+
+
+def _flipped(order: Tensor, pictures: int, seed: int, epoch: int, flips: str) -> Tensor:
+    if flips == "random":
+        return torch.randint(0, 2, order.shape, generator=generator(seed, epoch, "flips"), dtype=torch.bool)
+    in_even_epochs = torch.randint(0, 2, (pictures,), generator=generator(seed, "flips"), dtype=torch.bool)
+    return in_even_epochs[order] ^ bool(epoch % 2)
 
 
 def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:

@@ -1,34 +1,51 @@
-"""Checkpoints: written atomically, read without pickle, and checked against the network that they are to fill."""
+"""Checkpoints: written atomically with a hash of their content, read without pickle, checked against their network."""
 
+import hashlib
+import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import nn
+from torch import Tensor, nn
 
 from renderer.errors import InputError
 from train.wideresnet import WideResNet
 
-LAST, BEST, PUBLISHED = "last.pt", "best.pt", "model.safetensors"
+LAST, PREVIOUS, BEST, PUBLISHED = "last.pt", "previous.pt", "best.pt", "model.safetensors"
+HASH = "sha256"
 
 
-def save(path: Path, state: Mapping[str, Any]) -> None:
-    """Write tensors and plain values so that the file is, at any moment, either the old one or the new one."""
+def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
+    """Write tensors and plain values so that the file is, at any moment, either the old one or the new one.
+
+    previous: where the old one is kept. InputError where the disk does not take it; the old one then stays.
+    """
+    content = io.BytesIO()
+    torch.save({**state, HASH: content_hash(state)}, content)
     temporary = path.with_suffix(".tmp")
-    with open(temporary, "wb") as file:
-        torch.save(dict(state), file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
+        if previous and path.exists():
+            os.replace(path, previous)
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(
+            f"checkpoint {path} cannot be written ({error.strerror}): make room and go on with train.resume=true"
+        ) from error
 
 
 def load(path: Path) -> dict[str, Any]:
-    """What `save` wrote, on the CPU; InputError for a file that is not there or not a checkpoint."""
+    """What `save` wrote, on the CPU; InputError for a file that is not there, not a checkpoint or not as written."""
     if not path.is_file():
         raise InputError(f"checkpoint {path} does not exist: give a run folder that holds one")
     try:
@@ -37,7 +54,59 @@ def load(path: Path) -> dict[str, Any]:
         raise InputError(f"checkpoint {path} is damaged or no checkpoint; use another one of the run") from error
     if not isinstance(state, dict) or not {"model", "architecture"} <= state.keys():
         raise InputError(f"checkpoint {path} lacks its model or architecture: give one that `python -m train` wrote")
+    if state.pop(HASH, None) != content_hash(state):
+        raise InputError(f"checkpoint {path} is damaged: its content is not what its hash says; use another one")
     return state
+
+
+def exists(folder: Path) -> bool:
+    """Whether there is a run to go on with."""
+    return any((folder / name).exists() for name in (LAST, PREVIOUS))
+
+
+def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """The run's newest checkpoint that is whole, and what was wrong with a newer one; InputError where none is."""
+    try:
+        return load(folder / LAST), None
+    except InputError as error:
+        if not (folder / PREVIOUS).is_file():
+            raise
+        return load(folder / PREVIOUS), str(error)
+
+
+def content_hash(state: Any) -> str:
+    """SHA-256 over keys, types, shapes and values of nested mappings and sequences of tensors and plain values."""
+    digest = hashlib.sha256()
+    for part in _parts(state):
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _parts(value: Any) -> Iterator[bytes | memoryview]:
+    if isinstance(value, Tensor):
+        plain = value.detach().cpu().contiguous()
+        yield f"{plain.dtype}{tuple(plain.shape)}".encode()
+        yield memoryview(plain.flatten().view(torch.uint8).numpy())
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield f"{key!r}:".encode()
+            yield from _parts(item)
+    elif isinstance(value, list | tuple):
+        yield f"[{len(value)}]".encode()
+        for item in value:
+            yield from _parts(item)
+    else:
+        yield f"{value!r};".encode()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the renaming last through a loss of power, where folders can be synchronised."""
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def load_weights(network: nn.Module, weights: Mapping[str, torch.Tensor], path: Path) -> None:

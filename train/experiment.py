@@ -12,6 +12,7 @@ import torch
 import torchvision
 from omegaconf import DictConfig, OmegaConf
 
+from augment import processes
 from augment.phases import Phases
 from augment.scene import Scene, build_objects
 from augment.seeding import stream_seed
@@ -32,9 +33,11 @@ from train.data import (
     load_npz,
     stratified_split,
 )
-from train.device import choose_device
-from train.fit import Trainer, evaluate
-from train.logs import RunLog, console
+from train.device import choose_device, set_deterministic, set_threads
+from train.distributed import first_process_first
+from train.evaluation import evaluate
+from train.fit import Trainer
+from train.logs import NoLog, RunLog, console
 from train.photographs import evaluate_photographs, find_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
@@ -58,7 +61,8 @@ def load_data(config: DictConfig) -> DataSet:
     if data.name not in loaders:
         raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")
     console.info("data: %s", data.name)
-    return loaders[data.name]()
+    with first_process_first():
+        return loaders[data.name]()
 
 
 def write_pictures(config: DictConfig, size: int) -> None:
@@ -80,13 +84,23 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
     if settings.evaluate.photos:
         find_photographs(Path(settings.evaluate.photos), data.classes, settings.label)
     device = choose_device(settings.train.device)
+    set_threads(settings.train.threads)
+    set_deterministic(settings.train.deterministic)
     train, validation = stratified_split(data.train, settings.data.validation, seed=0)
     trainer = _build_trainer(settings, data, folder, device)
     _open_folder(trainer, config)
 
     def train_and_score() -> None:
-        console.info("%s pictures, %s classes; %s, %s", len(train), len(data.classes), device, trainer.model.precision)
-        with closing(RunLog(folder, trainer.epoch)) as log:
+        console.info(
+            "%s pictures, %s classes; %s, %s, %d threads, %d processes",
+            len(train),
+            len(data.classes),
+            device,
+            trainer.model.precision,
+            torch.get_num_threads(),
+            processes.count(),
+        )
+        with closing(NoLog() if processes.index() else RunLog(folder, trainer.history)) as log:
             trainer.fit(train.to(device), validation.to(device), log)
             log.scalars(_test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device))
 
@@ -109,15 +123,20 @@ def _build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, de
 def _open_folder(trainer: Trainer, config: DictConfig) -> None:
     """Resume from the folder, or start in it; InputError rather than writing over another run."""
     folder = trainer.folder
-    if (folder / checkpoint.LAST).exists():
+    if checkpoint.exists(folder):
         if not trainer.settings.resume:
             raise InputError(
                 f"run={folder} holds a run already: set train.resume=true to go on, or choose another run="
             )
         trainer.resume()
-        console.info("resumed %s after epoch %d", folder, trainer.epoch)
+        console.info("resumed %s after epoch %d%s", folder, trainer.epoch, trainer.part_of_epoch)
     elif trainer.settings.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
+    if processes.index() == 0:
+        _write_config(config, folder)
+
+
+def _write_config(config: DictConfig, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     resolved = OmegaConf.to_container(config, resolve=True)
     resolved["versions"] = {
@@ -135,7 +154,7 @@ def _build_service(
     light = load_light(settings.scene.light) * settings.scene.exposure
     scene, labels = None, torch.zeros(0, dtype=torch.int64)
     if settings.augment.renders:
-        with phases("operators"):
+        with phases("operators"), first_process_first():
             scene = _build_scene(settings, data, device)
         labels = torch.tensor([data.classes.index(label) for label in scene.labels])
     return AugmentationService(settings.augment, scene, labels.to(device), light.to(device), settings.seed, phases)
@@ -183,10 +202,10 @@ def _log_skipped(scene: Scene, cache: OperatorCache, seconds: float) -> None:
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
     """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
     test = data.test.to(device)
-    last = evaluate(trainer.model, test)["accuracy"]
+    last = evaluate(trainer.selected, test)["accuracy"]
     best = checkpoint.load(trainer.folder / checkpoint.BEST)
-    trainer.model.network.load_state_dict(best["model"])
-    selected = evaluate(trainer.model, test)["accuracy"]
+    trainer.selected.network.load_state_dict(best["model"])
+    selected = evaluate(trainer.selected, test)["accuracy"]
     console.info("test accuracy %.4f (epoch %d, selected on validation), %.4f (last)", selected, best["epoch"], last)
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 
@@ -195,10 +214,10 @@ def _photograph_scores(
     settings: ExperimentSettings, trainer: Trainer, data: DataSet, device: torch.device
 ) -> dict[str, float]:
     """The network's shares on the folder of photographs; empty without one."""
-    if not settings.evaluate.photos:
+    if not settings.evaluate.photos or processes.index():
         return {}
     summary = evaluate_photographs(
-        trainer.model,
+        trainer.selected,
         data.classes,
         Path(settings.evaluate.photos),
         settings.label,

@@ -2,53 +2,55 @@
 
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
-from augment.model_state import eval_mode
+from augment import processes
 from augment.phases import Phases
 from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError
 from train import checkpoint
-from train.batches import to_bytes, to_unit, training_batches
+from train.batches import batch_count, to_bytes, to_unit, training_batches
 from train.data import Split
+from train.distributed import replicated, summed
+from train.evaluation import evaluate
+from train.graphs import FixedSizes, compiles, training_pass
+from train.interruption import Interruption
 from train.logs import RunLog, console
 from train.precision import MixedPrecision
-from train.schedule import SCHEDULES, check_schedule
-
-EVALUATION_BATCH = 500
+from train.random_state import random_state, restore_random_state
+from train.recipe import TrainSettings
+from train.schedule import SCHEDULES
 
 
 @dataclass
-class TrainSettings:
-    """The recipe; the defaults are the paper's. device: auto, cpu, cuda or cuda:N. resume: go on from last.pt."""
+class EpochUnderWay:
+    """Its renders, the steps taken, and the sums of loss and hits over the pictures this process has seen (2,)."""
 
-    epochs: int = 150
-    batch_size: int = 128
-    learning_rate: float = 0.125
-    momentum: float = 0.9
-    weight_decay: float = 5e-4
-    schedule: str = "step"
-    precision: str = "auto"
-    device: str = "auto"
-    resume: bool = False
+    renders: Renders
+    sums: Tensor
+    step: int = 0
 
-    def __post_init__(self):
-        check_schedule(self.schedule)
-        if self.epochs < 1 or self.batch_size < 1:
-            raise InputError(f"train.epochs={self.epochs} and train.batch_size={self.batch_size} must be at least 1")
-        if not (0 < self.learning_rate < math.inf and 0 <= self.momentum < 1 and 0 <= self.weight_decay < math.inf):
-            raise InputError(
-                f"train.learning_rate={self.learning_rate} must be positive, train.momentum={self.momentum} in [0, 1) "
-                f"and train.weight_decay={self.weight_decay} not negative"
-            )
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values and tensors, over all processes; the renders as bytes, as they are trained on."""
+        diagnostics = dict(self.renders.diagnostics)
+        renders = {"images": to_bytes(self.renders.images), "labels": self.renders.labels, "diagnostics": diagnostics}
+        return {"renders": renders, "sums": summed(self.sums.clone()), "step": self.step}
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any], device: torch.device) -> "EpochUnderWay":
+        images, labels, diagnostics = (state["renders"][name] for name in ("images", "labels", "diagnostics"))
+        renders = Renders(to_unit(images).to(device), labels.to(device), diagnostics)
+        sums = state["sums"] if processes.index() == 0 else torch.zeros(2)
+        return cls(renders, sums.to(device), state["step"])
 
 
 class Trainer:
@@ -64,7 +66,14 @@ class Trainer:
         folder: Path,
         seed: int,
     ):
-        """architecture: what rebuilds the network from a checkpoint, classes included."""
+        """architecture: what rebuilds the network from a checkpoint, classes included.
+
+        InputError where the run's processes cannot share a batch equally.
+        """
+        if settings.batch_size % processes.count():
+            raise InputError(
+                f"train.batch_size={settings.batch_size} is not a multiple of the {processes.count()} processes"
+            )
         self.settings = settings
         self.model = model
         self.architecture = architecture
@@ -75,74 +84,147 @@ class Trainer:
         self.epoch = 0
         self.best_accuracy = -1.0
         self.best_epoch = 0
+        self.history: list[dict[str, float]] = []
+        self._device = next(model.parameters()).device
+        self._under_way: EpochUnderWay | None = None
+        self._random_state: dict[str, Any] | None = None  # where the epoch under way was left
+        self._best: dict[str, Any] | None = None  # selected, but not written yet
+        self._replica = replicated(model)
+        self._average = _averaged(model, settings.averaging)
         self.optimizer = torch.optim.SGD(
             model.parameters(),
             lr=settings.learning_rate,
             momentum=settings.momentum,
             weight_decay=settings.weight_decay,
             nesterov=settings.momentum > 0,
+            fused=True,
         )
+        compiled = compiles(settings.compile, self._device)
+        self._training_pass = training_pass(self._replica, settings.label_smoothing, compiled)
+        self._attacked, self._scored = (FixedSizes(m) if compiled else m for m in (model, self.selected))
+
+    @property
+    def selected(self) -> MixedPrecision:
+        """The network that is validated and kept: the average over steps, where there is one."""
+        return self._average.module if self._average else self.model
+
+    @property
+    def part_of_epoch(self) -> str:
+        """Of the epoch under way, in words; empty between two epochs."""
+        return f" and {self._under_way.step} steps" if self._under_way else ""
 
     def fit(self, train: Split, validation: Split, log: RunLog) -> None:
-        """Train to the last epoch; last.pt after every epoch, best.pt whenever validation improves.
+        """Train to the last epoch; best.pt holds the network of the best validation.
 
-        InputError where training diverges.
+        InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked for it.
         """
         mixed = with_room(train, len(self.service))
-        while self.epoch < self.settings.epochs:
-            torch.manual_seed(stream_seed(self.seed, self.epoch, "dropout"))
-            with self.phases("attack"):
-                renders = self.service.regenerate(self.model, self.epoch)
-                put_last(mixed, renders)
-            with self.phases("training"):
-                trained = self._train_epoch(mixed)
-            with self.phases("evaluation"):
-                validated = evaluate(self.model, validation)
-            self.epoch += 1
-            self._check_finite(trained["loss"] + validated["loss"])
-            with self.phases("input_output"):
-                if len(renders.labels):
-                    log.renders(renders.images, self.epoch)
-            self._report(log, trained, validated, renders)
-            with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
-                self._save(validated["accuracy"])
+        with Interruption() as interruption:
+            while self.epoch < self.settings.epochs:
+                if self._under_way is None:
+                    self._under_way = self._begin_epoch()
+                else:
+                    restore_random_state(self._random_state)
+                with self.phases("training"):
+                    put_last(mixed, self._under_way.renders)
+                    finished = self._train(mixed, interruption)
+                if finished:
+                    self._end_epoch(validation, len(mixed), log)
+                if interruption.requested():
+                    self._save()
+                    interruption.stop()
 
     def resume(self) -> None:
-        """Go on from the folder's last.pt; InputError where it is from another architecture."""
-        path = self.folder / checkpoint.LAST
-        state = checkpoint.load(path)
+        """Go on from the folder's newest whole checkpoint; InputError where it is from another architecture."""
+        state, problem = checkpoint.load_newest(self.folder)
+        if problem:
+            console.warning("%s: going on from the one before", problem)
         if state["architecture"] != self.architecture:
             raise InputError(
-                f"checkpoint {path} is from another architecture or other classes: resume with the settings of "
-                f"{self.folder / 'config.yaml'}, or start in another folder with run="
+                f"the checkpoint in {self.folder} is from another architecture or other classes: resume with the "
+                f"settings of {self.folder / 'config.yaml'}, or start in another folder with run="
             )
+        self.load_state_dict(state)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a run needs to go on as if it had never ended; bfloat16 needs no loss scaler."""
+        return {
+            **self._network_state(self.model),
+            "optimizer": self.optimizer.state_dict(),
+            "schedule": self.settings.schedule,
+            "average": self._average.state_dict() if self._average else None,
+            "service": self.service.state_dict(),
+            "precision": self.model.precision,
+            "random_state": random_state(),
+            "under_way": self._under_way.state_dict() if self._under_way else None,
+            "history": self.history,
+            "validation_accuracy_best": self.best_accuracy,
+            "epoch_best": self.best_epoch,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """What `state_dict` gave."""
         self.model.network.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
+        if self._average:
+            self._average.load_state_dict(state["average"])
         self.service.load_state_dict(state["service"])
-        self.model.precision = state["precision"]
-        self.epoch, self.best_accuracy, self.best_epoch = (
-            state[name] for name in ("epoch", "validation_accuracy_best", "epoch_best")
-        )
+        self.model.precision = self.selected.precision = state["precision"]
+        self._random_state = state["random_state"]
+        if state["under_way"]:
+            self._under_way = EpochUnderWay.from_state_dict(state["under_way"], self._device)
+        self.epoch, self.history = state["epoch"], state["history"]
+        self.best_accuracy, self.best_epoch = state["validation_accuracy_best"], state["epoch_best"]
 
-    def _train_epoch(self, split: Split) -> dict[str, float]:
+    def _begin_epoch(self) -> EpochUnderWay:
+        torch.manual_seed(stream_seed(self.seed, self.epoch, "dropout"))
+        with self.phases("attack"):
+            renders = self.service.regenerate(self._attacked, self.epoch)
+        return EpochUnderWay(renders, torch.zeros(2, device=self._device))
+
+    def _train(self, split: Split, interruption: Interruption) -> bool:
+        """Take the epoch's steps; whether all were taken, since a signal ends them early."""
         self.model.train()
-        total = math.ceil(len(split) / self.settings.batch_size)
-        loss_sum, correct = torch.zeros(2, device=split.images.device)
-        batches = training_batches(split.images, split.labels, self.settings.batch_size, self.seed, self.epoch)
-        for step, (images, labels) in enumerate(_progress(batches, total, f"epoch {self.epoch + 1}")):
-            self._set_learning_rate((self.epoch + step / total) / self.settings.epochs)
-            logits = self.model(images)
-            loss = F.cross_entropy(logits, labels)
+        now, settings = self._under_way, self.settings
+        total = batch_count(len(split), settings.batch_size)
+        batches = training_batches(
+            split.images, split.labels, settings.batch_size, self.seed, self.epoch, settings.flips, first=now.step
+        )
+        for images, labels in _progress(batches, now.step, total, f"epoch {self.epoch + 1}"):
+            self._set_learning_rate((self.epoch + now.step / total) / settings.epochs)
+            loss, hits = self._training_pass(images, labels)
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
             self.optimizer.step()
-            loss_sum += loss.detach() * len(labels)
-            correct += (logits.detach().argmax(1) == labels).sum()
-        return {"loss": float(loss_sum) / len(split), "accuracy": float(correct) / len(split)}
+            if self._average:
+                self._average.update_parameters(self.model)
+            now.sums += torch.stack([loss.detach() * len(labels), hits])
+            now.step += 1
+            if interruption.requested():
+                break
+        return now.step == total
 
     def _set_learning_rate(self, progress: float) -> None:
         for group in self.optimizer.param_groups:
             group["lr"] = self.settings.learning_rate * SCHEDULES[self.settings.schedule](progress)
+
+    def _end_epoch(self, validation: Split, pictures: int, log: RunLog) -> None:
+        now, self._under_way = self._under_way, None
+        seen = batch_count(pictures, self.settings.batch_size) * self.settings.batch_size
+        loss_sum, hits = summed(now.sums).tolist()
+        trained = {"loss": loss_sum / seen, "accuracy": hits / seen}
+        with self.phases("evaluation"):
+            validated = evaluate(self._scored, validation)
+        self.epoch += 1
+        self._check_finite(trained["loss"] + validated["loss"])
+        self._select(validated["accuracy"])
+        with self.phases("input_output"):
+            if len(now.renders.labels):
+                log.renders(now.renders.images, self.epoch)
+        self._report(log, trained, validated, now.renders)
+        if self.epoch % self.settings.checkpoint_every == 0 or self.epoch == self.settings.epochs:
+            with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
+                self._save()
 
     def _check_finite(self, loss: float) -> None:
         if not math.isfinite(loss):
@@ -151,29 +233,31 @@ class Trainer:
                 "set a lower one"
             )
 
-    def _save(self, accuracy: float) -> None:
-        weights = self.model.network.state_dict()
-        improved = accuracy > self.best_accuracy
-        if improved:
+    def _select(self, accuracy: float) -> None:
+        """Remember the network where its validation accuracy is the best so far."""
+        if accuracy > self.best_accuracy:
             self.best_accuracy, self.best_epoch = accuracy, self.epoch
-        state = {
-            "model": weights,
+            state = self._network_state(self.selected)
+            weights = {name: value.to("cpu", copy=True) for name, value in state["model"].items()}
+            self._best = {**state, "model": weights, "validation_accuracy": accuracy}
+
+    def _network_state(self, model: MixedPrecision) -> dict[str, Any]:
+        return {
+            "model": model.network.state_dict(),
             "architecture": self.architecture,
             "epoch": self.epoch,
             "seed": self.seed,
             "arm": self.service.settings.arm,
-            "validation_accuracy": accuracy,
         }
-        if improved:
-            checkpoint.save(self.folder / checkpoint.BEST, state)
-        progress = {
-            "optimizer": self.optimizer.state_dict(),
-            "service": self.service.state_dict(),
-            "precision": self.model.precision,
-            "validation_accuracy_best": self.best_accuracy,
-            "epoch_best": self.best_epoch,
-        }
-        checkpoint.save(self.folder / checkpoint.LAST, state | progress)
+
+    def _save(self) -> None:
+        """Write last.pt, keeping the one before, and best.pt where there is a better network, by the first process."""
+        state, best, self._best = self.state_dict(), self._best, None
+        if processes.index() > 0:
+            return
+        if best:
+            checkpoint.save(self.folder / checkpoint.BEST, best)
+        checkpoint.save(self.folder / checkpoint.LAST, state, self.folder / checkpoint.PREVIOUS)
 
     def _report(self, log: RunLog, trained: dict, validated: dict, renders: Renders) -> None:
         seconds = self.phases.take()
@@ -184,6 +268,7 @@ class Trainer:
             **{f"augment/{name}": value for name, value in renders.diagnostics.items()},
             **{f"seconds/{name}": value for name, value in seconds.items()},
         }
+        self.history.append({"epoch": self.epoch, **scalars})
         log.scalars(scalars, self.epoch)
         fooled = renders.diagnostics.get("fooled")
         console.info(
@@ -194,8 +279,8 @@ class Trainer:
             trained["accuracy"],
             validated["accuracy"],
             "" if fooled is None else f"  renders fooled {fooled:.2f}",
-            seconds["training"] + seconds["evaluation"] + seconds["attack"] + seconds["input_output"],
-            seconds["attack"],
+            sum(seconds.get(name, 0.0) for name in ("training", "evaluation", "attack", "input_output")),
+            seconds.get("attack", 0.0),
         )
 
 
@@ -214,22 +299,12 @@ def put_last(split: Split, renders: Renders) -> None:
     split.labels[first:] = renders.labels
 
 
-@torch.inference_mode()
-def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
-    """Mean cross entropy and top-1 accuracy in eval mode; the model's mode is restored."""
-    loss_sum, correct = torch.zeros(2, device=split.images.device)
-    with eval_mode(model):
-        for images, labels in _batched(split):
-            logits = model(to_unit(images))
-            loss_sum += F.cross_entropy(logits, labels, reduction="sum")
-            correct += (logits.argmax(1) == labels).sum()
-    return {"loss": float(loss_sum) / len(split), "accuracy": float(correct) / len(split)}
+def _averaged(model: MixedPrecision, decay: float) -> AveragedModel | None:
+    """The exponential moving average of weights and statistics over steps; None without decay."""
+    return AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(decay), use_buffers=True) if decay else None
 
 
-def _batched(split: Split) -> Iterable[tuple[Tensor, Tensor]]:
-    return zip(split.images.split(EVALUATION_BATCH), split.labels.split(EVALUATION_BATCH), strict=True)
-
-
-def _progress(batches: Iterable, total: int, description: str) -> Iterable:
+def _progress(batches: Iterable, first: int, total: int, description: str) -> Iterable:
     """A progress bar on a terminal, nothing elsewhere."""
-    return tqdm(batches, total=total, desc=description, leave=False, disable=not sys.stderr.isatty())
+    hidden = not sys.stderr.isatty()
+    return tqdm(batches, initial=first, total=total, desc=description, leave=False, disable=hidden)

@@ -3,7 +3,7 @@
 import io
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tensorboard.compat.proto.summary_pb2 import Summary
@@ -21,15 +21,15 @@ console = logging.getLogger("train")
 class RunLog:
     """Writes a run folder's metrics.jsonl, TensorBoard events and grids of renders.
 
-    epochs_done: what of an earlier, interrupted run is kept; later lines are dropped, since they will come again.
+    history: the epochs' lines of the checkpoint that a run goes on from. They replace what the file holds: later lines
+    come again, and one that a crash cut short does not count.
     """
 
-    def __init__(self, folder: Path, epochs_done: int = 0):
+    def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
         self._metrics = folder / METRICS
         self._renders = folder / "renders"
-        kept = [line for line in read_metrics(folder) if line.get("epoch", epochs_done + 1) <= epochs_done]
-        self._metrics.write_text("".join(json.dumps(line) + "\n" for line in kept))
-        self._board = SummaryWriter(str(folder), purge_step=epochs_done + 1)
+        self._metrics.write_text("".join(json.dumps(line) + "\n" for line in history))
+        self._board = SummaryWriter(str(folder), purge_step=len(history) + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
         """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores."""
@@ -54,6 +54,19 @@ class RunLog:
 
     def close(self) -> None:
         self._board.close()
+
+
+class NoLog:
+    """In place of a `RunLog`, for processes of a run that write nothing."""
+
+    def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
+        pass
+
+    def renders(self, images: Tensor, epoch: int) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:

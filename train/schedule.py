@@ -2,8 +2,6 @@
 
 import math
 
-from renderer.errors import InputError
-
 
 def step(progress: float) -> float:
     """×0.2 at 30, 60 and 80 % of the epochs (Zagoruyko and Komodakis 2016: 60, 120 and 160 of 200)."""
@@ -21,9 +19,3 @@ def one_cycle(progress: float) -> float:
 
 
 SCHEDULES = {"step": step, "cosine": cosine, "one_cycle": one_cycle}
-
-
-def check_schedule(name: str) -> None:
-    """InputError unless the schedule is known."""
-    if name not in SCHEDULES:
-        raise InputError(f"train.schedule={name}: choose one of {', '.join(SCHEDULES)}")

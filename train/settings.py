@@ -10,7 +10,7 @@ from augment.scene import ObjectSettings, count_views
 from augment.service import AugmentationSettings
 from renderer.errors import InputError
 from renderer.image import PictureSettings
-from train.fit import TrainSettings
+from train.recipe import TrainSettings
 
 
 @dataclass

@@ -7,7 +7,7 @@ import torch
 from common import Subject, random_scene, recognised
 from torch import Tensor
 
-from augment.attack import DescentSettings, Goal, Problem, Restart, descend
+from augment.attack import DescentSettings, Goal, Part, Problem, descend
 from augment.classifiers import Classifier
 from augment.mesh_scene import MeshScene
 from augment.parameters import Geometry, Kind, Lighting, StepSettings
@@ -63,7 +63,7 @@ def adversaries(
     """
     goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))
     first = descend(classifier, problem, goal, attack.descent, Phases())
-    onwards = Restart(problem, torch.arange(len(first.values)), first.values)
+    onwards = Part(problem, torch.arange(len(first.values)), first.values)
     longer = replace(attack.descent, max_steps=FURTHER)
     last = descend(classifier, onwards, Unreachable(goal.decrease), longer, Phases())
     return first.values, last.values

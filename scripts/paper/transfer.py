@@ -25,7 +25,7 @@ from adversaries import (
 from common import Subject, arguments, command, scene_of, subjects, table, versions, write_section
 from torch import Tensor
 
-from augment.attack import Problem, Restart
+from augment.attack import Part, Problem
 from augment.classifiers import Classifier
 from augment.seeding import generator
 from train.run_classifier import load_classifier
@@ -126,7 +126,7 @@ def _attacked(
 ) -> tuple[list[dict], list[Seen]]:
     """Attack the first network in the examples (A,) of its problem, and show what comes of it to all."""
     start = problems[0].start[kept]
-    first, further = adversaries(ATTACKS[kind], Restart(problems[0], kept, start), seen_by[0], subject.label, views=1)
+    first, further = adversaries(ATTACKS[kind], Part(problems[0], kept, start), seen_by[0], subject.label, views=1)
     states = (start, first, with_random_signs(first, start, draws), further, with_random_signs(further, start, draws))
     records = [
         {

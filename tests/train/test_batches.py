@@ -2,6 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from train import batches
 from train.batches import PADDING, crop_and_flip, to_bytes, to_unit, training_batches
 
 
@@ -32,13 +33,46 @@ def test_crops_are_those_of_a_reflect_padded_picture_for_every_shift(shape, flip
         assert torch.equal(picture, expected.flip(2) if flipped else expected)
 
 
-def test_each_epoch_shows_every_picture_once_with_its_own_label():
-    batches = epoch_of(100)
-    assert [len(labels) for _, labels in batches] == [7] * 14 + [2]
-    assert sorted(torch.cat([labels for _, labels in batches]).tolist()) == list(range(100))
-    for images, labels in batches:
-        assert images.dtype == torch.float32 and images.shape == (len(labels), 3, 8, 8)
-        assert torch.equal(images, (labels / 255).view(-1, 1, 1, 1).expand_as(images))
+def test_each_epoch_shows_every_picture_once_with_its_own_label_and_fills_the_last_batch_with_the_first():
+    shown = epoch_of(100)
+    assert [len(labels) for _, labels in shown] == [7] * 15
+    order = torch.cat([labels for _, labels in shown]).tolist()
+    assert sorted(order[:100]) == list(range(100)) and order[100:] == order[:5]
+    for images, labels in shown:
+        assert images.dtype == torch.uint8 and images.shape == (len(labels), 3, 8, 8)
+        assert torch.equal(images, labels.to(torch.uint8).view(-1, 1, 1, 1).expand_as(images))
+
+
+def test_fewer_pictures_than_a_batch_fill_it_several_times():
+    ((_, labels),) = epoch_of(3)
+    assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
+
+
+@pytest.mark.parametrize("flips", ["random", "alternating"])
+@pytest.mark.parametrize("pictures_at_once", [1, 20, 10**6])
+def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, pictures_at_once):
+    images, labels = noise(50, 3, 8, 8), torch.arange(50)
+    whole = list(training_batches(images, labels, 8, 0, 1, flips))
+    monkeypatch.setattr(batches, "CHUNK_BYTES", pictures_at_once * 3 * 8 * 8)
+    for first in range(len(whole) + 1):
+        rest = list(training_batches(images, labels, 8, 0, 1, flips, first))
+        assert len(rest) == len(whole) - first
+        for found, expected in zip(rest, whole[first:], strict=True):
+            assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+
+
+def test_alternating_flips_show_each_picture_mirrored_in_every_other_epoch():
+    ramp = torch.arange(11, dtype=torch.uint8).expand(40, 3, 11, 11)
+
+    def mirrored(epoch: int) -> torch.Tensor:
+        """By picture."""
+        ((images, labels),) = training_batches(ramp, torch.arange(40), 40, 0, epoch, "alternating")
+        flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
+        return flipped[labels.argsort()]
+
+    first, second, third = (mirrored(epoch) for epoch in range(3))
+    assert torch.equal(first, ~second) and torch.equal(first, third)
+    assert 0 < first.sum() < 40
 
 
 def test_batches_are_a_function_of_seed_and_epoch_alone():
@@ -56,7 +90,7 @@ def test_shifts_and_flips_are_all_drawn_about_equally_often():
     count, size, middle = 6000, 11, 5
     place = torch.arange(size * size).view(1, 1, size, size).expand(count, 3, -1, -1).to(torch.uint8)
     (images, _), *_ = training_batches(place, torch.zeros(count), count, seed=0, epoch=0)
-    seen = to_bytes(images)[:, 0, middle].long()
+    seen = images[:, 0, middle].long()
     flipped = seen[:, middle - 1] > seen[:, middle + 1]
     assert abs(flipped.double().mean() - 0.5) < 4 * 0.5 / count**0.5  # four standard deviations
     counts = seen[:, middle].bincount(minlength=size * size).view(size, size)[1:-1, 1:-1]

@@ -18,6 +18,7 @@ from renderer.errors import InputError
 from train import checkpoint, fit
 from train.data import DataSet
 from train.experiment import load_data, prepare, run
+from train.interruption import Interrupted
 from train.logs import read_metrics
 from train.settings import ExperimentSettings, read_settings
 
@@ -40,8 +41,8 @@ def interrupt_in_the_second_epoch(monkeypatch) -> None:
     """After its first batch."""
     training_batches = fit.training_batches
 
-    def interrupted(images, labels, batch_size, seed, epoch):
-        for number, batch in enumerate(training_batches(images, labels, batch_size, seed, epoch)):
+    def interrupted(images, labels, batch_size, seed, epoch, *rest, **more):
+        for number, batch in enumerate(training_batches(images, labels, batch_size, seed, epoch, *rest, **more)):
             if (epoch, number) == (1, 1):
                 raise KeyboardInterrupt
             yield batch
@@ -87,14 +88,92 @@ def test_an_interrupted_and_resumed_run_ends_as_an_uninterrupted_one(
         assert (tmp_path / "renders" / name).read_bytes() == (finished / "renders" / name).read_bytes()
 
 
+def run_with_signal(config, folder: Path, monkeypatch, epoch: int, step: int, number: signal.Signals) -> None:
+    """The signal comes while the step is taken."""
+    training_batches = fit.training_batches
+
+    def signalled(images, labels, batch_size, seed, now, *rest, **more):
+        for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
+            if (now, count) == (epoch, step):
+                signal.raise_signal(number)
+            yield batch
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit, "training_batches", signalled)
+        run(config, load_data(config), folder)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("step", [2, 4])
+def test_a_signal_ends_the_run_after_its_step_and_resuming_ends_as_if_it_had_not_come(
+    tiny, photos, finished, tmp_path, monkeypatch, number, step
+):
+    """Bit for bit, in the middle of an epoch and at its end (of 4 steps); with two more signals on the way."""
+    handlers = [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)]
+    overrides = (f"evaluate.photos={photos}", "train.resume=true")
+    for epoch, at in [(0, 1), (1, step), (2, 1)]:
+        with pytest.raises(Interrupted) as stopped:
+            run_with_signal(tiny(*overrides), tmp_path, monkeypatch, epoch, at, number)
+        assert (stopped.value.code, stopped.value.signal) == (128 + number, number.name)
+        assert [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)] == handlers
+        state = checkpoint.load(tmp_path / checkpoint.LAST)
+        under_way = state["under_way"]
+        assert (state["epoch"], under_way and under_way["step"]) == ((epoch, at) if at < 4 else (epoch + 1, None))
+        assert [line["epoch"] for line in read_metrics(tmp_path)] == list(range(1, state["epoch"] + 1))
+    torch.manual_seed(17)
+    run(tiny(*overrides), load_data(tiny()), tmp_path)
+    for name in (checkpoint.LAST, checkpoint.BEST):
+        assert_same_weights(tmp_path / name, finished / name)
+    assert metrics_without_times(tmp_path) == metrics_without_times(finished)
+
+
+def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
+    def impatient(images, labels, *rest, **more):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        yield images[:1], labels[:1]
+
+    monkeypatch.setattr(fit, "training_batches", impatient)
+    with pytest.raises(KeyboardInterrupt):
+        run(tiny("augment=none"), load_data(tiny()), tmp_path)
+    assert not checkpoint.exists(tmp_path)
+
+
+def test_a_damaged_newest_checkpoint_is_told_and_the_one_before_leads_to_the_same_end(
+    tiny, photos, finished, tmp_path, caplog
+):
+    shutil.copytree(finished, tmp_path / "run")
+    newest = tmp_path / "run" / checkpoint.LAST
+    newest.write_bytes(newest.read_bytes()[:-1000])
+    config = tiny("train.resume=true", f"evaluate.photos={photos}")
+    with caplog.at_level("WARNING", "train"):
+        run(config, load_data(config), tmp_path / "run")
+    assert f"checkpoint {newest} is damaged or no checkpoint" in caplog.text and "the one before" in caplog.text
+    assert_same_weights(newest, finished / checkpoint.LAST)
+    assert metrics_without_times(tmp_path / "run") == metrics_without_times(finished)
+
+
+def test_checkpoints_of_every_other_epoch_hold_the_same_and_the_last_one(tiny, photos, finished, tmp_path, monkeypatch):
+    saved = []
+    save = checkpoint.save
+    monkeypatch.setattr(checkpoint, "save", lambda path, *rest: saved.append(path.name) or save(path, *rest))
+    config = tiny("train.checkpoint_every=2", f"evaluate.photos={photos}")
+    run(config, load_data(config), tmp_path)
+    assert saved.count(checkpoint.LAST) == 2  # after epochs 2 and 3
+    for name in (checkpoint.LAST, checkpoint.BEST):
+        assert_same_weights(tmp_path / name, finished / name)
+
+
 KILLED = """
 import os, signal, sys
 import torch
 from omegaconf import OmegaConf
 from train import experiment, fit
 
-def kill_in_the_second_epoch(images, labels, batch_size, seed, epoch, batches=fit.training_batches):
-    for number, batch in enumerate(batches(images, labels, batch_size, seed, epoch)):
+training_batches = fit.training_batches
+
+def kill_in_the_second_epoch(images, labels, batch_size, seed, epoch, *rest, **more):
+    for number, batch in enumerate(training_batches(images, labels, batch_size, seed, epoch, *rest, **more)):
         if (epoch, number) == (1, 1):
             os.kill(os.getpid(), signal.SIGKILL)
         yield batch
@@ -139,7 +218,7 @@ def test_a_folder_that_holds_a_run_is_not_written_over(tiny, finished):
 @pytest.mark.parametrize("change", ["model.width=2", "model.depth=16", "model.dropout=0.1"])
 def test_resuming_with_another_architecture_is_refused(tiny, finished, change):
     config = tiny("train.resume=true", change)
-    with pytest.raises(InputError, match=r"last.pt is from another architecture.*config.yaml"):
+    with pytest.raises(InputError, match=r"checkpoint in .* is from another architecture.*config.yaml"):
         prepare(config, load_data(config), finished)
 
 

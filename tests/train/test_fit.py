@@ -9,11 +9,13 @@ from torch import nn
 from augment.phases import Phases
 from augment.service import Renders
 from renderer.errors import InputError
-from train import checkpoint, fit
+from train import checkpoint, evaluation, fit
 from train.data import Split
-from train.fit import Trainer, TrainSettings, evaluate, put_last, with_room
+from train.evaluation import evaluate
+from train.fit import Trainer, put_last, with_room
 from train.logs import RunLog, read_metrics
 from train.precision import MixedPrecision
+from train.recipe import TrainSettings
 from train.schedule import cosine
 from train.wideresnet import WideResNet
 
@@ -73,7 +75,13 @@ def fit_noise(trainer: Trainer) -> list[dict]:
         ({"momentum": -0.1}, "train.momentum=-0.1"),
         ({"weight_decay": -1.0}, "train.weight_decay=-1.0"),
         ({"weight_decay": math.nan}, "train.weight_decay=nan"),
-        ({"schedule": "linear"}, "train.schedule=linear"),
+        ({"schedule": "linear"}, "train.schedule=linear: choose one of step, cosine, one_cycle"),
+        ({"flips": "vertical"}, "train.flips=vertical: choose one of random, alternating"),
+        ({"compile": "maybe"}, "train.compile=maybe: choose one of auto, always, never"),
+        ({"label_smoothing": 1.0}, "train.label_smoothing=1.0"),
+        ({"averaging": -0.1}, "train.averaging=-0.1"),
+        ({"threads": 0}, "train.threads=0"),
+        ({"checkpoint_every": 0}, "train.checkpoint_every=0"),
     ],
 )
 def test_settings_out_of_range_name_their_key(settings, key):
@@ -118,7 +126,7 @@ def test_without_renders_the_data_stay_as_they_are():
 
 @pytest.mark.parametrize("training", [True, False])
 def test_evaluation_is_the_mean_over_all_pictures_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
-    monkeypatch.setattr(fit, "EVALUATION_BATCH", 7)
+    monkeypatch.setattr(evaluation, "BATCH", 7)
     torch.manual_seed(0)
     model = WideResNet(3, 10, 1, dropout=0.5).train(training)
     before = copy.deepcopy(model.state_dict())
@@ -137,7 +145,9 @@ def test_evaluation_is_the_mean_over_all_pictures_in_eval_mode_and_leaves_the_mo
 def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tmp_path, monkeypatch):
     """Two steps of a linear network against the update written down."""
     images, labels = torch.rand(2, 4, 3, 2, 2), torch.tensor([[0, 1, 2, 0], [1, 1, 2, 0]])
-    monkeypatch.setattr(fit, "training_batches", lambda *arguments: zip(images, labels, strict=True))
+    pictures = (images * 255).round().to(torch.uint8)
+    images = pictures / 255
+    monkeypatch.setattr(fit, "training_batches", lambda *arguments, first: zip(pictures, labels, strict=True))
     monkeypatch.setattr(fit, "evaluate", lambda *arguments: {"loss": 1.0, "accuracy": 0.0})
     torch.manual_seed(0)
     network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
@@ -145,7 +155,7 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
     settings = TrainSettings(1, 4, 0.5, momentum=0.9, weight_decay=0.1, schedule="cosine")
     trainer = Trainer(settings, MixedPrecision(network, "float32"), {}, NoRenders(), Phases(), tmp_path, seed=0)
     log = RunLog(tmp_path)
-    trainer.fit(Split(images.flatten(0, 1), labels.flatten()), noise(1), log)
+    trainer.fit(Split(pictures.flatten(0, 1), labels.flatten()), noise(1), log)
     log.close()
 
     velocities = [torch.zeros_like(weight), torch.zeros_like(bias)]
@@ -225,7 +235,9 @@ def test_resuming_with_another_architecture_is_an_error(tmp_path):
     fit_noise(make_trainer(tmp_path, epochs=1))
     other = make_trainer(tmp_path)
     other.architecture = {**ARCHITECTURE, "classes": ["fig", "lime", "plum"]}
-    with pytest.raises(InputError, match=r"last.pt is from another architecture or other classes: resume with"):
+    with pytest.raises(
+        InputError, match=r"checkpoint in .* is from another architecture or other classes: resume with"
+    ):
         other.resume()
 
 
@@ -234,9 +246,9 @@ def test_every_epoch_has_its_line_before_its_checkpoint(tmp_path, monkeypatch):
     lines_at_save = []
     save = checkpoint.save
 
-    def recorded(path, state):
+    def recorded(path, state, *previous):
         lines_at_save.append((path.name, state["epoch"], [line["epoch"] for line in read_metrics(tmp_path)]))
-        save(path, state)
+        save(path, state, *previous)
 
     monkeypatch.setattr(checkpoint, "save", recorded)
     fit_noise(make_trainer(tmp_path, epochs=2))

@@ -10,8 +10,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from train.logs import METRICS, RunLog, read_metrics
 
 
-def write_epochs(folder, epochs: range, done: int = 0) -> None:
-    log = RunLog(folder, done)
+def write_epochs(folder, epochs: range, history=()) -> None:
+    log = RunLog(folder, history)
     for epoch in epochs:
         log.scalars({"train/loss": 1 / epoch, "validation/accuracy": 0.25}, epoch)
     log.close()
@@ -33,26 +33,27 @@ def test_a_folder_without_metrics_has_no_lines(tmp_path):
     assert read_metrics(tmp_path) == []
 
 
-@pytest.mark.parametrize("done, kept", [(0, []), (2, [1, 2]), (5, [1, 2, 3])])
-def test_resuming_keeps_the_epochs_done_and_drops_what_comes_again(tmp_path, done, kept):
+@pytest.mark.parametrize("done", [0, 2, 3])
+def test_resuming_keeps_the_epochs_of_the_checkpoint_alone(tmp_path, done):
+    """Later lines come again, final scores too, and one that a crash cut short does not count."""
     write_epochs(tmp_path, range(1, 4))
-    log = RunLog(tmp_path, 3)
+    epochs = read_metrics(tmp_path)
+    log = RunLog(tmp_path, epochs)
     log.scalars({"test/accuracy": 0.5})
     log.close()
-    before = read_metrics(tmp_path)
-    RunLog(tmp_path, done).close()
-    assert read_metrics(tmp_path) == before[: len(kept)]
-    assert [line["epoch"] for line in read_metrics(tmp_path)] == kept
-
-
-def test_a_line_cut_short_by_a_crash_is_passed_over(tmp_path):
-    write_epochs(tmp_path, range(1, 3))
-    whole = read_metrics(tmp_path)
     with open(tmp_path / METRICS, "a") as file:
         file.write('{"epoch": 3, "train/lo')
-    assert read_metrics(tmp_path) == whole
-    write_epochs(tmp_path, range(3, 4), done=2)
-    assert [line["epoch"] for line in read_metrics(tmp_path)] == [1, 2, 3]
+    assert len(read_metrics(tmp_path)) == 4
+    write_epochs(tmp_path, range(done + 1, 4), epochs[:done])
+    assert read_metrics(tmp_path) == epochs
+
+
+def test_lines_that_a_file_has_lost_come_back_from_the_checkpoint(tmp_path):
+    write_epochs(tmp_path, range(1, 4))
+    epochs = read_metrics(tmp_path)
+    (tmp_path / METRICS).write_text("")
+    RunLog(tmp_path, epochs).close()
+    assert read_metrics(tmp_path) == epochs
 
 
 def test_tensorboard_reads_the_scalars_and_the_renders(tmp_path):
@@ -77,6 +78,6 @@ def test_tensorboard_reads_the_scalars_and_the_renders(tmp_path):
 
 def test_tensorboard_shows_each_epoch_of_a_resumed_run_once(tmp_path):
     write_epochs(tmp_path, range(1, 4))
-    write_epochs(tmp_path, range(2, 5), done=1)
+    write_epochs(tmp_path, range(2, 5), read_metrics(tmp_path)[:1])
     events = EventAccumulator(str(tmp_path)).Reload()
     assert [event.step for event in events.Scalars("train/loss")] == [1, 2, 3, 4]

@@ -3,8 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from renderer.errors import InputError
-from train.schedule import SCHEDULES, check_schedule, cosine, one_cycle, step
+from train.schedule import SCHEDULES, cosine, one_cycle, step
 
 
 @pytest.mark.parametrize("epochs", [10, 50, 150, 200])
@@ -31,10 +30,3 @@ def test_every_schedule_stays_within_the_peak_rate_and_reaches_it():
     for schedule in SCHEDULES.values():
         rates = [schedule(value) for value in np.linspace(0, 1, 1001)]
         assert min(rates) >= 0 and max(rates) == 1
-
-
-def test_an_unknown_schedule_is_refused_with_the_choices():
-    for name in SCHEDULES:
-        check_schedule(name)
-    with pytest.raises(InputError, match=r"train.schedule=linear: choose one of step, cosine, one_cycle"):
-        check_schedule("linear")

@@ -1,0 +1,119 @@
+"""Training in several processes that `torchrun` starts: one global batch, whatever their number."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.distributed.nn.functional import all_reduce
+from torch.nn.parallel import DistributedDataParallel
+
+from augment import processes
+
+
+@contextmanager
+def process_group() -> Iterator[None]:
+    """Join the processes that torchrun started; a run by itself has none to join."""
+    if int(os.environ.get("WORLD_SIZE", 1)) == 1:
+        yield
+        return
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+    try:
+        yield
+    finally:
+        dist.destroy_process_group()
+
+
+@contextmanager
+def first_process_first() -> Iterator[None]:
+    """Let the first process do alone what the others then find done, such as a download."""
+    if processes.index() > 0:
+        _wait()
+    yield
+    if processes.index() == 0:
+        _wait()
+
+
+def agreed(value):
+    """The first process's value, in all of them: numbers, text, times."""
+    values = [value]
+    if processes.count() > 1:
+        dist.broadcast_object_list(values, src=0)
+    return values[0]
+
+
+def any_process(flag: bool) -> bool:
+    """Whether the flag is set in any process."""
+    if processes.count() == 1:
+        return flag
+    flags = torch.tensor([float(flag)])  # on the CPU, so that no device has to catch up
+    dist.all_reduce(flags, dist.ReduceOp.MAX)
+    return bool(flags)
+
+
+def summed(values: Tensor) -> Tensor:
+    """The sum over all processes."""
+    if processes.count() > 1:
+        dist.all_reduce(values)
+    return values
+
+
+def replicated(model: nn.Module) -> nn.Module:
+    """The model whose gradients are averaged over all processes; itself where there is but one.
+
+    Batch normalisation takes its statistics over the global batch (`nn.SyncBatchNorm`), so that the result does not
+    depend on the number of processes.
+    """
+    if processes.count() == 1:
+        return model
+    synchronise_norms(model)
+    return DistributedDataParallel(model, broadcast_buffers=False)
+
+
+def synchronise_norms(model: nn.Module) -> None:
+    """Replace every batch normalisation inside the model by one over all processes."""
+    for parent in list(model.modules()):
+        for name, child in parent.named_children():
+            if isinstance(child, nn.BatchNorm2d):
+                kind = nn.SyncBatchNorm if child.weight.is_cuda else SyncBatchNormCPU
+                setattr(parent, name, _converted(child, kind))
+
+
+class SyncBatchNormCPU(nn.BatchNorm2d):
+    """`nn.SyncBatchNorm`, which is for GPUs alone, in elementary operations; every process has as many rows."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training:
+            return super().forward(x)
+        values = x.float()
+        mean = _average(values.mean((0, 2, 3)))
+        centred = values - mean.view(1, -1, 1, 1)
+        variance = _average(centred.square().mean((0, 2, 3)))
+        self._track(mean.detach(), variance.detach(), processes.count() * x.numel() // x.shape[1])
+        scale = self.weight * (variance + self.eps).rsqrt()
+        return (centred * scale.view(1, -1, 1, 1) + self.bias.view(1, -1, 1, 1)).to(x.dtype)
+
+    @torch.no_grad()
+    def _track(self, mean: Tensor, variance: Tensor, count: int) -> None:
+        self.num_batches_tracked += 1
+        self.running_mean.lerp_(mean, self.momentum)
+        self.running_var.lerp_(variance * count / (count - 1), self.momentum)
+
+
+def _average(values: Tensor) -> Tensor:
+    return all_reduce(values) / processes.count()
+
+
+def _converted(norm: nn.BatchNorm2d, kind: type[nn.Module]) -> nn.Module:
+    converted = kind(norm.num_features, norm.eps, norm.momentum, device=norm.weight.device)
+    converted.load_state_dict(norm.state_dict())
+    return converted
+
+
+def _wait() -> None:
+    if processes.count() > 1:
+        dist.barrier()

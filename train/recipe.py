@@ -1,0 +1,46 @@
+"""How a network is trained: conf/train.yaml's `train` as a dataclass."""
+
+import math
+from dataclasses import dataclass
+
+from renderer.errors import InputError
+from train.batches import FLIPS
+from train.graphs import COMPILE
+from train.schedule import SCHEDULES
+
+
+@dataclass
+class TrainSettings:
+    """The defaults are the paper's recipe; conf/train.yaml says what each key does."""
+
+    epochs: int = 150
+    batch_size: int = 128
+    learning_rate: float = 0.125
+    momentum: float = 0.9
+    weight_decay: float = 5e-4
+    schedule: str = "step"
+    flips: str = "random"
+    label_smoothing: float = 0.0
+    averaging: float = 0.0
+    precision: str = "auto"
+    device: str = "auto"
+    threads: int | None = None
+    compile: str = "auto"
+    deterministic: bool = False
+    checkpoint_every: int = 1
+    resume: bool = False
+
+    def __post_init__(self):
+        for name, choices in {"schedule": SCHEDULES, "flips": FLIPS, "compile": COMPILE}.items():
+            if getattr(self, name) not in choices:
+                raise InputError(f"train.{name}={getattr(self, name)}: choose one of {', '.join(choices)}")
+        for name in ("epochs", "batch_size", "checkpoint_every", "threads"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise InputError(f"train.{name}={value} must be at least 1")
+        for name in ("momentum", "label_smoothing", "averaging"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")
+        if not 0 < self.learning_rate < math.inf:
+            raise InputError(f"train.learning_rate={self.learning_rate} must be positive")
+        if not 0 <= self.weight_decay < math.inf:
+            raise InputError(f"train.weight_decay={self.weight_decay} must not be negative")
