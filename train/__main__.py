@@ -1,5 +1,8 @@
 """`python -m train`: train an arm, score it, and print the table. See conf/train.yaml for every setting."""
 
+import shlex
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import hydra
@@ -7,8 +10,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from augment import processes
 from train.cli import one_sentence_errors, with_suggestions
+from train.distributed import announce, announced, process_group
 from train.experiment import load_data, prepare, write_pictures
+from train.interruption import Interrupted
 from train.logs import console
 from train.report import format_table, summarise
 
@@ -18,6 +24,8 @@ from train.report import format_table, summarise
 def main(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
+    if processes.index() == 0:
+        announce(str(folder))
     config.run = str(folder)
     OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
     alone = hydra_config.mode == RunMode.RUN  # the cells of a sweep are compared with each other instead
@@ -30,9 +38,29 @@ def main(config: DictConfig) -> None:
     runs = {path: prepare(arm, data, path) for path, arm in arms.items()}  # all first: a mistake in any shows at once
     for path, train_and_score in runs.items():
         console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")
-        train_and_score()
+        try:
+            train_and_score()
+        except Interrupted as stop:
+            console.info("ended by %s; to go on: %s", stop.signal, resume_command(hydra_config.overrides.task, folder))
+            raise
     console.info("\n%s", format_table([summarise(path) for path in arms]))
 
 
+def resume_command(overrides: Iterable[str], folder: Path) -> str:
+    """The command that goes on with an interrupted run."""
+    start = f"torchrun --nproc_per_node={processes.count()} -m train" if processes.count() > 1 else "python -m train"
+    kept = [item for item in overrides if not item.startswith(("run=", "train.resume="))]
+    return shlex.join([*start.split(), *kept, f"run={folder}", "train.resume=true"])
+
+
+def start() -> None:
+    """`main` in one process, or in each that torchrun starts: the others write nothing and follow the first's folder."""
+    with process_group():
+        if processes.index() > 0:
+            console.setLevel("WARNING")
+            sys.argv.append(f"run='{announced()}'")
+        with_suggestions(main, "train")
+
+
 if __name__ == "__main__":
-    with_suggestions(main, "train")
+    start()

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.distributed.nn.functional import all_reduce
 from torch.nn.parallel import DistributedDataParallel
 
 from augment import processes
@@ -38,11 +37,16 @@ def first_process_first() -> Iterator[None]:
         _wait()
 
 
-def agreed(value):
-    """The first process's value, in all of them: numbers, text, times."""
-    values = [value]
+def announce(value: str) -> None:
+    """Tell the other processes, each of which waits in `announced`; the first one's to call."""
     if processes.count() > 1:
-        dist.broadcast_object_list(values, src=0)
+        dist.broadcast_object_list([value], src=0)
+
+
+def announced() -> str:
+    """What the first process announces."""
+    values = [None]
+    dist.broadcast_object_list(values, src=0)
     return values[0]
 
 
@@ -56,7 +60,7 @@ def any_process(flag: bool) -> bool:
 
 
 def summed(values: Tensor) -> Tensor:
-    """The sum over all processes."""
+    """The sum over all processes, in place."""
     if processes.count() > 1:
         dist.all_reduce(values)
     return values
@@ -71,7 +75,7 @@ def replicated(model: nn.Module) -> nn.Module:
     if processes.count() == 1:
         return model
     synchronise_norms(model)
-    return DistributedDataParallel(model, broadcast_buffers=False)
+    return DistributedDataParallel(model)
 
 
 def synchronise_norms(model: nn.Module) -> None:
@@ -89,7 +93,7 @@ class SyncBatchNormCPU(nn.BatchNorm2d):
     def forward(self, x: Tensor) -> Tensor:
         if not self.training:
             return super().forward(x)
-        values = x.float()
+        values = x.to(torch.promote_types(x.dtype, torch.float32))
         mean = _average(values.mean((0, 2, 3)))
         centred = values - mean.view(1, -1, 1, 1)
         variance = _average(centred.square().mean((0, 2, 3)))
@@ -104,12 +108,24 @@ class SyncBatchNormCPU(nn.BatchNorm2d):
         self.running_var.lerp_(variance * count / (count - 1), self.momentum)
 
 
+class _Sum(torch.autograd.Function):
+    """The sum over all processes; so is its gradient, since each process's loss depends on every one's values."""
+
+    @staticmethod
+    def forward(context, values: Tensor) -> Tensor:
+        return summed(values.clone())
+
+    @staticmethod
+    def backward(context, gradient: Tensor) -> Tensor:
+        return summed(gradient.clone())
+
+
 def _average(values: Tensor) -> Tensor:
-    return all_reduce(values) / processes.count()
+    return _Sum.apply(values) / processes.count()
 
 
 def _converted(norm: nn.BatchNorm2d, kind: type[nn.Module]) -> nn.Module:
-    converted = kind(norm.num_features, norm.eps, norm.momentum, device=norm.weight.device)
+    converted = kind(norm.num_features, norm.eps, norm.momentum, device=norm.weight.device, dtype=norm.weight.dtype)
     converted.load_state_dict(norm.state_dict())
     return converted
 

@@ -1,0 +1,182 @@
+"""Two processes against one, over gloo on a CPU."""
+
+import copy
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.multiprocessing as multiprocessing
+import torch.nn.functional as F
+from omegaconf import OmegaConf
+from PIL import Image
+
+from augment import processes
+from train import checkpoint, fit
+from train.distributed import any_process, process_group, replicated, summed
+from train.experiment import load_data, run
+from train.interruption import Interrupted
+from train.logs import read_metrics
+from train.wideresnet import WideResNet
+
+BATCH = torch.rand(12, 3, 8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+LABELS = torch.arange(12) % 3
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+def as_process(index: int, count: int, port: int, task: Callable, arguments: tuple) -> None:
+    torch.set_num_threads(1)
+    os.environ |= {"WORLD_SIZE": str(count), "RANK": str(index), "LOCAL_RANK": str(index)}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    with process_group():
+        task(*arguments)
+
+
+def in_processes(count: int, task: Callable, *arguments) -> None:
+    multiprocessing.spawn(as_process, (count, free_port(), task, arguments), nprocs=count)
+
+
+def network() -> WideResNet:
+    torch.manual_seed(0)
+    return WideResNet(3, 10, 1, dropout=0.4).double()
+
+
+def train_two_steps(folder: Path) -> None:
+    """Writes the losses, the gradients of the second step, and the buffers, and what the processes agree on."""
+    model = network()
+    replica, losses = replicated(model), []
+    share = torch.arange(12).view(processes.count(), -1)[processes.index()]
+    for step in range(2):
+        torch.manual_seed(step)
+        loss = F.cross_entropy(replica(BATCH[share]), LABELS[share])
+        model.zero_grad()
+        loss.backward()
+        losses.append(float(summed(loss.detach().clone())) / processes.count())
+    state = {
+        "losses": losses,
+        "gradients": {name: parameter.grad for name, parameter in model.named_parameters()},
+        "buffers": dict(model.named_buffers()),
+        "any": [any_process(processes.index() == 1), any_process(False)],
+        "merged": processes.merged(processes.share(5) * 10, processes.share(5), 5),
+        "few": processes.merged(processes.share(1) + 7, processes.share(1), 1),
+    }
+    torch.save(state, folder / f"{processes.index()}_of_{processes.count()}.pt")
+
+
+@pytest.fixture(scope="module")
+def steps(tmp_path_factory) -> list[dict]:
+    """Of one process, and of each of two."""
+    folder = tmp_path_factory.mktemp("steps")
+    train_two_steps(folder)
+    in_processes(2, train_two_steps, folder)
+    return [torch.load(folder / name, weights_only=True) for name in ("0_of_1.pt", "0_of_2.pt", "1_of_2.pt")]
+
+
+def test_losses_gradients_and_statistics_are_those_of_one_process_to_rounding(steps):
+    """In float64, with dropout and batch normalisation over the whole batch."""
+    one, *two = steps
+    for found in two:
+        torch.testing.assert_close(found["losses"], one["losses"], rtol=1e-12, atol=0)
+        torch.testing.assert_close(found["gradients"], one["gradients"], rtol=1e-9, atol=1e-13)
+        torch.testing.assert_close(found["buffers"], one["buffers"], rtol=1e-12, atol=1e-14)
+    assert max(gradient.abs().max() for gradient in one["gradients"].values()) > 0.1
+
+
+def test_all_processes_hold_the_same_bits(steps):
+    _, first, second = steps
+    for kind in ("gradients", "buffers"):
+        assert all(torch.equal(value, second[kind][name]) for name, value in first[kind].items())
+
+
+def test_processes_agree_and_their_shares_become_whole(steps):
+    one, *two = steps
+    assert one["any"] == [False, False] and one["merged"].tolist() == [0, 10, 20, 30, 40]
+    for found in two:
+        assert found["any"] == [True, False]
+        assert found["merged"].tolist() == [0, 10, 20, 30, 40] and found["few"].tolist() == [7]
+
+
+def test_one_process_uses_the_model_as_it_is():
+    model = network()
+    before = copy.deepcopy(model)
+    assert replicated(model) is model and [type(m) for m in model.modules()] == [type(m) for m in before.modules()]
+
+
+# ---------------------------------------------------------------------------------------- whole runs
+
+
+def run_from_file(config: Path, folder: Path) -> None:
+    settings = OmegaConf.load(config)
+    run(settings, load_data(settings), folder)
+
+
+def run_until_a_signal(config: Path, folder: Path) -> None:
+    """The second process alone gets it, in the second step of the second epoch."""
+    with interrupted_at(epoch=1, step=2, process=1), pytest.raises(Interrupted):
+        run_from_file(config, folder)
+
+
+@contextmanager
+def interrupted_at(epoch: int, step: int, process: int) -> Iterator[None]:
+    training_batches = fit.training_batches
+
+    def signalled(images, labels, batch_size, seed, now, *rest, **more):
+        for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
+            if (now, count, processes.index()) == (epoch, step, process):
+                signal.raise_signal(signal.SIGTERM)
+            yield batch
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit, "training_batches", signalled)
+        yield
+
+
+@pytest.fixture(scope="module")
+def runs(tiny, tmp_path_factory) -> Path:
+    """An adversarial run by one process, by two, and by two until a signal and then by one.
+
+    At a learning rate so low that rounding does not grow.
+    """
+    folder = tmp_path_factory.mktemp("runs")
+    for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
+        config = tiny("train.learning_rate=0.001", *overrides)
+        OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / f"{name}.yaml")
+    run_from_file(folder / "config.yaml", folder / "one")
+    in_processes(2, run_from_file, folder / "config.yaml", folder / "two")
+    in_processes(2, run_until_a_signal, folder / "config.yaml", folder / "mixed")
+    state = checkpoint.load(folder / "mixed" / checkpoint.LAST)
+    assert (state["epoch"], state["under_way"]["step"]) == (1, 2)
+    run_from_file(folder / "resume.yaml", folder / "mixed")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["two", "mixed"])
+def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
+    first, other = (checkpoint.load(runs / folder / checkpoint.LAST) for folder in ("one", name))
+    torch.testing.assert_close(other["model"], first["model"], rtol=1e-3, atol=1e-5)  # float32, three epochs
+    torch.testing.assert_close(other["service"], first["service"], rtol=0, atol=1e-3)
+    for epoch in (1, 2, 3):
+        grids = [np.asarray(Image.open(runs / folder / "renders" / f"epoch_00{epoch}.png")) for folder in ("one", name)]
+        np.testing.assert_allclose(*(grid.astype(int) for grid in grids), atol=1)  # of 255, where rounding decides
+    lines = [read_metrics(runs / folder) for folder in ("one", name)]
+    assert [line.get("epoch") for line in lines[1]] == [1, 2, 3, None]
+    for one, found in zip(*lines, strict=True):
+        for key in (key for key in one if not key.startswith("seconds/")):
+            assert found[key] == pytest.approx(one[key], rel=1e-3), key
+    assert all(line["augment/light_change"] > 0 for line in lines[0][:-1])
+
+
+def test_one_process_writes_for_all(runs):
+    files = [{path.name for path in (runs / name).iterdir() if "tfevents" not in path.name} for name in ("one", "two")]
+    assert files[0] == files[1]
+    assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1
