@@ -54,7 +54,7 @@ def resume_command(overrides: Iterable[str], folder: Path) -> str:
 
 
 def start() -> None:
-    """`main` in one process, or in each that torchrun starts: the others write nothing and follow the first's folder."""
+    """`main` in this process, or in each that torchrun starts; all take the first one's folder, and it alone writes."""
     with process_group():
         if processes.index() > 0:
             console.setLevel("WARNING")

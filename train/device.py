@@ -41,10 +41,10 @@ def set_deterministic(deterministic: bool) -> None:
     torch.backends.cudnn.benchmark = not deterministic
 
 
-def _quota(file: Path = QUOTA) -> int:
+def _quota() -> int:
     """Cores that the container may use, at least 1; the machine's where nothing limits them (cgroup v2, Linux)."""
     try:
-        quota, period = file.read_text().split()
+        quota, period = QUOTA.read_text().split()
         return max(1, int(quota) // int(period))
     except (OSError, ValueError):  # no such file, or "max 100000"
         return os.cpu_count() or 1
