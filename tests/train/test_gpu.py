@@ -1,0 +1,64 @@
+"""What only a GPU can show; skipped without one."""
+
+import pytest
+import torch
+
+from train import checkpoint
+from train.experiment import load_data, run
+from train.fit import Trainer
+from train.logs import read_metrics
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+
+
+def weights_of(config, folder) -> dict[str, torch.Tensor]:
+    run(config, load_data(config), folder)
+    return checkpoint.load(folder / checkpoint.LAST)["model"]
+
+
+@pytest.mark.parametrize("compile", ["auto", "never"])
+def test_a_gpu_trains_as_a_cpu_does_to_rounding(tiny, tmp_path, compile):
+    """At a learning rate so low that rounding does not grow; without dropout, whose draws differ."""
+    overrides = ("train.learning_rate=0.001", "model.dropout=0.0", "train.epochs=2")
+    expected = weights_of(tiny(*overrides), tmp_path / "cpu")
+    found = weights_of(tiny(*overrides, "train.device=cuda", f"train.compile={compile}"), tmp_path / "gpu")
+    torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-3)  # convolutions in TF32
+    lines = [read_metrics(tmp_path / name) for name in ("cpu", "gpu")]
+    assert lines[1][0]["augment/steps"] == pytest.approx(lines[0][0]["augment/steps"], abs=0.5)
+
+
+def test_deterministic_runs_repeat_bit_for_bit(tiny, tmp_path):
+    config = tiny("train.device=cuda", "train.precision=bfloat16", "train.deterministic=true", "train.epochs=2")
+    first, again = (weights_of(config, tmp_path / name) for name in ("first", "again"))
+    assert all(torch.equal(value, again[name]) for name, value in first.items())
+
+
+def test_an_interrupted_run_goes_on_bit_for_bit(tiny, tmp_path):
+    overrides = ("train.device=cuda", "train.deterministic=true")
+    whole = weights_of(tiny(*overrides), tmp_path / "whole")
+    weights_of(tiny(*overrides), tmp_path / "parts")
+    (tmp_path / "parts" / checkpoint.LAST).unlink()  # the last epoch is lost
+    parts = weights_of(tiny(*overrides, "train.resume=true"), tmp_path / "parts")
+    assert all(torch.equal(value, parts[name]) for name, value in whole.items())
+
+
+def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch):
+    """Steps that synchronise raise an error; phases and the ends of epochs may."""
+    train = Trainer._train
+
+    def watched(self, *arguments):
+        now, pass_ = self._under_way, self._training_pass
+
+        def asynchronous(*batch):
+            torch.cuda.set_sync_debug_mode("error" if now.step > 3 else "default")  # after what is compiled
+            return pass_(*batch)
+
+        self._training_pass = asynchronous
+        try:
+            return train(self, *arguments)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+            self._training_pass = pass_
+
+    monkeypatch.setattr(Trainer, "_train", watched)
+    weights_of(tiny("train.device=cuda", "augment=none", "train.epochs=1", "train.batch_size=4"), tmp_path)
