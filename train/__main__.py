@@ -1,5 +1,6 @@
 """`python -m train`: train an arm, score it, and print the table. See conf/train.yaml for every setting."""
 
+import sys
 from pathlib import Path
 
 import hydra
@@ -11,6 +12,7 @@ from train.cli import one_sentence_errors, with_suggestions
 from train.experiment import load_data, prepare, write_pictures
 from train.logs import console
 from train.report import format_table, summarise
+from train.sweep import check_launcher, run_cell
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="train")
@@ -19,13 +21,18 @@ def main(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
     config.run = str(folder)
+    if hydra_config.mode == RunMode.MULTIRUN:
+        run_cell(config, folder)
+    else:
+        run_arms(config, folder)
+
+
+def run_arms(config: DictConfig, folder: Path) -> None:
+    """Train the arms to compare with and the arm itself, and print their table."""
     OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
-    alone = hydra_config.mode == RunMode.RUN  # the cells of a sweep are compared with each other instead
     data = load_data(config)
     write_pictures(config, data.size)
-    arms = {
-        folder / arm: OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in (config.compare if alone else [])
-    }
+    arms = {folder / arm: OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
     arms[folder] = config
     runs = {path: prepare(arm, data, path) for path, arm in arms.items()}  # all first: a mistake in any shows at once
     for path, train_and_score in runs.items():
@@ -35,4 +42,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    one_sentence_errors(check_launcher)(sys.argv[1:])
     with_suggestions(main, "train")
