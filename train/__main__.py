@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 
 import hydra
@@ -17,6 +16,7 @@ from train.experiment import load_data, prepare, write_pictures
 from train.interruption import Interrupted
 from train.logs import console
 from train.report import format_table, summarise
+from train.sweep import check_launcher, run_cell
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="train")
@@ -27,13 +27,18 @@ def main(config: DictConfig) -> None:
     if processes.index() == 0:
         announce(str(folder))
     config.run = str(folder)
+    if hydra_config.mode == RunMode.MULTIRUN:
+        run_cell(config, folder)
+    else:
+        run_arms(config, folder)
+
+
+def run_arms(config: DictConfig, folder: Path) -> None:
+    """Train the arms to compare with and the arm itself, and print their table."""
     OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
-    alone = hydra_config.mode == RunMode.RUN  # the cells of a sweep are compared with each other instead
     data = load_data(config)
     write_pictures(config, data.size)
-    arms = {
-        folder / arm: OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in (config.compare if alone else [])
-    }
+    arms = {folder / arm: OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
     arms[folder] = config
     runs = {path: prepare(arm, data, path) for path, arm in arms.items()}  # all first: a mistake in any shows at once
     for path, train_and_score in runs.items():
@@ -41,20 +46,23 @@ def main(config: DictConfig) -> None:
         try:
             train_and_score()
         except Interrupted as stop:
-            console.info("ended by %s; to go on: %s", stop.signal, resume_command(hydra_config.overrides.task, folder))
+            console.info("ended by %s; to go on: %s", stop.signal, resume_command(folder))
             raise
     console.info("\n%s", format_table([summarise(path) for path in arms]))
 
 
-def resume_command(overrides: Iterable[str], folder: Path) -> str:
-    """The command that goes on with an interrupted run."""
+def resume_command(folder: Path) -> str:
+    """The command that goes on with this run."""
     start = f"torchrun --nproc_per_node={processes.count()} -m train" if processes.count() > 1 else "python -m train"
-    kept = [item for item in overrides if not item.startswith(("run=", "train.resume="))]
-    return shlex.join([*start.split(), *kept, f"run={folder}", "train.resume=true"])
+    overrides = [
+        override for override in HydraConfig.get().overrides.task if not override.startswith(("run=", "train.resume="))
+    ]
+    return shlex.join([*start.split(), *overrides, f"run={folder}", "train.resume=true"])
 
 
 def start() -> None:
     """`main` in this process, or in each that torchrun starts; all take the first one's folder, and it alone writes."""
+    one_sentence_errors(check_launcher)(sys.argv[1:])
     with process_group():
         if processes.index() > 0:
             console.setLevel("WARNING")

@@ -15,19 +15,29 @@ from renderer.errors import InputError
 USER_ERROR = 2
 
 
+def one_sentence(error: Exception) -> str | None:
+    """What the user can do about an error; None where it is no fault of the user's."""
+    match error:
+        case InputError():
+            return str(error)
+        case MissingMandatoryValue():
+            return f"{error.full_key} is not set: give {error.full_key}=..."
+        case InterpolationResolutionError():
+            return f"{error.full_key}: {str(error.msg).splitlines()[0]}"
+    return None
+
+
 def one_sentence_errors(function: Callable) -> Callable:
     """Print what the user can mend as one line, without a traceback, and exit with status 2."""
 
     @functools.wraps(function)
-    def wrapped(*arguments):
+    def wrapped(*arguments, **keywords):
         try:
-            return function(*arguments)
-        except InputError as error:
-            message = str(error)
-        except MissingMandatoryValue as error:
-            message = f"{error.full_key} is not set: give {error.full_key}=..."
-        except InterpolationResolutionError as error:
-            message = f"{error.full_key}: {str(error.msg).splitlines()[0]}"
+            return function(*arguments, **keywords)
+        except Exception as error:
+            message = one_sentence(error)
+            if message is None:
+                raise
         print(f"error: {message}", file=sys.stderr)
         sys.exit(USER_ERROR)
 

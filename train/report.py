@@ -3,8 +3,9 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, stdev
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -13,6 +14,7 @@ from train import checkpoint
 from train.experiment import CONFIG, PHOTOGRAPHS
 from train.logs import read_metrics
 from train.photographs import share
+from train.settings import decisive_settings
 
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; others are parts of these, or once a run
 RECIPE = ("epochs", "batch_size", "learning_rate", "momentum", "weight_decay", "schedule", "precision")
@@ -32,12 +34,22 @@ class RunSummary:
     def arm(self) -> str:
         return self.config.augment.arm
 
+    @cached_property
+    def settings(self) -> dict[str, object]:
+        return decisive_settings(self.config)
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether the folder holds a run with its final scores."""
+    lines = read_metrics(folder)
+    return bool(lines) and "epoch" not in lines[-1]
+
 
 def summarise(folder: Path) -> RunSummary:
     """Read a finished run; InputError for a folder that holds none."""
-    lines = read_metrics(folder)
-    if not lines or "epoch" in lines[-1]:
+    if not is_finished(folder):
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")
+    lines = read_metrics(folder)
     photographs = folder / PHOTOGRAPHS / "summary.json"
     phases = sorted({name for line in lines for name in line if name.startswith("seconds/")})
     return RunSummary(
@@ -50,12 +62,14 @@ def summarise(folder: Path) -> RunSummary:
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
-    """A Markdown table of the headline figures, one row per run, and the pictures to look at."""
-    label = runs[0].config.label
-    header = ["augment", "seed", "test accuracy", f"{label} recognised", f"others called {label}", "seconds per epoch"]
+    """A Markdown table of the headline figures and what the runs differ in, one row per run, and the pictures."""
+    label, varied = runs[0].config.label, _varied(runs)
+    figures = ["test accuracy", f"{label} recognised", f"others called {label}", "seconds per epoch"]
+    header = ["augment", *varied, "seed", *figures]
     rows = [
         [
             run.arm,
+            *(str(run.settings.get(key)) for key in varied),
             str(run.config.seed),
             f"{run.scores['test/accuracy']:.3f}",
             *(_interval(run.photographs and run.photographs[name]) for name in ("recall", "false_alarms")),
@@ -65,6 +79,26 @@ def format_table(runs: Sequence[RunSummary]) -> str:
     ]
     sheets = [run.folder / PHOTOGRAPHS / "contact_sheet.png" for run in runs if run.photographs]
     return "\n".join([_markdown(header, rows), *(f"picture: {sheet}" for sheet in sheets)])
+
+
+def format_spread(runs: Sequence[RunSummary]) -> str:
+    """A Markdown table, a row per group of runs that differ only in the seed: mean ± standard deviation; "" if none."""
+    label, varied = runs[0].config.label, _varied(runs)
+    groups: dict[str, list[RunSummary]] = {}
+    for run in runs:
+        groups.setdefault(repr({**run.settings, "seed": None}), []).append(run)
+    header = ["augment", *varied, "seeds", "test accuracy", f"{label} recognised", f"others called {label}"]
+    rows = [
+        [
+            group[0].arm,
+            *(str(group[0].settings.get(key)) for key in varied),
+            str(len(group)),
+            *map(_spread, zip(*map(_figures, group), strict=True)),
+        ]
+        for group in groups.values()
+        if len(group) > 1
+    ]
+    return _markdown(header, rows) if rows else ""
 
 
 def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str]) -> str:
@@ -88,6 +122,21 @@ def publish_run(folder: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     checkpoint.publish(out / checkpoint.PUBLISHED, checkpoint.load(folder / checkpoint.BEST))
     (out / "README.md").write_text(_card(run, out.name))
+
+
+def _varied(runs: Sequence[RunSummary]) -> list[str]:
+    """The settings that the runs differ in, but for the arm and the seed, which tables always show."""
+    keys = sorted({key for run in runs for key in run.settings} - {"augment.arm", "seed"})
+    return [key for key in keys if any(run.settings.get(key) != runs[0].settings.get(key) for run in runs)]
+
+
+def _figures(run: RunSummary) -> list[float | None]:
+    shares = [run.photographs and run.photographs[name]["value"] for name in ("recall", "false_alarms")]
+    return [run.scores["test/accuracy"], *shares]
+
+
+def _spread(values: Sequence[float | None]) -> str:
+    return "-" if None in values else f"{fmean(values):.3f} ± {stdev(values):.3f}"
 
 
 def _accuracy_table(runs: Sequence[RunSummary]) -> str:

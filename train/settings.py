@@ -1,6 +1,8 @@
 """conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
 
 import math
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from omegaconf import DictConfig, OmegaConf
@@ -11,6 +13,12 @@ from augment.service import AugmentationSettings
 from renderer.errors import InputError
 from renderer.image import PictureSettings
 from train.recipe import TrainSettings
+
+# Where, how and with what a run was made: these do not decide its result, nor name a sweep's cell.
+CIRCUMSTANCES = (
+    *("run", "sweep", "launcher", "compare", "versions", "renderer.cache"),
+    *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
+)
 
 
 @dataclass
@@ -85,9 +93,10 @@ class EvaluationSettings:
 
 @dataclass
 class ExperimentSettings:
-    """A whole run. run: its folder. label: the class under study. compare: arms to train beside it."""
+    """A whole run. run: its folder; sweep: that of a sweep. label: the class under study. compare: arms beside it."""
 
     run: str = ""
+    sweep: str = ""
     seed: int = 0
     label: str = "orange"
     compare: list[str] = field(default_factory=list)
@@ -121,6 +130,25 @@ def read_settings(kind: type, config: DictConfig, parent: str = ""):
     except OmegaConfBaseException as error:
         key = ".".join(filter(None, (parent, error.full_key)))
         raise InputError(": ".join(filter(None, (key, str(error.msg).splitlines()[0])))) from error
+
+
+def decisive_settings(config: DictConfig) -> dict[str, object]:
+    """What decides a run's result, by dotted key: all but the circumstances, with `${run}` for its own folder."""
+    settings = OmegaConf.to_container(config, resolve=True)
+    own = re.compile(f"^{re.escape(settings['run'])}(?=/|$)")
+    return {
+        key: own.sub("${run}", value) if isinstance(value, str) else value
+        for key, value in _dotted(settings)
+        if key not in CIRCUMSTANCES
+    }
+
+
+def _dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
+    for key, value in node.items():
+        if isinstance(value, dict) and prefix + key not in CIRCUMSTANCES:
+            yield from _dotted(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
 
 
 def read_object(item: str | dict, label: str, index: int) -> ObjectSettings:

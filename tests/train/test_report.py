@@ -8,7 +8,7 @@ from scipy.stats import binomtest
 from renderer.errors import InputError
 from train.checkpoint import PUBLISHED, load_network
 from train.photographs import share
-from train.report import format_comparison, format_table, publish_run, summarise
+from train.report import format_comparison, format_spread, format_table, publish_run, summarise
 
 VERSIONS = {"python": "3.11", "torch": "2.6"}
 
@@ -89,6 +89,28 @@ def test_the_headline_table_has_a_row_per_run_and_names_the_pictures(tmp_path, t
     ]
     pictures = [line for line in text.splitlines() if line.startswith("picture")]
     assert pictures == [f"picture: {with_photographs}/photographs/contact_sheet.png"]
+
+
+def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_path, tiny):
+    """0.2, 0.4 and 0.9 have the mean 0.5 and, by hand, the standard deviation √((0.09 + 0.01 + 0.16) / 2) = 0.361."""
+    recalled = {"a": 2, "b": 4, "c": 9, "d": 5}
+    settings = {"a": ["seed=0"], "b": ["seed=1"], "c": ["seed=2"], "d": ["seed=0", "train.epochs=9"]}
+    runs = [
+        summarise(made_up_run(tmp_path / name, tiny, "random", scored({"web": (hits, 10)}), *settings[name]))
+        for name, hits in recalled.items()
+    ]
+    assert [row[:3] for row in cells(format_table(runs))] == [
+        ["augment", "train.epochs", "seed"],
+        ["random", "3", "0"],
+        ["random", "3", "1"],
+        ["random", "3", "2"],
+        ["random", "9", "0"],
+    ]
+    assert cells(format_spread(runs)) == [
+        ["augment", "train.epochs", "seeds", "test accuracy", "orange recognised", "others called orange"],
+        ["random", "3", "3", "0.765 ± 0.000", "0.500 ± 0.361", "0.100 ± 0.000"],
+    ]
+    assert format_spread(runs[2:]) == ""
 
 
 def test_a_comparison_shows_every_source_and_the_share_without_some(tmp_path, tiny):

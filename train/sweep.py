@@ -1,0 +1,219 @@
+"""Sweeps, `python -m train --multirun`: a folder per cell, named by its overrides; what is done is not done again.
+
+Hydra's launchers run the cells, in this process or in others; what became of each is read from its folder.
+"""
+
+import atexit
+import hashlib
+import importlib.metadata
+import os
+import re
+import shutil
+import signal
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NoReturn
+
+from filelock import FileLock, Timeout
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from renderer.errors import InputError
+from train import checkpoint
+from train.cli import one_sentence, one_sentence_errors
+from train.experiment import CONFIG, load_data, run, write_pictures
+from train.logs import console
+from train.report import format_spread, format_table, is_finished, summarise
+from train.settings import CIRCUMSTANCES, decisive_settings
+
+FAILURE, LOCK = "failed.txt", ".lock"
+LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
+NEEDS = {  # launcher: its extra and the package in it
+    "joblib": ("joblib", "hydra-joblib-launcher"),
+    "slurm": ("slurm", "hydra-submitit-launcher"),
+    "submitit_local": ("slurm", "hydra-submitit-launcher"),
+}
+
+
+def cell_name(overrides: Sequence[str]) -> str:
+    """The name of a cell's folder, in alphabetical order: `augment-none+seed-0` for seed=0 augment=none.
+
+    Overrides that only say where and how it runs are left out. What is long is cut, and what a file system or Hydra's
+    command line might not take is replaced; both then end in @ and a hash of what was there, so that different cells
+    have different names, also where capitals do not count.
+    """
+    pairs = sorted(override.partition("=")[::2] for override in overrides)
+    name = "+".join(f"{_safe(key)}-{_safe(value)}" for key, value in pairs if key not in CIRCUMSTANCES) or "defaults"
+    return name if len(name) <= LONGEST_NAME else name[:LONGEST_NAME] + _hash(name)
+
+
+def _safe(text: str) -> str:
+    safe = re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII)
+    return text if text == safe.lower() and len(text) <= LONGEST_VALUE else safe[-LONGEST_VALUE:] + _hash(text)
+
+
+def _hash(text: str) -> str:
+    return f"@{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+OmegaConf.register_new_resolver("cell_name", cell_name, replace=True)  # launchers hand it on to their processes
+
+
+def check_launcher(arguments: Sequence[str]) -> None:
+    """InputError where the command line chooses a launcher whose extra is not installed, or Slurm where it is not.
+
+    Nor does torchrun start a sweep: its processes train one network together.
+    """
+    if {"--multirun", "-m"} & set(arguments) and "TORCHELASTIC_RUN_ID" in os.environ:
+        raise InputError("torchrun trains one run in several processes: start a sweep with python -m train --multirun")
+    chosen = [argument.removeprefix("launcher=") for argument in arguments if argument.startswith("launcher=")]
+    for launcher in NEEDS.keys() & set(chosen):
+        extra, package = NEEDS[launcher]
+        if not _is_installed(package):
+            raise InputError(f'launcher={launcher} needs {package}: pip install ".[{extra}]"')
+        if launcher == "slurm" and not shutil.which("sbatch"):
+            raise InputError("launcher=slurm needs Slurm's sbatch, which is not here: start the sweep on the cluster")
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        importlib.metadata.distribution(package)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def run_cell(config: DictConfig, folder: Path) -> None:
+    """Train a cell in its folder, or go on with it, unless it is finished; why it failed goes to its failed.txt.
+
+    What stops the process (SystemExit, KeyboardInterrupt) stops the sweep.
+    """
+    with _lock(folder) as ours:
+        if is_finished(folder) or not ours:
+            print(f"{'finished before' if ours else 'in training elsewhere'}: {folder}", flush=True)
+            return
+        (folder / FAILURE).unlink(missing_ok=True)
+        try:
+            _train(config, folder)
+        except Exception as error:
+            (folder / FAILURE).write_text(_reason(error) + "\n")
+
+
+def _train(config: DictConfig, folder: Path) -> None:
+    OmegaConf.resolve(config)
+    config.train.resume = checkpoint.exists(folder)
+    data = load_data(config)
+    write_pictures(config, data.size)
+    run(config, data, folder)
+
+
+def _reason(error: Exception) -> str:
+    """One line, which is logged, with the traceback of what is no fault of the user's."""
+    sentence = one_sentence(error)
+    reason = sentence or traceback.format_exception_only(error)[-1].strip()
+    console.error("failed: %s", reason, exc_info=error if sentence is None else None)
+    return reason
+
+
+@contextmanager
+def _lock(folder: Path) -> Iterator[bool]:
+    """Whether nobody else holds the folder, on any machine that shares it; nobody else gets it then."""
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
+
+
+class SweepReport(Callback):
+    """Checks a sweep before its first cell, and ends it with a table; exit status 1 where a cell is not finished."""
+
+    def __init__(self):
+        self.folders: list[Path] = []
+
+    @one_sentence_errors
+    def on_multirun_start(self, config: DictConfig, **_) -> None:
+        """One sentence and exit status 2 rather than two cells in a folder, or a cell where one has other settings."""
+        try:
+            cells = _compose_cells(config)
+        except HydraException:  # Hydra's sweeper composes them again, and says what is wrong
+            return
+        self.folders = [folder for folder, _ in cells]
+        for folder, cell in cells:
+            if self.folders.count(folder) > 1:
+                raise InputError(f"the sweep asks twice for {folder}: give each value once")
+            _check_same_settings(folder, cell)
+        atexit.register(self._print)  # where the launcher raises, or a signal stops the sweep:
+        signal.signal(signal.SIGTERM, _stop)
+
+    def on_multirun_end(self, **_) -> None:
+        atexit.unregister(self._print)
+        self._print()
+        if not all(map(is_finished, self.folders)):
+            sys.exit(1)
+
+    def _print(self) -> None:
+        print(format_sweep(self.folders), flush=True)
+
+
+def _stop(number: int, _) -> NoReturn:
+    sys.exit(128 + number)  # an exception, so that launchers end their processes
+
+
+def _compose_cells(sweep: DictConfig) -> list[tuple[Path, DictConfig]]:
+    """Folder and configuration of every cell that Hydra's basic sweeper makes of a --multirun's configuration."""
+    loader = GlobalHydra.instance().config_loader()
+    overrides = [f"{key}={value}" for key, value in (sweep.hydra.sweeper.params or {}).items()]
+    overrides = OverridesParser.create(loader).parse_overrides([*overrides, *sweep.hydra.overrides.task])
+    if any(override.key_or_group == "run" for override in overrides):
+        raise InputError("run= names the folder of a single run: name a sweep's with sweep=")
+    (grid,) = BasicSweeper.split_arguments(overrides, max_batch_size=None)
+    cells = [loader.load_sweep_config(sweep, cell) for cell in grid]
+    return [(Path(cell.hydra.sweep.dir, cell.hydra.sweep.subdir), cell) for cell in cells]
+
+
+def _check_same_settings(folder: Path, cell: DictConfig) -> None:
+    """InputError where the folder has a run, finished or begun, with other settings than the cell's."""
+    if not (is_finished(folder) or checkpoint.exists(folder)):
+        return
+    found = decisive_settings(OmegaConf.load(folder / CONFIG))
+    asked = decisive_settings(OmegaConf.masked_copy(cell, [key for key in cell if key != "hydra"]))
+    for key in sorted(found.keys() | asked.keys()):
+        if found.get(key) != asked.get(key):
+            raise InputError(
+                f"{folder} has {key}={found.get(key)}, and {asked.get(key)} is asked for: give another folder with "
+                "sweep=, or remove this one"
+            )
+
+
+def format_sweep(folders: Sequence[Path]) -> str:
+    """The finished cells' table, means over seeds where there are several, and what became of the others."""
+    finished = [summarise(folder) for folder in folders if is_finished(folder)]
+    parts = [f"{len(finished)} of {len(folders)} cells are finished"]
+    if finished:
+        parts += filter(None, [format_table(finished), format_spread(finished)])
+    parts += [f"{folder}: {_state(folder)}" for folder in folders if not is_finished(folder)]
+    return "\n" + "\n\n".join(parts)
+
+
+def _state(folder: Path) -> str:
+    """Of a cell that is not finished."""
+    if not folder.exists():
+        return "not begun"
+    with _lock(folder) as ours:
+        if not ours:
+            return "in training"
+    failure = folder / FAILURE
+    return f"failed: {failure.read_text().strip()}" if failure.exists() else "interrupted"
