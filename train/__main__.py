@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
 from train.cli import one_sentence_errors, with_suggestions
-from train.distributed import announce, announced, process_group
+from train.distributed import announce, announced, first_process_first, process_group
 from train.experiment import load_data, prepare, write_pictures
 from train.interruption import Interrupted
 from train.logs import console
@@ -37,7 +37,9 @@ def run_arms(config: DictConfig, folder: Path) -> None:
     """Train the arms to compare with and the arm itself, and print their table."""
     OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
     data = load_data(config)
-    write_pictures(config, data.size)
+    with first_process_first():
+        if processes.index() == 0:
+            write_pictures(config, data.size)
     arms = {folder / arm: OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
     arms[folder] = config
     runs = {path: prepare(arm, data, path) for path, arm in arms.items()}  # all first: a mistake in any shows at once
@@ -48,7 +50,8 @@ def run_arms(config: DictConfig, folder: Path) -> None:
         except Interrupted as stop:
             console.info("ended by %s; to go on: %s", stop.signal, resume_command(folder))
             raise
-    console.info("\n%s", format_table([summarise(path) for path in arms]))
+    if processes.index() == 0:
+        console.info("\n%s", format_table([summarise(path) for path in arms]))
 
 
 def resume_command(folder: Path) -> str:

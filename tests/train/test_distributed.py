@@ -2,8 +2,11 @@
 
 import copy
 import os
+import shlex
 import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +27,7 @@ from train.interruption import Interrupted
 from train.logs import read_metrics
 from train.wideresnet import WideResNet
 
+ROOT = Path(__file__).parents[2]
 BATCH = torch.rand(12, 3, 8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 LABELS = torch.arange(12) % 3
 
@@ -180,3 +184,31 @@ def test_one_process_writes_for_all(runs):
     files = [{path.name for path in (runs / name).iterdir() if "tfevents" not in path.name} for name in ("one", "two")]
     assert files[0] == files[1]
     assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1
+
+
+@pytest.mark.slow
+def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_path):
+    """The command of the README; the second call goes on where SIGTERM stopped the first."""
+    small = ["model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2", "augment.examples=10"]
+    data = ["data=npz", f"data.path={tiny_npz}", "evaluate.photos=null", "compare=[]"]
+    overrides = [*small, *data, "train.device=cpu", "train.epochs=200", "train.checkpoint_every=1000"]
+    start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    with subprocess.Popen([*start, *overrides], cwd=tmp_path, env=environment, **pipes) as first:
+        for line in first.stdout:
+            if line.startswith("epoch 1/"):
+                first.terminate()
+                break
+        (told,) = [line for line in first.stdout if line.startswith("ended by SIGTERM")]
+    assert first.returncode != 0
+    command = shlex.split(told.partition("to go on: ")[2])
+    assert command[:4] == ["torchrun", "--nproc_per_node=2", "-m", "train"]
+    (folder,) = (tmp_path / "runs").glob("*/*")
+    epochs = checkpoint.load(folder / checkpoint.LAST)["epoch"]
+    assert 1 <= epochs < 200
+    more = [f"train.epochs={epochs + 1}" if item == "train.epochs=200" else item for item in command[4:]]
+    done = subprocess.run([*start, *more], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"after epoch {epochs}" in done.stdout and done.stdout.count("| adversarial") == 1
+    assert [line.get("epoch") for line in read_metrics(folder)] == [*range(1, epochs + 2), None]
