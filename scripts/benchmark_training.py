@@ -55,8 +55,9 @@ def write_page(config: DictConfig) -> None:
 
 
 def _command() -> str:
-    """As given, but for the folders of this machine."""
-    return " ".join(["python scripts/benchmark_training.py", *(re.sub("=/.*/", "=", word) for word in sys.argv[1:])])
+    """As given, but for the absolute folders of this machine."""
+    words = (re.sub(r"(?<![\w.])/[^\s,]*/", "", word) for word in sys.argv[1:])
+    return " ".join(["python scripts/benchmark_training.py", *words])
 
 
 if __name__ == "__main__":

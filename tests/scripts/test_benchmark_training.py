@@ -274,14 +274,16 @@ def test_a_tiny_run_writes_the_page_and_its_figure(tmp_path, npz, monkeypatch, c
     pytest.importorskip("matplotlib")
     monkeypatch.setitem(peak.SIZES, "cpu", (32,))
     monkeypatch.setattr(peak, "BURST", 1e-9)
-    monkeypatch.setattr(sys, "argv", ["benchmark_training.py", f"data.path={npz}"])
+    monkeypatch.setattr(
+        sys, "argv", ["benchmark_training.py", f"data.path={npz}", "scene.meshes=[/home/a.glb,{mesh:../b.glb}]"]
+    )
     overrides = [*TINY, "data=npz", f"data.path={npz}", f"out={tmp_path}/docs/page.md", "epochs=1", "steps=1"]
     load_script().write_page(settings("benchmark_training", *overrides))
 
     text = (tmp_path / "docs" / "page.md").read_text()
     assert text in capsys.readouterr().out
     assert (tmp_path / "docs" / "page.png").read_bytes().startswith(b"\x89PNG")
-    assert "`python scripts/benchmark_training.py data.path=tiny.npz`" in text  # no folder of this machine
+    assert "`python scripts/benchmark_training.py data.path=tiny.npz scene.meshes=[a.glb,{mesh:../b.glb}]` " in text
     assert "(30 on average, of 10 renders)" in text
     rows = {cells[0]: cells[1:] for line in text.splitlines() if (cells := re.findall(r"(?<=\| ).*?(?= \|)", line))}
     assert [float(cell.split()[0]) > 0 for cell in rows["training"]] == [True, True]
@@ -293,16 +295,16 @@ def test_whole_epochs_count_every_picture(npz, one_thread, monkeypatch):
     """72 pictures in training and 8 in validation, in 9 batches, and 11 with the 10 renders."""
     monkeypatch.setitem(peak.SIZES, "cpu", (32,))
     monkeypatch.setattr(peak, "BURST", 1e-9)
-    config = settings("benchmark_training", *TINY, "data=npz", f"data.path={npz}", "epochs=1", "steps=0")
+    config = settings("benchmark_training", *TINY, "data=npz", f"data.path={npz}", "epochs=2", "steps=0")
     own = BenchmarkSettings("", config.epochs, config.steps, config.workers)
     found = measure(own, OmegaConf.masked_copy(config, list(ExperimentSettings.__annotations__)), load_npz(npz), CPU)
     work = found.workload
     assert (work.trained, work.validated, work.beside_renders) == (72, 8, 72)
     assert (work.batches(PLAIN), work.batches(ADVERSARIAL)) == (9, 11)
     for name in (PLAIN, ADVERSARIAL):
-        (measured,) = found.turns[name][1:]
-        assert found.totals(name) == pytest.approx([measured["epoch"]])
+        assert found.totals(name) == pytest.approx([measured["epoch"] for measured in found.turns[name][1:]])
         assert all(found.epochs(name)[0][phase] > 0 for phase in ("training", "evaluation", "input_output"))
+    assert found.attack_steps == 30 and found.operators(ADVERSARIAL) > 0
 
 
 # ---------------------------------------------------------------------------- scripts/reproduce.sh

@@ -72,7 +72,7 @@ def draw(path: Path, findings: Findings) -> None:
         ax.barh(names, widths, left=left, label=_words(phase))
         left = [start + width for start, width in zip(left, widths, strict=True)]
     ax.set_xlabel("seconds per epoch")
-    ax.legend(fontsize=8)
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     save(plt, figure, path)
 
 
