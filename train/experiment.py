@@ -87,7 +87,7 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
     set_threads(settings.train.threads)
     set_deterministic(settings.train.deterministic)
     train, validation = stratified_split(data.train, settings.data.validation, seed=0)
-    trainer = _build_trainer(settings, data, folder, device)
+    trainer = build_trainer(settings, data, folder, device)
     _open_folder(trainer, config)
 
     def train_and_score() -> None:
@@ -107,7 +107,8 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
     return train_and_score
 
 
-def _build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
+def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
+    """The run's network, optimiser and scene, ready for `Trainer.fit`; nothing is written before."""
     phases = Phases(device)
     precision = choose_precision(settings.train.precision, device)
     mean, std = channel_statistics(data.train.images)

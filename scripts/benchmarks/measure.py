@@ -86,11 +86,12 @@ def peak_bytes(call: Callable[[], object], device: torch.device) -> int:
 
 
 def machine(device: torch.device) -> str:
-    """One line: processor, threads, versions, and how busy the machine was."""
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else _processor()
+    """One line: GPU, where that is the device, processor, threads, versions, and how busy the machine was."""
+    gpu = f"{torch.cuda.get_device_name(device)}; " if device.type == "cuda" else ""
+    threads = torch.get_num_threads()
     versions = f"Python {platform.python_version()}, torch {torch.__version__}, NumPy {np.__version__}"
     load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores at the start"
-    return f"{name}, {torch.get_num_threads()} thread of the CPU; {versions}; {load}"
+    return f"{gpu}{_processor()}, {threads} thread{'s' if threads > 1 else ''} of the CPU; {versions}; {load}"
 
 
 def _processor() -> str:

@@ -13,7 +13,7 @@ FEW = 12  # settings that can all be named in the figure
 
 def draw_fronts(path: Path, panels: Sequence[Sequence[Row]]) -> None:
     """One set of axes per panel: all settings, by name or coloured by degree, their front and the default."""
-    plt = _pyplot()
+    plt = pyplot()
     lines = -(-len(panels) // 3)
     figure, axes = plt.subplots(lines, 3, figsize=(16, 5 * lines), squeeze=False)
     for ax, rows in zip(axes.flat, panels, strict=False):
@@ -28,7 +28,7 @@ def draw_fronts(path: Path, panels: Sequence[Sequence[Row]]) -> None:
         ax.legend(fontsize=8)
     for ax in axes.flat[len(panels) :]:
         ax.axis("off")
-    _save(plt, figure, path)
+    save(plt, figure, path)
 
 
 def _draw_front(ax, rows: Sequence[Row]) -> None:
@@ -48,7 +48,7 @@ def _draw_by_degree(ax, rows: Sequence[Row], colors) -> None:
 
 def draw_scaling(path: Path, points: Sequence[Point], workloads: Sequence[Sequence[Row]]) -> None:
     """Time and memory of a gradient by its variables, and time of each kind of work by size, vertices and lights."""
-    plt = _pyplot()
+    plt = pyplot()
     figure, axes = plt.subplots(2, 3, figsize=(16, 10))
     methods = list(dict.fromkeys(point.method for point in points))
     lines = {method: [point for point in points if point.method == method] for method in methods}
@@ -64,7 +64,7 @@ def draw_scaling(path: Path, points: Sequence[Point], workloads: Sequence[Sequen
     stepping = [row for row in by_size if row.setting in ("light step", "vertex step, refreshed")]
     _draw_lines(axes[1, 2], _by_work(stepping), "size", "error")
     axes[1, 2].set(title=by_size[0].panel, xlabel="size", ylabel="relative error")
-    _save(plt, figure, path)
+    save(plt, figure, path)
 
 
 def _by_work(rows: Sequence[Row]) -> dict[str, list[Row]]:
@@ -93,13 +93,15 @@ def _logarithmic(ax, *names: str) -> None:
     ax.grid(alpha=0.3, which="both")
 
 
-def _save(plt, figure, path: Path) -> None:
+def save(plt, figure, path: Path) -> None:
+    """Write the figure and let go of it."""
     figure.tight_layout()
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
 
-def _pyplot():
+def pyplot():
+    """matplotlib.pyplot without a display; InputError where it is not installed."""
     try:
         import matplotlib
     except ImportError as error:

@@ -3,10 +3,9 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from benchmarks.results import Row, markdown, pareto_front, shown, verdict
+from benchmarks.results import Row, Target, markdown, pareto_front, shown, targets_table, verdict
 from benchmarks.scaling import Point
 from benchmarks.skipping import Saving
-from benchmarks.targets import Target
 
 HEADER = """# Time against error
 
@@ -74,7 +73,7 @@ def page(findings: Findings, command: str, machine: str) -> str:
         header,
         *(f"{note}\n" for note in findings.notes),
         "## Targets\n",
-        _targets(findings.targets),
+        targets_table(findings.targets),
         WHY_NOT,
         "## Choices\n",
         "The error that counts is the larger of the two. All settings, not only the fronts, are in "
@@ -95,11 +94,6 @@ def page(findings: Findings, command: str, machine: str) -> str:
 def verdicts(findings: Findings) -> list[str]:
     """A sentence per panel of choices."""
     return [f"{rows[0].panel}: {verdict(rows)}" for rows in findings.choices]
-
-
-def _targets(targets: Sequence[Target]) -> str:
-    lines = [(t.what, t.asked, t.found, "—" if t.passed is None else "yes" if t.passed else "**no**") for t in targets]
-    return markdown(["what", "asked", "found", "met"], lines)
 
 
 def _choices(panels: Sequence[Sequence[Row]]) -> Iterator[str]:

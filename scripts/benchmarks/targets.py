@@ -1,27 +1,16 @@
 """The targets, each with what this run measured."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from benchmarks.comparison import ANALYTIC, BY_FACE, BY_SAMPLE, DIRECT, KEPT, MITSUBA, PYTORCH3D, REFRESHED
 from benchmarks.panels import SAMPLES, Bench
-from benchmarks.results import Row, shown
+from benchmarks.results import Row, Target, shown
 from benchmarks.skipping import build_operators
 from benchmarks.steps import light_step, vertex_step
 from renderer.cache import OperatorCache
 from renderer.mesh import Mesh
 
 QUOTED = {32: 1.3, 224: 13.0}  # ms, PyTorch3D with its fragments kept, measured once on another machine
-
-
-@dataclass(frozen=True)
-class Target:
-    """What is asked, what this run found, and whether that is enough: None where it could not be measured."""
-
-    what: str
-    asked: str
-    found: str
-    passed: bool | None
 
 
 def compared(panels: Sequence[Sequence[Row]]) -> list[Target]:
