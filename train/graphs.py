@@ -11,6 +11,7 @@ from train.batches import to_unit
 
 COMPILE = ("auto", "always", "never")
 SIZES = (16, 32, 64, 128, 512)  # of a batch in eval mode: attacks, whose examples leave when fooled, and evaluation
+RECOMPILE_LIMIT = 8 * len(SIZES)  # with and without gradients, in both modes; torch's 8 would send the rest to Python
 
 
 def compiles(choice: str, device: torch.device) -> bool:
@@ -39,6 +40,7 @@ class FixedSizes(nn.Module):
         super().__init__()
         self.model = model
         self._graphs = torch.compile(model.forward, backend=backend, dynamic=False)
+        torch._dynamo.config.recompile_limit = RECOMPILE_LIMIT
 
     def forward(self, images: Tensor) -> Tensor:
         if self.training or len(images) > SIZES[-1]:

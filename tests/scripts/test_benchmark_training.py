@@ -318,8 +318,6 @@ for argument in sys.argv:
         for cell in ("augment-none+seed-0", "augment-none+seed-1"):
             (pathlib.Path(argument[6:]) / cell).mkdir(parents=True)
 """
-SWEEPS = "sweep:" in (ROOT / "conf" / "train.yaml").read_text().split("hydra:")[0]
-FAST = (ROOT / "conf" / "experiment" / "fast.yaml").is_file()
 
 
 def reproduce(tmp_path: Path, *arguments: str, **environment: str) -> tuple[int, list[list[str]], str]:
@@ -372,15 +370,7 @@ def test_reproducing_measures_then_trains_and_compares_each_experiment(tmp_path,
         assert (tmp_path / f"runs_{experiment}.md").read_text().startswith(f"# experiment={experiment}\n")
 
 
-@pytest.mark.parametrize(
-    "machine",
-    [
-        pytest.param("cpu", marks=pytest.mark.xfail(not SWEEPS, reason="sweep= is to come", strict=True)),
-        pytest.param(
-            "gpu", marks=pytest.mark.xfail(not (SWEEPS and FAST), reason="experiment=fast is to come", strict=True)
-        ),
-    ],
-)
+@pytest.mark.parametrize("machine", ["cpu", "gpu"])
 def test_every_arm_that_is_reproduced_is_a_valid_run(tmp_path, machine):
     _, (_, *calls), _ = reproduce(tmp_path, machine, **GIVEN)
     for train, arm in itertools.product(calls[::2], ("none", "random", "adversarial")):
