@@ -19,6 +19,8 @@ class Interrupted(SystemExit):
 class Interruption:
     """Notes the first SIGTERM or SIGINT while it is entered; a second one acts as it would without.
 
+    So does one that nobody asked for any more when it is left without an error.
+
     Signals reach a process's main thread alone: in another one, none is noted.
     """
 
@@ -31,8 +33,10 @@ class Interruption:
             self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, error: type | None, *rest) -> None:
         self._restore()
+        if error is None and self._number is not None:
+            signal.raise_signal(self._number)
 
     def requested(self) -> bool:
         """Whether to stop now; the same in all processes of a run."""
