@@ -1,9 +1,11 @@
 """One run from its configuration: data, scene, network, training, scores on the test set and on photographs."""
 
+import errno
+import os
 import platform
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -46,6 +48,7 @@ from train.wideresnet import WideResNet
 
 CONFIG = "config.yaml"
 PHOTOGRAPHS = "photographs"
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def load_data(config: DictConfig) -> DataSet:
@@ -70,7 +73,8 @@ def write_pictures(config: DictConfig, size: int) -> None:
     if config.data.name == "shapes" and config.data.pictures:
         console.info("writing held-out renders in hard light (not photographs) to %s", config.data.pictures)
         cache = TensorCache(cache_folder(config.renderer.cache))
-        write_held_out(Path(config.data.pictures), size, config.data.seed, cache)
+        with _one_error_without_room(config.data.pictures):
+            write_held_out(Path(config.data.pictures), size, config.data.seed, cache)
 
 
 def run(config: DictConfig, data: DataSet, folder: Path) -> None:
@@ -88,8 +92,10 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
     set_deterministic(settings.train.deterministic)
     train, validation = stratified_split(data.train, settings.data.validation, seed=0)
     trainer = build_trainer(settings, data, folder, device)
-    _open_folder(trainer, config)
+    with _one_error_without_room(folder):
+        _open_folder(trainer, config)
 
+    @_one_error_without_room(folder)
     def train_and_score() -> None:
         console.info(
             "%s pictures, %s classes; %s, %s, %d threads, %d processes",
@@ -100,11 +106,24 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
             torch.get_num_threads(),
             processes.count(),
         )
-        with closing(NoLog() if processes.index() else RunLog(folder, trainer.history)) as log:
-            trainer.fit(train.to(device), validation.to(device), log)
-            log.scalars(_test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device))
+        log = NoLog() if processes.index() else RunLog(folder, trainer.history)
+        trainer.fit(train.to(device), validation.to(device), log)
+        log.scalars(_test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device))
 
     return train_and_score
+
+
+@contextmanager
+def _one_error_without_room(folder: Path | str) -> Iterator[None]:
+    """InputError where the disk is full, whatever was being written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        raise InputError(
+            f"{folder} cannot be written ({error.strerror}): make room and go on with train.resume=true"
+        ) from error
 
 
 def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
@@ -146,7 +165,9 @@ def _write_config(config: DictConfig, folder: Path) -> None:
         "torchvision": str(torchvision.__version__),
         "numpy": np.__version__,
     }
-    OmegaConf.save(OmegaConf.create(resolved), folder / CONFIG)
+    temporary = folder / "config.tmp"  # so that the old file is whole where the new one finds no room
+    OmegaConf.save(OmegaConf.create(resolved), temporary)
+    os.replace(temporary, folder / CONFIG)
 
 
 def _build_service(

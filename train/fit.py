@@ -139,13 +139,14 @@ class Trainer:
     def resume(self) -> None:
         """Go on from the folder's newest whole checkpoint; InputError where it is from another architecture."""
         state, problem = checkpoint.load_newest(self.folder)
-        if problem:
-            console.warning("%s: going on from the one before", problem)
         if state["architecture"] != self.architecture:
             raise InputError(
                 f"the checkpoint in {self.folder} is from another architecture or other classes: resume with the "
                 f"settings of {self.folder / 'config.yaml'}, or start in another folder with run="
             )
+        if problem:
+            console.warning("%s: going on from the one before", problem)
+            (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or the next one would take the place of the whole
         self.load_state_dict(state)
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,11 +1,12 @@
-"""Ending a run between two steps when the system or the user asks for it: SIGTERM or SIGINT."""
+"""Ending a run between two steps when the system or the user asks for it by a signal."""
 
 import signal
 import threading
 
 from train.distributed import any_process
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT)
+BATCH_SYSTEM = getattr(signal, "SIGUSR2", None)  # submitit's, before a job's time is over; Windows has none
+SIGNALS = tuple(filter(None, (signal.SIGTERM, signal.SIGINT, BATCH_SYSTEM)))
 
 
 class Interrupted(SystemExit):
@@ -17,9 +18,9 @@ class Interrupted(SystemExit):
 
 
 class Interruption:
-    """Notes the first SIGTERM or SIGINT while it is entered; a second one acts as it would without.
+    """Notes the first of `SIGNALS` while it is entered; a second one acts as it would without.
 
-    Signals reach a process's main thread alone: in another one, none is noted.
+    So does the first where nobody asks for it until it is left. Signals reach a process's main thread alone: in another one, none is noted.
     """
 
     def __init__(self):
@@ -31,16 +32,21 @@ class Interruption:
             self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, error: type | None, *rest) -> None:
         self._restore()
+        if error is None and self._number is not None:
+            signal.raise_signal(self._number)
 
     def requested(self) -> bool:
         """Whether to stop now; the same in all processes of a run."""
         return any_process(self._number is not None)
 
     def stop(self) -> None:
-        """Raise `Interrupted`."""
-        raise Interrupted(self._number or signal.SIGTERM)  # the signal may have reached another process alone
+        """Raise `Interrupted`, after a batch system's own handler, which may queue the job again and exit."""
+        number = self._number or signal.SIGTERM  # the signal may have reached another process alone
+        if number == BATCH_SYSTEM and callable(signal.getsignal(number)):
+            signal.raise_signal(number)
+        raise Interrupted(number)
 
     def _note(self, number: int, frame) -> None:
         self._number = number

@@ -3,12 +3,16 @@
 import io
 import json
 import logging
+import os
+import socket
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.record_writer import RecordWriter
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 from torchvision.transforms.functional import to_pil_image
 from torchvision.utils import make_grid
 
@@ -16,29 +20,38 @@ from train.batches import to_bytes
 
 METRICS = "metrics.jsonl"
 console = logging.getLogger("train")
+logging.raiseExceptions = False  # where a disk is full, train.log lacks lines, and the run's own error is all one sees
 
 
 class RunLog:
     """Writes a run folder's metrics.jsonl, TensorBoard events and grids of renders.
 
     history: the epochs' lines of the checkpoint that a run goes on from. They replace what the file holds: later lines
-    come again, and one that a crash cut short does not count.
+    come again, and one that a crash cut short does not count. TensorBoard is told to forget what is later, too.
+
+    OSError where the disk does not take it.
     """
 
     def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
         self._metrics = folder / METRICS
         self._renders = folder / "renders"
+        self._board = folder / f"events.out.tfevents.{time.time():010.0f}.{socket.gethostname()}.{os.getpid()}"
+        self._epochs = len(history)
         self._metrics.write_text("".join(json.dumps(line) + "\n" for line in history))
-        self._board = SummaryWriter(str(folder), purge_step=len(history) + 1)
+        self._show(0, file_version="brain.Event:2")
+        self._show(self._epochs + 1, session_log=SessionLog(status=SessionLog.START))
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
-        """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores."""
+        """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores.
+
+        TensorBoard shows those one step after the last epoch, where a resumed run replaces them.
+        """
         line = values if epoch is None else {"epoch": epoch, **values}
         with open(self._metrics, "a") as file:
             file.write(json.dumps(line) + "\n")
-        for name, value in values.items():
-            self._board.add_scalar(name, value, epoch or 0)
-        self._board.flush()
+        self._epochs = self._epochs if epoch is None else epoch
+        shown = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+        self._show(epoch or self._epochs + 1, summary=Summary(value=shown))
 
     def renders(self, images: Tensor, epoch: int) -> None:
         """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
@@ -47,13 +60,14 @@ class RunLog:
         to_pil_image(grid).save(png, "PNG", compress_level=1)
         self._renders.mkdir(exist_ok=True)
         (self._renders / f"epoch_{epoch:03d}.png").write_bytes(png.getvalue())
-        # The same bytes for TensorBoard: its add_image would encode once more, at twice the cost of all the rest.
         channels, height, width = grid.shape
         image = Summary.Image(height=height, width=width, colorspace=channels, encoded_image_string=png.getvalue())
-        self._board.file_writer.add_summary(Summary(value=[Summary.Value(tag="renders", image=image)]), epoch)
+        self._show(epoch, summary=Summary(value=[Summary.Value(tag="renders", image=image)]))
 
-    def close(self) -> None:
-        self._board.close()
+    def _show(self, step: int, **content) -> None:
+        """Write an event for TensorBoard, at once; torch's SummaryWriter has a thread, whose errors nobody catches."""
+        with open(self._board, "ab") as file:
+            RecordWriter(file).write(Event(wall_time=time.time(), step=step, **content).SerializeToString())
 
 
 class NoLog:
@@ -63,9 +77,6 @@ class NoLog:
         pass
 
     def renders(self, images: Tensor, epoch: int) -> None:
-        pass
-
-    def close(self) -> None:
         pass
 
 

@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import re
@@ -127,6 +128,24 @@ def test_a_signal_ends_the_run_after_its_step_and_resuming_ends_as_if_it_had_not
     assert metrics_without_times(tmp_path) == metrics_without_times(finished)
 
 
+@pytest.mark.parametrize("listens", [True, False])
+def test_a_batch_systems_signal_writes_a_checkpoint_before_its_own_handler_acts(tiny, tmp_path, monkeypatch, listens):
+    epochs = []
+
+    def requeue(number, frame):
+        epochs.append(checkpoint.load(tmp_path / checkpoint.LAST)["epoch"])
+        raise SystemExit(-1)
+
+    before = signal.signal(signal.SIGUSR2, requeue if listens else signal.SIG_DFL)
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            run_with_signal(tiny("augment=none"), tmp_path, monkeypatch, 1, 2, signal.SIGUSR2)
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert (stopped.value.code, epochs) == ((-1, [1]) if listens else (128 + signal.SIGUSR2, []))
+    assert checkpoint.load(tmp_path / checkpoint.LAST)["under_way"]["step"] == 2
+
+
 def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
     def impatient(images, labels, *rest, **more):
         signal.raise_signal(signal.SIGINT)
@@ -162,6 +181,55 @@ def test_checkpoints_of_every_other_epoch_hold_the_same_and_the_last_one(tiny, p
     assert saved.count(checkpoint.LAST) == 2  # after epochs 2 and 3
     for name in (checkpoint.LAST, checkpoint.BEST):
         assert_same_weights(tmp_path / name, finished / name)
+
+
+def fail_with(number: int):
+    def fail(*arguments, **more):
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    "writer, done",
+    [
+        pytest.param("train.logs.RunLog._show", 0, id="TensorBoard"),
+        pytest.param("train.logs.RunLog.renders", 0, id="renders"),
+        pytest.param("train.logs.RunLog.scalars", 0, id="metrics"),
+        pytest.param("train.experiment.evaluate_photographs", 1, id="photographs"),
+    ],
+)
+def test_a_full_disk_is_one_error_wherever_it_is_met_and_the_run_can_go_on(
+    tiny, photos, tmp_path, monkeypatch, writer, done
+):
+    config = tiny("train.epochs=1", "train.resume=true", f"evaluate.photos={photos}")
+    with monkeypatch.context() as patch:
+        patch.setattr(writer, fail_with(errno.ENOSPC))
+        with pytest.raises(InputError, match=rf"{re.escape(str(tmp_path))} cannot be written \(No space left"):
+            run(config, load_data(config), tmp_path)
+    assert checkpoint.exists(tmp_path) == bool(done)
+    run(config, load_data(config), tmp_path)
+    assert len(read_metrics(tmp_path)) == 2
+
+
+def test_an_error_of_the_system_that_room_would_not_mend_is_not_called_a_full_disk(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr("train.logs.RunLog.scalars", fail_with(errno.EIO))
+    with pytest.raises(OSError, match="Input/output error"):
+        run(tiny("train.epochs=1"), load_data(tiny()), tmp_path)
+
+
+def test_a_configuration_that_does_not_fit_leaves_the_old_one_whole(tiny, finished, tmp_path, monkeypatch):
+    shutil.copytree(finished, tmp_path / "run")
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+
+    def cut_short(config, path):
+        Path(path).write_text("seed")
+        fail_with(errno.ENOSPC)()
+
+    monkeypatch.setattr(OmegaConf, "save", cut_short)
+    with pytest.raises(InputError, match=r"make room and go on with train\.resume=true"):
+        prepare(tiny("train.resume=true"), load_data(tiny()), tmp_path / "run")
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
 
 
 KILLED = """

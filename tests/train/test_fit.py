@@ -55,11 +55,7 @@ def make_trainer(folder, **settings) -> Trainer:
 
 
 def fit_noise(trainer: Trainer) -> list[dict]:
-    log = RunLog(trainer.folder)
-    try:
-        trainer.fit(noise(40), noise(20), log)
-    finally:
-        log.close()
+    trainer.fit(noise(40), noise(20), RunLog(trainer.folder))
     return read_metrics(trainer.folder)
 
 
@@ -154,9 +150,7 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
     weight, bias = (parameter.detach().clone().requires_grad_() for parameter in network[1].parameters())
     settings = TrainSettings(1, 4, 0.5, momentum=0.9, weight_decay=0.1, schedule="cosine")
     trainer = Trainer(settings, MixedPrecision(network, "float32"), {}, NoRenders(), Phases(), tmp_path, seed=0)
-    log = RunLog(tmp_path)
-    trainer.fit(Split(pictures.flatten(0, 1), labels.flatten()), noise(1), log)
-    log.close()
+    trainer.fit(Split(pictures.flatten(0, 1), labels.flatten()), noise(1), RunLog(tmp_path))
 
     velocities = [torch.zeros_like(weight), torch.zeros_like(bias)]
     losses = []
@@ -205,6 +199,17 @@ def test_a_resumed_run_remembers_the_best_epoch(tmp_path, monkeypatch):
     assert (last["epoch"], last["epoch_best"], last["validation_accuracy_best"]) == (2, 1, 0.6)
 
 
+def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tmp_path):
+    """So a second accident, while the next one is written, is not the end of the run."""
+    fit_noise(make_trainer(tmp_path, epochs=2))
+    (tmp_path / checkpoint.LAST).write_bytes(b"")
+    trainer = make_trainer(tmp_path, epochs=2)
+    trainer.resume()
+    assert trainer.epoch == 1
+    fit_noise(trainer)
+    assert [checkpoint.load(tmp_path / name)["epoch"] for name in (checkpoint.PREVIOUS, checkpoint.LAST)] == [1, 2]
+
+
 def test_epochs_train_in_training_mode_however_the_network_is_found(tmp_path):
     trainer = make_trainer(tmp_path, epochs=2)
     trainer.model.eval()
@@ -225,9 +230,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_with_the_last_good_checkpoint(tm
 def test_training_learns_what_can_be_told_apart(tmp_path):
     data = noise(64)
     data.images[torch.arange(64), data.labels] //= 4
-    log = RunLog(tmp_path)
-    make_trainer(tmp_path, epochs=5, schedule="one_cycle").fit(data, data, log)
-    log.close()
+    make_trainer(tmp_path, epochs=5, schedule="one_cycle").fit(data, data, RunLog(tmp_path))
     assert read_metrics(tmp_path)[-1]["validation/accuracy"] > 0.95
 
 

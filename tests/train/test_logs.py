@@ -1,4 +1,5 @@
 import json
+import logging
 import struct
 
 import numpy as np
@@ -7,14 +8,13 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from train.logs import METRICS, RunLog, read_metrics
+from train.logs import METRICS, RunLog, console, read_metrics
 
 
 def write_epochs(folder, epochs: range, history=()) -> None:
     log = RunLog(folder, history)
     for epoch in epochs:
         log.scalars({"train/loss": 1 / epoch, "validation/accuracy": 0.25}, epoch)
-    log.close()
 
 
 def test_each_epoch_is_one_line_of_json_and_the_final_scores_another(tmp_path):
@@ -22,7 +22,6 @@ def test_each_epoch_is_one_line_of_json_and_the_final_scores_another(tmp_path):
     log.scalars({"train/loss": 0.1 + 0.2}, epoch=1)
     first = (tmp_path / METRICS).read_text()  # at once, for whoever looks on
     log.scalars({"test/accuracy": 1.0})
-    log.close()
     assert first == '{"epoch": 1, "train/loss": 0.30000000000000004}\n'
     lines = (tmp_path / METRICS).read_text().splitlines()
     assert [json.loads(line) for line in lines] == read_metrics(tmp_path)
@@ -40,7 +39,6 @@ def test_resuming_keeps_the_epochs_of_the_checkpoint_alone(tmp_path, done):
     epochs = read_metrics(tmp_path)
     log = RunLog(tmp_path, epochs)
     log.scalars({"test/accuracy": 0.5})
-    log.close()
     with open(tmp_path / METRICS, "a") as file:
         file.write('{"epoch": 3, "train/lo')
     assert len(read_metrics(tmp_path)) == 4
@@ -52,7 +50,7 @@ def test_lines_that_a_file_has_lost_come_back_from_the_checkpoint(tmp_path):
     write_epochs(tmp_path, range(1, 4))
     epochs = read_metrics(tmp_path)
     (tmp_path / METRICS).write_text("")
-    RunLog(tmp_path, epochs).close()
+    RunLog(tmp_path, epochs)
     assert read_metrics(tmp_path) == epochs
 
 
@@ -62,7 +60,6 @@ def test_tensorboard_reads_the_scalars_and_the_renders(tmp_path):
     log.scalars({"train/loss": 0.5}, epoch=1)
     log.scalars({"train/loss": 0.25}, epoch=2)
     log.renders(renders, epoch=2)
-    log.close()
     events = EventAccumulator(str(tmp_path)).Reload()
     assert [(event.step, event.value) for event in events.Scalars("train/loss")] == [(1, 0.5), (2, 0.25)]
     (image,) = events.Images("renders")
@@ -81,3 +78,24 @@ def test_tensorboard_shows_each_epoch_of_a_resumed_run_once(tmp_path):
     write_epochs(tmp_path, range(2, 5), read_metrics(tmp_path)[:1])
     events = EventAccumulator(str(tmp_path)).Reload()
     assert [event.step for event in events.Scalars("train/loss")] == [1, 2, 3, 4]
+
+
+def test_tensorboard_shows_the_final_scores_of_a_run_that_is_scored_again_once(tmp_path):
+    write_epochs(tmp_path, range(1, 4))
+    epochs = read_metrics(tmp_path)
+    for accuracy in (0.5, 0.25):
+        RunLog(tmp_path, epochs).scalars({"test/accuracy": accuracy})
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert [(event.step, event.value) for event in events.Scalars("test/accuracy")] == [(4, 0.25)]
+
+
+def test_a_console_line_that_finds_no_room_is_lost_and_nothing_else(capsys):
+    handler = logging.StreamHandler(open("/dev/full", "w"))  # noqa: SIM115 (closing it fails, too)
+    console.addHandler(handler)
+    try:
+        console.warning("a line")
+    finally:
+        console.removeHandler(handler)
+        with pytest.raises(OSError, match="No space left"):
+            handler.stream.close()
+    assert capsys.readouterr() == ("", "")

@@ -1,0 +1,137 @@
+"""One process of a training run: where it is, and how it ends by itself, by a signal or by an error."""
+
+import re
+import resource
+import signal
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from torture.workshop import Workshop
+from train.logs import METRICS
+
+PATIENCE = 300  # seconds after which a process that should have ended has hung
+POLL = 0.002
+OUTERMOST = "_run_module_as_main"  # function of every stack; the last to be written
+
+# By the innermost of these functions on the stack; None: any function of the file.
+PHASES = {
+    ("checkpoint.py", "save"): "checkpoint",
+    ("logs.py", None): "log",
+    ("fit.py", "_begin_epoch"): "attack",
+    ("fit.py", "_train"): "training",
+    ("fit.py", "_end_epoch"): "evaluation",
+    ("experiment.py", "_test_scores"): "scoring",
+    ("experiment.py", "_photograph_scores"): "scoring",
+    ("fit.py", "fit"): "training",
+}
+START, END = "start-up", "exit"
+FIT = ("attack", "training", "evaluation")
+ORDER = (START, *FIT, "log", "checkpoint", "scoring", END)
+LINES = {
+    "training": lambda epochs: 0,
+    "half": lambda epochs: epochs // 2,
+    "scoring": lambda epochs: epochs,
+    "end": lambda epochs: epochs + 1,
+}
+FRAME = re.compile(r'File ".*/train/(\w+\.py)", line \d+ in (\w+)')
+
+
+@dataclass(frozen=True)
+class Moment:
+    """seconds: after the process's "start", or after it began to train and logged as many lines as LINES says."""
+
+    since: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Ending:
+    """status: as a shell says it. caught: whether the process itself ended, and no signal ended it."""
+
+    status: int
+    caught: bool
+    output: str
+    errors: str
+
+
+class Life:
+    """A process that begins or resumes `run`. limit: bytes that none of its files may exceed."""
+
+    def __init__(self, workshop: Workshop, run: Path, limit: int | None = None):
+        self.run = run
+        self._epochs = workshop.epochs
+        self._boards = self._count_boards()  # of earlier lives
+        self._process = subprocess.Popen(
+            workshop.command(run),
+            cwd=workshop.folder,
+            env=workshop.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        if limit is not None:
+            resource.prlimit(self._process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+        self._stacks = workshop.stacks / f"{self._process.pid}.stacks"
+
+    def wait(self, moment: Moment) -> bool:
+        """Whether the process still runs when the moment comes."""
+        while not self._reached(moment.since):
+            if self._process.poll() is not None:
+                return False
+            time.sleep(POLL)
+        try:
+            self._process.wait(moment.seconds)
+        except subprocess.TimeoutExpired:
+            return True
+        return False
+
+    def send(self, number: signal.Signals) -> str:
+        """The phase in which the signal found the process."""
+        phase = self.phase()
+        self._process.send_signal(number)
+        return phase
+
+    def phase(self) -> str:
+        """Where the process is, by the stack that it writes when asked; START before it can be asked."""
+        before = self._stacks.stat().st_size if self._stacks.is_file() else 0
+        if not before:
+            return START
+        self._process.send_signal(signal.SIGUSR1)
+        deadline = time.monotonic() + 0.2  # a process that is ending may answer no more
+        while OUTERMOST not in (stack := self._stacks.read_text()[before:]) and time.monotonic() < deadline:
+            time.sleep(POLL)
+        return innermost_phase(stack) or (END if self._reached("training") else START)
+
+    def end(self) -> Ending:
+        """Wait for the end; a process that hangs is killed and says so."""
+        try:
+            output, errors = self._process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            output, errors = self._process.communicate()
+            errors += f"hung for {PATIENCE} s"
+        self._stacks.unlink(missing_ok=True)
+        code = self._process.returncode
+        return Ending(abs(code) + 128 * (code < 0), code >= 0, output, errors)
+
+    def _reached(self, since: str) -> bool:
+        if since == "start":
+            return True
+        return self._count_boards() > self._boards and self._count_lines() >= LINES[since](self._epochs)
+
+    def _count_boards(self) -> int:
+        return len(list(self.run.glob("events.out.tfevents.*")))
+
+    def _count_lines(self) -> int:
+        path = self.run / METRICS
+        return path.read_bytes().count(b"\n") if path.is_file() else 0
+
+
+def innermost_phase(stack: str) -> str | None:
+    """What `faulthandler` wrote, the innermost function first, as a phase; None outside them all."""
+    for file, function in FRAME.findall(stack):
+        if phase := PHASES.get((file, function)) or PHASES.get((file, None)):
+            return phase
+    return None
