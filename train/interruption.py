@@ -20,7 +20,8 @@ class Interrupted(SystemExit):
 class Interruption:
     """Notes the first of `SIGNALS` while it is entered; a second one acts as it would without.
 
-    So does the first where nobody asks for it until it is left. Signals reach a process's main thread alone: in another one, none is noted.
+    So does the first where nobody asks for it until it is left. Signals reach a process's main thread alone: in another
+    one, none is noted.
     """
 
     def __init__(self):
