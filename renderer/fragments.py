@@ -109,18 +109,19 @@ def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settin
     else:
         pixels, pixel = _compact(hits // samples**2, size**2)
         counts = np.bincount(pixel, minlength=len(pixels))
-    corners = faces.take(seen, axis=0)
-    outlines = torch.from_numpy(projected[:, :2].take(corners, axis=0))
-    a, b, c = outlines.unbind(1)
+    corners = np.ascontiguousarray(faces.take(seen, axis=0).T)
+    outlines = projected[:, :2].T.take(corners, axis=1)
+    (ax, bx, cx), (ay, by, cy) = outlines
+    behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
     return Fragments(
         size=size,
         samples=samples,
         pixels=torch.from_numpy(pixels),
         coverage=torch.from_numpy(counts / samples**2),
         faces=torch.from_numpy(seen),
-        corners=torch.from_numpy(corners),
-        facing=torch.where(_cross(b - a, c - a) < 0, -1.0, 1.0).double()[:, None],
-        outlines=outlines,
+        corners=torch.from_numpy(corners).T,  # with all first corners side by side in memory, as they are read
+        facing=torch.from_numpy(np.where(behind, -1.0, 1.0))[:, None],
+        outlines=torch.from_numpy(outlines.T),
         pixel=torch.from_numpy(pixel),
         face=torch.from_numpy(face),
         sample=torch.from_numpy(hits),
