@@ -91,7 +91,7 @@ def _radiance(operator: Operator, lights: Tensor) -> Tensor:
     live = live_coefficients(operator.degree).to(lights.device)
     kept = lights.index_select(-2, live).to(operator.transfer.dtype)
     if len(operator.transfer) == 1:
-        product = kept.mT @ operator.transfer[0] * operator.albedo
+        product = (kept.mT @ operator.transfer[0]).mul_(operator.albedo)
     else:
         product = torch.einsum("...kc,ckp->...cp", kept, operator.transfer)
     return product.to(lights.dtype)
