@@ -163,9 +163,9 @@ def _computed_in(dtype: torch.dtype) -> torch.dtype:
 
 def smooth_normals(fragments: Fragments, vertices: Tensor, faces: Tensor) -> Tensor:
     """(S, 3) vertex normals interpolated to the samples, on the side that the camera sees; not of unit length."""
+    corners = fragments.corners.T.flatten()
     near = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
-    near[fragments.corners.flatten()] = True
-    around = faces[near[faces].any(1)]  # the other faces touch no vertex that a sample sees
-    normals = vertex_normals(vertices, around)[fragments.corners] * fragments.facing.to(vertices)[:, None]
-    barycentric = fragments.barycentric().to(vertices)
-    return torch.einsum("sc,scd->sd", barycentric, normals.index_select(0, fragments.face))
+    near[corners] = True
+    around = faces[near.index_select(0, faces.T.flatten()).view(3, -1).any(0)]  # the others touch no vertex in sight
+    normals = vertex_normals(vertices, around).T.index_select(1, corners).unflatten(1, (3, -1))
+    return fragments.interpolate((normals * fragments.facing.T.to(normals)).permute(2, 1, 0))
