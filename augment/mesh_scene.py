@@ -141,8 +141,8 @@ class MeshScene:
         (fragments,) = build_fragments(
             vertices, self.mesh.faces, [camera], self.settings, self.backend, closed=self.mesh.closed
         )
-        albedo = surface_albedo(self.mesh, fragments, self.settings.encoding) * self.gain
-        return fragments.to(self.light.device), albedo.to(self.light)
+        fragments = fragments.to(self.light.device)
+        return fragments, (surface_albedo(self.mesh, fragments, self.settings.encoding) * self.gain).to(self.light)
 
 
 def _in_order(parts: Sequence[Tensor], places: Iterable[Sequence[int]]) -> Tensor:

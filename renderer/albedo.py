@@ -1,6 +1,8 @@
 """The albedo at a view's samples, linear: of the mesh as it was loaded, or as a parameter per face or per texel."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,14 +13,30 @@ from renderer.fragments import BLOCK, Fragments
 from renderer.image import decode
 from renderer.mesh import Mesh
 
-Linear = Callable[[Tensor], Tensor]
+
+@dataclass(frozen=True)
+class _Texture:
+    """texels: row-major indices (S,) → linear albedo (3, S)."""
+
+    height: int
+    width: int
+    texels: Callable[[Tensor], Tensor]
 
 
 def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
     """(S, 3) float64 linear albedo at the samples: corner colour × texture, each decoded before it is interpolated."""
     decoded = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(fragments.coverage)
-    textures = [torch.from_numpy(texture).to(decoded.device) for texture in mesh.textures]
-    return _albedo(mesh, fragments, textures, lambda texels: decoded.index_select(0, texels.long()), encoding)
+
+    bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=decoded.device)
+
+    def texels(packed: Tensor, index: Tensor) -> Tensor:
+        channels = (packed.index_select(0, index) >> bits) & 255
+        return decoded.index_select(0, channels.long().flatten()).view(3, -1)
+
+    packed = [torch.from_numpy(each).to(decoded.device) for each in mesh.packed_textures]
+    return _albedo(
+        mesh, fragments, [_Texture(*each.shape, partial(texels, each.flatten())) for each in packed], encoding
+    )
 
 
 def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], encoding: str) -> Tensor:
@@ -28,7 +46,8 @@ def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor]
     """
     for texture in textures:
         require_bounded(texture=texture)
-    return _albedo(mesh, fragments, textures, lambda texels: texels, encoding)
+    rows = [_Texture(*each.shape[:2], partial(torch.index_select, each.flatten(0, 1).T, 1)) for each in textures]
+    return _albedo(mesh, fragments, rows, encoding)
 
 
 def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
@@ -37,25 +56,35 @@ def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
     return _of_faces(albedo.index_select(0, fragments.faces), fragments)
 
 
-def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], linear: Linear, encoding: str) -> Tensor:
-    """Corner colour × texture at the samples. `linear` turns texels (N,), as they are stored, into linear albedo."""
-    if mesh.one_color is not None:
-        color = _linear_colors(mesh.one_color, fragments, encoding)
-        return color[:, None].expand(3, len(fragments.face)).T
+def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[_Texture], encoding: str) -> Tensor:
+    """Corner colour × texture at the samples."""
     faces = fragments.faces.cpu().numpy()
-    colors = _linear_colors(mesh.corner_colors.take(faces, axis=0), fragments, encoding)
-    one_per_face = (colors == colors[:, :1]).all()
-    albedo = _of_faces(colors[:, 0], fragments) if one_per_face else fragments.interpolate(colors)
+    albedo = _colors(mesh, faces, fragments, encoding)
     if not textures:
         return albedo
     uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(albedo)).T
-    texture_ids = torch.from_numpy(mesh.texture_ids[faces]).to(fragments.face.device).index_select(0, fragments.face)
-    albedo = albedo.T
+    texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)
+    if len(textures) == 1 and not texture_ids.any():
+        return albedo * _bilinear(textures[0], uvs).T
+    albedo, texture_ids = albedo.T, texture_ids.index_select(0, fragments.face)
     for index, texture in enumerate(textures):
         here = torch.nonzero(texture_ids == index).squeeze(1)
-        value = _bilinear(texture, linear, uvs.index_select(1, here))
+        value = _bilinear(texture, uvs.index_select(1, here))
         albedo = albedo.index_copy(1, here, albedo.index_select(1, here) * value)
     return albedo.T
+
+
+def _colors(mesh: Mesh, faces: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:
+    """(S, 3) the corners' colours, as authored for display, as linear albedo, float64 on the fragments' device."""
+    colors = mesh.corner_colors[:1] if mesh.one_color else mesh.corner_colors.take(faces, axis=0)
+    corner_colors = torch.from_numpy(colors).to(fragments.coverage)
+    require_bounded(corner_colors=corner_colors)
+    corner_colors = decode(corner_colors, encoding)
+    if mesh.one_color:
+        return corner_colors[0, 0][:, None].expand(3, len(fragments.face)).T
+    if (corner_colors == corner_colors[:, :1]).all():
+        return _of_faces(corner_colors[:, 0], fragments)
+    return fragments.interpolate(corner_colors)
 
 
 def _of_faces(values: Tensor, fragments: Fragments) -> Tensor:
@@ -63,26 +92,16 @@ def _of_faces(values: Tensor, fragments: Fragments) -> Tensor:
     return values.T.contiguous().index_select(1, fragments.face).T  # by rows: it takes half as long
 
 
-def _linear_colors(colors: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:
-    """Colours as authored to linear albedo, float64 on the fragments' device."""
-    corner_colors = torch.from_numpy(colors).to(fragments.coverage)
-    require_bounded(corner_colors=corner_colors)
-    return decode(corner_colors, encoding)
-
-
-def _bilinear(texture: Tensor, linear: Linear, uvs: Tensor) -> Tensor:
-    """(3, S) linear albedo of a texture (H, W, 3) that repeats, at uvs (2, S).
+def _bilinear(texture: _Texture, uvs: Tensor) -> Tensor:
+    """(3, S) linear albedo of a texture that repeats, at uvs (2, S).
 
     Texel centres are at half-integers, v = 0 is the bottom row's lower edge.
     """
-    (height, width), texels = texture.shape[:2], texture.flatten()
-    channels = torch.arange(3, device=uvs.device)[:, None]
     blocks = []
     for u, v in (block.unbind() for block in uvs.split(BLOCK, dim=1)):
-        columns, rows = _neighbours(u, width), _neighbours(1 - v, height)
-        taps = [(down * across, row * width + column) for row, down in rows for column, across in columns]
-        values = [linear(texels.index_select(0, (3 * tap.long() + channels).flatten())) for _, tap in taps]
-        blocks.append(sum(weight * value.view(3, -1) for (weight, _), value in zip(taps, values, strict=True)))
+        columns, rows = _neighbours(u, texture.width), _neighbours(1 - v, texture.height)
+        taps = [(down * across, row * texture.width + column) for row, down in rows for column, across in columns]
+        blocks.append(sum(weight * texture.texels(index.long()) for weight, index in taps))
     return torch.cat(blocks, dim=1)
 
 

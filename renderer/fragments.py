@@ -75,7 +75,7 @@ class Fragments:
 
     def interpolate(self, corners: Tensor) -> Tensor:
         """(S, D) values at the samples of faces whose corners have values (G, 3, D); differentiable in them."""
-        rows = corners.permute(1, 2, 0).flatten(0, 1)
+        rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
         return _Interpolation.apply(rows, self.face, self._barycentric).T
 
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
