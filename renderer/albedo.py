@@ -82,7 +82,7 @@ def _colors(mesh: Mesh, faces: np.ndarray, fragments: Fragments, encoding: str) 
     corner_colors = decode(corner_colors, encoding)
     if mesh.one_color:
         return corner_colors[0, 0][:, None].expand(3, len(fragments.face)).T
-    if (corner_colors == corner_colors[:, :1]).all():
+    if mesh.one_color_per_face:
         return _of_faces(corner_colors[:, 0], fragments)
     return fragments.interpolate(corner_colors)
 

@@ -52,13 +52,15 @@ class Fragments:
     @cached_property
     def _barycentric(self) -> Tensor:
         """(3, S): colours, texture coordinates and normals all ask for it."""
-        a, b, c = self.outlines.unbind(1)
-        area = _cross(b - a, c - a)[:, None]
-        area = area.masked_fill(area == 0, 1)
-        faces = torch.cat([a, (b - a) / area, (c - a) / area], dim=1).T.contiguous()
+        outlines = self.outlines.permute(2, 1, 0)
+        edges = outlines[:, 1:] - outlines[:, :1]
+        (bx, cx), (by, cy) = edges
+        area = bx * cy - cx * by
+        scaled = edges / area.masked_fill(area == 0, 1)
+        faces = torch.cat([outlines[:, 0], scaled.flatten(0, 1)])
         weights = faces.new_empty(3, len(self.face))
         for weight, face, at in _blocks(weights, self.face, self.positions().T):
-            x0, y0, bx, by, cx, cy = faces.index_select(1, face)
+            x0, y0, bx, cx, by, cy = faces.index_select(1, face)
             x, y = at[0] - x0, at[1] - y0
             weight[1], weight[2] = x * cy - y * cx, y * bx - x * by
             weight[0] = 1 - weight[1] - weight[2]
@@ -184,7 +186,3 @@ def _divide(numbers: Tensor, by: int) -> tuple[Tensor, Tensor]:
     """(quotient, remainder) of whole numbers, as floats."""
     quotient = (numbers / by).floor()
     return quotient, numbers - quotient * by
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -72,6 +72,11 @@ class Mesh:
         return len(self.faces) > 0 and bool((self.corner_colors == self.corner_colors[:1, :1]).all())
 
     @cached_property
+    def one_color_per_face(self) -> bool:
+        """Whether the corners of each face have the same colour."""
+        return bool((self.corner_colors == self.corner_colors[:, :1]).all())
+
+    @cached_property
     def packed_textures(self) -> tuple[np.ndarray, ...]:
         """(H, W) int32 each: red, green and blue in the bits from 0, 8 and 16, since one number is looked up faster."""
         return tuple(texture.astype(np.int32) @ np.array([1, 2**8, 2**16], dtype=np.int32) for texture in self.textures)
