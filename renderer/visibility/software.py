@@ -13,15 +13,19 @@ SUBSAMPLES = 2**SUBSAMPLE_BITS  # corners snap to this fraction of a sample
 FAR = 2**24 - 1  # depth is a 24-bit key, and surface at the far plane itself is not drawn
 FACE_BITS = 32  # a sample's key is its depth above so many bits of face index, so the least key wins
 EMPTY = (FAR << FACE_BITS) - 1  # less than any key at the far plane; its face index reads -1
-FACES, PARTS = 2**13, 2**14  # faces, and their rows or samples, at a time: what they take stays in the cache
+FACES, PARTS = 2**14, 2**13  # faces, and their rows or samples, at a time: what they take stays in the cache
 
 
 def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """Ids by the contract in `renderer.visibility`, for finite points."""
-    return np.stack([_rasterise_view(view, faces, resolution, closed) for view in points])
+    ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
+    for view, picture in zip(points, ids, strict=True):
+        picture[:] = _keys(view, faces, resolution, closed).reshape(picture.shape)  # of which an id is the lower half
+    return ids
 
 
-def _rasterise_view(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+    """(R²,) the least key of each sample."""
     positions, depths = _snap(points[:, :2], resolution), (points[:, 2] + 1) / 2 * FAR
     keys = np.full(resolution * resolution, EMPTY)
     for begin in range(0, len(faces), FACES):
@@ -38,8 +42,8 @@ def _rasterise_view(points: np.ndarray, faces: np.ndarray, resolution: int, clos
             sample, face = row * resolution + left, ids.take(triangle)
             for span, step in _parts(right - left):
                 depth = at_row.take(span) + slope.take(span) * (offset.take(span) + step)
-                np.minimum.at(keys, sample.take(span) + step, _keys(depth, face.take(span)))
-    return keys.reshape(resolution, resolution).astype(np.int32)
+                np.minimum.at(keys, sample.take(span) + step, _key(depth, face.take(span)))
+    return keys
 
 
 def _snap(points: np.ndarray, resolution: int) -> np.ndarray:
@@ -120,7 +124,7 @@ def _planes(corners: np.ndarray, depths: np.ndarray) -> np.ndarray:
     return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, a, by_column, by_row])
 
 
-def _keys(depth: np.ndarray, face: np.ndarray) -> np.ndarray:
+def _key(depth: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Depths, rounded and limited to [0, FAR), above face indices."""
     depth = np.rint(depth).astype(np.int64)
     depth = np.minimum(depth.view(np.uint64), FAR).view(np.int64)  # negative ones are large as unsigned
