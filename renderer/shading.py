@@ -85,6 +85,10 @@ class _Irradiance(torch.autograd.Function):
         unit, polynomial = unit.to(light.dtype), _Polynomial.of(light)
         blocks = zip(*map(polynomial, unit.split(BLOCK, dim=1)), strict=True)
         value, slope = (torch.cat(parts, dim=-1) for parts in blocks)
+        absent = torch.nonzero(length == 0).squeeze(1)
+        if len(absent):  # the homogeneous polynomials are not those of `basis` at 0
+            live, rows = _live_harmonics(unit[:, absent], math.isqrt(len(light)) - 1)
+            value[:, absent] = light[live].T @ rows
         ctx.save_for_backward(unit, length, slope if ctx.needs_input_grad[0] else None)
         ctx.light = light.shape
         return value
@@ -99,12 +103,10 @@ class _Irradiance(torch.autograd.Function):
             tangential = solid - unit * (unit * solid).sum(0)
             by_normal = tangential / length.masked_fill(length == 0, torch.inf)
         if ctx.needs_input_grad[1]:
-            degree = math.isqrt(ctx.light[0]) - 1
-            live = live_coefficients(degree).tolist()
-            blocks = zip(unit.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True)
-            by_live = sum(torch.stack(select_rows(block, live)) @ above.T for block, above in blocks)
             by_light = unit.new_zeros(ctx.light)
-            by_light[live] = by_live * _factors(degree).to(unit)[live]
+            for block, above in zip(unit.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True):
+                live, rows = _live_harmonics(block, math.isqrt(ctx.light[0]) - 1)
+                by_light[live] += rows @ above.T
         return by_normal, by_light
 
 
@@ -148,6 +150,12 @@ def _slopes(degree: int) -> Tensor:
     l = bands(degree)
     slopes = monomial_coefficients(degree - 1) @ homogeneous_gradients(degree)[:, : degree**2]
     return slopes * ((l > 0) & (l % 2 == degree % 2))
+
+
+def _live_harmonics(unit: Tensor, degree: int) -> tuple[list[int], Tensor]:
+    """(the K coefficients that reach a surface, what one of each does at unit or zero vectors (3, N): (K, N))."""
+    live = live_coefficients(degree).tolist()
+    return live, torch.stack(select_rows(unit, live)) * _factors(degree).to(unit)[live]
 
 
 @per_degree

@@ -22,7 +22,7 @@ from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError
 from renderer.fragments import Fragments, build_fragments
-from renderer.harmonics import MAX_DEGREE, lambertian_factors, live_coefficients, rotate
+from renderer.harmonics import MAX_DEGREE, irradiance_basis, lambertian_factors, live_coefficients, rotate
 from renderer.image import PictureSettings, clamped, develop
 from renderer.mesh import Mesh
 from renderer.shading import irradiance, radiance
@@ -128,6 +128,18 @@ def test_the_irradiance_of_short_and_of_zero_normals_is_finite_and_no_gradient_i
         lit = irradiance(normals, draw(49, 3).to(dtype))
         (gradient,) = torch.autograd.grad(lit.sum(), normals)
         assert lit.isfinite().all() and not gradient.isnan().any() and not gradient[-len(SPECIAL) :].any()
+
+
+def test_a_zero_normal_has_the_irradiance_of_the_basis_at_zero():
+    """And its derivative by the light, among normals that are not zero."""
+    normals, light = some_normals(5).index_fill(0, torch.tensor([1, 4]), 0), draw(49, 3).requires_grad_(True)
+    lit = irradiance(normals, light)
+    rows = irradiance_basis(normals, 6)
+    expected = rows @ light[live_coefficients(6)]
+    torch.testing.assert_close(lit, expected.T, rtol=0, atol=16 * EPS * brightest(light))
+    upstream = draw(*lit.shape, seed=1)
+    (found,), (by_basis,) = (torch.autograd.grad(value, light, upstream) for value in (lit, expected.T))
+    torch.testing.assert_close(found, by_basis, rtol=0, atol=64 * EPS * float(by_basis.abs().max()))
 
 
 def test_the_blocks_are_of_no_consequence(monkeypatch):
