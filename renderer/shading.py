@@ -99,7 +99,8 @@ class _Irradiance(torch.autograd.Function):
         unit, length, slope = ctx.saved_tensors
         by_normal = by_light = None
         if ctx.needs_input_grad[0]:
-            solid = (slope * upstream).sum(1)
+            solid = slope[:, 0] * upstream[0]
+            solid.addcmul_(slope[:, 1], upstream[1]).addcmul_(slope[:, 2], upstream[2])
             tangential = solid - unit * (unit * solid).sum(0)
             by_normal = tangential / length.masked_fill(length == 0, torch.inf)
         if ctx.needs_input_grad[1]:
@@ -139,8 +140,10 @@ class _Polynomial:
         A homogeneous polynomial is its slope times its argument, over its degree (Euler).
         """
         slope = torch.addmm(self.linear, self.even, monomials(unit, self.degree - 1)).unflatten(0, (3, 3))
-        once = torch.addmm(self.constant, self.linear.view(3, 3).T, unit, alpha=1 - 1 / self.degree)
-        return torch.add(once, (slope * unit[:, None]).sum(0), alpha=1 / self.degree), slope
+        value = torch.addmm(self.constant, self.linear.view(3, 3).T, unit, alpha=1 - 1 / self.degree)
+        for along, component in zip(slope, unit, strict=True):
+            value.addcmul_(along, component, value=1 / self.degree)
+        return value, slope
 
 
 @per_degree
