@@ -1,7 +1,7 @@
 """One mesh before cameras and backgrounds, rendered under conditions that an attack may change."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -86,8 +86,7 @@ class MeshScene:
             for view, camera in enumerate(self.cameras[example]):
                 rows[camera].append(row * self.views + view)
         parts = [self._relit_view(camera, conditions, examples, cells) for camera, cells in rows.items()]
-        order = torch.tensor([cell for cells in rows.values() for cell in cells]).argsort()
-        return torch.cat(parts)[order.to(self.light.device)].unflatten(0, (len(examples), self.views))
+        return _in_order(parts, rows.values()).unflatten(0, (len(examples), self.views))
 
     def _relit_view(
         self, camera: OrthographicCamera, conditions: Conditions, examples: list[int], cells: list[int]
@@ -95,8 +94,8 @@ class MeshScene:
         """(B, 3, size²) pictures from one camera; cells are rows of A × V."""
         row = torch.tensor(cells, device=self.light.device) // self.views
         operator = self.operator(camera)
-        seen = operator.radiance(conditions.light[row])
-        behind = self.backgrounds[torch.tensor(examples, device=self.light.device)[row]]
+        seen = operator.radiance(conditions.light.index_select(0, row))
+        behind = self.backgrounds.index_select(0, torch.tensor(examples, device=self.light.device)[row])
         return self._develop(seen, operator.coverage, behind, operator.pixels)
 
     def _reshade(self, conditions: Conditions, examples: list[int]) -> Tensor:
@@ -120,12 +119,13 @@ class MeshScene:
             albedo = clamp(albedo + offset, albedo.clamp(min=1))
         smooth_faces = self.faces if self.settings.normals == "smooth" else None
         seen = radiance(fragments, vertices, conditions.light[row], albedo, smooth_faces)
-        return self._develop(seen, fragments.coverage.to(seen), self.backgrounds[example], fragments.pixels)
+        return self._develop(seen, fragments.coverage.to(seen), self.backgrounds[example].clone(), fragments.pixels)
 
     def _develop(self, seen: Tensor, coverage: Tensor, behind: Tensor, pixels: Tensor) -> Tensor:
-        """(..., 3, size²) pictures of radiance (..., 3, P) in front of pictures."""
-        covered = develop(seen, coverage[None], behind[..., pixels], self.settings.encoding)
-        return behind.index_copy(-1, pixels, covered)
+        """(..., 3, size²) pictures of radiance (..., 3, P) in front of pictures, which are overwritten."""
+        rows = behind.flatten(0, -2)  # torch selects from matrices ten times faster than from stacks of them
+        covered = develop(seen, coverage[None], rows.index_select(1, pixels).view_as(seen), self.settings.encoding)
+        return rows.index_copy_(1, pixels, covered.flatten(0, -2)).view_as(behind)
 
     def _build_operator(self, camera: OrthographicCamera) -> Operator:
         built = self._operators.operators(
@@ -141,5 +141,13 @@ class MeshScene:
         (fragments,) = build_fragments(
             vertices, self.mesh.faces, [camera], self.settings, self.backend, closed=self.mesh.closed
         )
-        albedo = surface_albedo(self.mesh, fragments, self.settings.encoding) * self.gain
-        return fragments.to(self.light.device), albedo.to(self.light)
+        fragments = fragments.to(self.light.device)
+        return fragments, (surface_albedo(self.mesh, fragments, self.settings.encoding) * self.gain).to(self.light)
+
+
+def _in_order(parts: Sequence[Tensor], places: Iterable[Sequence[int]]) -> Tensor:
+    """The entries of several tensors in one, each at its place."""
+    if len(parts) == 1:
+        return parts[0]
+    order = torch.tensor([place for part in places for place in part]).argsort()
+    return torch.cat(parts).index_select(0, order.to(parts[0].device))

@@ -1,24 +1,42 @@
 """The albedo at a view's samples, linear: of the mesh as it was loaded, or as a parameter per face or per texel."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from renderer.errors import require_bounded
-from renderer.fragments import Fragments
+from renderer.fragments import BLOCK, Fragments
 from renderer.image import decode
 from renderer.mesh import Mesh
 
-Linear = Callable[[Tensor], Tensor]
+
+@dataclass(frozen=True)
+class _Texture:
+    """texels: row-major indices (S,) → linear albedo (3, S)."""
+
+    height: int
+    width: int
+    texels: Callable[[Tensor], Tensor]
 
 
 def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
     """(S, 3) float64 linear albedo at the samples: corner colour × texture, each decoded before it is interpolated."""
     decoded = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(fragments.coverage)
-    textures = [torch.from_numpy(texture).to(decoded.device) for texture in mesh.textures]
-    return _albedo(mesh, fragments, textures, lambda texels: decoded[texels.long()], encoding)
+
+    bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=decoded.device)
+
+    def texels(packed: Tensor, index: Tensor) -> Tensor:
+        channels = (packed.index_select(0, index) >> bits) & 255
+        return decoded.index_select(0, channels.long().flatten()).view(3, -1)
+
+    packed = [torch.from_numpy(each).to(decoded.device) for each in mesh.packed_textures]
+    return _albedo(
+        mesh, fragments, [_Texture(*each.shape, partial(texels, each.flatten())) for each in packed], encoding
+    )
 
 
 def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], encoding: str) -> Tensor:
@@ -28,58 +46,69 @@ def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor]
     """
     for texture in textures:
         require_bounded(texture=texture)
-    return _albedo(mesh, fragments, textures, lambda texels: texels, encoding)
+    rows = [_Texture(*each.shape[:2], partial(torch.index_select, each.flatten(0, 1).T, 1)) for each in textures]
+    return _albedo(mesh, fragments, rows, encoding)
 
 
 def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
     """(S, 3) linear albedo at the samples, of one per face of the mesh (F, 3); differentiable. InputError: NaN."""
     require_bounded(albedo=albedo)
-    return albedo.index_select(0, fragments.faces).index_select(0, fragments.face)
+    return _of_faces(albedo.index_select(0, fragments.faces), fragments)
 
 
-def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], linear: Linear, encoding: str) -> Tensor:
-    """Corner colour × texture at the samples. `linear` turns texels (N, 3), as they are stored, into linear albedo."""
-    if mesh.one_color is not None:
-        color = _linear_colors(mesh.one_color, fragments, encoding)
-        return color.expand(len(fragments.face), 3)
+def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[_Texture], encoding: str) -> Tensor:
+    """Corner colour × texture at the samples."""
     faces = fragments.faces.cpu().numpy()
-    colors = _linear_colors(mesh.corner_colors[faces], fragments, encoding)
-    if not textures and (colors == colors[:, :1]).all():  # one for each face
-        return colors[:, 0].index_select(0, fragments.face)
-    barycentric = fragments.barycentric()
-    albedo = _interpolate(barycentric, colors, fragments.face)
-    texture_ids = torch.from_numpy(mesh.texture_ids[faces]).to(fragments.face.device)[fragments.face]
-    uvs = torch.from_numpy(mesh.corner_uvs[faces]).to(albedo)
+    albedo = _colors(mesh, faces, fragments, encoding)
+    if not textures:
+        return albedo
+    uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(albedo)).T
+    texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)
+    if len(textures) == 1 and not texture_ids.any():
+        return albedo * _bilinear(textures[0], uvs).T
+    albedo, texture_ids = albedo.T, texture_ids.index_select(0, fragments.face)
     for index, texture in enumerate(textures):
         here = torch.nonzero(texture_ids == index).squeeze(1)
-        value = _bilinear(texture, linear, _interpolate(barycentric[here], uvs, fragments.face[here]))
-        albedo = albedo.index_copy(0, here, albedo[here] * value)
-    return albedo
+        value = _bilinear(texture, uvs.index_select(1, here))
+        albedo = albedo.index_copy(1, here, albedo.index_select(1, here) * value)
+    return albedo.T
 
 
-def _linear_colors(colors: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:
-    """Colours as authored to linear albedo, float64 on the fragments' device."""
+def _colors(mesh: Mesh, faces: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:
+    """(S, 3) the corners' colours, as authored for display, as linear albedo, float64 on the fragments' device."""
+    colors = mesh.corner_colors[:1] if mesh.one_color else mesh.corner_colors.take(faces, axis=0)
     corner_colors = torch.from_numpy(colors).to(fragments.coverage)
     require_bounded(corner_colors=corner_colors)
-    return decode(corner_colors, encoding)
+    corner_colors = decode(corner_colors, encoding)
+    if mesh.one_color:
+        return corner_colors[0, 0][:, None].expand(3, len(fragments.face)).T
+    if mesh.one_color_per_face:
+        return _of_faces(corner_colors[:, 0], fragments)
+    return fragments.interpolate(corner_colors)
 
 
-def _interpolate(barycentric: Tensor, corners: Tensor, face: Tensor) -> Tensor:
-    """Values (S, D) at samples of faces whose corners have values (G, 3, D)."""
-    return torch.einsum("sc,scd->sd", barycentric, corners.index_select(0, face))
+def _of_faces(values: Tensor, fragments: Fragments) -> Tensor:
+    """Values (S, D) at samples of faces (G, D)."""
+    return values.T.contiguous().index_select(1, fragments.face).T  # by rows: it takes half as long
 
 
-def _bilinear(texture: Tensor, linear: Linear, uvs: Tensor) -> Tensor:
-    """(S, 3) linear albedo of a texture (H, W, 3) that repeats, at uvs (S, 2).
+def _bilinear(texture: _Texture, uvs: Tensor) -> Tensor:
+    """(3, S) linear albedo of a texture that repeats, at uvs (2, S).
 
     Texel centres are at half-integers, v = 0 is the bottom row's lower edge.
     """
-    height, width = texture.shape[:2]
-    x, y = uvs[:, 0] * width - 0.5, (1 - uvs[:, 1]) * height - 0.5
-    column, row = x.floor().long(), y.floor().long()
-    texels, value = texture.flatten(0, 1), uvs.new_zeros(len(uvs), 3)
-    for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        weight = (1 - (y - row - down).abs()) * (1 - (x - column - across).abs())
-        tap = texels.index_select(0, (row + down) % height * width + (column + across) % width)
-        value = value + weight[:, None] * linear(tap)
-    return value
+    blocks = []
+    for u, v in (block.unbind() for block in uvs.split(BLOCK, dim=1)):
+        columns, rows = _neighbours(u, texture.width), _neighbours(1 - v, texture.height)
+        taps = [(down * across, row * texture.width + column) for row, down in rows for column, across in columns]
+        blocks.append(sum(weight * texture.texels(index.long()) for weight, index in taps))
+    return torch.cat(blocks, dim=1)
+
+
+def _neighbours(along: Tensor, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """(index, weight) of the texels before and after places (S,), in a texture that repeats from 0 to 1."""
+    place = along * count - 0.5
+    first = place.floor()
+    share = place - first
+    first, second = (index - count * (index / count).floor() for index in (first, first + 1))  # the remainder
+    return (first, 1 - share), (second, share)

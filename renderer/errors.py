@@ -28,4 +28,7 @@ def require_bounded(**tensors: Tensor) -> None:
 
 
 def _largest(tensor: Tensor) -> float:
-    return tensor.detach().abs().max().item() if tensor.numel() else 0.0  # NaN wins any maximum
+    if not tensor.numel():
+        return 0.0
+    low, high = torch.aminmax(tensor.detach())  # both are NaN where anything is
+    return max(-low.item(), high.item())

@@ -3,17 +3,21 @@
 Rasterised once and then held fixed, while light, albedo or the positions of the vertices are differentiated.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from renderer.camera import OrthographicCamera
 from renderer.errors import require_finite
 from renderer.image import PictureSettings
 from renderer.visibility import Backend
+
+BLOCK = 2**14  # samples at a time
 
 
 @dataclass(frozen=True)
@@ -43,23 +47,38 @@ class Fragments:
 
     def barycentric(self) -> Tensor:
         """(S, 3) float64 weights of the faces' corners at the samples, clipped into the face: corners were snapped."""
-        a, b, c = self.outlines.index_select(0, self.face).unbind(1)
-        area = _cross(b - a, c - a)
-        at = self.positions()
-        weights = (
-            torch.stack([_cross(b - at, c - at), _cross(c - at, a - at)], dim=1)
-            / torch.where(area == 0, 1, area)[:, None]
-        )
-        weights = torch.cat([weights, 1 - weights.sum(1, keepdim=True)], dim=1).clamp(0, 1)
-        return weights / weights.sum(1, keepdim=True)
+        return self._barycentric.T
+
+    @cached_property
+    def _barycentric(self) -> Tensor:
+        """(3, S): colours, texture coordinates and normals all ask for it."""
+        outlines = self.outlines.permute(2, 1, 0)
+        edges = outlines[:, 1:] - outlines[:, :1]
+        (bx, cx), (by, cy) = edges
+        area = bx * cy - cx * by
+        scaled = edges / area.masked_fill(area == 0, 1)
+        faces = torch.cat([outlines[:, 0], scaled.flatten(0, 1)])
+        weights = faces.new_empty(3, len(self.face))
+        for weight, face, at in _blocks(weights, self.face, self.positions().T):
+            x0, y0, bx, cx, by, cy = faces.index_select(1, face)
+            x, y = at[0] - x0, at[1] - y0
+            weight[1], weight[2] = x * cy - y * cx, y * bx - x * by
+            weight[0] = 1 - weight[1] - weight[2]
+            weight.clamp_(0, 1).div_(weight.sum(0))
+        return weights
 
     def positions(self) -> Tensor:
         """(S, 2) float64 places of the samples, in the same coordinates as `outlines`."""
-        pixel, within = self.sample // self.samples**2, self.sample % self.samples**2
-        column = pixel % self.size * self.samples + within % self.samples
-        row = pixel // self.size * self.samples + within // self.samples
+        pixel, within = _divide(self.sample.double(), self.samples**2)  # as floats: integers divide ten times as slowly
+        (row, column), (down, across) = _divide(pixel, self.size), _divide(within, self.samples)
         resolution = self.size * self.samples
-        return torch.stack([2 * column + 1, 2 * (resolution - row) - 1], dim=1).double() / resolution - 1
+        column, row = column * self.samples + across, row * self.samples + down
+        return torch.stack([2 * column + 1, 2 * (resolution - row) - 1]).T / resolution - 1
+
+    def interpolate(self, corners: Tensor) -> Tensor:
+        """(S, D) values at the samples of faces whose corners have values (G, 3, D); differentiable in them."""
+        rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
+        return _Interpolation.apply(rows, self.face, self._barycentric).T
 
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(pixel (R,), face (R,), albedo (R, C)): neighbouring samples of one face in one pixel as one, since they
@@ -69,13 +88,36 @@ class Fragments:
         starts = torch.ones_like(self.pixel, dtype=torch.bool)
         starts[1:] = (self.pixel[1:] != self.pixel[:-1]) | (self.face[1:] != self.face[:-1])
         run = starts.cumsum(0) - 1
-        summed = albedo.new_zeros(int(run[-1]) + 1, albedo.shape[1]).index_add(0, run, albedo / self.samples**2)
-        return self.pixel[starts], self.face[starts], summed
+        summed = albedo.new_zeros(albedo.shape[1], int(run[-1]) + 1).index_add(1, run, albedo.T / self.samples**2)
+        return self.pixel[starts], self.face[starts], summed.T
 
     def to(self, device: torch.device | str) -> "Fragments":
         """The same on another device."""
-        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **moved)
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)})
+
+
+class _Interpolation(torch.autograd.Function):
+    """Values (D, S) of corners' (3 D, G), all of a corner together, by blocks of samples that stay in the cache."""
+
+    @staticmethod
+    def forward(ctx, corners: Tensor, face: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(face, weights)
+        ctx.corners = corners.shape
+        values = corners.new_empty(len(corners) // 3, len(face))
+        for value, index, weight in _blocks(values, face, weights):
+            at_corners = corners.index_select(1, index).unflatten(0, (3, -1))
+            torch.sum(at_corners.mul_(weight[:, None]), 0, out=value)
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None, None]:
+        face, weights = ctx.saved_tensors
+        by_corners = upstream.new_zeros(ctx.corners)
+        for above, index, weight in _blocks(upstream, face, weights.to(upstream)):
+            by_corners.index_add_(1, index, (weight[:, None] * above).flatten(0, 1))
+        return by_corners, None, None
 
 
 def build_fragments(
@@ -109,18 +151,19 @@ def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settin
     else:
         pixels, pixel = _compact(hits // samples**2, size**2)
         counts = np.bincount(pixel, minlength=len(pixels))
-    corners = faces.take(seen, axis=0)
-    outlines = torch.from_numpy(projected[:, :2].take(corners, axis=0))
-    a, b, c = outlines.unbind(1)
+    corners = np.ascontiguousarray(faces.take(seen, axis=0).T)
+    outlines = projected[:, :2].T.take(corners, axis=1)
+    (ax, bx, cx), (ay, by, cy) = outlines
+    behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
     return Fragments(
         size=size,
         samples=samples,
         pixels=torch.from_numpy(pixels),
         coverage=torch.from_numpy(counts / samples**2),
         faces=torch.from_numpy(seen),
-        corners=torch.from_numpy(corners),
-        facing=torch.where(_cross(b - a, c - a) < 0, -1.0, 1.0).double()[:, None],
-        outlines=outlines,
+        corners=torch.from_numpy(corners).T,  # with all first corners side by side in memory, as they are read
+        facing=torch.from_numpy(np.where(behind, -1.0, 1.0))[:, None],
+        outlines=torch.from_numpy(outlines.T),
         pixel=torch.from_numpy(pixel),
         face=torch.from_numpy(face),
         sample=torch.from_numpy(hits),
@@ -134,5 +177,12 @@ def _compact(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(present), (np.cumsum(present) - 1)[values]
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """Views of so many samples, the last axis of each tensor, at a time."""
+    return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
+
+
+def _divide(numbers: Tensor, by: int) -> tuple[Tensor, Tensor]:
+    """(quotient, remainder) of whole numbers, as floats."""
+    quotient = (numbers / by).floor()
+    return quotient, numbers - quotient * by

@@ -140,15 +140,56 @@ def gradient_matrices(degree: int) -> Tensor:
     return matrices
 
 
+@per_degree
+def homogeneous_gradients(degree: int) -> Tensor:
+    """(3, (degree + 1)², (degree + 1)²) float64: ∂(r^degree Y_k)/∂x_d = Σ_j r^(degree - 1) Y_j [d, j, k], for k in the
+    bands of the degree's parity, which r^degree makes homogeneous polynomials.
+
+    The gradient's product with x is `degree` times such a polynomial (Euler), so that one sum over j gives both.
+    Source: of x_d Y_k, the part in band l - 1 is ∂(r^l Y_k)/∂x_d / (2l + 1), and by symmetry the one in band l + 1 is
+    the transposed.
+    """
+    solid, l = gradient_matrices(degree), bands(degree)
+    down = solid / (2 * l + 1)
+    return solid + (degree - l) * (down + down.mT)
+
+
+@per_degree
+def monomial_coefficients(degree: int) -> Tensor:
+    """(J, (degree + 1)²) float64: r^degree Y_k = Σ_j [j, k] × `monomials` j, for k in the bands of the degree's parity.
+
+    Each by derivatives: that of x^a y^b z^c is ∂^degree / (∂x^a ∂y^b ∂z^c) / (a! b! c!).
+    """
+    if degree == 0:
+        return torch.full((1, 1), 1 / math.sqrt(4 * math.pi), dtype=torch.float64)
+    below = monomial_coefficients(degree - 1)
+    along_x, along_y, along_z = below @ homogeneous_gradients(degree)[:, : below.shape[1]]
+    powers = torch.tensor([a or b or degree for a in range(degree, -1, -1) for b in range(degree - a, -1, -1)])
+    return torch.cat([along_x, along_y[-degree:], along_z[-1:]]) / powers[:, None]  # in the order of `monomials`
+
+
+def monomials(vectors: Tensor, degree: int) -> Tensor:
+    """((degree + 1)(degree + 2) / 2, N): x^a y^b z^c with a + b + c = degree, from x^degree to z^degree, of (3, N)."""
+    x, y, z = vectors
+    products = torch.ones_like(vectors[:1])
+    for power in range(1, degree + 1):
+        before, count = products, len(products)
+        products = vectors.new_empty(count + power + 1, vectors.shape[1])
+        torch.mul(before, x, out=products[:count])
+        torch.mul(before[count - power :], y, out=products[count:-1])  # those without x
+        torch.mul(before[-1], z, out=products[-1])
+    return products
+
+
 def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     """(unit vectors (3, ...), lengths (...)) of vectors (3, ...); a zero vector stays zero.
 
     Nothing under- or overflows on the way. Components come first, since rows are what a processor adds fastest.
     """
     largest = vectors.abs().amax(0)
-    scaled = vectors / torch.where(largest > 0, largest, 1)
-    norm = scaled.square().sum(0).sqrt()
-    return scaled / torch.where(norm > 0, norm, 1), norm * largest
+    scaled = vectors / largest.masked_fill(largest == 0, 1)
+    norm = scaled.square().sum(0).sqrt()  # at least 1, unless the vector is zero
+    return scaled / norm.clamp(min=1), norm * largest
 
 
 @per_degree

@@ -60,8 +60,10 @@ def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
 class _Clamp(torch.autograd.Function):
     @staticmethod
     def forward(ctx, values: Tensor, ceiling: Tensor | float) -> Tensor:
-        ctx.save_for_backward((values >= 0) & (values <= ceiling))
-        return values.clamp(min=0).clamp(max=ceiling)
+        clamped = values.clamp(min=0).clamp_(max=ceiling)
+        # As numbers: with booleans, comparison and product take several times as long.
+        ctx.save_for_backward(torch.eq(values, clamped, out=torch.empty_like(values)))
+        return clamped
 
     @staticmethod
     @once_differentiable
@@ -71,7 +73,7 @@ class _Clamp(torch.autograd.Function):
 
 
 def _composite(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str) -> Tensor:
-    return radiance + (1 - coverage) * decode(background, encoding)
+    return torch.addcmul(radiance, 1 - coverage, decode(background, encoding))
 
 
 def encode(linear: Tensor, encoding: str) -> Tensor:

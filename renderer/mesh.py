@@ -67,10 +67,19 @@ class Mesh:
         return np.linalg.norm(self._doubled_area_vectors(), axis=1) / 2
 
     @cached_property
-    def one_color(self) -> np.ndarray | None:
-        """(3,) float32 sRGB-encoded, where the whole mesh has the same colour and no texture."""
-        alike = len(self.faces) > 0 and not self.textures and (self.corner_colors == self.corner_colors[:1, :1]).all()
-        return self.corner_colors[0, 0] if alike else None
+    def one_color(self) -> bool:
+        """Whether all corners have the same colour."""
+        return len(self.faces) > 0 and bool((self.corner_colors == self.corner_colors[:1, :1]).all())
+
+    @cached_property
+    def one_color_per_face(self) -> bool:
+        """Whether the corners of each face have the same colour."""
+        return bool((self.corner_colors == self.corner_colors[:, :1]).all())
+
+    @cached_property
+    def packed_textures(self) -> tuple[np.ndarray, ...]:
+        """(H, W) int32 each: red, green and blue in the bits from 0, 8 and 16, since one number is looked up faster."""
+        return tuple(texture.astype(np.int32) @ np.array([1, 2**8, 2**16], dtype=np.int32) for texture in self.textures)
 
     @cached_property
     def closed(self) -> bool:

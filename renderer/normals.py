@@ -23,8 +23,7 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     Source: the paper's Section 3, ∂n/∂v = -h nᵀ/|h|² with h from the opposite edge to the corner v; the sign in print
     is the wrong way round.
     """
-    require_finite(vertices=vertices)
-    return _Unit.apply(_AreaVectors.apply(vertices, faces)).T.to(vertices.dtype)
+    return _Unit.apply(area_vectors(vertices, faces)).T.to(vertices.dtype)
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -32,28 +31,33 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
     Vertices of no face, or whose faces cancel, have the zero vector. Shapes and errors as in `face_normals`.
     """
-    require_finite(vertices=vertices)
-    weighted, corners = _AreaVectors.apply(vertices, faces).repeat(1, 3), faces.T.flatten()
+    weighted, corners = area_vectors(vertices, faces).repeat(1, 3), faces.T.flatten()
     summed = weighted.new_zeros(3, len(vertices)).index_add(1, corners, weighted)
     areas = weighted.new_zeros(len(vertices)).index_add(0, corners, _length(weighted.detach()))
     cancelled = _length(summed.detach()) <= ROUNDING * areas
     return _Unit.apply(summed.masked_fill(cancelled, 0)).T.to(vertices.dtype)
 
 
-class _AreaVectors(torch.autograd.Function):
-    """(3, F) float64 normals with the faces' areas as their lengths, up to one factor for all of them."""
+def area_vectors(vertices: Tensor, faces: Tensor) -> Tensor:
+    """(3, F) float64 normals with the faces' areas as their lengths, up to one factor for all of them.
 
+    Shapes and errors as in `face_normals`.
+    """
+    require_finite(vertices=vertices)
+    return _AreaVectors.apply(vertices, faces)
+
+
+class _AreaVectors(torch.autograd.Function):
     @staticmethod
     def forward(ctx, vertices: Tensor, faces: Tensor) -> Tensor:
         corners = vertices.index_select(0, faces.T.flatten()).double().T.unflatten(1, (3, -1)).contiguous()
-        scale = _power_of_two(corners)
-        a, b, c = (corners / scale).unbind(1)
-        first, second = b - a, c - a
-        product = _cross(first, second)
-        lengths = first.square().sum(0) * second.square().sum(0)
-        thin = torch.nonzero(product.square().sum(0) <= SLIVER**2 * lengths).squeeze(1)
+        edges = corners[:, 1:] - corners[:, :1]
+        scale = _power_of_two(edges)
+        first, second = edges.div_(scale).unbind(1)
+        product, lengths = _cross(first, second), edges.square().sum(0)
+        thin = torch.nonzero(product.square().sum(0) <= SLIVER**2 * lengths[0] * lengths[1]).squeeze(1)
         if len(thin):
-            product[:, thin] = _exact_cross(a[:, thin], b[:, thin], c[:, thin])
+            product[:, thin] = _exact_cross(*(corners[:, :, thin] / scale).unbind(1))
         ctx.save_for_backward(faces, first, second, scale)
         ctx.vertices = vertices.shape, vertices.dtype
         return product
@@ -91,11 +95,11 @@ def _length(vectors: Tensor) -> Tensor:
     return vectors.square().sum(0).sqrt()
 
 
-def _power_of_two(corners: Tensor) -> Tensor:
+def _power_of_two(edges: Tensor) -> Tensor:
     """About the extent of the faces: dividing by it rounds nothing, and keeps products in range at any size."""
-    if not corners.numel():
-        return corners.new_ones(())
-    largest = (corners - corners[:, :1]).abs().max()
+    if not edges.numel():
+        return edges.new_ones(())
+    largest = edges.abs().max()
     _, exponent = torch.frexp(torch.where(largest > 0, largest, 1))
     return torch.ldexp(torch.ones_like(largest), exponent)
 

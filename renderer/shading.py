@@ -15,16 +15,18 @@ from renderer.errors import InputError, require_bounded, require_finite
 from renderer.fragments import Fragments
 from renderer.harmonics import (
     bands,
-    gradient_matrices,
+    homogeneous_gradients,
     lambertian_factors,
     live_coefficients,
+    monomial_coefficients,
+    monomials,
     per_degree,
     select_rows,
     unit_vectors,
 )
-from renderer.normals import face_normals, vertex_normals
+from renderer.normals import area_vectors, vertex_normals
 
-BLOCK = 2**15  # normals at a time
+BLOCK = 2**14  # normals at a time
 
 
 def radiance(
@@ -38,14 +40,15 @@ def radiance(
     """
     require_bounded(albedo=albedo)  # the normals and the irradiance check the rest
     wide = _computed_in(vertices.dtype)
-    positions, albedo = vertices.to(wide), albedo.to(wide)
+    albedo = albedo.to(wide)
     if smooth_faces is None:
         pixel, face, weights = fragments.merge(albedo)
-        normals = face_normals(positions, fragments.corners) * fragments.facing.to(positions)
-        shade = irradiance(normals, light).index_select(1, face)
+        normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
+        shade = _irradiance(normals, light, wide).index_select(1, face)
     else:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
-        shade = irradiance(smooth_normals(fragments, positions, smooth_faces), light)
+        normals = smooth_normals(fragments, vertices.to(wide), smooth_faces)
+        shade = _irradiance(normals.T, light, wide)
     seen = shade * weights.T
     if fragments.samples > 1:  # a sample is a pixel otherwise
         seen = seen.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, seen)
@@ -61,63 +64,107 @@ def irradiance(normals: Tensor, light: Tensor) -> Tensor:
     Source: the paper's equation for R in appendix B.2; its derivative by n in appendix D, here a polynomial too.
     """
     require_finite(normals=normals)
+    wide = _computed_in(normals.dtype)
+    return _irradiance(normals.T.to(wide), light, wide).to(normals.dtype)
+
+
+def _irradiance(normals: Tensor, light: Tensor, dtype: torch.dtype) -> Tensor:
+    """`irradiance` of finite normals (3, N), which become unit vectors in their own dtype, computed in another."""
     require_bounded(light=light)
     if light.ndim != 2 or light.shape[1] != 3 or math.isqrt(len(light)) ** 2 != len(light) or not len(light):
         raise InputError(f"light has shape {tuple(light.shape)}: give ((degree + 1)², 3) coefficients")
-    wide = _computed_in(normals.dtype)
-    return _Irradiance.apply(normals.to(wide), light.to(wide)).to(normals.dtype)
+    return _Irradiance.apply(normals, light.to(dtype))
 
 
 class _Irradiance(torch.autograd.Function):
-    """Goes by blocks of normals and computes their harmonics again in the backward pass: what it keeps is the normals'
-    size, not 31 times that."""
+    """Finds value and slope together, and keeps the slope for the backward pass: three numbers a channel."""
 
     @staticmethod
     def forward(ctx, normals: Tensor, light: Tensor) -> Tensor:
-        unit, length = unit_vectors(normals.T.contiguous())
-        bands = _bands(math.isqrt(len(light)) - 1)
-        weights = light[list(bands.live)] * bands.factors.to(light)
-        ctx.save_for_backward(unit, length, weights)
-        ctx.bands, ctx.light = bands, light.shape
-        blocks = [weights.T @ _rows(block, bands.live) for block in unit.split(BLOCK, dim=1)]
-        return torch.cat(blocks, dim=1)
+        unit, length = unit_vectors(normals)
+        unit, polynomial = unit.to(light.dtype), _Polynomial.of(light)
+        blocks = zip(*map(polynomial, unit.split(BLOCK, dim=1)), strict=True)
+        value, slope = (torch.cat(parts, dim=-1) for parts in blocks)
+        absent = torch.nonzero(length == 0).squeeze(1)
+        if len(absent):  # the homogeneous polynomials are not those of `basis` at 0
+            live, rows = _live_harmonics(unit[:, absent], math.isqrt(len(light)) - 1)
+            value[:, absent] = light[live].T @ rows
+        ctx.save_for_backward(unit, length, slope if ctx.needs_input_grad[0] else None)
+        ctx.light = light.shape
+        return value
 
     @staticmethod
     @once_differentiable
     def backward(ctx, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        unit, length, weights = ctx.saved_tensors
-        bands, by_normal, by_light = ctx.bands, None, None
-        blocks = list(zip(unit.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True))
+        unit, length, slope = ctx.saved_tensors
+        by_normal = by_light = None
         if ctx.needs_input_grad[0]:
-            slopes = torch.einsum("djk,kc->dcj", bands.ladder.to(weights), weights)
-            solid = torch.cat([_contract(slopes, _rows(block, bands.below), above) for block, above in blocks], dim=1)
+            solid = slope[:, 0] * upstream[0]
+            solid.addcmul_(slope[:, 1], upstream[1]).addcmul_(slope[:, 2], upstream[2])
             tangential = solid - unit * (unit * solid).sum(0)
-            by_normal = (tangential / length.masked_fill(length == 0, torch.inf)).T
+            by_normal = tangential / length.masked_fill(length == 0, torch.inf)
         if ctx.needs_input_grad[1]:
-            by_weight = sum(_rows(block, bands.live) @ above.T for block, above in blocks)
             by_light = unit.new_zeros(ctx.light)
-            by_light[list(bands.live)] = by_weight * bands.factors.to(unit)
+            for block, above in zip(unit.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True):
+                live, rows = _live_harmonics(block, math.isqrt(ctx.light[0]) - 1)
+                by_light[live] += rows @ above.T
         return by_normal, by_light
 
 
 @dataclass(frozen=True)
-class _Bands:
-    """Of the harmonics to some degree: the K that reach a surface, with A_l (K, 1), and the J of which the gradients of
-    those consist, with what they take of each (3 axes, J, K)."""
+class _Polynomial:
+    """One light's irradiance as a polynomial in the unit normal: its even bands from 2 on as a homogeneous one of
+    `degree`, by its slopes (9, J), per axis and channel, in monomials; bands 1 (9, 1) and 0 (3, 1)."""
 
-    live: tuple[int, ...]
-    factors: Tensor
-    below: tuple[int, ...]
-    ladder: Tensor
+    degree: int
+    even: Tensor
+    linear: Tensor
+    constant: Tensor
+
+    @staticmethod
+    def of(light: Tensor) -> "_Polynomial":
+        """light: ((degree + 1)², 3)."""
+        degree = math.isqrt(len(light)) - 1
+        weights = light.new_zeros(max(len(light), 9), 3)
+        weights[: len(light)] = light * _factors(degree).to(light)
+        degree = max(degree - degree % 2, 2)
+        even, linear = (
+            torch.einsum("djk,kc->dcj", _slopes(power).to(light), weights[: (power + 1) ** 2]).flatten(0, 1)
+            for power in (degree, 1)
+        )
+        return _Polynomial(degree, even, linear, weights[:1].T / math.sqrt(4 * math.pi))
+
+    def __call__(self, unit: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (3, N) and slope (3 axes, 3, N) at unit vectors (3, N); of the slope, the tangential part counts.
+
+        A homogeneous polynomial is its slope times its argument, over its degree (Euler).
+        """
+        slope = torch.addmm(self.linear, self.even, monomials(unit, self.degree - 1)).unflatten(0, (3, 3))
+        value = torch.addmm(self.constant, self.linear.view(3, 3).T, unit, alpha=1 - 1 / self.degree)
+        for along, component in zip(slope, unit, strict=True):
+            value.addcmul_(along, component, value=1 / self.degree)
+        return value, slope
 
 
 @per_degree
-def _bands(degree: int) -> _Bands:
-    live = live_coefficients(degree)
-    ladder = gradient_matrices(degree)[:, :, live]
-    below = torch.nonzero(ladder.abs().sum((0, 2))).squeeze(1)
-    factors = lambertian_factors(degree)[bands(degree)[live]]
-    return _Bands(tuple(live.tolist()), factors[:, None], tuple(below.tolist()), ladder[:, below])
+def _slopes(degree: int) -> Tensor:
+    """(3, J, (degree + 1)²): the slope by each axis of r^degree Y_k in monomials, for the bands of the degree's parity
+    from 1 on."""
+    l = bands(degree)
+    slopes = monomial_coefficients(degree - 1) @ homogeneous_gradients(degree)[:, : degree**2]
+    return slopes * ((l > 0) & (l % 2 == degree % 2))
+
+
+def _live_harmonics(unit: Tensor, degree: int) -> tuple[list[int], Tensor]:
+    """(the K coefficients that reach a surface, what one of each does at unit or zero vectors (3, N): (K, N))."""
+    live = live_coefficients(degree).tolist()
+    return live, torch.stack(select_rows(unit, live)) * _factors(degree).to(unit)[live]
+
+
+@per_degree
+def _factors(degree: int) -> Tensor:
+    """((degree + 1)², 1): what a diffuse surface keeps of each coefficient."""
+    return lambertian_factors(degree)[bands(degree)][:, None]
 
 
 def _computed_in(dtype: torch.dtype) -> torch.dtype:
@@ -125,23 +172,11 @@ def _computed_in(dtype: torch.dtype) -> torch.dtype:
     return torch.promote_types(dtype, torch.float32)
 
 
-def _rows(unit: Tensor, indices: tuple[int, ...]) -> Tensor:
-    """Some harmonics (len(indices), N) of unit vectors (3, N)."""
-    rows = select_rows(unit, indices)
-    return torch.stack(rows) if rows else unit.new_zeros(0, unit.shape[1])
-
-
-def _contract(slopes: Tensor, values: Tensor, upstream: Tensor) -> Tensor:
-    """Σ over channels of upstream (3, N) × gradients: (3 axes, N)."""
-    gradients = (slopes.flatten(0, 1) @ values).unflatten(0, (3, 3))
-    return (gradients * upstream).sum(1)
-
-
 def smooth_normals(fragments: Fragments, vertices: Tensor, faces: Tensor) -> Tensor:
     """(S, 3) vertex normals interpolated to the samples, on the side that the camera sees; not of unit length."""
+    corners = fragments.corners.T.flatten()
     near = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
-    near[fragments.corners.flatten()] = True
-    around = faces[near[faces].any(1)]  # the other faces touch no vertex that a sample sees
-    normals = vertex_normals(vertices, around)[fragments.corners] * fragments.facing.to(vertices)[:, None]
-    barycentric = fragments.barycentric().to(vertices)
-    return torch.einsum("sc,scd->sd", barycentric, normals.index_select(0, fragments.face))
+    near[corners] = True
+    around = faces[near.index_select(0, faces.T.flatten()).view(3, -1).any(0)]  # the others touch no vertex in sight
+    normals = vertex_normals(vertices, around).T.index_select(1, corners).unflatten(1, (3, -1))
+    return fragments.interpolate((normals * fragments.facing.T.to(normals)).permute(2, 1, 0))

@@ -5,11 +5,13 @@ radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactl
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import linear
 
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
@@ -64,15 +66,21 @@ class Operator:
         """
         require_bounded(radiance_gradient=radiance_gradient)
         upstream = radiance_gradient.to(self.transfer.dtype)
-        if len(self.transfer) == 1:
-            product = (upstream * self.albedo) @ self.transfer[0].T
+        if self._shared is not None:
+            product = linear(upstream * self.albedo, self._shared)
         else:
             product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
         return (_spread(self.degree).to(product) @ product.mT).to(radiance_gradient.dtype)
 
     def to(self, device: torch.device | str) -> "Operator":
         """The same on another device."""
-        return replace(self, **{name: part.to(device) for name, part in vars(self).items() if name != "degree"})
+        names = [field.name for field in fields(self) if field.name != "degree"]
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+
+    @cached_property
+    def _shared(self) -> Tensor | None:
+        """(K, P), where the channels share it; kept, since at 32² even an index counts."""
+        return self.transfer[0] if len(self.transfer) == 1 else None
 
 
 class _Radiance(torch.autograd.Function):
@@ -90,8 +98,8 @@ class _Radiance(torch.autograd.Function):
 def _radiance(operator: Operator, lights: Tensor) -> Tensor:
     live = live_coefficients(operator.degree).to(lights.device)
     kept = lights.index_select(-2, live).to(operator.transfer.dtype)
-    if len(operator.transfer) == 1:
-        product = kept.mT @ operator.transfer[0] * operator.albedo
+    if operator._shared is not None:
+        product = (kept.mT @ operator._shared).mul_(operator.albedo)
     else:
         product = torch.einsum("...kc,ckp->...cp", kept, operator.transfer)
     return product.to(lights.dtype)

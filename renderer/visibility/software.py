@@ -1,7 +1,7 @@
-"""The NumPy rasteriser: fixed-point corners and exact integer edge functions, as GPUs have them.
+"""The NumPy rasteriser: fixed-point corners and exact integer arithmetic, as GPUs have them.
 
-A triangle's box of samples is cut into tiles of 4×4: what differs from triangle to triangle is gathered once for a
-tile, and its samples are evaluated without a gather. The longest axis is the last one of every array.
+A triangle is cut into rows, and what it covers of a row into samples, so that only covered samples are ever looked at.
+The longest axis is the last one of every array.
 """
 
 from collections.abc import Iterator
@@ -13,35 +13,37 @@ SUBSAMPLES = 2**SUBSAMPLE_BITS  # corners snap to this fraction of a sample
 FAR = 2**24 - 1  # depth is a 24-bit key, and surface at the far plane itself is not drawn
 FACE_BITS = 32  # a sample's key is its depth above so many bits of face index, so the least key wins
 EMPTY = (FAR << FACE_BITS) - 1  # less than any key at the far plane; its face index reads -1
-TILE = 4  # samples per side
-TILES, FACES = 2**12, 2**15  # at a time: bounds the memory and stays in the cache
+FACES, PARTS = 2**14, 2**13  # faces, and their rows or samples, at a time: what they take stays in the cache
 
 
 def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """Ids by the contract in `renderer.visibility`, for finite points."""
-    return np.stack([_rasterise_view(view, faces, resolution, closed) for view in points])
+    ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
+    for view, picture in zip(points, ids, strict=True):
+        picture[:] = _keys(view, faces, resolution, closed).reshape(picture.shape)  # of which an id is the lower half
+    return ids
 
 
-def _rasterise_view(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+    """(R²,) the least key of each sample."""
     positions, depths = _snap(points[:, :2], resolution), (points[:, 2] + 1) / 2 * FAR
-    stride = resolution + TILE - 1  # tiles may reach beyond the last column and row
-    keys = np.full(stride * stride, EMPTY)
-    places = np.add.outer(np.arange(TILE) * stride, np.arange(TILE)).ravel()
+    keys = np.full(resolution * resolution, EMPTY)
     for begin in range(0, len(faces), FACES):
         block = np.ascontiguousarray(faces[begin : begin + FACES].T)
-        drawn, first, last = _cull(positions.take(block, axis=1), resolution, closed)
+        drawn, first, rows = _cull(positions.take(block, axis=1), resolution, closed)
         corners = _sort(block.take(drawn, axis=1))  # so that duplicate faces have one depth and tie
-        edges, fractions, areas = _edges(positions.take(corners, axis=1))
-        corner_depths, ids = depths.take(corners), drawn + begin
-        for triangle, column, row in _tiles(first, last):
-            tile, place, edge = _inside(edges.take(triangle, axis=2), column, row)
-            sample = (row * stride + column).take(tile) + places.take(place)
-            triangle = triangle.take(tile)
-            weighted = (edge + fractions.take(triangle, axis=1)) * corner_depths.take(triangle, axis=1)
-            depth = np.rint(weighted.sum(axis=0) / areas.take(triangle)).astype(np.int64)
-            depth = np.minimum(depth.view(np.uint64), FAR).view(np.int64)  # negative ones are large as unsigned
-            np.minimum.at(keys, sample, (depth << FACE_BITS) | ids.take(triangle))
-    return keys.reshape(stride, stride)[:resolution, :resolution].astype(np.int32)
+        places = positions.take(corners, axis=1)
+        edges, planes, ids = _edges(places), _planes(places, depths.take(corners)), drawn + begin
+        for triangle, row in _parts(rows):
+            row += first.take(triangle)
+            left, right = _crossings(edges, triangle, row, resolution)
+            x, y, depth, slope, by_row = planes.take(triangle, axis=1)
+            at_row, offset = depth + (row - y) * by_row, left - x
+            sample, face = row * resolution + left, ids.take(triangle)
+            for span, step in _parts(right - left):
+                depth = at_row.take(span) + slope.take(span) * (offset.take(span) + step)
+                np.minimum.at(keys, sample.take(span) + step, _key(depth, face.take(span)))
+    return keys
 
 
 def _snap(points: np.ndarray, resolution: int) -> np.ndarray:
@@ -55,13 +57,27 @@ def _snap(points: np.ndarray, resolution: int) -> np.ndarray:
 
 
 def _cull(corners: np.ndarray, resolution: int, closed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which triangles (2, 3, F) to draw (T,), and the first and last column and row (2, T) of their boxes."""
-    areas = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    first = ((corners.min(axis=1) + SUBSAMPLES - 1) >> SUBSAMPLE_BITS).clip(0, None)
-    last = (corners.max(axis=1) >> SUBSAMPLE_BITS).clip(None, resolution - 1)
+    """Which triangles (2, 3, F) to draw (T,), and the first and the number of the rows (T,) that they reach.
+
+    By the top-left rule a sample on an edge belongs to the triangle that has the edge at its left or, if level, its
+    top. So rows and columns begin at or after a triangle's least coordinate, and end before its greatest.
+    """
+    areas = _doubled_areas(corners)
+    first = _next_sample(corners.min(axis=1)).clip(0, None)
+    counts = _next_sample(corners.max(axis=1)).clip(None, resolution) - first
     towards = areas < 0 if closed else areas != 0  # y runs down: counter-clockwise areas are negative
-    drawn = np.flatnonzero(towards & (first <= last).all(axis=0))
-    return drawn, first.take(drawn, axis=1), last.take(drawn, axis=1)
+    drawn = np.flatnonzero(towards & (counts > 0).all(axis=0))
+    return drawn, first[1].take(drawn), counts[1].take(drawn)
+
+
+def _doubled_areas(corners: np.ndarray) -> np.ndarray:
+    (ax, bx, cx), (ay, by, cy) = corners
+    return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+
+
+def _next_sample(positions: np.ndarray) -> np.ndarray:
+    """The first row or column at or after each."""
+    return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
 
 
 def _sort(corners: np.ndarray) -> np.ndarray:
@@ -70,50 +86,57 @@ def _sort(corners: np.ndarray) -> np.ndarray:
     return np.stack([least, corners.sum(axis=0) - least - greatest, greatest])
 
 
-def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edge functions (3, 3, T) int64 with their fractions (3, T), and doubled areas (T,), of triangles (2, 3, T).
+def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges (3, 3, T) of triangles (2, 3, T), and the first row (T,) after each triangle's middle corner.
 
-    The edge function opposite each corner is x·column + y·row + constant + fraction, in 1/256 sample², positive inside
-    whichever way the triangle winds. By the top-left rule a sample on an edge belongs to the triangle that has the
-    edge at its left or, if level, its top. Fractions are in [0, 1], so that a sample is inside where the integers'
-    sum is not negative.
+    The edges go from the top to the bottom, from the top to the middle and from the middle to the bottom corner. Minus
+    the column where a row crosses one is (slope · row + constant) / height, of its three numbers.
     """
-    start = corners[:, [1, 2, 0]]
-    along = corners[:, [2, 0, 1]] - start
-    areas = _cross(along[:, 0], along[:, 1])
-    along *= np.sign(areas)
-    dx, dy = along
-    top_left = (dy < 0) | ((dy == 0) & (dx > 0))
-    exact = _cross(start, along)
-    constant = (exact + top_left - 1) >> SUBSAMPLE_BITS
-    fractions = (exact - constant * SUBSAMPLES) / SUBSAMPLES
-    return np.stack([-dy, dx, constant]), fractions, np.abs(areas) / SUBSAMPLES
+    x, y = corners
+    downwards = _sort((y << 32) + x)  # the sums may wrap around, and wrap back
+    x = ((downwards + 2**31) & (2**32 - 1)) - 2**31
+    y = (downwards - x) >> 32
+    start, end = [0, 0, 1], [2, 1, 2]
+    dx, dy = x[end] - x[start], y[end] - y[start]
+    return np.stack([-SUBSAMPLES * dx, y[start] * dx - x[start] * dy, SUBSAMPLES * dy]), _next_sample(y[1])
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[0] * b[1] - a[1] * b[0]
+def _crossings(
+    edges: tuple[np.ndarray, np.ndarray], triangle: np.ndarray, row: np.ndarray, resolution: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The first column in a triangle and the first after it, for each of its rows."""
+    numbers, middle = edges
+    below = row >= middle.take(triangle)
+    both = np.stack([triangle, triangle + (1 + below) * len(middle)])
+    slope, constant, height = numbers.reshape(3, -1).take(both, axis=1)
+    columns = (-((slope * row + constant) // height)).clip(0, resolution)
+    return np.minimum(*columns), np.maximum(*columns)
 
 
-def _tiles(first: np.ndarray, last: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """(triangle, first column, first row) of the tiles that cover the triangles' boxes, at most TILES at a time."""
-    columns, rows = (last - first) // TILE + 1
-    counts = columns * rows
+def _planes(corners: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """(5, T) of triangles (2, 3, T) with depths (3, T): of the first corner column, row and depth, and the depth's
+    slopes by column and row."""
+    (ax, bx, cx), (ay, by, cy) = corners
+    a, b, c = depths
+    scale = SUBSAMPLES / _doubled_areas(corners)
+    by_column = ((b - a) * (cy - ay) - (c - a) * (by - ay)) * scale
+    by_row = ((c - a) * (bx - ax) - (b - a) * (cx - ax)) * scale
+    return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, a, by_column, by_row])
+
+
+def _key(depth: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Depths, rounded and limited to [0, FAR), above face indices."""
+    depth = np.rint(depth).astype(np.int64)
+    depth = np.minimum(depth.view(np.uint64), FAR).view(np.int64)  # negative ones are large as unsigned
+    return (depth << FACE_BITS) | face
+
+
+def _parts(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(whole, part): each whole as often as it has parts, numbered from 0; about PARTS at a time, wholes uncut."""
     ends = np.cumsum(counts)
-    for begin in range(0, counts.sum(), TILES):
-        end = min(begin + TILES, ends[-1])
-        low, high = np.searchsorted(ends, [begin, end - 1], side="right")
-        repeats = np.diff(ends[low : high + 1].clip(None, end), prepend=begin)
-        triangle = np.repeat(np.arange(low, high + 1), repeats)
-        down, across = np.divmod(np.arange(begin, end) - (ends - counts).take(triangle), columns.take(triangle))
-        yield triangle, first[0].take(triangle) + across * TILE, first[1].take(triangle) + down * TILE
-
-
-def _inside(edges: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The samples in their triangles: tile, row-major place in it (S,) and the edge functions (3, S) but fractions."""
-    x, y, constant = edges
-    steps = np.arange(TILE)[:, None]
-    at_left = (constant + x * column + y * row)[:, None] + y[:, None] * steps
-    edge = (at_left[:, :, None] + (x[:, None] * steps)[:, None]).reshape(3, -1)
-    inside = np.flatnonzero((edge[0] | edge[1] | edge[2]) >= 0)  # none has its sign bit set
-    place = inside // len(row)
-    return inside - place * len(row), place, edge.take(inside, axis=1)
+    starts, begin, done = ends - counts, 0, 0
+    while begin < len(counts):
+        end = max(begin + 1, np.searchsorted(ends, done + PARTS, side="right"))
+        whole = np.repeat(np.arange(begin, end), counts[begin:end])
+        yield whole, np.arange(done, done + len(whole)) - starts.take(whole)
+        begin, done = end, ends[end - 1]

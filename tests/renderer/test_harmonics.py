@@ -16,9 +16,12 @@ from renderer.harmonics import (
     basis,
     basis_gradient,
     gradient_matrices,
+    homogeneous_gradients,
     irradiance_basis,
     lambertian_factors,
     live_coefficients,
+    monomial_coefficients,
+    monomials,
     project,
     quadrature,
     rotate,
@@ -236,8 +239,48 @@ def test_the_gradient_matrices_are_the_derivatives_of_the_solid_harmonics(degree
     np.testing.assert_allclose(gradient_matrices(degree), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("degree", [1, 2, 5, 6])
+def test_homogeneous_harmonics_have_the_gradients_of_central_differences(degree):
+    """r^degree Y at points off the sphere, for the bands of the degree's parity, with Y by scipy."""
+    points, step = torch.tensor([0.7, 1.2])[:, None] * random_directions(2), 1e-5
+    chosen = (bands(degree) % 2 == degree % 2).numpy()
+
+    def homogeneous(at: torch.Tensor, power: int) -> np.ndarray:
+        return at.norm(dim=1, keepdim=True).numpy() ** power * scipy_basis(at, degree)
+
+    for axis, matrix in enumerate(homogeneous_gradients(degree).numpy()):
+        offset = step * torch.eye(3, dtype=torch.float64)[axis]
+        expected = (homogeneous(points + offset, degree) - homogeneous(points - offset, degree)) / (2 * step)
+        # The difference's error is that of its third derivative, of the order of degree³ × step², and EPS / step.
+        np.testing.assert_allclose(
+            homogeneous(points, degree - 1) @ matrix[:, chosen], expected[:, chosen], rtol=0, atol=1e-7
+        )
+
+
+def test_monomials_are_in_alphabetical_order():
+    (values,) = monomials(torch.tensor([[2.0, 3.0, 5.0]]).T, 2).T
+    assert values.tolist() == [4, 6, 10, 9, 15, 25]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 5, 6, 12])
+def test_harmonics_are_polynomials_in_monomials_of_the_degrees_parity(degree):
+    points = torch.cat([random_directions(20), torch.tensor(POLES + EQUATOR, dtype=torch.float64)])
+    chosen = (bands(degree) % 2 == degree % 2).numpy()
+    values = monomials(points.T, degree).T @ monomial_coefficients(degree)
+    # Measured against EPS: coefficients of either sign cancel, by a factor of 50 or less at degree 12.
+    np.testing.assert_allclose(values[:, chosen], scipy_basis(points, degree)[:, chosen], rtol=0, atol=200 * EPS)
+
+
 @pytest.mark.parametrize(
-    "function", [harmonics.gradient_matrices, harmonics.bands, harmonics.lambertian_factors, live_coefficients]
+    "function",
+    [
+        harmonics.gradient_matrices,
+        harmonics.homogeneous_gradients,
+        harmonics.monomial_coefficients,
+        harmonics.bands,
+        harmonics.lambertian_factors,
+        live_coefficients,
+    ],
 )
 def test_constants_first_asked_for_in_inference_mode_serve_training_later(function):
     """They are kept, and autograd refuses to save tensors made in that mode."""

@@ -22,7 +22,7 @@ from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError
 from renderer.fragments import Fragments, build_fragments
-from renderer.harmonics import MAX_DEGREE, lambertian_factors, live_coefficients, rotate
+from renderer.harmonics import MAX_DEGREE, irradiance_basis, lambertian_factors, live_coefficients, rotate
 from renderer.image import PictureSettings, clamped, develop
 from renderer.mesh import Mesh
 from renderer.shading import irradiance, radiance
@@ -130,6 +130,18 @@ def test_the_irradiance_of_short_and_of_zero_normals_is_finite_and_no_gradient_i
         assert lit.isfinite().all() and not gradient.isnan().any() and not gradient[-len(SPECIAL) :].any()
 
 
+def test_a_zero_normal_has_the_irradiance_of_the_basis_at_zero():
+    """And its derivative by the light, among normals that are not zero."""
+    normals, light = some_normals(5).index_fill(0, torch.tensor([1, 4]), 0), draw(49, 3).requires_grad_(True)
+    lit = irradiance(normals, light)
+    rows = irradiance_basis(normals, 6)
+    expected = rows @ light[live_coefficients(6)]
+    torch.testing.assert_close(lit, expected.T, rtol=0, atol=16 * EPS * brightest(light))
+    upstream = draw(*lit.shape, seed=1)
+    (found,), (by_basis,) = (torch.autograd.grad(value, light, upstream) for value in (lit, expected.T))
+    torch.testing.assert_close(found, by_basis, rtol=0, atol=64 * EPS * float(by_basis.abs().max()))
+
+
 def test_the_blocks_are_of_no_consequence(monkeypatch):
     inputs = [tensor.requires_grad_(True) for tensor in (some_normals(40), draw(49, 3))]
     results = []
@@ -141,11 +153,12 @@ def test_the_blocks_are_of_no_consequence(monkeypatch):
         torch.testing.assert_close(pieced, whole, rtol=0, atol=64 * EPS * whole.abs().max().item())
 
 
-def test_what_is_kept_for_the_backward_pass_is_as_large_as_the_normals():
+def test_what_is_kept_for_the_backward_pass_is_a_slope_by_each_axis_and_channel():
+    """Beside the normals' directions and lengths; not their 31 harmonics."""
     kept = []
     with torch.autograd.graph.saved_tensors_hooks(lambda tensor: kept.append(tensor.numel()), lambda _: None):
         irradiance(draw(1000, 3).requires_grad_(True), draw(49, 3).requires_grad_(True))
-    assert sum(kept) <= 1000 * 4 + 49 * 3
+    assert sum(kept) <= 1000 * (4 + 9)
 
 
 @pytest.mark.parametrize("shape", [(10, 3), (49, 1), (49,), (3, 49)])

@@ -97,7 +97,7 @@ def reference(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
     """(R, R) ids of one view (V, 3) by the contract's words: in Python's integers, each sample of each face in turn.
 
     A sample is inside if every edge function is positive there or, where one is 0, a little to the right or, where it
-    stays 0, a little below. Depth is in float64, with the corners in the order of their indices.
+    stays 0, a little below. Depth is in float64, on the plane from the corner with the least index.
     """
     points = np.clip(points, -SPAN / resolution, SPAN / resolution)
     places, depths = snapped(points[:, :2], resolution), ((points[:, 2] + 1) / 2 * FAR).tolist()
@@ -110,12 +110,16 @@ def reference(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
         )
         area = doubled_area(a, b, c)
         sides = [(b, c), (c, a), (a, b)] if area > 0 else [(c, b), (a, c), (b, a)]
+        (bx, by), (cx, cy) = ((corner[0] - a[0], corner[1] - a[1]) for corner in (b, c))
+        b_rise, c_rise, scale = depth_b - depth_a, depth_c - depth_a, 256 / area if area else 0
+        by_column, by_row = (b_rise * cy - c_rise * by) * scale, (c_rise * bx - b_rise * cx) * scale
         for row, column in np.ndindex(ids.shape):
             sample = (column * 256 + 128, row * 256 + 128)
             edges = [doubled_area(p, q, sample) for p, q in sides]
             slopes = [(p[1] - q[1], q[0] - p[0]) for p, q in sides]
             if area and all((edge, *slope) > (0, 0, 0) for edge, slope in zip(edges, slopes, strict=True)):
-                depth = round((edges[0] * depth_a + edges[1] * depth_b + edges[2] * depth_c) / abs(area))
+                right, down = ((place - corner) / 256 for place, corner in zip(sample, a, strict=True))
+                depth = round((depth_a + down * by_row) + right * by_column)
                 if 0 <= depth < nearest[row, column]:
                     ids[row, column], nearest[row, column] = index, depth
     return ids
@@ -349,11 +353,11 @@ def test_software_equals_the_reference_where_the_rounding_of_float64_decides():
     np.testing.assert_array_equal(ids[0], reference(points[0], faces, 16, closed=False))
 
 
-@pytest.mark.parametrize(("tiles", "faces_at_a_time"), [(1, 100), (7, 3), (100, 1)])
-def test_software_draws_the_same_however_little_at_a_time(monkeypatch, tiles, faces_at_a_time):
+@pytest.mark.parametrize(("parts", "faces_at_a_time"), [(1, 100), (7, 3), (100, 1)])
+def test_software_draws_the_same_however_little_at_a_time(monkeypatch, parts, faces_at_a_time):
     points, faces = random_triangles(seed=4, count=40, reach=1.3)
     at_once = rasterise(points, faces, 16, "software")
-    monkeypatch.setattr(software, "TILES", tiles)
+    monkeypatch.setattr(software, "PARTS", parts)
     monkeypatch.setattr(software, "FACES", faces_at_a_time)
     np.testing.assert_array_equal(rasterise(points, faces, 16, "software"), at_once)
 
