@@ -99,9 +99,9 @@ class Trainer:
             nesterov=settings.momentum > 0,
             fused=True,
         )
-        self._compiled = compiles(settings.compile, self._device)
-        self._training_pass = training_pass(self._replica, settings.label_smoothing, self._compiled)
-        self._attacked, self._scored = (FixedSizes(m) if self._compiled else m for m in (model, self.selected))
+        compiled = compiles(settings.compile, self._device)
+        self._training_pass = training_pass(self._replica, settings.label_smoothing, compiled)
+        self._attacked, self._scored = (FixedSizes(m) if compiled else m for m in (model, self.selected))
 
     @property
     def selected(self) -> MixedPrecision:
@@ -119,8 +119,6 @@ class Trainer:
         InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked for it.
         """
         mixed = with_room(train, len(self.service))
-        if self._compiled:
-            torch.compiler.reset()  # the compiler keeps a limited number of graphs, and earlier runs have theirs
         with Interruption() as interruption:
             while self.epoch < self.settings.epochs:
                 if self._under_way is None:

@@ -11,7 +11,7 @@ from train.batches import to_unit
 
 COMPILE = ("auto", "always", "never")
 SIZES = (16, 32, 64, 128, 512)  # of a batch in eval mode: attacks, whose examples leave when fooled, and evaluation
-RECOMPILE_LIMIT = 8 * len(SIZES)  # with and without gradients, in both modes; torch's 8 would send the rest to Python
+RECOMPILE_LIMIT = 16 * len(SIZES)  # of some runs in a process, each with and without gradients; torch's 8 are too few
 
 
 def compiles(choice: str, device: torch.device) -> bool:

@@ -1,6 +1,5 @@
 """An arm of an experiment in the real `Trainer`, an epoch at a time."""
 
-from contextlib import closing
 from pathlib import Path
 
 import torch
@@ -36,8 +35,8 @@ class Arm:
         trainer = self.trainer
         self._make_sure()
         trainer.settings.epochs = trainer.epoch + 1
-        with closing(RunLog(trainer.folder, trainer.history)) as log, self._phases(EPOCH):
-            trainer.fit(*self._splits, log)
+        with self._phases(EPOCH):
+            trainer.fit(*self._splits, RunLog(trainer.folder, trainer.history))
         line = trainer.history[-1]
         seconds = {name.partition("/")[2]: value for name, value in line.items() if name.startswith("seconds/")}
         seconds["input_output"] += trainer.phases.take()["input_output"]  # the checkpoint, written after the line
