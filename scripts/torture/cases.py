@@ -24,7 +24,7 @@ from train.cli import USER_ERROR
 from train.logs import METRICS
 
 GRACE = 0.1  # seconds at most from SIGTERM to SIGKILL
-DISK = "16m"
+DISK = "64m"
 
 
 @dataclass
@@ -125,18 +125,18 @@ def interrupted(
     """Interrupt and resume that many times, in as many runs as it takes: each goes on until it ends by itself."""
     outcome = Outcome(case)
     while (left := count - outcome.stops.total()) > 0:
-        run = bench.folder(case)
+        run, ending = bench.folder(case), None
         for _ in range(left):
             life = Life(bench.workshop, run)
             if not life.wait(bench.moment(rng, since)):
                 ending = life.end()
                 break
-            phase, ending, faults = interrupt(life, rng)
-            outcome.add("said", *(f"{run.name}, {phase}: {fault}" for fault in faults))
-            outcome.stops[phase] += bool(ending.status)  # it may have come too late
-        else:
-            ending = Life(bench.workshop, run).end()
-        conclude(outcome, bench, run, ending)
+            stop = interrupt(life, rng)
+            outcome.add("said", *(f"{run.name}, {stop.phase}: {fault}" for fault in stop.faults))
+            outcome.stops[stop.phase] += bool(stop.ending.status)  # it may have come too late
+            if life.reached("end"):  # what is left could only be scored once more
+                break
+        conclude(outcome, bench, run, ending or Life(bench.workshop, run).end())
     return outcome
 
 

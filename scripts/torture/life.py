@@ -77,7 +77,7 @@ class Life:
 
     def wait(self, moment: Moment) -> bool:
         """Whether the process still runs when the moment comes."""
-        while not self._reached(moment.since):
+        while not self.reached(moment.since):
             if self._process.poll() is not None:
                 return False
             time.sleep(POLL)
@@ -86,6 +86,12 @@ class Life:
         except subprocess.TimeoutExpired:
             return True
         return False
+
+    def reached(self, since: str) -> bool:
+        """Whether a kind of moment is past."""
+        if since == "start":
+            return True
+        return self._count_boards() > self._boards and self._count_lines() >= LINES[since](self._epochs)
 
     def send(self, number: signal.Signals) -> str:
         """The phase in which the signal found the process."""
@@ -102,7 +108,7 @@ class Life:
         deadline = time.monotonic() + 0.2  # a process that is ending may answer no more
         while OUTERMOST not in (stack := self._stacks.read_text()[before:]) and time.monotonic() < deadline:
             time.sleep(POLL)
-        return innermost_phase(stack) or (END if self._reached("training") else START)
+        return innermost_phase(stack) or (END if self.reached("training") else START)
 
     def end(self) -> Ending:
         """Wait for the end; a process that hangs is killed and says so."""
@@ -115,11 +121,6 @@ class Life:
         self._stacks.unlink(missing_ok=True)
         code = self._process.returncode
         return Ending(abs(code) + 128 * (code < 0), code >= 0, output, errors)
-
-    def _reached(self, since: str) -> bool:
-        if since == "start":
-            return True
-        return self._count_boards() > self._boards and self._count_lines() >= LINES[since](self._epochs)
 
     def _count_boards(self) -> int:
         return len(list(self.run.glob("events.out.tfevents.*")))

@@ -17,12 +17,14 @@ CONCERNS = {  # of faults, and the heads of their columns
     "said": "exit status and words",
 }
 INTRODUCTION = """\
-Made by `{command}` with torch {torch} on {machine}. Undisturbed, a run has {epochs} epochs of {epoch:.0f} ms after
-{start:.0f} s of start-up; half of the moments are uniform over all of it, half over what follows the start-up. Every
-run is resumed until it ends by itself. *Equal*: to the undisturbed one, bit for bit and seconds aside, in every tensor
-and value of `last.pt` and `best.pt`; in `metrics.jsonl`, each epoch once; in what TensorBoard shows, each epoch once;
-in the bytes of all pictures and photographs' scores. *As it should*: a signal ends it with 128 + its number, a full
-disk or damage to both checkpoints with 2 and one sentence, and nothing else is on stderr.
+Made by `{command}` with torch {torch} on {machine}. Undisturbed, a run has {epochs} epochs of {epoch:.0f} ms
+after {start:.0f} s of start-up. Half of the moments are uniform over all of it, half over what follows the start-up.
+Every run is resumed until it ends by itself.
+
+- *Equal* to the undisturbed run, bit for bit and seconds aside: every tensor and value of `last.pt` and `best.pt`; the
+  lines of `metrics.jsonl` and what TensorBoard shows, each epoch once; all pictures and the photographs' scores.
+- *As it should*: a signal ends the run with 128 + its number, a full disk or damage to both checkpoints with 2 and one
+  sentence; a run that falls back to the checkpoint before says so; nothing else is on stderr.
 """
 
 
