@@ -14,7 +14,8 @@ from tempfile import TemporaryDirectory
 import hydra
 import numpy as np
 from omegaconf import DictConfig
-from torture.cases import Bench, Case, Outcome, all_cases, prepare
+from torture.bench import Bench, Outcome, prepare
+from torture.cases import Case, all_cases
 from torture.page import failures, merged, page
 from torture.workshop import furnish
 

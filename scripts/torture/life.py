@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torture.workshop import Workshop
+from train.cli import USER_ERROR
 from train.logs import METRICS
 
 PATIENCE = 300  # seconds after which a process that should have ended has hung
@@ -54,6 +55,17 @@ class Ending:
     caught: bool
     output: str
     errors: str
+
+    @property
+    def terse(self) -> bool:
+        """Whether stderr holds nothing, or one line on how to go on."""
+        lines = self.errors.splitlines()
+        return not lines or (len(lines) == 1 and "train.resume=true" in lines[0])
+
+    def is_one_sentence(self, advice: str) -> bool:
+        """Whether the process ended with an error that its user can mend, which says this."""
+        lines = self.errors.splitlines()
+        return self.status == USER_ERROR and len(lines) == 1 and lines[0].startswith("error: ") and advice in lines[0]
 
 
 class Life:

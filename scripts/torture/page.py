@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from torture.cases import Bench, Outcome
+from torture.bench import Bench, Outcome
 from torture.life import ORDER
 
 CONCERNS = {  # of faults, and the heads of their columns

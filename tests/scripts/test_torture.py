@@ -17,8 +17,9 @@ ROOT = Path(__file__).parents[2]
 EPOCHS = 3
 
 sys.path.append(str(ROOT / "scripts"))
-from torture.cases import Bench, Outcome, interrupted, kill  # noqa: E402
+from torture.bench import Bench, Outcome  # noqa: E402
 from torture.comparison import compare, differences  # noqa: E402
+from torture.interruptions import interrupted, kill  # noqa: E402
 from torture.life import PHASES, innermost_phase  # noqa: E402
 from torture.page import CONCERNS, failures, merged, page  # noqa: E402
 from torture.workshop import Workshop, furnish  # noqa: E402
