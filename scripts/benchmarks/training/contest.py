@@ -23,7 +23,7 @@ from train.wideresnet import WideResNet
 
 PICTURES, CLASSES, SIZE = 50_000, 100, 32  # CIFAR-100's
 EPOCHS = {"cpu": 9, "cuda": 10}
-STEPS = {"cpu": 2, "cuda": 0}
+STEPS = {"cpu": 4, "cuda": 0}
 FEWER = 3
 MOST_WORKERS = 8
 
