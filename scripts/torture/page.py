@@ -17,6 +17,8 @@ CONCERNS = {  # of faults, and the heads of their columns
     "said": "exit status and words",
 }
 INTRODUCTION = """\
+# Interruptions
+
 Made by `{command}` with torch {torch} on {machine}. Undisturbed, a run has {epochs} epochs of {epoch:.0f} ms
 after {start:.0f} s of start-up. Half of the moments are uniform over all of it, half over what follows the start-up.
 Every run is resumed until it ends by itself.
