@@ -20,8 +20,8 @@ class Interrupted(SystemExit):
 class Interruption:
     """Notes the first of `SIGNALS` while it is entered; a second one acts as it would without.
 
-    So does the first where nobody asks for it until it is left. Signals reach a process's main thread alone: in another
-    one, none is noted.
+    So does the first where nobody asks for it until it is left. Signals that the process was started to ignore stay
+    ignored, and they reach its main thread alone: in another one, none is noted.
     """
 
     def __init__(self):
@@ -30,7 +30,8 @@ class Interruption:
 
     def __enter__(self) -> "Interruption":
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+            heeded = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+            self._before = {number: signal.signal(number, self._note) for number in heeded}
         return self
 
     def __exit__(self, error: type | None, *rest) -> None:

@@ -146,6 +146,16 @@ def test_a_batch_systems_signal_writes_a_checkpoint_before_its_own_handler_acts(
     assert checkpoint.load(tmp_path / checkpoint.LAST)["under_way"]["step"] == 2
 
 
+def test_a_signal_that_is_ignored_stays_so(tiny, tmp_path, monkeypatch):
+    """As nohup ignores SIGHUP, a shell ignores SIGINT for what it starts in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        run_with_signal(tiny("augment=none"), tmp_path, monkeypatch, 1, 2, signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "test/accuracy" in read_metrics(tmp_path)[-1]
+
+
 def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
     def impatient(images, labels, *rest, **more):
         signal.raise_signal(signal.SIGINT)
