@@ -142,6 +142,11 @@ class Trainer:
                 f"the checkpoint in {self.folder} is from another architecture or other classes: resume with the "
                 f"settings of {self.folder / 'config.yaml'}, or start in another folder with run="
             )
+        if self._average and not state["average"]:
+            raise InputError(
+                f"train.averaging={self.settings.averaging}, and the checkpoint in {self.folder} has no average: "
+                "resume with train.averaging=0"
+            )
         if problem:
             console.warning("%s: going on from the one before", problem)
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or the next one would take the place of the whole

@@ -257,3 +257,37 @@ def test_every_epoch_has_its_line_before_its_checkpoint(tmp_path, monkeypatch):
     fit_noise(make_trainer(tmp_path, epochs=2))
     last = [entry[1:] for entry in lines_at_save if entry[0] == checkpoint.LAST]
     assert last == [(1, [1]), (2, [1, 2])]
+
+
+def test_the_average_follows_the_steps_and_is_what_is_validated_and_kept(tmp_path):
+    trainer, weights = make_trainer(tmp_path, epochs=2, averaging=0.8), []
+    trainer.optimizer.register_step_post_hook(
+        lambda *arguments: weights.append(trainer.model.network.head.weight.detach().clone())
+    )
+    fit_noise(trainer)
+    average = weights[0]
+    for weight in weights[1:]:
+        average = 0.8 * average + 0.2 * weight
+    torch.testing.assert_close(trainer.selected.network.head.weight, average)
+    assert not torch.allclose(trainer.model.network.head.weight, average)
+    validated = evaluate(trainer.selected, noise(20))
+    assert validated["accuracy"] == read_metrics(tmp_path)[-1]["validation/accuracy"]
+
+
+def test_a_resumed_average_goes_on_bit_for_bit(tmp_path):
+    fit_noise(make_trainer(tmp_path, averaging=0.8))
+    whole = checkpoint.load(tmp_path / checkpoint.LAST)
+    (tmp_path / checkpoint.LAST).unlink()  # the epoch before the last is left
+    resumed = make_trainer(tmp_path, averaging=0.8)
+    resumed.resume()
+    assert resumed.epoch == 2
+    fit_noise(resumed)
+    again = checkpoint.load(tmp_path / checkpoint.LAST)
+    assert again["average"].keys() == whole["average"].keys()
+    assert all(torch.equal(value, whole["average"][name]) for name, value in again["average"].items())
+
+
+def test_resuming_with_an_average_that_the_run_has_not_is_an_error(tmp_path):
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    with pytest.raises(InputError, match=r"train.averaging=0.8, and the checkpoint in .* has no average"):
+        make_trainer(tmp_path, averaging=0.8).resume()
