@@ -88,7 +88,8 @@ rasterises by OpenGL on a GTX 1080, for ResNet-101, which is about twenty times 
 {ratios}
 
 At 32² a step is that of the training's attack: 100 examples (two meshes, 10 views, 5 backgrounds), WideResNet-16-4 as
-in `pretrained/none`, with its bias for the label raised so that no example leaves the batch.
+in `pretrained/none`, with its bias for the label raised so that no example leaves the batch. Pictures of one view on
+several backgrounds, as the training has them, share what is read from memory once an iteration.
 
 ### How many iterations, how many seconds
 
@@ -107,12 +108,13 @@ gradient at unit length, at most {max_steps}, no limit to the norm. Seconds incl
 
 @dataclass(frozen=True)
 class Setup:
-    """What a single picture shows, and how it is drawn."""
+    """What the pictures show, one on each background, and how they are drawn."""
 
     name: str
     subject: Subject
     samples: int
     normals: str
+    backgrounds: Sequence[float] = (0.5,)
 
 
 @dataclass(frozen=True)
@@ -192,18 +194,18 @@ def iteration(
     return Iteration(setup, kind, pixels, *(tuple(column) for column in zip(*rows[1:], strict=True)))
 
 
-def single_picture(
-    setup: Setup, kind: str, classifier: nn.Module, field: float, options: argparse.Namespace
-) -> Iteration:
-    """An attack on one picture that never succeeds, since its target is the least likely class."""
+def one_view(setup: Setup, kind: str, classifier: nn.Module, field: float, options: argparse.Namespace) -> Iteration:
+    """An attack on the pictures of one view that never succeeds, since its targets are the least likely classes."""
     camera, size, subject = OrthographicCamera(POLAR, 0.0, field), classifier.size, setup.subject
-    picture = PictureSettings(size, setup.samples, normals=setup.normals)
-    behind, light = torch.full((1, 3, size, size), 0.5), load_light(options.light)
-    scene = MeshScene(subject.mesh, [[camera]], behind, light, picture, choose(), subject.gain)
+    picture, count = PictureSettings(size, setup.samples, normals=setup.normals), len(setup.backgrounds)
+    behind = torch.tensor(setup.backgrounds).view(-1, 1, 1, 1).expand(-1, 3, size, size)
+    scene = MeshScene(
+        subject.mesh, [[camera]] * count, behind, load_light(options.light), picture, choose(), subject.gain
+    )
     make, settings = KINDS[kind]
-    problem, examples = Perturbation(scene, [make(scene, settings)]), torch.arange(1)
-    images = problem.render(problem.start, examples).detach()[0]
-    label = torch.tensor([[classifier.label(subject.label)]])
+    problem = Perturbation(scene, [make(scene, settings)])
+    images = problem.render(problem.start, torch.arange(count)).detach()[:, 0]
+    label = torch.full((count, 1), classifier.label(subject.label))
     goal = Goal(label, classifier(images).argmin(1, keepdim=True))
     descent = DescentSettings(options.passes - 1, shorten=kind == "geometry")
     pixels = len(scene.operator(camera).pixels)
@@ -213,7 +215,7 @@ def single_picture(
         pixels,
         classifier,
         images,
-        label[0],
+        label[:, 0],
         lambda watch: descend(classifier, problem, goal, descent, watch),
         options.passes,
         options.turns,
@@ -354,9 +356,19 @@ def main() -> None:
         Setup(f"{chosen[0].name}, textured, smooth, 2×2 samples", fine(chosen[0]), 2, "smooth"),
         Setup("solid:orange, flat, 1 sample", fine(Subject("solid", load_object(SOLID), options.label)), 1, "flat"),
     )
-    measured = [single_picture(setups[0], kind, classifier, field, options) for kind in KINDS for field in FIELDS]
+    measured = [one_view(setups[0], kind, classifier, field, options) for kind in KINDS for field in FIELDS]
     largest = {kind: next(each for each in measured if each.kind == kind) for kind in KINDS}
-    plain = [single_picture(setups[1], kind, classifier, FIELDS[0], options) for kind in KINDS]
+    plain = [one_view(setups[1], kind, classifier, FIELDS[0], options) for kind in KINDS]
+    shared = [
+        one_view(
+            replace(setup, name=f"{setup.name}, {len(GREYS)} backgrounds", backgrounds=GREYS),
+            "lighting",
+            classifier,
+            FIELDS[0],
+            options,
+        )
+        for setup in reversed(setups)
+    ]
     training = training_step(chosen, options)
     done = [each for subject in chosen for each in attacks(subject, classifier, options)]
     share_of = {kind: np.median(np.divide(each.inside, each.whole)) for kind, each in largest.items()}
@@ -369,7 +381,7 @@ def main() -> None:
         most=largest["lighting"].pixels,
         classifier_share=f"{share_of['lighting']:.0%}",
         geometry_share=f"{share_of['geometry']:.0%}",
-        ratios=table(RATIO_COLUMNS, map(ratio_row, (training, *plain, *largest.values()))),
+        ratios=table(RATIO_COLUMNS, map(ratio_row, (training, *plain, *largest.values(), *shared))),
         examples=len(done),
         max_steps=options.max_steps,
         distribution=table(ATTACK_COLUMNS, distribution_rows(done, [subject.name for subject in chosen])),
@@ -377,7 +389,7 @@ def main() -> None:
         command=command(),
         versions=versions(),
     )
-    records = [asdict(each) for each in (*measured, *plain, training, *done)]
+    records = [asdict(each) for each in (*measured, *plain, *shared, training, *done)]
     write_section(options.out, "run_time", "Run time", text, records)
     draw(measured, options.out / "paper" / "run_time.png")
 
