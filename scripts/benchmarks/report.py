@@ -52,8 +52,8 @@ class Findings:
 
 
 WHY_NOT = """\
-What stands in the way. At 32² one light's picture and gradient are some twenty operations on a few thousand numbers,
-whose cost is Python's and torch's for each operation and not the arithmetic; a light among 100 costs a fraction of it
+At 32² one light's picture and gradient are some twenty operations on a few thousand numbers, whose cost is Python's and
+torch's for each operation and not the arithmetic; a light among 100 costs a fraction of it
 ([Light step by lights](#light-step-by-lights-32)). Rasterising anew takes more than half of a vertex step and is the
 same work for plain autograd; [Gradient by the vertices](#gradient-by-the-vertices-224) has the ratios without it, too.
 """

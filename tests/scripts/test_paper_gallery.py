@@ -134,7 +134,7 @@ def options():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_iteration_holds_its_time_in_the_classifier_and_the_pixels_it_covers(subject, options, kind):
-    measured = run_time.single_picture(Setup("ball", subject, 2, "smooth"), kind, bright(), 4.0, options)
+    measured = run_time.one_view(Setup("ball", subject, 2, "smooth"), kind, bright(), 4.0, options)
     assert len(measured.whole) == len(measured.bare) == len(measured.inside) == options.turns
     assert (measured.renderer > 0).all() and min(measured.inside) > 0
     # The unit ball fills π/16 of a picture that is 4 wide; its outline of 6π pixels counts whole.
