@@ -17,7 +17,7 @@ from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
-from renderer.harmonics import irradiance_basis, live_coefficients, per_degree
+from renderer.harmonics import irradiance_basis, live_coefficients
 from renderer.image import PictureSettings
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
@@ -70,17 +70,29 @@ class Operator:
             product = linear(upstream * self.albedo, self._shared)
         else:
             product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
-        return (_spread(self.degree).to(product) @ product.mT).to(radiance_gradient.dtype)
+        return (self._places @ product.mT).to(radiance_gradient.dtype)
 
     def to(self, device: torch.device | str) -> "Operator":
         """The same on another device."""
         names = [field.name for field in fields(self) if field.name != "degree"]
         return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
+    # Kept, since at 32² even an index or a look at a dtype counts.
+
     @cached_property
     def _shared(self) -> Tensor | None:
-        """(K, P), where the channels share it; kept, since at 32² even an index counts."""
+        """(K, P), where the channels share it."""
         return self.transfer[0] if len(self.transfer) == 1 else None
+
+    @cached_property
+    def _live(self) -> Tensor:
+        """(K,) indices of the coefficients that reach a surface."""
+        return live_coefficients(self.degree).to(self.transfer.device)
+
+    @cached_property
+    def _places(self) -> Tensor:
+        """((degree + 1)², K): puts the live coefficients in their places, with exact zeros in the others."""
+        return torch.eye((self.degree + 1) ** 2).to(self.transfer)[:, self._live]
 
 
 class _Radiance(torch.autograd.Function):
@@ -96,19 +108,12 @@ class _Radiance(torch.autograd.Function):
 
 
 def _radiance(operator: Operator, lights: Tensor) -> Tensor:
-    live = live_coefficients(operator.degree).to(lights.device)
-    kept = lights.index_select(-2, live).to(operator.transfer.dtype)
+    kept = lights.index_select(-2, operator._live).to(operator.transfer.dtype)
     if operator._shared is not None:
         product = (kept.mT @ operator._shared).mul_(operator.albedo)
     else:
         product = torch.einsum("...kc,ckp->...cp", kept, operator.transfer)
     return product.to(lights.dtype)
-
-
-@per_degree
-def _spread(degree: int) -> Tensor:
-    """((degree + 1)², K) float32: puts the live coefficients in their places, with exact zeros in the others."""
-    return torch.eye((degree + 1) ** 2)[:, live_coefficients(degree)]
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
