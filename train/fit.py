@@ -3,12 +3,10 @@
 import math
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
@@ -18,9 +16,10 @@ from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError
 from train import checkpoint
-from train.batches import batch_count, to_bytes, to_unit, training_batches
+from train.batches import batch_count, training_batches
 from train.data import Split
 from train.distributed import replicated, summed
+from train.epoch import EpochUnderWay, put_last, with_room
 from train.evaluation import evaluate
 from train.graphs import FixedSizes, compiles, training_pass
 from train.interruption import Interruption
@@ -29,28 +28,6 @@ from train.precision import MixedPrecision
 from train.random_state import random_state, restore_random_state
 from train.recipe import TrainSettings
 from train.schedule import SCHEDULES
-
-
-@dataclass
-class EpochUnderWay:
-    """Its renders, the steps taken, and the sums of loss and hits over the pictures this process has seen (2,)."""
-
-    renders: Renders
-    sums: Tensor
-    step: int = 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """Plain values and tensors, over all processes; the renders as bytes, as they are trained on."""
-        diagnostics = dict(self.renders.diagnostics)
-        renders = {"images": to_bytes(self.renders.images), "labels": self.renders.labels, "diagnostics": diagnostics}
-        return {"renders": renders, "sums": summed(self.sums.clone()), "step": self.step}
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any], device: torch.device) -> "EpochUnderWay":
-        images, labels, diagnostics = (state["renders"][name] for name in ("images", "labels", "diagnostics"))
-        renders = Renders(to_unit(images).to(device), labels.to(device), diagnostics)
-        sums = state["sums"] if processes.index() == 0 else torch.zeros(2)
-        return cls(renders, sums.to(device), state["step"])
 
 
 class Trainer:
@@ -288,21 +265,6 @@ class Trainer:
             sum(seconds.get(name, 0.0) for name in ("training", "evaluation", "attack", "input_output")),
             seconds.get("attack", 0.0),
         )
-
-
-def with_room(split: Split, count: int) -> Split:
-    """The split's pictures and, behind them, room for an epoch's renders."""
-    images, labels = split.images, split.labels
-    return Split(
-        torch.cat([images, images.new_zeros(count, *images.shape[1:])]), torch.cat([labels, labels.new_zeros(count)])
-    )
-
-
-def put_last(split: Split, renders: Renders) -> None:
-    """Overwrite the split's last pictures with the renders, as 8-bit pictures."""
-    first = len(split) - len(renders.labels)
-    split.images[first:] = to_bytes(renders.images)
-    split.labels[first:] = renders.labels
 
 
 def _averaged(model: MixedPrecision, decay: float) -> AveragedModel | None:

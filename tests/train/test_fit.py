@@ -11,8 +11,9 @@ from augment.service import Renders
 from renderer.errors import InputError
 from train import checkpoint, evaluation, fit
 from train.data import Split
+from train.epoch import put_last, with_room
 from train.evaluation import evaluate
-from train.fit import Trainer, put_last, with_room
+from train.fit import Trainer
 from train.logs import RunLog, read_metrics
 from train.precision import MixedPrecision
 from train.recipe import TrainSettings
