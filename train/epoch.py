@@ -13,6 +13,8 @@ from train.batches import to_bytes, to_unit
 from train.data import Split
 from train.distributed import summed
 
+PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; others are parts of these, or once a run
+
 
 def with_room(split: Split, count: int) -> Split:
     """The split's pictures and, behind them, room for an epoch's renders."""

@@ -19,7 +19,7 @@ from train import checkpoint
 from train.batches import batch_count, training_batches
 from train.data import Split
 from train.distributed import replicated, summed
-from train.epoch import EpochUnderWay, put_last, with_room
+from train.epoch import PHASES, EpochUnderWay, put_last, with_room
 from train.evaluation import evaluate
 from train.graphs import FixedSizes, compiles, training_pass
 from train.interruption import Interruption
@@ -107,8 +107,11 @@ class Trainer:
                     finished = self._train(mixed, interruption)
                 if finished:
                     self._end_epoch(validation, len(mixed), log)
-                if interruption.requested():
-                    self._save()
+                ending = interruption.requested()
+                if ending or self._checkpoint_is_due():
+                    with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
+                        self._save()
+                if ending:
                     interruption.stop()
 
     def resume(self) -> None:
@@ -205,9 +208,11 @@ class Trainer:
             if len(now.renders.labels):
                 log.renders(now.renders.images, self.epoch)
         self._report(log, trained, validated, now.renders)
-        if self.epoch % self.settings.checkpoint_every == 0 or self.epoch == self.settings.epochs:
-            with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
-                self._save()
+
+    def _checkpoint_is_due(self) -> bool:
+        """Between two epochs, or after the last."""
+        every, last = self.settings.checkpoint_every, self.settings.epochs
+        return self._under_way is None and (self.epoch % every == 0 or self.epoch == last)
 
     def _check_finite(self, loss: float) -> None:
         if not math.isfinite(loss):
@@ -262,7 +267,7 @@ class Trainer:
             trained["accuracy"],
             validated["accuracy"],
             "" if fooled is None else f"  renders fooled {fooled:.2f}",
-            sum(seconds.get(name, 0.0) for name in ("training", "evaluation", "attack", "input_output")),
+            sum(seconds.get(name, 0.0) for name in PHASES),
             seconds.get("attack", 0.0),
         )
 

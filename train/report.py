@@ -11,12 +11,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
 from train import checkpoint
+from train.epoch import PHASES
 from train.experiment import CONFIG, PHOTOGRAPHS
 from train.logs import read_metrics
 from train.photographs import share
 from train.settings import decisive_settings
 
-PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; others are parts of these, or once a run
 RECIPE = ("epochs", "batch_size", "learning_rate", "momentum", "weight_decay", "schedule", "precision")
 
 

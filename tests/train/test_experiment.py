@@ -146,6 +146,13 @@ def test_a_batch_systems_signal_writes_a_checkpoint_before_its_own_handler_acts(
     assert checkpoint.load(tmp_path / checkpoint.LAST)["under_way"]["step"] == 2
 
 
+def test_a_signal_at_an_epochs_end_leaves_the_epoch_before_to_fall_back_to(tiny, tmp_path, monkeypatch):
+    with pytest.raises(Interrupted):
+        run_with_signal(tiny("augment=none"), tmp_path, monkeypatch, 1, 4, signal.SIGTERM)
+    epochs = [checkpoint.load(tmp_path / name)["epoch"] for name in (checkpoint.LAST, checkpoint.PREVIOUS)]
+    assert epochs == [2, 1]
+
+
 def test_a_signal_that_is_ignored_stays_so(tiny, tmp_path, monkeypatch):
     """As nohup ignores SIGHUP, a shell ignores SIGINT for what it starts in the background."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -10,7 +10,7 @@ from benchmarks.training.arm import EPOCH
 from benchmarks.training.peak import TRAINING
 from benchmarks.training.turns import Turn
 from train.batches import batch_count
-from train.report import PHASES
+from train.epoch import PHASES
 
 PLAIN, ADVERSARIAL, BASELINE, PRODUCTS = "augment=none", "augment=adversarial", "baseline", "matrix products"
 REST = "everything else"

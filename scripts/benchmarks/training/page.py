@@ -8,7 +8,7 @@ from benchmarks.plots import pyplot, save
 from benchmarks.results import markdown, shown, targets_table
 from benchmarks.training.findings import ADVERSARIAL, BASELINE, PLAIN, REST, RUN, Findings, Spread, targets
 from benchmarks.training.peak import PRECISIONS
-from train.report import PHASES
+from train.epoch import PHASES
 
 HEADER = """# Training speed
 
