@@ -159,10 +159,11 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
         for step in range(settings.max_steps + 1):
             chosen = candidate[active].requires_grad_(True)
             rendered = problem.render(chosen, active)
+            aim = goal.of(active)
             with phases("attack_classifier"):
-                seen = _classifier_pass(model, rendered.detach(), goal.of(active), settings.batch_size)
+                seen = _classifier_pass(model, rendered.detach(), aim, settings.batch_size)
             (gradient,) = torch.autograd.grad(rendered, chosen, seen.gradient)
-            reached = goal.of(active).reached(seen.predicted)
+            reached = aim.reached(seen.predicted)
             if step == 0:
                 images, cost_before, fooled_before = rendered.detach().clone(), seen.cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
@@ -181,19 +182,20 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
 
 
 def _classifier_pass(model: nn.Module, pictures: Tensor, goal: Goal, batch_size: int) -> _Pass:
-    views = pictures.shape[1]
+    views, flat = pictures.shape[1], pictures.flatten(0, 1)
     decrease, increase = goal.decrease.flatten(), None if goal.increase is None else goal.increase.flatten()
-    flat, costs, predicted, gradients = pictures.flatten(0, 1), [], [], []
+    gradient, costs, predicted = torch.empty_like(flat), [], []
     for begin in range(0, len(flat), batch_size):
         part = slice(begin, begin + batch_size)
         batch = flat[part].detach().requires_grad_(True)
         logits = model(batch)
         cost = adversarial_cost(logits, decrease[part], None if increase is None else increase[part])
-        gradients += torch.autograd.grad(cost.sum(), batch)
+        (by_picture,) = torch.autograd.grad(cost.sum(), batch)
+        gradient[part] = by_picture  # laid out as the pictures are, not as the network's channels
         costs.append(cost.detach())
         predicted.append(logits.detach().argmax(1))
     return _Pass(
         torch.cat(costs).unflatten(0, (-1, views)).sum(1),
         torch.cat(predicted).unflatten(0, (-1, views)),
-        torch.cat(gradients).unflatten(0, (-1, views)),
+        gradient.unflatten(0, (-1, views)),
     )

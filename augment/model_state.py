@@ -10,20 +10,22 @@ from torch import nn
 @contextmanager
 def eval_mode(model: nn.Module) -> Iterator[None]:
     """Eval mode inside; each module's own mode restored after, since a frozen layer may differ from the whole."""
-    modes = [(module, module.training) for module in model.modules()]
-    model.eval()
+    training = [module for module in model.modules() if module.training]
+    if training:  # setting the mode of a large network takes as long as rendering a picture
+        model.eval()
     try:
         yield
     finally:
-        for module, mode in modes:
-            module.training = mode
+        for module in training:
+            module.training = True
 
 
 @contextmanager
 def as_found(model: nn.Module) -> Iterator[None]:
     """Eval mode and no gradients for parameters inside; mode, requires_grad and random state restored after."""
-    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    devices = {parameter.device for parameter in model.parameters() if parameter.is_cuda}
+    parameters = list(model.parameters())
+    trainable = [parameter for parameter in parameters if parameter.requires_grad]
+    devices = {parameter.device for parameter in parameters if parameter.is_cuda}
     for parameter in trainable:
         parameter.requires_grad_(False)
     try:

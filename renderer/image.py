@@ -38,13 +38,27 @@ def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: st
     radiance: (..., 3, P) linear, already weighted with coverage. coverage: (..., 1, P) in [0, 1].
     background: (..., 3 or 1, 1 or P) picture values behind the surface. Returns (..., 3, P). InputError: NaN.
     """
-    require_bounded(radiance=radiance, coverage=coverage, background=background)
-    return encode(clamp(_composite(radiance, coverage, background, encoding)), encoding)
+    require_bounded(radiance=radiance)
+    return develop_composite(radiance + behind(coverage, background, encoding), encoding)
+
+
+def behind(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
+    """What a background adds to the radiance in front of it, linear (..., 3 or 1, P); shapes as in `develop`.
+
+    InputError: NaN.
+    """
+    require_bounded(coverage=coverage, background=background)
+    return (1 - coverage) * decode(background, encoding)
+
+
+def develop_composite(composite: Tensor, encoding: str = "linear") -> Tensor:
+    """`develop`, given the sum of radiance and what is `behind` it."""
+    return encode(clamp(composite), encoding)
 
 
 def clamped(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
     """Which picture values `develop` clamps, where the gradient is therefore zero. Boolean (..., 3, P)."""
-    composite = _composite(radiance, coverage, background, encoding)
+    composite = radiance + behind(coverage, background, encoding)
     return (composite < 0) | (composite > 1)
 
 
@@ -70,10 +84,6 @@ class _Clamp(torch.autograd.Function):
     def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
         (passing,) = ctx.saved_tensors
         return upstream * passing, None
-
-
-def _composite(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str) -> Tensor:
-    return torch.addcmul(radiance, 1 - coverage, decode(background, encoding))
 
 
 def encode(linear: Tensor, encoding: str) -> Tensor:

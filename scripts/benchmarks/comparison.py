@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ KEPT, REFRESHED = "visibility kept", "re-rasterised"
 MITSUBA, PYTORCH3D = "Mitsuba 3", "PyTorch3D"
 SAMPLES_OF = {MITSUBA: 16, PYTORCH3D: 1}  # per pixel
 
-FINER = 4  # samples per side, as many in all as Mitsuba has
+COARSER, FINER = 2, 4  # samples per side: as attacks have by default, and as many in all as Mitsuba has
 SHADINGS = {ANALYTIC: shading.radiance, BY_FACE: shade_by_face, BY_SAMPLE: reference.radiance}
 
 Peers = Mapping[str, Callable]  # makers by name
@@ -92,18 +93,23 @@ def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
         row = _row(f"gradient by the vertices, {size}²", view)
         for name, shade in SHADINGS.items():
             errors = exact.vertex_errors(view, 1, light, shade)
-            for visibility in (KEPT, REFRESHED):
-                call = vertex_step(view, 1, light, kept=visibility == KEPT, shade=shade)
-                yield replace(row, setting=f"{name}, {visibility}", samples=1, **errors), call
-        errors = exact.vertex_errors(view, FINER, light)
-        finer = replace(row, setting=f"{ANALYTIC}, {REFRESHED}, {FINER}² samples", samples=FINER**2, **errors)
-        yield finer, vertex_step(view, FINER, light)
+            kept = replace(row, setting=f"{name}, {KEPT}", samples=1, **errors)
+            yield kept, vertex_step(view, 1, light, kept=True, shade=shade)
+        for samples, name in (*product((1, COARSER), SHADINGS), (FINER, ANALYTIC)):
+            errors = exact.vertex_errors(view, samples, light, SHADINGS[name])
+            refreshed = replace(row, setting=rasterised(name, samples), samples=samples**2, **errors)
+            yield refreshed, vertex_step(view, samples, light, shade=SHADINGS[name])
         for name, peer in _set_up(view, peers):
             call = partial(peer.vertex_gradient, view.image_gradient.cpu().float().numpy())
             errors = exact.errors(torch.from_numpy(peer.picture()), torch.from_numpy(call()), exact.by_vertices)
             yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
 
     return bench.timed(entries())
+
+
+def rasterised(name: str, samples: int) -> str:
+    """The row of a shading whose every step rasterises anew, with so many samples per side of a pixel."""
+    return f"{name}, {REFRESHED}, {samples}² samples"
 
 
 def _irradiance(normals: Tensor) -> Tensor:

@@ -54,8 +54,9 @@ class Findings:
 WHY_NOT = """\
 At 32² one light's picture and gradient are some twenty operations on a few thousand numbers, whose cost is Python's and
 torch's for each operation and not the arithmetic; a light among 100 costs a fraction of it
-([Light step by lights](#light-step-by-lights-32)). Rasterising anew takes more than half of a vertex step and is the
-same work for plain autograd; [Gradient by the vertices](#gradient-by-the-vertices-224) has the ratios without it, too.
+([Light step by lights](#light-step-by-lights-32)). Plain autograd sample by sample is `renderer.reference`; face by
+face it shades each face once, as the analytic derivative does. Rasterising anew takes more than half of a vertex step
+and is the same work for all; [Gradient by the vertices](#gradient-by-the-vertices-224) has the ratios without it, too.
 """
 
 

@@ -2,7 +2,18 @@
 
 from collections.abc import Sequence
 
-from benchmarks.comparison import ANALYTIC, BY_FACE, BY_SAMPLE, DIRECT, KEPT, MITSUBA, PYTORCH3D, REFRESHED
+from benchmarks.comparison import (
+    ANALYTIC,
+    BY_FACE,
+    BY_SAMPLE,
+    COARSER,
+    DIRECT,
+    KEPT,
+    MITSUBA,
+    PYTORCH3D,
+    REFRESHED,
+    rasterised,
+)
 from benchmarks.panels import SAMPLES, Bench
 from benchmarks.results import Row, Target, shown
 from benchmarks.skipping import build_operators
@@ -16,12 +27,15 @@ QUOTED = {32: 1.3, 224: 13.0}  # ms, PyTorch3D with its fragments kept, measured
 def compared(panels: Sequence[Sequence[Row]]) -> list[Target]:
     """Of the panels of `comparison`: light at the small size, light at the large one, vertices at the large one."""
     small, large, vertices = ({row.setting: row for row in rows} for rows in panels)
-    analytic = f"{ANALYTIC}, {REFRESHED}"
     return [
         *(_faster(rows, DIRECT, PYTORCH3D, least) for rows, least in ((large, 10), (small, 30))),
         *(_faster(rows, DIRECT, MITSUBA, least) for rows, least in ((large, 300), (small, 400))),
-        _faster(vertices, analytic, MITSUBA, 30),
-        *(_faster(vertices, analytic, f"{peer}, {REFRESHED}", 3) for peer in (BY_SAMPLE, BY_FACE)),
+        _faster(vertices, rasterised(ANALYTIC, 1), MITSUBA, 30),
+        *(
+            _faster(vertices, rasterised(ANALYTIC, samples), rasterised(peer, samples), 3)
+            for peer in (BY_SAMPLE, BY_FACE)
+            for samples in (COARSER, 1)
+        ),
     ]
 
 

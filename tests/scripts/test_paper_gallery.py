@@ -132,9 +132,14 @@ def options():
     return Namespace(light="grace", passes=2, turns=3, seed=0, examples=2, max_steps=5, label="orange")
 
 
+@pytest.mark.parametrize(("views", "backgrounds"), [(1, (0.5,)), (3, GREYS)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_iteration_holds_its_time_in_the_classifier_and_the_pixels_it_covers(subject, options, kind):
-    measured = run_time.one_view(Setup("ball", subject, 2, "smooth"), kind, bright(), 4.0, options)
+def test_an_iteration_holds_its_time_in_the_classifier_and_the_pixels_it_covers(
+    subject, options, kind, views, backgrounds
+):
+    """A ball looks the same from all sides."""
+    setup = Setup("ball", subject, 2, "smooth", views, backgrounds)
+    measured = run_time.stubborn(setup, kind, bright(), 4.0, options.passes, options)
     assert len(measured.whole) == len(measured.bare) == len(measured.inside) == options.turns
     assert (measured.renderer > 0).all() and min(measured.inside) > 0
     # The unit ball fills π/16 of a picture that is 4 wide; its outline of 6π pixels counts whole.
