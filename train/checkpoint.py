@@ -23,7 +23,7 @@ HASH = "sha256"
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
     """Write tensors and plain values so that the file is, at any moment, either the old one or the new one.
 
-    previous: where the old one is kept. InputError where the disk does not take it; the old one then stays.
+    previous: where the old one is kept. OSError that names the path where the disk does not take it; the old one stays.
     """
     content = io.BytesIO()
     torch.save({**state, HASH: content_hash(state)}, content)
@@ -39,9 +39,7 @@ def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> 
         _sync_folder(path.parent)
     except OSError as error:
         temporary.unlink(missing_ok=True)
-        raise InputError(
-            f"checkpoint {path} cannot be written ({error.strerror}): make room and go on with train.resume=true"
-        ) from error
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def load(path: Path) -> dict[str, Any]:

@@ -121,8 +121,9 @@ def _one_error_without_room(folder: Path | str) -> Iterator[None]:
     except OSError as error:
         if error.errno not in NO_ROOM:
             raise
+        place = error.filename or folder
         raise InputError(
-            f"{folder} cannot be written ({error.strerror}): make room and go on with train.resume=true"
+            f"{place} cannot be written ({error.strerror}): make room and go on with train.resume=true"
         ) from error
 
 
