@@ -22,7 +22,7 @@ from renderer.errors import InputError
 from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
 from renderer.visibility import Backend, choose
-from train.cli import one_sentence_errors
+from train.cli import command_line, one_sentence_errors
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -108,7 +108,7 @@ def _write(folder: Path, findings: Findings, description: str) -> None:
     results.write_csv(folder / "renderer_scaling.csv", [asdict(point) for point in findings.scaling])
     plots.draw_fronts(folder / "renderer_pareto.png", findings.panels)
     plots.draw_scaling(folder / "renderer_scaling.png", findings.scaling, findings.workloads)
-    command = " ".join(["python scripts/benchmark_renderer.py", *sys.argv[1:]])
+    command = command_line(sys.argv[1:])
     (folder / "performance_renderer.md").write_text(report.page(findings, command, description))
 
 

@@ -3,7 +3,6 @@
 Writes docs/performance.md and a figure beside it. conf/benchmark_training.yaml has the settings.
 """
 
-import re
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -15,7 +14,7 @@ from benchmarks.training.contest import BenchmarkSettings, load, measure
 from benchmarks.training.page import draw, page
 from omegaconf import DictConfig, OmegaConf
 
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import command_line, one_sentence_errors, with_suggestions
 from train.device import choose_device, set_deterministic, set_threads
 from train.graphs import compiles
 from train.settings import read_settings
@@ -39,7 +38,7 @@ def write_page(config: DictConfig) -> None:
     settings, description = settings.on(device), machine(device)
     findings = measure(settings, config, load(config), device)
     facts = {
-        "command": _command(),
+        "command": command_line(sys.argv[1:]),
         "machine": description,
         "network": f"WideResNet-{config.model.depth}-{config.model.width} with dropout {config.model.dropout:g}",
         "data": f"`data={config.data.name}`" if config.data.path else "random pictures like CIFAR-100's",
@@ -52,12 +51,6 @@ def write_page(config: DictConfig) -> None:
     draw(figure, findings)
     out.write_text(page(findings, facts, figure.name))
     print(f"\n{out.read_text()}\nwritten: {out} and {figure}")
-
-
-def _command() -> str:
-    """As given, but for the absolute folders of this machine."""
-    words = (re.sub(r"(?<![\w.])/[^\s,]*/", "", word) for word in sys.argv[1:])
-    return " ".join(["python scripts/benchmark_training.py", *words])
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from stress.page import failures, measure, page
 from stress.refusals import refusals
 
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import command_line, one_sentence_errors, with_suggestions
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="stress_renderer")
@@ -19,7 +19,7 @@ def main(config: DictConfig) -> None:
     tables = measure(config.degree, config.subdivisions, config.size, config.slivers)
     refused = list(refusals())
     out = Path(config.out)
-    out.write_text(page(tables, refused, " ".join(["python scripts/stress_renderer.py", *sys.argv[1:]])))
+    out.write_text(page(tables, refused, command_line(sys.argv[1:])))
     print(f"{out}: {sum(len(table.rows) for table in tables)} conditions and {len(refused)} refusals")
     if failed := failures(tables, refused):
         sys.exit("\n".join(failed))

@@ -20,7 +20,7 @@ from torture.page import failures, merged, page
 from torture.workshop import furnish
 
 from renderer.errors import InputError
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import command_line, one_sentence_errors, with_suggestions
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="torture")
@@ -33,7 +33,7 @@ def main(config: DictConfig) -> None:
         with ThreadPoolExecutor(config.jobs) as pool:
             started = [pool.submit(_conduct, case, bench, config.seed, number) for number, case in enumerate(cases)]
         outcomes = merged([future.result() for future in started])
-    text = page(outcomes, bench, " ".join(["python scripts/torture.py", *sys.argv[1:]]))
+    text = page(outcomes, bench, command_line(sys.argv[1:]))
     print(text)
     if config.out:
         Path(config.out).write_text(text)

@@ -2,8 +2,11 @@
 
 import difflib
 import functools
+import re
+import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
@@ -13,6 +16,7 @@ from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 from renderer.errors import InputError
 
 USER_ERROR = 2
+FOLDERS = re.compile(r"(?<!\w)(~|\.{1,2})?/([^\s,:=]*/)?")  # of a path that does not begin in the clone
 
 
 def one_sentence(error: Exception) -> str | None:
@@ -53,6 +57,12 @@ def with_suggestions(main: Callable[[], None], config_name: str) -> None:
             for line in _suggestions(sys.argv[1:], config_name):
                 print(line, file=sys.stderr)
         raise
+
+
+def command_line(arguments: Sequence[str]) -> str:
+    """The command of the running script in scripts/, from the clone's root and without the folders of this machine."""
+    script = Path(sys.argv[0]).resolve().as_posix().rpartition("/scripts/")[2]
+    return shlex.join(["python", f"scripts/{script}", *(FOLDERS.sub("", argument) for argument in arguments)])
 
 
 def _suggestions(arguments: list[str], config_name: str) -> Iterator[str]:

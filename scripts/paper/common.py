@@ -4,7 +4,6 @@ import argparse
 import json
 import math
 import platform
-import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from renderer.lights import load_light
 from renderer.mesh import Mesh
 from renderer.visibility import choose
 from train.attacks.experiment import logits_of
+from train.cli import command_line
 
 DOCS = Path(__file__).parents[2] / "docs"
 FIELDS_OF_VIEW = (2.0, 3.0)  # the paper's appendix on rendering quality
@@ -141,13 +141,12 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def command() -> str:
-    """This run's command line as Markdown: files by their names alone, and without where the page goes."""
-    script, *words = sys.argv
+    """This run's command line as Markdown, without where the page goes."""
+    words = sys.argv[1:]
     if "--out" in words:
         at = words.index("--out")
         del words[at : at + 2]
-    words = [Path(word).name if word.startswith(("/", "./", "../", "~")) else word for word in words]
-    return f"```bash\nPYTHONPATH=. python scripts/paper/{Path(script).name} {shlex.join(words)}\n```"
+    return f"```bash\nPYTHONPATH=. {command_line(words)}\n```"
 
 
 def versions() -> str:

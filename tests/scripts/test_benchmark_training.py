@@ -275,7 +275,7 @@ def test_a_tiny_run_writes_the_page_and_its_figure(tmp_path, npz, monkeypatch, c
     monkeypatch.setitem(peak.SIZES, "cpu", (32,))
     monkeypatch.setattr(peak, "BURST", 1e-9)
     monkeypatch.setattr(
-        sys, "argv", ["benchmark_training.py", f"data.path={npz}", "scene.meshes=[/home/a.glb,{mesh:../b.glb}]"]
+        sys, "argv", ["scripts/benchmark_training.py", f"data.path={npz}", "scene.meshes=[/home/a.glb,{mesh:../b.glb}]"]
     )
     overrides = [*TINY, "data=npz", f"data.path={npz}", f"out={tmp_path}/docs/page.md", "epochs=1", "steps=1"]
     load_script().write_page(settings("benchmark_training", *overrides))
@@ -283,7 +283,7 @@ def test_a_tiny_run_writes_the_page_and_its_figure(tmp_path, npz, monkeypatch, c
     text = (tmp_path / "docs" / "page.md").read_text()
     assert text in capsys.readouterr().out
     assert (tmp_path / "docs" / "page.png").read_bytes().startswith(b"\x89PNG")
-    assert "`python scripts/benchmark_training.py data.path=tiny.npz scene.meshes=[a.glb,{mesh:../b.glb}]` " in text
+    assert "`python scripts/benchmark_training.py data.path=tiny.npz 'scene.meshes=[a.glb,{mesh:b.glb}]'` " in text
     assert "(30 on average, of 10 renders)" in text
     rows = {cells[0]: cells[1:] for line in text.splitlines() if (cells := re.findall(r"(?<=\| ).*?(?= \|)", line))}
     assert [float(cell.split()[0]) > 0 for cell in rows["training"]] == [True, True]

@@ -7,7 +7,7 @@ import pytest
 
 from renderer.errors import InputError
 from train.checkpoint import LAST
-from train.cli import USER_ERROR, one_sentence_errors, with_suggestions
+from train.cli import USER_ERROR, command_line, one_sentence_errors, with_suggestions
 from train.experiment import load_data, prepare
 
 ROOT = Path(__file__).parents[2]
@@ -151,3 +151,39 @@ def test_an_error_of_the_users_input_is_not_followed_by_suggestions(monkeypatch,
         with_suggestions(one_sentence_errors(main), "train")
     assert stop.value.code == USER_ERROR
     assert capsys.readouterr().err == "error: said before\n"
+
+
+# ---------------------------------------------------------------------------------------- on pages
+
+
+@pytest.mark.parametrize(
+    "script, arguments, shown",
+    [
+        (
+            "/home/me/scripts/clone/scripts/torture.py",
+            ["out=docs/interruptions.md"],
+            "torture.py out=docs/interruptions.md",
+        ),
+        (
+            "scripts/paper/run_time.py",
+            ["--meshes", "/me/a.glb:3", "../b.glb"],
+            "paper/run_time.py --meshes a.glb:3 b.glb",
+        ),
+        (
+            "scripts/attack.py",
+            ["scene.meshes=[~/a.glb,{mesh:/me/b.glb,gain:3}]"],
+            "attack.py 'scene.meshes=[a.glb,{mesh:b.glb,gain:3}]'",
+        ),
+        (
+            "scripts/attack.py",
+            ["data.path=./c d.npz", "train.device=cuda:0"],
+            "attack.py 'data.path=c d.npz' train.device=cuda:0",
+        ),
+        ("scripts/benchmark_renderer.py", [], "benchmark_renderer.py"),
+    ],
+)
+def test_a_page_shows_its_command_as_it_can_be_typed_without_the_machines_folders(
+    monkeypatch, script, arguments, shown
+):
+    monkeypatch.setattr(sys, "argv", [script])
+    assert command_line(arguments) == f"python scripts/{shown}"
