@@ -25,18 +25,21 @@ class _Texture:
 
 def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
     """(S, 3) float64 linear albedo at the samples: corner colour × texture, each decoded before it is interpolated."""
-    decoded = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(fragments.coverage)
+    textures = _packed_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
+    return _albedo(mesh, fragments, textures, encoding)
 
-    bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=decoded.device)
+
+def _packed_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[_Texture]:
+    """The mesh's own textures, eight bits a channel, decoded to the dtype and device of `like`."""
+    decoded = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(like)
+    bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=like.device)
 
     def texels(packed: Tensor, index: Tensor) -> Tensor:
         channels = (packed.index_select(0, index) >> bits) & 255
         return decoded.index_select(0, channels.long().flatten()).view(3, -1)
 
-    packed = [torch.from_numpy(each).to(decoded.device) for each in mesh.packed_textures]
-    return _albedo(
-        mesh, fragments, [_Texture(*each.shape, partial(texels, each.flatten())) for each in packed], encoding
-    )
+    packed = [torch.from_numpy(each).to(like.device) for each in mesh.packed_textures]
+    return [_Texture(*each.shape, partial(texels, each.flatten())) for each in packed]
 
 
 def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], encoding: str) -> Tensor:

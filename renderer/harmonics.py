@@ -19,8 +19,9 @@ MAX_DEGREE = 20
 Constant = TypeVar("Constant")
 
 
-def per_degree(function: Callable[[int], Constant]) -> Callable[[int], Constant]:
-    """Computed once per degree, and usable in training even if it was first asked for in inference mode."""
+def per_degree(function: Callable[..., Constant]) -> Callable[..., Constant]:
+    """Computed once per degree (and dtype and device), and usable in training even if first asked for in inference
+    mode."""
     return cache(torch.inference_mode(False)(function))
 
 

@@ -50,9 +50,9 @@ def area_vectors(vertices: Tensor, faces: Tensor) -> Tensor:
 class _AreaVectors(torch.autograd.Function):
     @staticmethod
     def forward(ctx, vertices: Tensor, faces: Tensor) -> Tensor:
-        corners = vertices.index_select(0, faces.T.flatten()).double().T.unflatten(1, (3, -1)).contiguous()
+        corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double().unflatten(1, (3, -1))
         edges = corners[:, 1:] - corners[:, :1]
-        scale = _power_of_two(edges)
+        scale = _power_of_two(edges) if vertices.dtype == torch.float64 else edges.new_ones(())  # room enough
         first, second = edges.div_(scale).unbind(1)
         product, lengths = _cross(first, second), edges.square().sum(0)
         thin = torch.nonzero(product.square().sum(0) <= SLIVER**2 * lengths[0] * lengths[1]).squeeze(1)

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -125,14 +126,9 @@ class _Polynomial:
     def of(light: Tensor) -> "_Polynomial":
         """light: ((degree + 1)², 3)."""
         degree = math.isqrt(len(light)) - 1
-        weights = light.new_zeros(max(len(light), 9), 3)
-        weights[: len(light)] = light * _factors(degree).to(light)
-        degree = max(degree - degree % 2, 2)
-        even, linear = (
-            torch.einsum("djk,kc->dcj", _slopes(power).to(light), weights[: (power + 1) ** 2]).flatten(0, 1)
-            for power in (degree, 1)
-        )
-        return _Polynomial(degree, even, linear, weights[:1].T / math.sqrt(4 * math.pi))
+        per_light = _slopes_per_light(degree, light.dtype, light.device)
+        slopes = (per_light @ light[: per_light.shape[2]]).mT.flatten(0, 1)
+        return _Polynomial(_even(degree), slopes[:, :-1], slopes[:, -1:], light[:1].T * math.sqrt(math.pi / 4))
 
     def __call__(self, unit: Tensor) -> tuple[Tensor, Tensor]:
         """Value (3, N) and slope (3 axes, 3, N) at unit vectors (3, N); of the slope, the tangential part counts.
@@ -144,6 +140,20 @@ class _Polynomial:
         for along, component in zip(slope, unit, strict=True):
             value.addcmul_(along, component, value=1 / self.degree)
         return value, slope
+
+
+@per_degree
+def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(3, J + 1, K): what one of each of a light's first K coefficients adds to the slopes of a `_Polynomial`: by each
+    axis, those of its even bands in monomials, and that of band 1."""
+    even = _even(degree)
+    slopes = torch.cat([_slopes(even), F.pad(_slopes(1), (0, (even + 1) ** 2 - 4))], dim=1) * _factors(even).T
+    return slopes[..., : (degree + 1) ** 2].to(device, dtype)
+
+
+def _even(degree: int) -> int:
+    """The degree of the homogeneous polynomial that holds the even bands from 2 on."""
+    return max(degree - degree % 2, 2)
 
 
 @per_degree
