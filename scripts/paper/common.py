@@ -4,10 +4,12 @@ import argparse
 import json
 import math
 import platform
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 import torch
@@ -28,6 +30,7 @@ from train.cli import command_line
 DOCS = Path(__file__).parents[2] / "docs"
 FIELDS_OF_VIEW = (2.0, 3.0)  # the paper's appendix on rendering quality
 GREYS = (0.0, 0.25, 0.5, 0.75, 1.0)
+AS_THEY_ARE = ("#", "|", "!", "```")  # headings, tables, pictures and code
 SECTIONS = ("norm_balls", "transfer", "unseen_views", "rendering_quality", "gallery", "run_time")
 
 
@@ -125,13 +128,28 @@ def write_section(out: Path, name: str, title: str, text: str, records: Iterable
     folder = out / "paper"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
-    (folder / f"{name}.md").write_text(f"## {title}\n\n{text.strip()}\n")
+    (folder / f"{name}.md").write_text(f"## {title}\n\n{wrapped(text.strip())}\n")
     there = [folder / f"{section}.md" for section in SECTIONS if (folder / f"{section}.md").is_file()]
     head = (
-        "# The paper's tables and figures\n\nEach section is written by the script that it names; do not edit. "
+        "# The paper's tables and figures\n\nEach section is written by the script that it names; do not edit.\n"
         'Renders of orange_sketchfab show "An Orange" by thisisepic, Sketchfab, CC BY-SA 4.0.\n'
     )
     (out / "paper.md").write_text("\n".join([head, *(path.read_text() for path in there)]))
+
+
+def wrapped(text: str) -> str:
+    """Markdown whose paragraphs and lists have lines of at most 120 characters."""
+    return "\n\n".join(
+        block if block.startswith(AS_THEY_ARE) else "\n".join(map(_filled, re.split("\n(?=- )", block)))
+        for block in text.split("\n\n")
+    )
+
+
+def _filled(paragraph: str) -> str:
+    hanging = "  " if paragraph.startswith("- ") else ""
+    return fill(
+        " ".join(paragraph.split()), 120, subsequent_indent=hanging, break_long_words=False, break_on_hyphens=False
+    )
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

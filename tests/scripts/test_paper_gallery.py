@@ -23,7 +23,7 @@ SIZE = 24
 sys.path.append(str(ROOT / "scripts" / "paper"))
 run_time = pytest.importorskip("run_time", reason="needs the benchmark extra", exc_type=ImportError)
 import gallery  # noqa: E402
-from common import GREYS, Subject, scene_of  # noqa: E402
+from common import GREYS, Subject, scene_of, wrapped  # noqa: E402
 from rendering_quality import (  # noqa: E402
     View,
     bootstrap,
@@ -122,6 +122,19 @@ def test_histograms_hold_each_recognised_render_once_under_its_mesh_field_and_gr
     assert sum(cell["recognised"] for cell in cells.values()) == 6
     assert cells[2.0, GREYS[0]]["histogram"] == [1] + 19 * [0] and cells[2.0, GREYS[4]]["histogram"] == 19 * [0] + [1]
     assert cells[3.0, GREYS[1]]["histogram"][10] == 1 and cells[2.0, GREYS[0]]["rendered"] == 2
+
+
+# ---------------------------------------------------------------------------------------- the page
+
+
+def test_paragraphs_and_lists_are_wrapped_and_tables_headings_and_code_are_not():
+    words, row, code = "word " * 60, f"| {'cell ' * 40}|", f"```bash\n{'word ' * 40}\n```"
+    text = "\n\n".join(["## Title", words, f"- {words}\n- one\n  item", row, code])
+    heading, paragraph, items, table, block = wrapped(text).split("\n\n")
+    assert [heading, table, block] == ["## Title", row, code]
+    assert paragraph.split() == words.split() and items.split() == f"- {words} - one item".split()
+    assert max(map(len, f"{paragraph}\n{items}".split("\n"))) <= 120
+    assert [line[:2] for line in items.split("\n")] == ["- ", "  ", "  ", "- "] and items.endswith("- one item")
 
 
 # ---------------------------------------------------------------------------------------- run time
