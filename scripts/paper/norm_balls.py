@@ -87,7 +87,7 @@ taken for, each beside its change (grey: none):
 
 The paper shows its shares in a figure and prints none, so that only their order can be compared. What differs:
 
-- {count} pictures instead of 10,000, since a step of a shape takes a CPU more than a tenth of a second. All show one
+- {count} pictures instead of 10,000, since a step of a shape takes a CPU about a tenth of a second. All show one
   class: the intervals are about views of these meshes, not about shapes at large.
 - {classifier} instead of ResNet-101; up to {steps} steps, where the paper's appendix has 30. The paper does not say
   how its attacks step within the ball, nor how often a random one may try; one draw and as many as there are steps
