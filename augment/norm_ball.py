@@ -1,5 +1,6 @@
 """Norm-balls in a space of parameters: the exact projection into them and uniform draws from them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor
 from renderer.errors import InputError
 
 NORMS = ("linf", "l2")
+Domain = Callable[[Tensor], Tensor]
 
 
 @dataclass
@@ -27,15 +29,16 @@ class NormBall:
         if self.radius is not None and not self.radius >= 0:
             raise InputError(f"attack: radius={self.radius} must not be below zero, or null for no limit")
 
-    def project(self, values: Tensor, centre: Tensor) -> Tensor:
-        """The nearest points of the ball in the Euclidean sense; values and centre (A, D)."""
+    def project(self, values: Tensor, centre: Tensor, domain: Domain = lambda values: values) -> Tensor:
+        """The nearest points of the ball in the Euclidean sense; values and centre (A, D).
+
+        domain: clamps values to a box that holds the centre; then the nearest points of what ball and box share.
+        """
         if self.radius is None:
-            return values
+            return domain(values)
         if self.norm == "linf":
-            return values.clamp(centre - self.radius, centre + self.radius)
-        offset = values - centre
-        length = offset.norm(dim=1, keepdim=True)
-        return torch.where(length > self.radius, centre + offset * (self.radius / length), values)
+            return domain(values).clamp(centre - self.radius, centre + self.radius)
+        return _project_on_sphere(values, centre, self.radius, domain)
 
     def sample(self, centre: Tensor, generator: torch.Generator) -> Tensor:
         """A uniform draw around each centre (A, D), on the generator's device. InputError where there is no radius."""
@@ -48,3 +51,23 @@ class NormBall:
             share = torch.rand(len(centre), 1, generator=generator) ** (1 / centre.shape[1])
             offset = direction / direction.norm(dim=1, keepdim=True) * share
         return centre + self.radius * offset.to(centre)
+
+
+def _project_on_sphere(values: Tensor, centre: Tensor, radius: float, domain: Domain) -> Tensor:
+    """Straight towards the values and along the domain's ends from there on, as far as the radius goes.
+
+    Where the box cuts an axis off, the others may go further: what is left of the squared radius is theirs. Each round
+    but the last cuts off another axis.
+    """
+    offset = values - centre
+    share = (radius / offset.norm(dim=1, keepdim=True)).clamp(max=1)
+    while True:
+        straight = torch.where(share < 1, centre + share * offset, values)
+        nearest = domain(straight)
+        cut = nearest != straight
+        left = radius**2 - torch.where(cut, nearest - centre, 0).square().sum(1, keepdim=True)
+        longer = (left.clamp(min=0).sqrt() / torch.where(cut, 0, offset).norm(dim=1, keepdim=True)).clamp(max=1)
+        further = cut.any(1, keepdim=True) & (longer > share)
+        if not further.any():
+            return nearest
+        share = torch.where(further, longer, share)

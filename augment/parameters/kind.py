@@ -64,15 +64,15 @@ class Kind(ABC):
         """The conditions with this part of them set to values (A, D)."""
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Values (A, D) of the examples (A,) moved into the norm-ball and into what is physically possible."""
-        return self.ball.project(self.within_domain(values), self.start[examples])
+        """The nearest values (A, D) of the examples (A,) within the norm-ball and what is physically possible."""
+        return self.ball.project(values, self.start[examples], self.within_domain)
 
     def sample(self, generator: torch.Generator, examples: Tensor) -> Tensor:
         """Uniform draws (A, D) from the balls of the examples (A,), within the domain."""
         return self.project(self.ball.sample(self.start[examples], generator), examples)
 
     def within_domain(self, values: Tensor) -> Tensor:
-        """Values (A, D) moved into their domain; by default there is no bound."""
+        """Values (A, D) moved into their domain, a box around the start; by default there is no bound."""
         return values
 
     def step(self, gradient: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy import stats
+from scipy import optimize, stats
 from torch import Tensor
 
 from augment.norm_ball import NORMS, NormBall
@@ -54,6 +54,41 @@ def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
     assert torch.equal(nearest[inside], values[inside])
     assert torch.equal(NormBall(name, 0.0).project(values, centre), centre)
     assert torch.equal(NormBall(name, None).project(values, centre), values)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", NORMS)
+@given(
+    pair=arrays(np.float64, (2, 3), elements=st.floats(-3, 3)),
+    ends=arrays(np.float64, (2, 3), elements=st.one_of(st.floats(0, 2), st.just(np.inf))),
+    radius=st.floats(0.01, 4),
+)
+@settings(max_examples=100, deadline=None)
+def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with_the_ball(
+    name, dtype, pair, ends, radius
+):
+    """The ends are distances from the centre, downwards and upwards. No descent by scipy gets nearer."""
+    (values, centre), (down, up) = torch.from_numpy(pair).to(dtype), torch.from_numpy(ends).to(dtype)
+    low, high = centre - down, centre + up
+    nearest = NormBall(name, radius).project(values[None], centre[None], lambda v: v.clamp(low, high))[0]
+    rounding = 64 * torch.finfo(dtype).eps
+    assert nearest.dtype == dtype and (low <= nearest).all() and (nearest <= high).all()
+    offset = (nearest - centre).double()[None]
+    assert norm(offset, name) <= radius + rounding
+    v, c = values.double().numpy(), centre.double().numpy()
+    box = [(max(a, d - radius), min(b, d + radius)) for a, b, d in zip(low.double(), high.double(), c, strict=True)]
+    ball = {"type": "ineq", "fun": lambda x: radius**2 - ((x - c) ** 2).sum(), "jac": lambda x: 2 * (c - x)}
+    found = optimize.minimize(
+        lambda x: ((x - v) ** 2).sum(),
+        c,
+        jac=lambda x: 2 * (x - v),
+        bounds=box,
+        constraints=[ball] if name == "l2" else [],
+        method="SLSQP",
+        options={"ftol": 1e-12},
+    )
+    # SLSQP may leave the ball by a little.
+    assert np.linalg.norm(nearest.double().numpy() - v) <= math.sqrt(found.fun) + 1e-5
 
 
 def test_a_corner_is_reached_exactly():
