@@ -61,7 +61,10 @@ BATCH = 32  # pictures per pass through the classifier, as in conf/attack.yaml
 FEWER = 10  # iterations, the paper's
 SHARES = {"quartile": 0.25, "median": 0.5, "third quartile": 0.75, "90 %": 0.9, "most": 1.0}
 ITERATION_COLUMNS = ["attack", "pixels", "classifier, ms", "renderer, ms", "iteration, ms"]
-RATIO_COLUMNS = ["attack", "on", "classifier's pass, ms", "iteration, ms", "ratio", "target"]
+RATIO_COLUMNS = [
+    *("attack", "on", "classifier's pass, ms", "renderer, ms", "iteration, ms"),
+    *("iteration / pass", "1 + renderer / pass", "target"),
+]
 ATTACK_COLUMNS = ["mesh", "attacks", "fooled", *(f"{unit}, {name}" for unit in ("steps", "s") for name in SHARES)]
 COLOURS = ("#a9b8d8", "#e8743b")  # classifier, renderer
 
@@ -88,6 +91,10 @@ rasterises by OpenGL on a GTX 1080, for ResNet-101, which is about twenty times 
 ### Against the classifier's own forward and input-gradient pass
 
 {ratios}
+
+On a machine that others share, the same pass through the classifier takes a tenth more or less from one second to the
+next, at times a quarter, and iteration / pass with it. 1 + renderer / pass leaves that out; the renderer is all of
+an iteration but the pass; the targets are judged by it.
 
 100 examples at 224² are 20 views on 5 backgrounds, {batch} per pass through {classifier}. At 32² a step is that of the
 training's attack: two meshes, 10 views and 5 backgrounds, WideResNet-16-4 as in `pretrained/none`, with its bias for
@@ -132,10 +139,6 @@ class Iteration:
     bare: tuple[float, ...]  # the classifier's forward and input-gradient pass alone
     whole: tuple[float, ...]  # an iteration of the attack
     inside: tuple[float, ...]  # its part in the classifier
-
-    @property
-    def ratio(self) -> np.ndarray:
-        return np.divide(self.whole, self.bare)
 
     @property
     def renderer(self) -> np.ndarray:
@@ -313,14 +316,14 @@ def iteration_rows(measured: Sequence[Iteration]) -> list[list[str]]:
 
 
 def ratio_row(each: Iteration) -> list[str]:
-    ratio = float(np.median(each.ratio))
+    ratio = 1 + each.renderer / each.bare
     target = TRAINING_TARGET if each.setup == TRAINING else TARGETS[each.kind]
-    met = "met" if ratio <= target else "not met"
+    met = "met" if np.median(ratio) <= target else "not met"
     return [
         each.kind,
         each.setup,
-        *map(one_digit, (each.bare, each.whole)),
-        quartiles(each.ratio, 3),
+        *map(one_digit, (each.bare, each.renderer, each.whole)),
+        *(quartiles(values, 3) for values in (np.divide(each.whole, each.bare), ratio)),
         f"{target}: {met}",
     ]
 
