@@ -62,7 +62,7 @@ def with_suggestions(main: Callable[[], None], config_name: str) -> None:
 def command_line(arguments: Sequence[str]) -> str:
     """The command of the running script in scripts/, from the clone's root and without the folders of this machine."""
     script = Path(sys.argv[0]).resolve().as_posix().rpartition("/scripts/")[2]
-    return shlex.join(["python", f"scripts/{script}", *(FOLDERS.sub("", argument) for argument in arguments)])
+    return shlex.join(FOLDERS.sub("", word) for word in ("python", f"scripts/{script}", *arguments))
 
 
 def _suggestions(arguments: list[str], config_name: str) -> Iterator[str]:

@@ -220,7 +220,7 @@ def test_a_script_writes_its_page_data_and_picture_without_folders(script, words
     threads = torch.get_num_threads()
     given = ["--meshes", str(tmp_path / "ball.glb"), "--out", str(tmp_path)]
     name = Path(script.__file__).stem
-    monkeypatch.setattr(sys, "argv", [f"{name}.py", *given, *words, "--threads", str(threads)])
+    monkeypatch.setattr(sys, "argv", [script.__file__, *given, *words, "--threads", str(threads)])
     script.main()
     page = (tmp_path / "paper.md").read_text()
     data = (tmp_path / "paper" / f"{name}.jsonl").read_text()
