@@ -100,8 +100,8 @@ class MeshScene:
         """(B, 3, P) picture values from one camera; cells are rows of A × V."""
         rows = [cell // self.views for cell in cells]
         seen = self.operator(camera).radiance(conditions.light.index_select(0, self._index(rows)))
-        behind = torch.stack([self._behind(camera, examples[row]) for row in rows])
-        return develop_composite(seen + behind, self.settings.encoding)
+        added = torch.stack([self._behind(camera, examples[row]) for row in rows])
+        return develop_composite(seen + added, self.settings.encoding)
 
     def _reshade(self, conditions: Conditions, examples: list[int]) -> Tensor:
         """View by view."""

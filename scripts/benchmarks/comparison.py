@@ -91,14 +91,12 @@ def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
         view, light = bench.view(bench.plan.mesh, size), bench.light()
         exact = Exact(view, _irradiance)
         row = _row(f"gradient by the vertices, {size}²", view)
-        for name, shade in SHADINGS.items():
-            errors = exact.vertex_errors(view, 1, light, shade)
-            kept = replace(row, setting=f"{name}, {KEPT}", samples=1, **errors)
-            yield kept, vertex_step(view, 1, light, kept=True, shade=shade)
         for samples, name in (*product((1, COARSER), SHADINGS), (FINER, ANALYTIC)):
-            errors = exact.vertex_errors(view, samples, light, SHADINGS[name])
-            refreshed = replace(row, setting=rasterised(name, samples), samples=samples**2, **errors)
-            yield refreshed, vertex_step(view, samples, light, shade=SHADINGS[name])
+            shade = SHADINGS[name]
+            found = replace(row, samples=samples**2, **exact.vertex_errors(view, samples, light, shade))
+            if samples == 1:
+                yield replace(found, setting=f"{name}, {KEPT}"), vertex_step(view, 1, light, kept=True, shade=shade)
+            yield replace(found, setting=rasterised(name, samples)), vertex_step(view, samples, light, shade=shade)
         for name, peer in _set_up(view, peers):
             call = partial(peer.vertex_gradient, view.image_gradient.cpu().float().numpy())
             errors = exact.errors(torch.from_numpy(peer.picture()), torch.from_numpy(call()), exact.by_vertices)

@@ -36,7 +36,7 @@ from augment.parameters import Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.scene import ObjectSettings, Scene, SceneObject, load_object
 from augment.service import AugmentationService, AugmentationSettings, LightAttackSettings
-from renderer.camera import OrthographicCamera, ring
+from renderer.camera import ring
 from renderer.image import PictureSettings
 from renderer.lights import load_light
 from renderer.subdivision import subdivide
@@ -45,7 +45,6 @@ from renderer.visibility import choose
 from train.photographs.shares import share
 from train.run_classifier import load_classifier
 
-POLAR = np.pi / 3
 VERTICES = 10_000
 FIELDS = (2.0, 2.8, 4.0, 5.7, 8.0)  # each halves the pixels of the one before
 KINDS = {
@@ -209,7 +208,7 @@ def stubborn(
 ) -> Iteration:
     """An attack that never succeeds, since its targets are the least likely classes."""
     size, subject = classifier.size, setup.subject
-    views = [OrthographicCamera(POLAR, 0.0, field)] if setup.views == 1 else ring(setup.views, field)
+    views = ring(setup.views, field)
     cameras, greys = zip(*product(views, setup.backgrounds), strict=True)
     picture, count = PictureSettings(size, setup.samples, normals=setup.normals), len(cameras)
     behind = torch.tensor(greys).view(-1, 1, 1, 1).expand(-1, 3, size, size)
