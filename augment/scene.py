@@ -8,9 +8,9 @@ from torch import Tensor
 
 from renderer.cache import OperatorCache
 from renderer.camera import ring
-from renderer.errors import InputError
+from renderer.errors import InputError, require_bounded
 from renderer.harmonics import live_coefficients
-from renderer.image import PictureSettings, clamped, develop
+from renderer.image import PictureSettings, behind, clamped, develop_composite
 from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
 from renderer.transfer import COEFFICIENTS, DEGREE, Operator, apply_transfer
@@ -116,6 +116,8 @@ class Scene:
         self._coefficients = _kept_coefficients()
         for name in ("pixels", "transfer", "albedo", "coverage", "backgrounds", "_coefficients"):
             setattr(self, name, getattr(self, name).to(device))
+        greys = self.backgrounds.view(-1, 1, 1)
+        self._behind = behind(self.coverage[:, None], greys, settings.encoding).flatten(0, 1)  # (E, 1, P)
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -127,21 +129,20 @@ class Scene:
         """
         if examples is None:
             examples = torch.arange(len(self), device=lights.device)
-        covered = develop(*self._layers(lights, examples), encoding=self.settings.encoding)
-        behind = self.backgrounds[examples % len(self.backgrounds)].view(-1, 1, 1)
-        pictures = behind.repeat(1, 3, self.settings.size**2).index_copy(2, self.pixels, covered)
+        covered = develop_composite(self._composite(lights, examples), self.settings.encoding)
+        greys = self.backgrounds[examples % len(self.backgrounds)].view(-1, 1, 1)
+        pictures = greys.repeat(1, 3, self.settings.size**2).index_copy(2, self.pixels, covered)
         return pictures.unflatten(2, (self.settings.size, self.settings.size))
 
     def clamped_share(self, lights: Tensor) -> Tensor:
         """Per example, the share of its covered pixels' values that the clamp changes. (E,)"""
         examples = torch.arange(len(self), device=lights.device)
-        radiance, coverage, background = self._layers(lights, examples)
-        over = clamped(radiance, coverage, background, encoding=self.settings.encoding)
-        covered = (coverage > 0).expand_as(over)
+        over = clamped(self._composite(lights, examples))
+        covered = (self.coverage[examples // len(self.backgrounds)] > 0).expand_as(over)
         return (over & covered).sum((1, 2)) / covered.sum((1, 2)).clamp(min=1)
 
-    def _layers(self, lights: Tensor, examples: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Radiance (A, 3, P), coverage (A, 1, P) and background (A, 1, 1) of A examples.
+    def _composite(self, lights: Tensor, examples: Tensor) -> Tensor:
+        """Radiance and what is behind it of A examples, linear (A, 3, P).
 
         One product per operator, for all of its backgrounds at once: lights are laid out on a grid of the operators
         in use × backgrounds, which leaves gaps where an example is not wanted.
@@ -154,11 +155,9 @@ class Scene:
         everything = len(used) == len(self.transfer)
         transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
         radiance = apply_transfer(grid.unflatten(0, (len(used), per_operator)), transfer, albedo)
-        return (
-            radiance.flatten(0, 1).index_select(0, cell),
-            self.coverage[examples // per_operator],
-            self.backgrounds[examples % per_operator].view(-1, 1, 1),
-        )
+        radiance = radiance.flatten(0, 1).index_select(0, cell)
+        require_bounded(radiance=radiance)
+        return radiance + self._behind[examples]
 
 
 def _kept_coefficients() -> Tensor:

@@ -56,9 +56,8 @@ def develop_composite(composite: Tensor, encoding: str = "linear") -> Tensor:
     return encode(clamp(composite), encoding)
 
 
-def clamped(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
-    """Which picture values `develop` clamps, where the gradient is therefore zero. Boolean (..., 3, P)."""
-    composite = radiance + behind(coverage, background, encoding)
+def clamped(composite: Tensor) -> Tensor:
+    """Where `develop_composite` clamps and the gradient is therefore zero. Boolean, as the composite."""
     return (composite < 0) | (composite > 1)
 
 

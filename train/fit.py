@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
 from augment import processes
@@ -24,6 +23,7 @@ from train.evaluation import evaluate
 from train.graphs import FixedSizes, compiles, training_pass
 from train.interruption import Interruption
 from train.logs import RunLog, console
+from train.moving_average import MovingAverage
 from train.precision import MixedPrecision
 from train.random_state import random_state, restore_random_state
 from train.recipe import TrainSettings
@@ -67,7 +67,7 @@ class Trainer:
         self._random_state: dict[str, Any] | None = None  # where the epoch under way was left
         self._best: dict[str, Any] | None = None  # selected, but not written yet
         self._replica = replicated(model)
-        self._average = _averaged(model, settings.averaging)
+        self._average = MovingAverage(model, settings.averaging) if settings.averaging else None
         self.optimizer = torch.optim.SGD(
             model.parameters(),
             lr=settings.learning_rate,
@@ -178,12 +178,12 @@ class Trainer:
         )
         for images, labels in _progress(batches, now.step, total, f"epoch {self.epoch + 1}"):
             self._set_learning_rate((self.epoch + now.step / total) / settings.epochs)
-            loss, hits = self._training_pass(images, labels)
             self.optimizer.zero_grad(set_to_none=True)
+            loss, hits = self._training_pass(images, labels)
             loss.backward()
             self.optimizer.step()
             if self._average:
-                self._average.update_parameters(self.model)
+                self._average.update(self.model)
             now.sums += torch.stack([loss.detach() * len(labels), hits])
             now.step += 1
             if interruption.requested():
@@ -270,11 +270,6 @@ class Trainer:
             sum(seconds.get(name, 0.0) for name in PHASES),
             seconds.get("attack", 0.0),
         )
-
-
-def _averaged(model: MixedPrecision, decay: float) -> AveragedModel | None:
-    """The exponential moving average of weights and statistics over steps; None without decay."""
-    return AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(decay), use_buffers=True) if decay else None
 
 
 def _progress(batches: Iterable, first: int, total: int, description: str) -> Iterable:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from renderer.errors import InputError
-from renderer.image import ENCODINGS, PictureSettings, clamped, decode, develop, encode
+from renderer.image import ENCODINGS, PictureSettings, behind, clamped, decode, develop, encode
 
 EPS = torch.finfo(torch.float64).eps
 
@@ -29,6 +29,10 @@ def share(coverage: float) -> torch.Tensor:
 
 def grey(value: float) -> torch.Tensor:
     return torch.full((1, 1), value, dtype=torch.float64)
+
+
+def composite(radiance: torch.Tensor, coverage: torch.Tensor, background: torch.Tensor, encoding: str) -> torch.Tensor:
+    return radiance + behind(coverage, background, encoding)
 
 
 def test_the_surface_lies_over_the_background_by_its_coverage():
@@ -139,8 +143,8 @@ def test_clamped_values_are_those_without_a_gradient(encoding):
         scene = (radiance, share(0.5), grey(background))
         (gradient,) = torch.autograd.grad(develop(*scene, encoding).sum(), radiance)
         assert gradient.isfinite().all()
-        torch.testing.assert_close(clamped(*scene, encoding), gradient == 0)
-    assert clamped(radiance, share(0.5), grey(0.0), encoding).flatten().tolist() == [True, False, True]
+        torch.testing.assert_close(clamped(composite(*scene, encoding)), gradient == 0)
+    assert clamped(composite(radiance, share(0.5), grey(0.0), encoding)).flatten().tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -148,7 +152,7 @@ def test_black_and_white_themselves_are_not_clamped(encoding):
     """So that a light of zero can grow."""
     radiance = pixel(0, 0.5, 1).requires_grad_(True)
     scene = (radiance, share(1.0), grey(math.pi / 4))
-    assert not clamped(*scene, encoding).any()
+    assert not clamped(composite(*scene, encoding)).any()
     (gradient,) = torch.autograd.grad(develop(*scene, encoding).sum(), radiance)
     slopes = [12.92, 1.055 / 2.4 * 0.5 ** (1 / 2.4 - 1), 1.055 / 2.4] if encoding == "srgb" else [1, 1, 1]
     np.testing.assert_allclose(gradient[:, 0], slopes, rtol=8 * EPS)

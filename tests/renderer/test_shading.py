@@ -23,7 +23,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import MAX_DEGREE, irradiance_basis, lambertian_factors, live_coefficients, rotate
-from renderer.image import PictureSettings, clamped, develop
+from renderer.image import PictureSettings, behind, clamped, develop
 from renderer.mesh import Mesh
 from renderer.shading import irradiance, radiance
 from renderer.transfer import build_operators
@@ -298,7 +298,8 @@ class Picture:
         return canvas.index_copy(1, fragments.pixels, develop(*parts))
 
     def clamped(self, *inputs) -> torch.Tensor:
-        return clamped(*self.parts(*inputs)[1])
+        lit, *around = self.parts(*inputs)[1]
+        return clamped(lit + behind(*around))
 
 
 def slope(function, inputs, steps, length: float = 1e-5) -> torch.Tensor:

@@ -42,7 +42,8 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tiny, tmp_path):
     assert all(torch.equal(value, parts[name]) for name, value in whole.items())
 
 
-def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch):
+@pytest.mark.parametrize("averaging", [0.0, 0.9])
+def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, averaging):
     """Steps that synchronise raise an error; phases and the ends of epochs may."""
     train = Trainer._train
 
@@ -61,4 +62,5 @@ def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch):
             self._training_pass = pass_
 
     monkeypatch.setattr(Trainer, "_train", watched)
-    weights_of(tiny("train.device=cuda", "augment=none", "train.epochs=1", "train.batch_size=4"), tmp_path)
+    few = ("augment=none", "train.epochs=1", "train.batch_size=4")
+    weights_of(tiny("train.device=cuda", *few, f"train.averaging={averaging}"), tmp_path)
