@@ -109,7 +109,7 @@ def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, g
 
 
 def mean_luminance(coefficients: Tensor) -> float:
-    return float(coefficients[0].double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64))
+    return float(coefficients[0].cpu().double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64))
 
 
 def _read_light_map(path: Path) -> Tensor:
