@@ -1,5 +1,6 @@
 """CUDA graphs of a network's passes, which spare a GPU the wait for Python; a CPU gains nothing from compiling."""
 
+import functools
 from collections.abc import Callable
 
 import torch
@@ -8,26 +9,50 @@ from torch import Tensor, nn
 
 from augment import processes
 from train.batches import to_unit
+from train.logs import console
 
 COMPILE = ("auto", "always", "never")
 SIZES = (16, 32, 64, 128, 512)  # of a batch in eval mode: attacks, whose examples leave when fooled, and evaluation
-RECOMPILE_LIMIT = 16 * len(SIZES)  # of some runs in a process, each with and without gradients; torch's 8 are too few
+RECOMPILE_LIMIT = 4 * len(SIZES)  # each with and without gradients, which torch's 8 are too few for
 
 
 def compiles(choice: str, device: torch.device) -> bool:
-    """Whether to compile: "auto" does on one GPU; several processes wait for each other inside a pass."""
-    return choice == "always" or (choice == "auto" and device.type == "cuda" and processes.count() == 1)
+    """Whether to compile.
+
+    "auto" does on one GPU where a trial succeeds; several processes wait for each other inside a pass.
+    """
+    if choice != "auto":
+        return choice == "always"
+    return device.type == "cuda" and processes.count() == 1 and compiler_works(device)
+
+
+@functools.cache
+def compiler_works(device: torch.device) -> bool:
+    """Whether torch.compile can build here, which takes a C compiler and Python's headers; says so where it cannot."""
+    try:
+        torch.compile(torch.exp)(torch.zeros(2, device=device))
+    except Exception as error:  # of torch's, of Triton's or of the compiler's
+        reason = " ".join(str(error).splitlines()[:2])
+        console.warning("compile: torch.compile fails here, so that training is slower: %s", reason)
+        return False
+    return True
 
 
 def training_pass(model: nn.Module, label_smoothing: float, compiled: bool) -> Callable[[Tensor, Tensor], tuple]:
-    """A function of uint8 pictures (B, 3, H, W) and labels (B,): the mean cross entropy, and how many are right."""
+    """A function of uint8 pictures (B, 3, H, W) and labels (B,): the mean cross entropy, and how many are right.
+
+    compiled: torch forgets what it compiled before, since its limit counts the graphs of all runs of a process.
+    """
 
     def loss_and_hits(images: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
         logits = model(to_unit(images))
         loss = F.cross_entropy(logits, labels, label_smoothing=label_smoothing)
         return loss, (logits.detach().argmax(1) == labels).sum()
 
-    return torch.compile(loss_and_hits, mode="reduce-overhead", dynamic=False) if compiled else loss_and_hits
+    if not compiled:
+        return loss_and_hits
+    torch.compiler.reset()
+    return torch.compile(loss_and_hits, mode="reduce-overhead", dynamic=False)
 
 
 class FixedSizes(nn.Module):

@@ -1,10 +1,11 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from torch._dynamo.exc import BackendCompilerFailed
 
 from augment.model_state import eval_mode
 from train import graphs
-from train.graphs import SIZES, FixedSizes, compiles, training_pass
+from train.graphs import RECOMPILE_LIMIT, SIZES, FixedSizes, compiler_works, compiles, training_pass
 from train.wideresnet import WideResNet
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda")
@@ -31,8 +32,23 @@ class Recorded:
     "choice, device, expected",
     [("auto", GPU, True), ("auto", CPU, False), ("always", CPU, True), ("never", GPU, False)],
 )
-def test_one_gpu_compiles_unless_told(choice, device, expected):
+def test_one_gpu_compiles_unless_told(monkeypatch, choice, device, expected):
+    monkeypatch.setattr(graphs, "compiler_works", lambda device: True)
     assert compiles(choice, device) == expected
+
+
+def test_a_gpu_without_a_compiler_trains_all_the_same(monkeypatch, caplog):
+    def no_compiler(images):
+        raise BackendCompilerFailed("inductor", RuntimeError("Failed to find C compiler."), None)
+
+    monkeypatch.setattr(graphs.torch, "compile", lambda function: no_compiler)
+    monkeypatch.setattr(graphs.torch, "zeros", lambda size, device: None)
+    compiler_works.cache_clear()
+    assert not compiles("auto", GPU) and compiles("always", GPU)
+    assert not compiles("auto", GPU)
+    (line,) = caplog.messages
+    assert "torch.compile fails here" in line and "Failed to find C compiler." in line
+    compiler_works.cache_clear()
 
 
 def test_several_processes_do_not_compile_unless_told(monkeypatch):
@@ -54,6 +70,20 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
         found, exact = (torch.autograd.grad((x * weights).sum(), images)[0] for x in (logits, expected))
         torch.testing.assert_close(found, exact)
     assert [shape[0] for shape in backend.shapes] == [16, 32, 64]
+
+
+def test_no_run_of_a_sweep_is_compiled_less_than_the_first(network):
+    """Torch would stop at a number of graphs, of all the runs of a process together."""
+    found, picture = [], torch.zeros(1, 3, 8, 8, dtype=torch.float64)
+    for _ in range(RECOMPILE_LIMIT // len(SIZES) + 1):
+        backend = Recorded()
+        training_pass(network, 0.1, compiled=True)  # as each run begins
+        fixed = FixedSizes(network, backend).eval()
+        with torch.no_grad():
+            for size in SIZES:
+                fixed(picture.expand(size, -1, -1, -1))
+        found.append([shape[0] for shape in backend.shapes])
+    assert found == [list(SIZES)] * len(found)
 
 
 def test_training_mode_and_larger_batches_use_the_model_as_it_is(network):
