@@ -56,4 +56,5 @@ def test_an_installation_runs_from_any_folder(installed, tmp_path):
         text=True,
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert "experiment: cpu, demo, paper" in done.stdout and "learning_rate" in done.stdout
+    assert done.stdout.startswith("train is powered by Hydra")
+    assert "experiment: cpu, demo, fast, paper" in done.stdout and "learning_rate" in done.stdout
