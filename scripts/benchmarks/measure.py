@@ -102,5 +102,5 @@ def _processor() -> str:
 
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:
     """Root mean square of the difference, over the reference's own root mean square."""
-    reference = reference.double()
-    return float((value.double().cpu() - reference).norm() / reference.norm())
+    value, reference = (tensor.cpu().double() for tensor in (value, reference))
+    return float((value - reference).norm() / reference.norm())
