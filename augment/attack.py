@@ -168,11 +168,11 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
                 images, cost_before, fooled_before = rendered.detach().clone(), seen.cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
             better = reached | (seen.cost < cost[active]) if settings.shorten else torch.ones_like(reached)
-            rows, worse = torch.nonzero(better).squeeze(1), active[~better]
+            rows = torch.nonzero(better).squeeze(1)
             kept = active[rows]
             values[kept], images[kept], slope[kept] = candidate[kept], rendered.detach()[rows], gradient[rows]
             cost[kept], predicted[kept], fooled[kept] = seen.cost[rows], seen.predicted[rows], reached[rows]
-            length[worse] /= 2
+            length[active[~better]] /= 2
             active = active[~reached]
             if step == settings.max_steps or not len(active):
                 break

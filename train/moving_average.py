@@ -24,7 +24,8 @@ class MovingAverage:
         average = get_ema_multi_avg_fn(self._decay if self._begun else 0.0)
         own, latest = _tensors(self.module), _tensors(model)
         for dtype in {tensor.dtype for tensor in own}:
-            average(*([tensor for tensor in tensors if tensor.dtype == dtype] for tensors in (own, latest)), None)
+            kept, new = ([tensor for tensor in tensors if tensor.dtype == dtype] for tensors in (own, latest))
+            average(kept, new, None)
         self._begun = True
 
     def state_dict(self) -> dict[str, Any]:
