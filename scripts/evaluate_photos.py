@@ -16,15 +16,15 @@ from train.precision import MixedPrecision, choose_precision
 @one_sentence_errors
 def main(config: DictConfig) -> None:
     device = choose_device(config.device)
-    network, classes = load_network(Path(config.run))
-    model = MixedPrecision(network.to(device), choose_precision(config.precision, device))
+    network = load_network(Path(config.run), config.size)
+    model = MixedPrecision(network.module.to(device), choose_precision(config.precision, device))
     summary = evaluate_photographs(
         model,
-        classes,
+        network.classes,
         Path(config.photos),
         config.label,
         Path(config.out),
-        size=config.size,
+        size=network.size,
         skip_unreadable=config.skip_unreadable,
         device=device,
     )

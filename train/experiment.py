@@ -132,13 +132,16 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
     phases = Phases(device)
     precision = choose_precision(settings.train.precision, device)
     mean, std = channel_statistics(data.train.images)
-    architecture = asdict(settings.model)
+    shape = asdict(settings.model)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
-    network = WideResNet(len(data.classes), **architecture, mean=mean, std=std).to(device)
+    network = WideResNet(len(data.classes), **shape, mean=mean, std=std)
+    facts = {"classes": data.classes, "size": data.size, "encoding": settings.renderer.encoding, **shape}
+    if settings.train.init_from:
+        checkpoint.start_from(network, checkpoint.describe(network, **facts), Path(settings.train.init_from))
     service = _build_service(settings, data, device, phases)
-    model = MixedPrecision(network, precision)
-    checkpointed = {"classes": list(data.classes), **architecture}
-    return Trainer(settings.train, model, checkpointed, service, phases, folder, settings.seed)
+    model = MixedPrecision(network.to(device), precision)
+    described = checkpoint.describe(network, **facts)
+    return Trainer(settings.train, model, described, service, phases, folder, settings.seed)
 
 
 def _open_folder(trainer: Trainer, config: DictConfig) -> None:
@@ -225,10 +228,11 @@ def _log_skipped(scene: Scene, cache: OperatorCache, seconds: float) -> None:
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
     """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
     test = data.test.to(device)
-    last = evaluate(trainer.selected, test)["accuracy"]
+    last = selected = evaluate(trainer.selected, test)["accuracy"]
     best = checkpoint.load(trainer.folder / checkpoint.BEST)
-    trainer.selected.network.load_state_dict(best["model"])
-    selected = evaluate(trainer.selected, test)["accuracy"]
+    if best["epoch"] != trainer.epoch:
+        trainer.selected.network.load_state_dict(best["model"])
+        selected = evaluate(trainer.selected, test)["accuracy"]
     console.info("test accuracy %.4f (epoch %d, selected on validation), %.4f (last)", selected, best["epoch"], last)
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 

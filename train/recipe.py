@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from renderer.errors import InputError
 from train.batches import FLIPS
+from train.distortions import DISTORTIONS
 from train.graphs import COMPILE
 from train.schedule import SCHEDULES
 
@@ -13,13 +14,16 @@ from train.schedule import SCHEDULES
 class TrainSettings:
     """The defaults are the paper's recipe; conf/train.yaml says what each key does."""
 
+    init_from: str | None = None
     epochs: int = 150
+    images_per_epoch: int | None = None
     batch_size: int = 128
     learning_rate: float = 0.125
     momentum: float = 0.9
     weight_decay: float = 5e-4
     schedule: str = "step"
     flips: str = "random"
+    distortion: str = "none"
     label_smoothing: float = 0.0
     averaging: float = 0.0
     precision: str = "auto"
@@ -31,10 +35,11 @@ class TrainSettings:
     resume: bool = False
 
     def __post_init__(self):
-        for name, choices in {"schedule": SCHEDULES, "flips": FLIPS, "compile": COMPILE}.items():
+        choices_of = {"schedule": SCHEDULES, "flips": FLIPS, "distortion": DISTORTIONS, "compile": COMPILE}
+        for name, choices in choices_of.items():
             if getattr(self, name) not in choices:
                 raise InputError(f"train.{name}={getattr(self, name)}: choose one of {', '.join(choices)}")
-        for name in ("epochs", "batch_size", "checkpoint_every", "threads"):
+        for name in ("epochs", "images_per_epoch", "batch_size", "checkpoint_every", "threads"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise InputError(f"train.{name}={value} must be at least 1")
         for name in ("momentum", "label_smoothing", "averaging"):

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from renderer.errors import InputError
-from train.batches import training_batches
+from train.batches import Round, training_batches
 from train.data import Split, load_npz
 from train.recipe import TrainSettings
 from train.settings import ExperimentSettings, read_settings
@@ -101,7 +101,7 @@ def test_the_baselines_loader_draws_the_same_pictures_as_ours():
     mean, std = (0.5, 0.4, 0.3), (0.2, 0.3, 0.4)
     torch.manual_seed(0)
     theirs = list(build_loader(split, 128, mean, std, 0, CPU))
-    ours = list(training_batches(split.images, split.labels, 128, seed=0, epoch=0))
+    ours = list(training_batches(split.images, split.labels, 128, 0, Round(0, 0, torch.arange(len(split)))))
     assert [part.shape for part in theirs[0]] == [part.shape for part in ours[0]]
 
     scale, offset = (torch.tensor(values).view(3, 1, 1) for values in (std, mean))

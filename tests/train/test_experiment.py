@@ -42,9 +42,9 @@ def interrupt_in_the_second_epoch(monkeypatch) -> None:
     """After its first batch."""
     training_batches = fit.training_batches
 
-    def interrupted(images, labels, batch_size, seed, epoch, *rest, **more):
-        for number, batch in enumerate(training_batches(images, labels, batch_size, seed, epoch, *rest, **more)):
-            if (epoch, number) == (1, 1):
+    def interrupted(images, labels, batch_size, seed, now, *rest, **more):
+        for number, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more)):
+            if (now.epoch, number) == (1, 1):
                 raise KeyboardInterrupt
             yield batch
 
@@ -89,13 +89,13 @@ def test_an_interrupted_and_resumed_run_ends_as_an_uninterrupted_one(
         assert (tmp_path / "renders" / name).read_bytes() == (finished / "renders" / name).read_bytes()
 
 
-def run_with_signal(config, folder: Path, monkeypatch, epoch: int, step: int, number: signal.Signals) -> None:
+def run_with_signal(config, folder: Path, monkeypatch, round_number: int, step: int, number: signal.Signals) -> None:
     """The signal comes while the step is taken."""
     training_batches = fit.training_batches
 
     def signalled(images, labels, batch_size, seed, now, *rest, **more):
         for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
-            if (now, count) == (epoch, step):
+            if (now.number, count) == (round_number, step):
                 signal.raise_signal(number)
             yield batch
 
@@ -258,9 +258,9 @@ from train import experiment, fit
 
 training_batches = fit.training_batches
 
-def kill_in_the_second_epoch(images, labels, batch_size, seed, epoch, *rest, **more):
-    for number, batch in enumerate(training_batches(images, labels, batch_size, seed, epoch, *rest, **more)):
-        if (epoch, number) == (1, 1):
+def kill_in_the_second_epoch(images, labels, batch_size, seed, now, *rest, **more):
+    for number, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more)):
+        if (now.epoch, number) == (1, 1):
             os.kill(os.getpid(), signal.SIGKILL)
         yield batch
 
@@ -306,6 +306,44 @@ def test_resuming_with_another_architecture_is_refused(tiny, finished, change):
     config = tiny("train.resume=true", change)
     with pytest.raises(InputError, match=r"checkpoint in .* is from another architecture.*config.yaml"):
         prepare(config, load_data(config), finished)
+
+
+# ---------------------------------------------------------------------------------------- rounds and starts
+
+
+def test_a_signal_between_two_rounds_or_within_one_leads_to_the_same_end(tiny, tmp_path, monkeypatch):
+    """Bit for bit: 40 of 54 images an epoch, in rounds of 16, 16 and 8, each with 4 renders (2, 2 and 1 steps)."""
+    overrides = ("augment.every=16", "train.images_per_epoch=40", "train.resume=true")
+    run(tiny(*overrides), load_data(tiny()), tmp_path / "whole")
+    folder = tmp_path / "stopped"
+    for number, at in [(1, 2), (4, 1), (6, 2)]:
+        with pytest.raises(Interrupted):
+            run_with_signal(tiny(*overrides), folder, monkeypatch, number, at, signal.SIGTERM)
+        assert checkpoint.load(folder / checkpoint.LAST)["under_way"]["step"] == {1: 4, 4: 3, 6: 2}[number]
+    run(tiny(*overrides), load_data(tiny()), folder)
+    assert_same_weights(folder / checkpoint.LAST, tmp_path / "whole" / checkpoint.LAST)
+    assert metrics_without_times(folder) == metrics_without_times(tmp_path / "whole")
+
+
+def test_every_round_is_trained_on_renders_made_for_its_own_weights(tiny, tmp_path, monkeypatch):
+    trained = []
+    put_last = fit.put_last
+    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
+    config = tiny("train.epochs=1", "augment=random", "augment.every=20")
+    run(config, load_data(config), tmp_path)
+    assert len(trained) == 3  # 54 images
+    assert len(torch.cat([renders.images for renders in trained]).unique(dim=0)) == 3 * 4
+    (line,) = [line for line in read_metrics(tmp_path) if "epoch" in line]
+    assert line["augment/loss"] == pytest.approx(sum(renders.diagnostics["loss"] for renders in trained) / 3)
+
+
+def test_a_run_starts_from_the_selected_network_of_another(tiny, finished, tmp_path):
+    config = tiny(f"train.init_from={finished}", "augment=none", "train.epochs=1", "train.learning_rate=1e-30")
+    run(config, load_data(config), tmp_path)
+    first, found = checkpoint.load(finished / checkpoint.BEST), checkpoint.load(tmp_path / checkpoint.LAST)
+    for name, value in first["model"].items():
+        assert "running" in name or "batches" in name or torch.equal(found["model"][name], value), name
+    assert found["epoch"] == 1
 
 
 # ---------------------------------------------------------------------------------------- arms
@@ -390,11 +428,11 @@ def test_the_selected_network_is_the_best_on_validation_and_the_one_that_is_scor
     accuracies = [line["validation/accuracy"] for line in epochs]
     best = checkpoint.load(finished / checkpoint.BEST)
     assert best["epoch"] == scores["test/epoch"] == accuracies.index(max(accuracies)) + 1
-    network, classes = checkpoint.load_network(finished)
+    network = checkpoint.load_network(finished)
     test = load_data(tiny()).test
-    logits = network(test.images / 255)
+    logits = network.module(test.images / 255)
     assert scores["test/accuracy"] == pytest.approx((logits.argmax(1) == test.labels).double().mean().item())
-    assert classes == ("apple", "orange", "pear")
+    assert network.classes == ("apple", "orange", "pear") and network.size == 16
 
 
 class GuardedData:

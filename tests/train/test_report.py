@@ -162,8 +162,8 @@ def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_ma
     out = tmp_path / "pretrained" / "tiny-adversarial"
     publish_run(finished, out)
     assert sorted(path.name for path in out.iterdir()) == ["README.md", PUBLISHED]
-    network, classes = load_network(out)
-    assert classes == ("apple", "orange", "pear") and network.head.in_features == 64
+    network = load_network(out)
+    assert network.classes == ("apple", "orange", "pear") and network.module.head.in_features == 64
     card = (out / "README.md").read_text()
     rows = dict(cells(card)[1:])
     run = summarise(finished)
