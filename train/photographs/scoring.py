@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple
 from pathlib import Path
 
@@ -12,8 +12,8 @@ import torch
 from renderer.errors import InputError
 from train.photographs.answers import Answer, ask, rank_classes
 from train.photographs.contact_sheet import choose_sections, draw_contact_sheet
-from train.photographs.folder import find_photographs, load_photographs
-from train.photographs.shares import share
+from train.photographs.figures import figures, pool_all, pool_by_source, share_true
+from train.photographs.folder import SEPARATOR, find_photographs, load_photographs
 
 WRONG_ANSWERS = 5  # how many of the most common wrong answers are named
 
@@ -43,7 +43,10 @@ def evaluate_photographs(
     - recall, top5: of the photographs of class `label`, with their most_common_wrong answers;
     - false_alarms: the share of all others that are called `label`;
     - by_class: n, recall, top5, called_label (the share called `label`) and most_common_wrong;
-    - by_source: n, recall, top5 and false_alarms, over the photographs whose source is known.
+    - auc, recall_at: how well the log-odds of `label` tell its photographs from the others, as `rank` returns them;
+    - size;
+    - by_source: n, recall, top5, false_alarms, auc and recall_at, over the photographs whose source is known; they are
+      ranked among the others of their source and of the sources that they name as look-alikes.
 
     Shares come with their 95 % Wilson intervals, as `share` returns them.
 
@@ -56,7 +59,7 @@ def evaluate_photographs(
     photographs, images, unreadable = load_photographs(folder, found, size, skip_unreadable)
     logits = ask(model, images, len(classes), batch_size, device)
     answers = rank_classes(photographs, logits, classes, label)
-    summary = _summarise(answers, label, unreadable)
+    summary = _summarise(answers, label, size, unreadable)
 
     out.mkdir(parents=True, exist_ok=True)
     _write_csv(out / "photographs.csv", answers, label)
@@ -66,38 +69,28 @@ def evaluate_photographs(
     return summary
 
 
-def _summarise(answers: Sequence[Answer], label: str, unreadable: Sequence[str]) -> dict:
-    by_class, by_source = defaultdict(list), defaultdict(list)
+def _summarise(answers: Sequence[Answer], label: str, size: int, unreadable: Sequence[str]) -> dict:
+    by_class = defaultdict(list)
     for answer in answers:
         by_class[answer.photograph.label].append(answer)
-        if answer.photograph.source is not None:
-            by_source[answer.photograph.source].append(answer)
-    mine = by_class.get(label, [])
+    whole = pool_all(answers, label)
     return {
         "label": label,
+        "size": size,
         "n": {
             "photographs": len(answers),
-            "label": len(mine),
-            "others": len(answers) - len(mine),
+            "label": len(whole.mine),
+            "others": len(whole.others),
             "unreadable": len(unreadable),
         },
-        **_figures(answers, label),
-        "most_common_wrong": _most_common_wrong(mine),
+        **figures(whole, label),
+        "most_common_wrong": _most_common_wrong(whole.mine),
         "by_source": {
-            source: {"n": len(group), **_figures(group, label)} for source, group in sorted(by_source.items())
+            source: {"n": len(pool.mine) + len(pool.others), **figures(pool, label)}
+            for source, pool in pool_by_source(answers, label).items()
         },
         "by_class": {name: _class_figures(group, label) for name, group in sorted(by_class.items())},
         "unreadable": list(unreadable),
-    }
-
-
-def _figures(answers: Sequence[Answer], label: str) -> dict:
-    mine = [answer for answer in answers if answer.photograph.label == label]
-    others = [answer for answer in answers if answer.photograph.label != label]
-    return {
-        "recall": _share_true(answer.true_rank == 1 for answer in mine),
-        "top5": _share_true(answer.true_rank <= 5 for answer in mine),
-        "false_alarms": _share_true(answer.prediction == label for answer in others),
     }
 
 
@@ -105,9 +98,9 @@ def _class_figures(answers: Sequence[Answer], label: str) -> dict:
     ranks = [answer.true_rank for answer in answers if answer.true_rank is not None]
     return {
         "n": len(answers),
-        "recall": _share_true(rank == 1 for rank in ranks),
-        "top5": _share_true(rank <= 5 for rank in ranks),
-        "called_label": _share_true(answer.prediction == label for answer in answers),
+        "recall": share_true(rank == 1 for rank in ranks),
+        "top5": share_true(rank <= 5 for rank in ranks),
+        "called_label": share_true(answer.prediction == label for answer in answers),
         "most_common_wrong": _most_common_wrong(answers),
     }
 
@@ -118,16 +111,11 @@ def _most_common_wrong(answers: Sequence[Answer]) -> dict[str, int]:
     return dict(ordered[:WRONG_ANSWERS])
 
 
-def _share_true(outcomes: Iterable[bool]) -> dict:
-    outcomes = list(outcomes)
-    return share(sum(outcomes), len(outcomes))
-
-
 def _write_csv(path: Path, answers: Sequence[Answer], label: str) -> None:
-    header = ["path", "label", "source", "prediction", "probability", "true_probability", "true_rank"]
+    header = ["path", "label", "source", "look_alikes", "prediction", "probability", "true_probability", "true_rank"]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*header, f"{label}_probability", f"{label}_rank"])
+        writer.writerow([*header, f"{label}_probability", f"{label}_rank", f"{label}_log_odds"])
         for answer in answers:
-            photograph, *figures = astuple(answer)
-            writer.writerow([*photograph, *figures])
+            (*photograph, look_alikes), *said = astuple(answer)
+            writer.writerow([*photograph, SEPARATOR.join(look_alikes), *said])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy.special import softmax
+from scipy.special import logsumexp, softmax
 from scipy.stats import binomtest
 
 from renderer.errors import InputError
@@ -20,17 +20,43 @@ def share(hits: int, n: int) -> dict:
 
 NOTHING = {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
 
+
+def ranked(auc: float | None, label: int, others: int) -> dict:
+    """The ranking of the story's photographs, without intervals.
+
+    Their log-odds depend on the rank of orange alone; 1 is the highest. The only thresholds are those of rank 1, which
+    no orange exceeds.
+    """
+    recall = {"value": None, "threshold": None}
+    if auc is not None:
+        recall = {"value": 0, "threshold": -logsumexp([-1, -2, -3, -4, -5])}
+    return {
+        "auc": {"value": auc, "label": label, "others": others},
+        "recall_at": dict.fromkeys(("0.05", "0.10", "0.20"), recall),
+    }
+
+
+# Orange has the ranks 1, 2, 6, 5, 2 on its own photographs a to e and 1, 5, 2, 1, 2 on the others f to j, so that those
+# five beat 3, 1, 0, 0, 1 of the others and tie with 2, 2, 0, 1, 2: an AUC of (5 + 7/2) / 25.
 STORY_SUMMARY = {
     "label": "orange",
+    "size": 32,
     "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0},
     "recall": share(1, 5),
     "top5": share(4, 5),
     "false_alarms": share(2, 5),
+    **ranked(0.34, 5, 5),
     "most_common_wrong": {"pear": 2, "apple": 1, "plum": 1},
     "by_source": {
-        "lab": {"n": 2, "recall": share(1, 2), "top5": share(2, 2), "false_alarms": NOTHING},
-        "shop": {"n": 2, "recall": NOTHING, "top5": NOTHING, "false_alarms": share(1, 2)},
-        "street": {"n": 4, "recall": share(0, 2), "top5": share(1, 2), "false_alarms": share(1, 2)},
+        "lab": {"n": 2, "recall": share(1, 2), "top5": share(2, 2), "false_alarms": NOTHING, **ranked(None, 2, 0)},
+        "shop": {"n": 2, "recall": NOTHING, "top5": NOTHING, "false_alarms": share(1, 2), **ranked(None, 0, 2)},
+        "street": {
+            "n": 4,
+            "recall": share(0, 2),
+            "top5": share(1, 2),
+            "false_alarms": share(1, 2),
+            **ranked(0.25, 2, 2),
+        },
     },
     "by_class": {
         "orange": {
@@ -66,9 +92,18 @@ def rounded(tree):
     return round(tree, 12) if isinstance(tree, float) else tree
 
 
+def take_intervals(figures: dict) -> list[dict]:
+    """Remove the intervals of a ranking; what is removed, with the values."""
+    ranked = [figures["auc"], *figures["recall_at"].values()]
+    return [{"value": figure["value"], "low": figure.pop("low"), "high": figure.pop("high")} for figure in ranked]
+
+
 @pytest.mark.parametrize("batch_size", [1, 3, 256])
 def test_every_figure_of_a_known_model_is_right(story, tmp_path, batch_size):
     summary = evaluate_photographs(*story, "orange", tmp_path / "out", batch_size=batch_size)
+    for figures in (summary, *summary["by_source"].values()):
+        for figure in take_intervals(figures):
+            assert set(figure.values()) == {None} or figure["low"] <= figure["value"] <= figure["high"]
     assert rounded(summary) == rounded(STORY_SUMMARY)
     ordered = summary["by_class"]["orange"]["most_common_wrong"]
     assert list(ordered.items()) == [("pear", 2), ("apple", 1), ("plum", 1)]
