@@ -40,14 +40,13 @@ from train.distributed import first_process_first
 from train.evaluation import evaluate
 from train.fit import Trainer
 from train.logs import NoLog, RunLog, console
-from train.photographs import evaluate_photographs, find_photographs, format_summary
+from train.photographs import FIGURES, evaluate_photographs, find_figure, find_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
 from train.settings import ExperimentSettings, read_object, read_settings
 from train.wideresnet import WideResNet
 
 CONFIG = "config.yaml"
-PHOTOGRAPHS = "photographs"
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -85,8 +84,8 @@ def run(config: DictConfig, data: DataSet, folder: Path) -> None:
 def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], None]:
     """Everything of `run` that comes before the first epoch, where wrong input shows; the result is the rest of it."""
     settings = read_settings(ExperimentSettings, config)
-    if settings.evaluate.photos:
-        find_photographs(Path(settings.evaluate.photos), data.classes, settings.label)
+    for photographs in settings.evaluate.folders.values():
+        find_photographs(photographs, data.classes, settings.label)
     device = choose_device(settings.train.device)
     set_threads(settings.train.threads)
     set_deterministic(settings.train.deterministic)
@@ -240,19 +239,19 @@ def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[
 def _photograph_scores(
     settings: ExperimentSettings, trainer: Trainer, data: DataSet, device: torch.device
 ) -> dict[str, float]:
-    """The network's shares on the folder of photographs; empty without one."""
-    if not settings.evaluate.photos or processes.index():
-        return {}
-    summary = evaluate_photographs(
-        trainer.selected,
-        data.classes,
-        Path(settings.evaluate.photos),
-        settings.label,
-        trainer.folder / PHOTOGRAPHS,
-        size=data.size,
-        skip_unreadable=settings.evaluate.skip_unreadable,
-        device=device,
-    )
-    console.info("%s", format_summary(summary))
-    shares = {f"photographs/{name}": summary[name]["value"] for name in ("recall", "top5", "false_alarms")}
-    return {name: value for name, value in shares.items() if value is not None}
+    """The network's figures on each folder of photographs, as NAME/FIGURE; empty without one."""
+    scores = {}
+    for name, photographs in settings.evaluate.folders.items() if processes.index() == 0 else ():
+        summary = evaluate_photographs(
+            trainer.selected,
+            data.classes,
+            photographs,
+            settings.label,
+            trainer.folder / name,
+            size=data.size,
+            skip_unreadable=settings.evaluate.skip_unreadable,
+            device=device,
+        )
+        console.info("%s: %s", name, format_summary(summary))
+        scores |= {f"{name}/{figure}": find_figure(summary, figure)["value"] for figure in ("top5", *FIGURES)}
+    return {name: value for name, value in scores.items() if value is not None}

@@ -4,6 +4,8 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -19,6 +21,8 @@ CIRCUMSTANCES = (
     *("run", "sweep", "launcher", "compare", "versions", "renderer.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
+PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
+RESERVED = ("renders", "rendered_pictures", "test")  # other sub-folders and scores of a run
 
 
 @dataclass
@@ -85,10 +89,30 @@ class ModelSettings:
 
 @dataclass
 class EvaluationSettings:
-    """photos: a folder of photographs to score the network on. skip_unreadable: pass over those that are broken."""
+    """photos: a folder of photographs to score the network on, or several by name. skip_unreadable: pass over those
+    that are broken.
+    """
 
-    photos: str | None = None
+    photos: Any = None  # str | dict[str, str] | None, a union that OmegaConf has no type for
     skip_unreadable: bool = False
+
+    def __post_init__(self):
+        given = self.photos
+        named = isinstance(given, dict) and all(isinstance(folder, str) for folder in given.values())
+        if not (given is None or isinstance(given, str) or named):
+            raise InputError(f"evaluate.photos={given} must be a folder, or a mapping of names to folders")
+        for name in self.folders:
+            if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
+                raise InputError(
+                    f"evaluate.photos.{name}: name a sub-folder of the run, of letters, digits, _ and -, and none of "
+                    f"{', '.join(RESERVED)}"
+                )
+
+    @property
+    def folders(self) -> dict[str, Path]:
+        """The folders of photographs by the name of the run's sub-folder that gets their scores."""
+        named = self.photos if isinstance(self.photos, dict) else {PHOTOGRAPHS: self.photos} if self.photos else {}
+        return {str(name): Path(folder) for name, folder in named.items()}
 
 
 @dataclass

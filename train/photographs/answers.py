@@ -28,7 +28,7 @@ class Answer:
     true_rank: int | None
     asked_probability: float
     asked_rank: int
-    asked_log_odds: float
+    asked_log_odds: float | None
 
 
 def ask(

@@ -6,16 +6,16 @@ import numpy as np
 
 REPLICATES = 2000
 BLOCK = 250  # replicates at a time, which bounds the memory
-SEED = 0
+IMAGES, RUNS = 0, 1  # seeds for what is drawn, so that images and runs are drawn independently
 
 
-def draw_samples(*sizes: int) -> Iterator[tuple[np.ndarray, ...]]:
-    """Blocks of replicates; each holds how often every image is drawn, (BLOCK, size) counts for each of the sizes.
+def draw_samples(*sizes: int, seed: int = IMAGES) -> Iterator[tuple[np.ndarray, ...]]:
+    """Blocks of replicates: how often each image, or run, is drawn, (BLOCK, size) counts for each of the sizes.
 
-    As many images are drawn, with replacement, as there are; groups of different kind are drawn apart (stratified).
+    As many are drawn, with replacement, as there are; groups of different kind are drawn apart (stratified).
     Equal sizes give equal draws, so that figures of two networks on the same images are replicated in pairs.
     """
-    generator = np.random.default_rng(SEED)
+    generator = np.random.default_rng(seed)
     for _ in range(REPLICATES // BLOCK):
         yield tuple(_draw_counts(generator, size) for size in sizes)
 
@@ -38,3 +38,15 @@ def interval(replicates: np.ndarray) -> dict[str, float]:
     """
     low, high = np.quantile(replicates, (0.025, 0.975))
     return {"low": float(low), "high": float(high)}
+
+
+def replicate_difference(one: np.ndarray, other: np.ndarray, paired: bool) -> np.ndarray:
+    """The difference in mean of two groups of runs in each replicate, (REPLICATES,), with runs drawn again, too.
+
+    The groups are their runs' replicates, (S, REPLICATES) and (T, REPLICATES). paired: S = T, and the s-th runs of both
+    are drawn together.
+    """
+    groups = [one - other] if paired else [one, -other]
+    blocks = zip(*draw_samples(*map(len, groups), seed=RUNS), strict=True)
+    drawn = [np.concatenate(counts) for counts in blocks]  # a row's counts sum to the group's size
+    return sum((counts.T * group).mean(axis=0) for counts, group in zip(drawn, groups, strict=True))

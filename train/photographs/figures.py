@@ -5,12 +5,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
+import numpy as np
+
 from train.photographs.answers import Answer
-from train.photographs.ranking import RATES, rank
+from train.photographs.bootstrap import replicate_share
+from train.photographs.ranking import RATES, Ranking, rank
 from train.photographs.shares import share
 
+OVERALL = ""  # in the place of a source: all images
 # The headline figures, by their place in a summary or in one of its sources.
-FIGURES = ("recall", "false_alarms", "auc", *(f"recall_at/{rate}" for rate in RATES))
+RANKED = ("auc", *(f"recall_at/{rate}" for rate in RATES))
+FIGURES = ("recall", "false_alarms", *RANKED)
 
 
 @dataclass(frozen=True)
@@ -24,29 +29,43 @@ class Pool:
     others: Sequence[Answer]
     rivals: Sequence[Answer]
 
+    @property
+    def scores(self) -> tuple[list[float], list[float]]:
+        """The log-odds, where known, of the class and of what it is ranked against."""
+        mine, rivals = (
+            [answer.asked_log_odds for answer in group if answer.asked_log_odds is not None]
+            for group in (self.mine, self.rivals)
+        )
+        return mine, rivals
 
-def pool_all(answers: Sequence[Answer], label: str) -> Pool:
-    """All answers, each image of the class against every other thing."""
-    others = [answer for answer in answers if answer.photograph.label != label]
-    return Pool([answer for answer in answers if answer.photograph.label == label], others, others)
 
+def pool_answers(answers: Sequence[Answer], label: str) -> dict[str, Pool]:
+    """OVERALL, where each image of the class is ranked against every other thing, and each known source by its name.
 
-def pool_by_source(answers: Sequence[Answer], label: str) -> dict[str, Pool]:
-    """A pool per known source, in alphabetical order, with the others of the sources that it is paired with."""
+    A source's images of the class are ranked against the others of it and of the sources that they name as look-alikes.
+    """
     by_source = defaultdict(list)
     for answer in answers:
         if answer.photograph.source is not None:
             by_source[answer.photograph.source].append(answer)
-    pools = {source: pool_all(group, label) for source, group in sorted(by_source.items())}
-    return {
-        source: Pool(pool.mine, pool.others, [rival for name in _rivals(source, pool) for rival in pools[name].others])
-        for source, pool in pools.items()
+    own = {source: pool_all(group, label) for source, group in sorted(by_source.items())}
+    return {OVERALL: pool_all(answers, label)} | {
+        source: Pool(
+            pool.mine, pool.others, [rival for name in _paired(source, pool, own) for rival in own[name].others]
+        )
+        for source, pool in own.items()
     }
 
 
-def _rivals(source: str, pool: Pool) -> list[str]:
-    """The source and those that its images of the class name as look-alikes."""
-    return sorted({source}.union(*(answer.photograph.look_alikes for answer in pool.mine)))
+def pool_all(answers: Sequence[Answer], label: str) -> Pool:
+    """The answers, each image of the class against every other thing."""
+    others = [answer for answer in answers if answer.photograph.label != label]
+    return Pool([answer for answer in answers if answer.photograph.label == label], others, others)
+
+
+def _paired(source: str, pool: Pool, known: Iterable[str]) -> list[str]:
+    """The source and those that its images of the class name as look-alikes, but for such as could not be read."""
+    return sorted({source}.union(*(answer.photograph.look_alikes for answer in pool.mine)).intersection(known))
 
 
 def figures(pool: Pool, label: str) -> dict:
@@ -55,8 +74,24 @@ def figures(pool: Pool, label: str) -> dict:
         "recall": share_true(answer.true_rank == 1 for answer in pool.mine),
         "top5": share_true(answer.true_rank <= 5 for answer in pool.mine),
         "false_alarms": share_true(answer.prediction == label for answer in pool.others),
-        **rank(*([answer.asked_log_odds for answer in group] for group in (pool.mine, pool.rivals))),
+        **rank(*pool.scores),
     }
+
+
+def replicate_figures(pool: Pool, label: str) -> dict[str, np.ndarray]:
+    """FIGURES in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown.
+
+    Those of two networks on the same images are pairs: each replicate has the same images.
+    """
+    outcomes = {
+        "recall": [answer.true_rank == 1 for answer in pool.mine],
+        "false_alarms": [answer.prediction == label for answer in pool.others],
+    }
+    replicates = {name: replicate_share(np.array(told)) for name, told in outcomes.items() if told}
+    if all(pool.scores):
+        ranked = Ranking(*pool.scores).replicates()
+        replicates |= dict(zip(RANKED, (ranked["auc"], *(ranked[rate] for rate in RATES)), strict=True))
+    return replicates
 
 
 def share_true(outcomes: Iterable[bool]) -> dict:

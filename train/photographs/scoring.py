@@ -1,20 +1,21 @@
 """Score a model on a folder of photographs: recall and false alarms of one class, and the files that tell of them."""
 
-import csv
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import astuple
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 
 from renderer.errors import InputError
 from train.photographs.answers import Answer, ask, rank_classes
+from train.photographs.answers_table import ANSWERS, write_answers
 from train.photographs.contact_sheet import choose_sections, draw_contact_sheet
-from train.photographs.figures import figures, pool_all, pool_by_source, share_true
-from train.photographs.folder import SEPARATOR, find_photographs, load_photographs
+from train.photographs.figures import OVERALL, Pool, figures, pool_answers, share_true
+from train.photographs.folder import find_photographs, load_photographs
+from train.photographs.roc import draw_roc, rank_pools, write_roc_csv
 
+SUMMARY = "summary.json"
 WRONG_ANSWERS = 5  # how many of the most common wrong answers are named
 
 
@@ -36,8 +37,8 @@ def evaluate_photographs(
     `find_photographs`.
 
     Written into `out`: photographs.csv, a row per photograph (probability and rank of the true class are
-    empty for `other_*`); contact_sheet.png, hits, misses and false alarms; and summary.json, which is also
-    returned:
+    empty for `other_*`); contact_sheet.png, hits, misses and false alarms; roc.csv and roc.png, the ROC curves
+    overall and of each source that has both kinds; and summary.json, which is also returned:
 
     - n: photographs, label, others, unreadable; label; unreadable: their paths;
     - recall, top5: of the photographs of class `label`, with their most_common_wrong answers;
@@ -59,21 +60,27 @@ def evaluate_photographs(
     photographs, images, unreadable = load_photographs(folder, found, size, skip_unreadable)
     logits = ask(model, images, len(classes), batch_size, device)
     answers = rank_classes(photographs, logits, classes, label)
-    summary = _summarise(answers, label, size, unreadable)
+    pools = pool_answers(answers, label)
+    summary = _summarise(answers, pools, label, size, unreadable)
 
     out.mkdir(parents=True, exist_ok=True)
-    _write_csv(out / "photographs.csv", answers, label)
+    write_answers(out / ANSWERS, answers, label)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    (out / SUMMARY).write_text(text + "\n", encoding="utf-8")
     draw_contact_sheet(choose_sections(answers, images, label)).save(out / "contact_sheet.png")
+    rankings = rank_pools(pools)
+    write_roc_csv(out / "roc.csv", rankings)
+    draw_roc(rankings, label).savefig(out / "roc.png")
     return summary
 
 
-def _summarise(answers: Sequence[Answer], label: str, size: int, unreadable: Sequence[str]) -> dict:
+def _summarise(
+    answers: Sequence[Answer], pools: Mapping[str, Pool], label: str, size: int, unreadable: Sequence[str]
+) -> dict:
     by_class = defaultdict(list)
     for answer in answers:
         by_class[answer.photograph.label].append(answer)
-    whole = pool_all(answers, label)
+    whole = pools[OVERALL]
     return {
         "label": label,
         "size": size,
@@ -87,7 +94,8 @@ def _summarise(answers: Sequence[Answer], label: str, size: int, unreadable: Seq
         "most_common_wrong": _most_common_wrong(whole.mine),
         "by_source": {
             source: {"n": len(pool.mine) + len(pool.others), **figures(pool, label)}
-            for source, pool in pool_by_source(answers, label).items()
+            for source, pool in pools.items()
+            if source != OVERALL
         },
         "by_class": {name: _class_figures(group, label) for name, group in sorted(by_class.items())},
         "unreadable": list(unreadable),
@@ -109,13 +117,3 @@ def _most_common_wrong(answers: Sequence[Answer]) -> dict[str, int]:
     counts = Counter(answer.prediction for answer in answers if answer.true_rank != 1)
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     return dict(ordered[:WRONG_ANSWERS])
-
-
-def _write_csv(path: Path, answers: Sequence[Answer], label: str) -> None:
-    header = ["path", "label", "source", "look_alikes", "prediction", "probability", "true_probability", "true_rank"]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*header, f"{label}_probability", f"{label}_rank", f"{label}_log_odds"])
-        for answer in answers:
-            (*photograph, look_alikes), *said = astuple(answer)
-            writer.writerow([*photograph, SEPARATOR.join(look_alikes), *said])
