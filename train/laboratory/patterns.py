@@ -51,13 +51,13 @@ def checkers(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def half(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """One side of a line through the object."""
-    return (points[..., 0] > rng.uniform(-0.2, 0.2)).astype(float)
+    return (points[..., 0] > rng.uniform(-0.12, 0.12)).astype(float)
 
 
 def spots(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Discs of one size at random places, over about a third of the image."""
+    """Discs of one size at random places, over about half of the image."""
     radius = rng.uniform(0.08, 0.25)
-    centres = rng.uniform(-1, 1, (round(1.6 / (math.pi * radius**2)), 2))
+    centres = rng.uniform(-1, 1, (round(2.8 / (math.pi * radius**2)), 2))
     lit = np.zeros(points.shape[:-1], dtype=bool)
     for centre in centres:
         lit |= ((points - centre) ** 2).sum(axis=-1) < radius**2

@@ -20,10 +20,10 @@ class LabSettings:
     label: str = "orange"
     lights: int = 180
     patterns: list[str] = field(default_factory=lambda: list(FAMILIES))
-    brightness: list[float] = field(default_factory=lambda: [0.15, 1.5])
+    brightness: list[float] = field(default_factory=lambda: [0.15, 2.0])
     exposure: float = 1.0
     size: int = 64
-    samples: int = 64
+    samples: int = 32
     bounces: int = 4
     seed: int = 0
 

@@ -19,9 +19,9 @@ class Shot:
     """One light, camera and pose, for whatever object.
 
     brightness: radiance of a white surface that faces the projector where its image is white. pattern: the image
-    (H, W, 3). ambient: radiance from everywhere (3,). table: albedo (3,). projector, camera: places (3,). aim: the
-    point (3,) that the camera looks at. half_width: half of what it sees there. turn: the object's rotation (3, 3).
-    scale: the object's largest coordinate.
+    (H, W, 3). ambient: radiance from everywhere (3,). table: albedo (3,). projector, camera: places (3,). centre,
+    aim: the points (3,) that they look at. half_width: half of what the camera sees there. turn: the object's rotation
+    (3, 3). scale: the object's largest coordinate.
     """
 
     family: str
@@ -31,6 +31,7 @@ class Shot:
     table: np.ndarray
     projector: np.ndarray
     camera: np.ndarray
+    centre: np.ndarray
     aim: np.ndarray
     half_width: float
     turn: np.ndarray
@@ -51,18 +52,20 @@ def draw_shots(lights: int, families: Sequence[str], brightness: Sequence[float]
 
 
 def draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:
-    """A shot under a pattern of the family. The projector stands on the camera's side, up to 80° off."""
+    """A shot under a pattern of the family. The projector stands on the camera's side, up to 70° off."""
     azimuth, half_width, scale = rng.uniform(0, 360), rng.uniform(1.2, 1.9), rng.uniform(0.75, 1)
     distance = half_width / math.tan(math.radians(FIELD_OF_VIEW / 2))
-    aim = np.array([0, 0, 0.8 * scale]) + rng.uniform(-0.25, 0.25, 3)
+    centre = np.array([0, 0, 0.8 * scale])
+    aim = centre + rng.uniform(-0.25, 0.25, 3)
     return Shot(
         family=family,
         brightness=brightness,
         pattern=draw_pattern(family, rng),
         ambient=rng.uniform(0.005, 0.05) * draw_colour(rng),
         table=rng.uniform(0.02, 0.12) * draw_colour(rng),
-        projector=_place(azimuth + rng.uniform(-80, 80), rng.uniform(25, 70), rng.uniform(5, 8)),
+        projector=centre + _place(azimuth + rng.uniform(-70, 70), rng.uniform(25, 70), rng.uniform(5, 8)),
         camera=aim + _place(azimuth, rng.uniform(18, 60), distance),
+        centre=centre,
         aim=aim,
         half_width=half_width,
         turn=_turn(2, rng.uniform(0, 360)) @ _turn(0, rng.uniform(0, 60)) @ _turn(2, rng.uniform(0, 360)),

@@ -16,27 +16,26 @@ FLOOR = 100.0  # half of the table's width
 
 
 def photograph(parts: Sequence[Part], shot: Shot, size: int, samples: int, bounces: int, seed: int) -> np.ndarray:
-    """(size, size, 3) float32 linear radiance; the seed is that of Mitsuba's samples, `samples` per pixel.
+    """(size, size, 3) float32 linear radiance; the seed is that of Mitsuba's samples, `samples` per pixel and light.
 
-    InputError: Mitsuba is not installed.
+    The projector and the surroundings are rendered one by one and added: with both in one scene each path would draw
+    which of them to look at, which is most of the noise. InputError: Mitsuba is not installed.
     """
     with _mitsuba() as mi:
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": "path", "max_depth": bounces + 1},
-                "sensor": _sensor(mi, shot, size),
-                "projector": _projector(mi, shot),
-                "ambient": {"type": "constant", "radiance": _rgb(shot.ambient)},
-                "table": {
-                    "type": "rectangle",
-                    "to_world": mi.ScalarTransform4f().scale(FLOOR),
-                    "bsdf": {"type": "diffuse", "reflectance": _rgb(shot.table)},
-                },
-                **{f"part_{index}": shape for index, shape in enumerate(_object(mi, parts, shot))},
-            }
-        )
-        return np.array(mi.render(scene, spp=samples, seed=seed))
+        surroundings = {"type": "constant", "radiance": _rgb(shot.ambient)}
+        still = {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": bounces + 1},
+            "sensor": _sensor(mi, shot, size),
+            "table": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale(FLOOR),
+                "bsdf": {"type": "diffuse", "reflectance": _rgb(shot.table)},
+            },
+            **{f"part_{index}": shape for index, shape in enumerate(_object(mi, parts, shot))},
+        }
+        scenes = [mi.load_dict({**still, "light": light}) for light in (_projector(mi, shot), surroundings)]
+        return sum(np.array(mi.render(scene, spp=samples, seed=seed)) for scene in scenes)
 
 
 @contextmanager
@@ -63,10 +62,10 @@ def _sensor(mi, shot: Shot, size: int) -> dict:
 
 def _projector(mi, shot: Shot) -> dict:
     """Mitsuba's gives a white surface that faces it at distance 1 the radiance of its image."""
-    distance = float(np.linalg.norm(shot.projector - shot.aim))
+    distance = float(np.linalg.norm(shot.projector - shot.centre))
     return {
         "type": "projector",
-        "to_world": mi.ScalarTransform4f().look_at(origin=list(shot.projector), target=list(shot.aim), up=[0, 0, 1]),
+        "to_world": mi.ScalarTransform4f().look_at(origin=list(shot.projector), target=list(shot.centre), up=[0, 0, 1]),
         "fov": 2 * float(np.degrees(np.arctan(THROW / distance))),
         "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(shot.pattern), "raw": True},
         "scale": shot.brightness * distance**2,
