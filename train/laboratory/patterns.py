@@ -9,6 +9,9 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+import torch
+
+from renderer.image import decode
 
 RESOLUTION = 512  # pixels per side of a projected image
 TWO_COLOURED = ("gradient", "stripes", "checkers")  # the others have darkness beside their colour
@@ -24,8 +27,9 @@ def draw_pattern(family: str, rng: np.random.Generator, resolution: int = RESOLU
 
 
 def draw_colour(rng: np.random.Generator) -> np.ndarray:
-    """(3,) linear RGB of any hue, from white to pure; the largest channel is 1."""
-    return np.array(colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(), 1.0))
+    """(3,) linear RGB, the largest channel 1: any hue, from white to pure by even steps of the sRGB values."""
+    sent = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(), 1.0)
+    return decode(torch.tensor(sent, dtype=torch.float64), "srgb").numpy()
 
 
 def solid_colour(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:

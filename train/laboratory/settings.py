@@ -31,9 +31,7 @@ class LabSettings:
         if unknown := [name for name in self.patterns if name not in FAMILIES]:
             raise InputError(f"patterns: {unknown[0]!r} is not known: choose from {', '.join(FAMILIES)}")
         if not self.patterns or self.lights < 1 or self.lights % len(self.patterns):
-            raise InputError(
-                f"lights={self.lights} must be a multiple of the number of patterns, {len(self.patterns)}, and at least one"
-            )
+            raise InputError(f"lights={self.lights} must be a positive multiple of the {len(self.patterns)} patterns")
         if len(self.brightness) != 2 or not 0 < self.brightness[0] <= self.brightness[1] < math.inf:
             raise InputError(f"brightness={self.brightness} must be two positive numbers, the dimmer one first")
         if not 0 < self.exposure < math.inf:
