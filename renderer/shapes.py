@@ -1,8 +1,8 @@
 """Procedural solids: the embedded orange, the other things of the demo data set and look-alikes, from formulas alone.
 
 Names are CIFAR-100 class names, so that a classifier's labels agree; look-alikes are what CIFAR-100 lacks. Every solid
-is closed, stands upright along z, has counter-clockwise faces outward and lies within about [−1, 1]³. Colours are RGB in
-[0, 1], sRGB-encoded.
+is closed, stands upright along z, has counter-clockwise faces outward and lies within about [−1, 1]³. Colours are RGB
+in [0, 1], sRGB-encoded.
 
 Most solids are surfaces of revolution. The profile is drawn in strokes, each a list of (radius, height)
 points with a paint of its own; a stroke starts where the one before it ended. The whole runs from the axis

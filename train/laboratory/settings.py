@@ -20,7 +20,7 @@ class LabSettings:
     label: str = "orange"
     lights: int = 180
     patterns: list[str] = field(default_factory=lambda: list(FAMILIES))
-    brightness: list[float] = field(default_factory=lambda: [0.15, 2.0])
+    brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])
     exposure: float = 1.0
     size: int = 64
     samples: int = 32
