@@ -175,7 +175,7 @@ def _dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
             yield prefix + key, value
 
 
-def read_object(item: str | dict, label: str, index: int) -> ObjectSettings:
-    """An entry of scene.meshes: a file or solid of the class `label`, or a mapping that may name its own."""
+def read_object(item: str | dict, label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
+    """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own."""
     keys = item if isinstance(item, dict) else {"mesh": item}
-    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"scene.meshes[{index}]")
+    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")
