@@ -1,29 +1,21 @@
-"""Measure the renderer's largest errors and write them as docs/accuracy.md: python scripts/stress_renderer.py"""
+"""Measure the renderer's largest errors and write them as docs/accuracy.md: python scripts/check_accuracy.py"""
 
 import sys
-from pathlib import Path
 
 import hydra
-import torch
 from omegaconf import DictConfig
-from stress.page import failures, measure, page
-from stress.refusals import refusals
 
-from train.cli import command_line, one_sentence_errors, with_suggestions
+from train.cli import one_sentence_errors, with_suggestions
+from train.settings import read_settings
+from train.studies.accuracy.study import AccuracySettings, run
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="stress_renderer")
+@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="check_accuracy")
 @one_sentence_errors
 def main(config: DictConfig) -> None:
-    torch.set_num_threads(1)
-    tables = measure(config.degree, config.subdivisions, config.size, config.slivers)
-    refused = list(refusals())
-    out = Path(config.out)
-    out.write_text(page(tables, refused, command_line(sys.argv[1:])))
-    print(f"{out}: {sum(len(table.rows) for table in tables)} conditions and {len(refused)} refusals")
-    if failed := failures(tables, refused):
+    if failed := run(read_settings(AccuracySettings, config)):
         sys.exit("\n".join(failed))
 
 
 if __name__ == "__main__":
-    with_suggestions(main, "stress_renderer")
+    with_suggestions(main, "check_accuracy")

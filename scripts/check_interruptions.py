@@ -1,59 +1,24 @@
-"""Interrupt training runs in many ways and show that they end as if nothing had happened: python scripts/torture.py
+"""Interrupt training runs in many ways and show that they end as if nothing had happened.
 
-Linux only: processes tell by a signal where they are, and the size of their files is limited from outside.
+python scripts/check_interruptions.py; Linux only, since the size of a process's files is limited from outside.
 """
 
-import signal
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
-from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import hydra
-import numpy as np
 from omegaconf import DictConfig
-from torture.bench import Bench, Outcome, prepare
-from torture.cases import Case, all_cases
-from torture.page import failures, merged, page
-from torture.workshop import furnish
 
-from renderer.errors import InputError
-from train.cli import command_line, one_sentence_errors, with_suggestions
+from train.cli import one_sentence_errors, with_suggestions
+from train.settings import read_settings
+from train.studies.interruptions.study import InterruptionSettings, run
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="torture")
+@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="check_interruptions")
 @one_sentence_errors
 def main(config: DictConfig) -> None:
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # inherited by processes that cannot answer yet
-    with nullcontext(config.keep) if config.keep else TemporaryDirectory() as folder:
-        bench = prepare(furnish(_empty(Path(folder).absolute()), config.epochs))
-        cases = all_cases(config.kills, config.signals, config.draws, config.jobs)
-        with ThreadPoolExecutor(config.jobs) as pool:
-            started = [pool.submit(_conduct, case, bench, config.seed, number) for number, case in enumerate(cases)]
-        outcomes = merged([future.result() for future in started])
-    text = page(outcomes, bench, command_line(sys.argv[1:]))
-    print(text)
-    if config.out:
-        Path(config.out).write_text(text)
-    if failed := failures(outcomes):
+    if failed := run(read_settings(InterruptionSettings, config)):
         sys.exit("\n".join(failed))
 
 
-def _conduct(case: Case, bench: Bench, seed: int, number: int) -> Outcome:
-    """One case, in a folder of its own and with moments of its own."""
-    outcome = case(replace(bench, runs=bench.runs / str(number)), np.random.default_rng([seed, number]))
-    print(f"{outcome.case}: {len(failures([outcome]))} faults", file=sys.stderr)
-    return outcome
-
-
-def _empty(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    if any(folder.iterdir()):
-        raise InputError(f"keep={folder} is not empty: choose another folder")
-    return folder
-
-
 if __name__ == "__main__":
-    with_suggestions(main, "torture")
+    with_suggestions(main, "check_interruptions")

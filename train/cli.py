@@ -5,7 +5,7 @@ import functools
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from hydra import compose, initialize_config_module
@@ -59,9 +59,10 @@ def with_suggestions(main: Callable[[], None], config_name: str) -> None:
         raise
 
 
-def command_line(arguments: Sequence[str]) -> str:
+def command_line() -> str:
     """The command of the running script in scripts/, from the clone's root and without the folders of this machine."""
-    script = Path(sys.argv[0]).resolve().as_posix().rpartition("/scripts/")[2]
+    name, *arguments = sys.argv
+    script = Path(name).resolve().as_posix().rpartition("/scripts/")[2]
     return shlex.join(FOLDERS.sub("", word) for word in ("python", f"scripts/{script}", *arguments))
 
 

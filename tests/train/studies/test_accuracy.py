@@ -10,25 +10,24 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import eval_legendre, sph_harm_y
 
-ROOT = Path(__file__).parents[2]
+from train.studies.accuracy import reference
+from train.studies.accuracy.conditions import Row
+from train.studies.accuracy.measure import Error, Setup, light
+from train.studies.accuracy.page import Table, failures, page
+from train.studies.accuracy.reference import exact, extended
+from train.studies.accuracy.refusals import Refusal, refusals
+from train.studies.accuracy.shapes import sphere
+from train.studies.accuracy.study import AccuracySettings, measure
+
+ROOT = Path(__file__).parents[3]
 REDUCED = {"degree": 6, "subdivisions": 2, "size": 64, "slivers": 1}
-
-sys.path.append(str(ROOT / "scripts"))
-from stress import reference  # noqa: E402
-from stress.conditions import Row  # noqa: E402
-from stress.measure import Error, Setup, light  # noqa: E402
-from stress.page import Table, failures, measure, page  # noqa: E402
-from stress.reference import exact, extended  # noqa: E402
-from stress.refusals import Refusal, refusals  # noqa: E402
-from stress.shapes import sphere  # noqa: E402
-
 DIRECTIONS = np.random.default_rng(0).normal(size=(3, 20))
 BOTH = pytest.mark.parametrize("lift", [extended, exact], ids=["extended", "exact"])
 
 
 @pytest.fixture(scope="module")
 def tables():
-    return measure(**REDUCED)
+    return measure(AccuracySettings("", **REDUCED))
 
 
 def rows_by_title(text: str) -> dict[str, int]:
@@ -76,7 +75,7 @@ def test_what_is_not_finite_or_not_refused_fails_the_script():
 @pytest.mark.slow
 def test_the_command_writes_the_page(tmp_path):
     settings = [f"{name}={value}" for name, value in REDUCED.items()]
-    command = [sys.executable, str(ROOT / "scripts" / "stress_renderer.py"), f"out={tmp_path}/page.md", *settings]
+    command = [sys.executable, str(ROOT / "scripts" / "check_accuracy.py"), f"out={tmp_path}/page.md", *settings]
     done = subprocess.run(command, cwd=ROOT, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     committed = (ROOT / "docs" / "accuracy.md").read_text()

@@ -1,5 +1,3 @@
-import ast
-import faulthandler
 import os
 import re
 import shutil
@@ -12,22 +10,21 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from omegaconf import DictConfig
 
-ROOT = Path(__file__).parents[2]
+from train import checkpoint
+from train.checkpoint import BEST, LAST, PREVIOUS
+from train.experiment import load_data, run
+from train.logs import METRICS, RunLog, read_metrics
+from train.studies.interruptions.bench import Bench, Outcome
+from train.studies.interruptions.comparison import compare, differences
+from train.studies.interruptions.disturbances import interrupted, kill
+from train.studies.interruptions.observed import NAMES, PHASES, observe
+from train.studies.interruptions.page import CONCERNS, failures, merged, page
+from train.studies.interruptions.small_run import SmallRun, write_inputs
+
+ROOT = Path(__file__).parents[3]
 EPOCHS = 3
-
-sys.path.append(str(ROOT / "scripts"))
-from torture.bench import Bench, Outcome  # noqa: E402
-from torture.comparison import compare, differences  # noqa: E402
-from torture.interruptions import interrupted, kill  # noqa: E402
-from torture.life import PHASES, innermost_phase  # noqa: E402
-from torture.page import CONCERNS, failures, merged, page  # noqa: E402
-from torture.workshop import Workshop, furnish  # noqa: E402
-
-from train import checkpoint  # noqa: E402
-from train.checkpoint import BEST, LAST, PREVIOUS  # noqa: E402
-from train.experiment import load_data, run  # noqa: E402
-from train.logs import METRICS, RunLog, read_metrics  # noqa: E402
 
 
 def state(epoch: int) -> dict:
@@ -85,6 +82,11 @@ def show_again(run: Path) -> None:
     log = RunLog(run, [{}] * EPOCHS)
     log.scalars({"train/loss": 1 / EPOCHS}, EPOCHS)
     (run / METRICS).write_text(text)
+
+
+def configured(small: SmallRun, folder: Path) -> DictConfig:
+    with initialize_config_module("conf", version_base="1.3"):
+        return compose("train", small.overrides(folder))
 
 
 # ---------------------------------------------------------------------------------------- the comparison
@@ -183,41 +185,45 @@ def test_differences_are_named_by_where_they_are(found, expected, names):
 # ---------------------------------------------------------------------------------------- where a process is
 
 
-def test_the_phases_are_told_by_functions_that_exist():
-    for file, function in PHASES:
-        tree = ast.parse((ROOT / "train" / file).read_text())
-        assert function in {None} | {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+class Record(list):
+    """A byte, and all that it has been."""
+
+    def __init__(self):
+        super().__init__([0])
+        self.past = []
+
+    def __setitem__(self, place, value):
+        super().__setitem__(place, value)
+        self.past.append(NAMES[value])
 
 
-def test_a_stack_tells_its_innermost_phase(tmp_path, monkeypatch):
-    """Of a real stack: of a checkpoint that is being written."""
-    stacks = tmp_path / "stacks"
+def test_a_run_tells_its_innermost_phase(tmp_path, monkeypatch):
+    """From its first epoch to its scores, and after each what it was in before."""
+    for functions in PHASES.values():
+        for owner, name in functions:
+            monkeypatch.setattr(owner, name, getattr(owner, name))  # taken back after the test
+    record = Record()
+    observe(record)
+    config = configured(write_inputs(tmp_path, epochs=2), tmp_path / "run")
+    run(config, load_data(config), tmp_path / "run")
+    epoch = [
+        *("training", "attack", "training", "training", "training"),
+        *("evaluation", "log", "evaluation", "log", "evaluation", "training"),
+        *("checkpoint", "training") * 2,
+    ]
+    assert record.past[: len(epoch)] == epoch
+    assert record.past[-6:] == ["scoring", "", "scoring", "", "log", ""] and record == [0]
 
-    def write_stack(descriptor: int) -> None:
-        with open(stacks, "w") as file:
-            faulthandler.dump_traceback(file)
 
-    monkeypatch.setattr(checkpoint.os, "fsync", write_stack)
-    checkpoint.save(tmp_path / LAST, state(1))
-    assert innermost_phase(stacks.read_text()) == "checkpoint"
-
-
-@pytest.mark.parametrize(
-    "frames, phase",
-    [
-        (["fit.py _begin_epoch", "fit.py fit"], "attack"),
-        (["fit.py _train", "fit.py fit"], "training"),
-        (["evaluation.py evaluate", "fit.py _end_epoch", "fit.py fit"], "evaluation"),
-        (["logs.py scalars", "fit.py _report", "fit.py _end_epoch", "fit.py fit"], "log"),
-        (["checkpoint.py save", "fit.py _save", "fit.py _end_epoch", "fit.py fit"], "checkpoint"),
-        (["evaluation.py evaluate", "experiment.py _test_scores", "experiment.py train_and_score"], "scoring"),
-        (["experiment.py prepare", "__main__.py main"], None),
-        ([], None),
-    ],
-)
-def test_the_innermost_function_that_is_listed_tells_the_phase(frames, phase):
-    lines = [f'  File "/x/train/{frame.split()[0]}", line 7 in {frame.split()[1]}' for frame in ["nn.py f", *frames]]
-    assert innermost_phase("\n".join(["Current thread 0x1 (most recent call first):", *lines])) == phase
+def test_a_function_that_fails_leaves_its_phase(monkeypatch):
+    for functions in PHASES.values():
+        for owner, name in functions:
+            monkeypatch.setattr(owner, name, getattr(owner, name))
+    memory = bytearray(1)
+    observe(memory)
+    with pytest.raises(OSError):
+        checkpoint.save(Path("/nowhere") / LAST, state(1))
+    assert memory[0] == 0
 
 
 # ---------------------------------------------------------------------------------------- the table
@@ -233,7 +239,7 @@ def test_the_table_has_a_row_for_each_case_and_faults_are_failures(tmp_path):
             Outcome("disk filled"),
         ]
     )
-    bench = Bench(Workshop(tmp_path, 5), tmp_path, tmp_path, tmp_path, {"start": 9.0, "training": 3.0, "scoring": 1.0})
+    bench = Bench(SmallRun(tmp_path, 5), tmp_path, tmp_path, tmp_path, {"start": 9.0, "training": 3.0, "scoring": 1.0})
     rows = [line for line in page(outcomes, bench, "command").splitlines() if line.startswith("|")]
     assert rows[2:] == [
         "| SIGKILL | 3 | 5 | start-up 1, attack 4 | equal | **faults: 1** | equal | equal | as it should |",
@@ -248,11 +254,10 @@ def test_the_table_has_a_row_for_each_case_and_faults_are_failures(tmp_path):
 
 def test_a_killed_process_is_resumed_to_the_same_end(tmp_path):
     """As one that was not, in this process."""
-    workshop, reference = furnish(tmp_path, epochs=EPOCHS), tmp_path / "reference"
-    with initialize_config_module("conf", version_base="1.3"):
-        config = compose("train", workshop.command(reference)[3:])
+    small, reference = write_inputs(tmp_path, epochs=EPOCHS), tmp_path / "reference"
+    config = configured(small, reference)
     run(config, load_data(config), reference)
-    bench = Bench(workshop, tmp_path / "runs", reference, tmp_path / "half", {"training": 0.1})
+    bench = Bench(small, tmp_path / "runs", reference, tmp_path / "half", {"training": 0.1})
     outcome = interrupted("SIGKILL", kill, 1, bench, np.random.default_rng(0), since=("training",))
     assert (outcome.runs, outcome.stops.total()) == (1, 1) and "start-up" not in outcome.stops
     assert outcome.faults == {concern: [] for concern in CONCERNS}
@@ -262,7 +267,7 @@ def test_a_killed_process_is_resumed_to_the_same_end(tmp_path):
 @pytest.mark.slow
 def test_the_command_writes_a_table_without_faults(tmp_path):
     settings = ["kills=2", "signals=1", "draws=1", "epochs=8", f"out={tmp_path}/table.md", f"keep={tmp_path}/runs"]
-    command = [sys.executable, str(ROOT / "scripts" / "torture.py"), *settings]
+    command = [sys.executable, str(ROOT / "scripts" / "check_interruptions.py"), *settings]
     done = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     table = (tmp_path / "table.md").read_text()

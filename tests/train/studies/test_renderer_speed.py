@@ -1,6 +1,5 @@
 import copy
 import csv
-import importlib.util
 import itertools
 import math
 import sys
@@ -13,13 +12,9 @@ import torch
 
 from renderer import reference
 from renderer.visibility import choose
-
-SCRIPTS = Path(__file__).parents[2] / "scripts"
-sys.path.append(str(SCRIPTS))
-
-from benchmarks import measure, results, scenes, steps  # noqa: E402
-from benchmarks.reference import Converged  # noqa: E402
-from benchmarks.results import Row  # noqa: E402
+from train.studies.renderer_speed import measure, results, scenes, steps, study
+from train.studies.renderer_speed.reference import Converged
+from train.studies.renderer_speed.results import Row
 
 EPS32, EPS64 = torch.finfo(torch.float32).eps, torch.finfo(torch.float64).eps
 CPU = torch.device("cpu")
@@ -181,7 +176,7 @@ def test_plain_autograd_by_face_and_by_sample_is_the_analytic_gradient():
         torch.testing.assert_close(other, found[0], rtol=0, atol=1e3 * EPS64 * float(found[0].abs().max()))
 
 
-# ---------------------------------------------------------------------------- the script
+# ---------------------------------------------------------------------------- the study
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -191,15 +186,13 @@ def read(path: Path) -> list[dict[str, str]]:
 
 def test_a_quick_run_writes_every_file(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
-    spec = importlib.util.spec_from_file_location("benchmark_renderer", SCRIPTS / "benchmark_renderer.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    monkeypatch.setattr(script, "_backends", lambda: (choose("software"),))
-    monkeypatch.setattr(sys, "argv", ["benchmark_renderer.py", "--quick", "--out", str(tmp_path)])
+    monkeypatch.setattr(study, "_backends", lambda: (choose("software"),))
+    monkeypatch.setattr(sys, "argv", ["scripts/benchmark_renderer.py", "quick=true"])
+    settings = study.RendererSpeedSettings(str(tmp_path), "cpu", peers=False, quick=True, scene=study.SceneSettings([]))
     monkeypatch.setenv("LP_NUM_THREADS", "0")
     threads = torch.get_num_threads()
     try:
-        script.main()
+        study.run(settings)
     finally:
         torch.set_num_threads(threads)
 
@@ -214,6 +207,7 @@ def test_a_quick_run_writes_every_file(tmp_path, monkeypatch, capsys):
     for figure in ("renderer_pareto.png", "renderer_scaling.png"):
         assert (tmp_path / figure).read_bytes().startswith(b"\x89PNG")
     page = (tmp_path / "performance_renderer.md").read_text()
+    assert page.startswith("# Time against error\n\n`python scripts/benchmark_renderer.py quick=true` measures ")
     output = capsys.readouterr().out
     for panel in chosen:
         assert f"{panel}: The default, " in output

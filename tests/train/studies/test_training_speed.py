@@ -1,4 +1,3 @@
-import importlib.util
 import itertools
 import json
 import os
@@ -19,15 +18,10 @@ from train.batches import training_batches
 from train.data import Split, load_npz
 from train.recipe import TrainSettings
 from train.settings import ExperimentSettings, read_settings
-from train.wideresnet import WideResNet
-
-ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "scripts"))
-
-from benchmarks.training import peak  # noqa: E402
-from benchmarks.training.baseline import Baseline, build_loader, use_plain_dropout  # noqa: E402
-from benchmarks.training.contest import BenchmarkSettings, compete, measure  # noqa: E402
-from benchmarks.training.findings import (  # noqa: E402
+from train.studies.training_speed import peak
+from train.studies.training_speed.baseline import Baseline, build_loader, use_plain_dropout
+from train.studies.training_speed.contest import BenchmarkSettings, compete, measure
+from train.studies.training_speed.findings import (
     ADVERSARIAL,
     BASELINE,
     PLAIN,
@@ -37,9 +31,12 @@ from benchmarks.training.findings import (  # noqa: E402
     Workload,
     targets,
 )
-from benchmarks.training.page import page  # noqa: E402
-from benchmarks.training.turns import take_turns  # noqa: E402
+from train.studies.training_speed.page import page
+from train.studies.training_speed.study import run as write_page
+from train.studies.training_speed.turns import take_turns
+from train.wideresnet import WideResNet
 
+ROOT = Path(__file__).parents[3]
 CPU = torch.device("cpu")
 TINY = [
     "model.depth=10",
@@ -256,13 +253,6 @@ def test_settings_out_of_range_name_their_key(name, value):
 # ---------------------------------------------------------------------------- the script
 
 
-def load_script():
-    spec = importlib.util.spec_from_file_location("benchmark_training", ROOT / "scripts" / "benchmark_training.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    return script
-
-
 @pytest.fixture
 def one_thread():
     threads = torch.get_num_threads()
@@ -278,7 +268,7 @@ def test_a_tiny_run_writes_the_page_and_its_figure(tmp_path, npz, monkeypatch, c
         sys, "argv", ["scripts/benchmark_training.py", f"data.path={npz}", "scene.meshes=[/home/a.glb,{mesh:../b.glb}]"]
     )
     overrides = [*TINY, "data=npz", f"data.path={npz}", f"out={tmp_path}/docs/page.md", "epochs=1", "steps=1"]
-    load_script().write_page(settings("benchmark_training", *overrides))
+    write_page(settings("benchmark_training", *overrides))
 
     text = (tmp_path / "docs" / "page.md").read_text()
     assert text in capsys.readouterr().out

@@ -1,1 +1,1 @@
-"""The renderer's largest errors, condition by condition: what scripts/stress_renderer.py measures."""
+"""The largest errors of the renderer, condition by condition."""

@@ -11,7 +11,7 @@ from renderer.camera import OrthographicCamera
 from renderer.image import PictureSettings
 from renderer.lights import ambient
 from renderer.mesh import Mesh, normalise
-from stress.measure import (
+from train.studies.accuracy.measure import (
     CAMERA,
     Errors,
     Setup,
@@ -24,8 +24,8 @@ from stress.measure import (
     with_vertex_normals,
     worst,
 )
-from stress.reference import exact, unit_normals
-from stress.shapes import (
+from train.studies.accuracy.reference import exact, unit_normals
+from train.studies.accuracy.shapes import (
     TRIANGLE,
     Chart,
     box,

@@ -17,8 +17,8 @@ from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.transfer import build_operators
 from renderer.visibility import Backend, choose
-from stress import reference
-from stress.reference import exact, extended
+from train.studies.accuracy import reference
+from train.studies.accuracy.reference import exact, extended
 
 BACKEND = choose("software")
 CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, field_of_view=2.2)

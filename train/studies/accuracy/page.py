@@ -9,17 +9,19 @@ import mpmath
 import numpy as np
 import torch
 
-from stress import conditions
-from stress.conditions import Row
-from stress.measure import Error
-from stress.refusals import Refusal
+from train.studies.accuracy.conditions import Row
+from train.studies.accuracy.measure import Error
+from train.studies.accuracy.refusals import Refusal
+from train.studies.page import joined
+from train.tables import markdown
 
-INTRODUCTION = """# Accuracy under stress
+INTRODUCTION = """# Accuracy
 
-How far the renderer is off, condition by condition. The reference ([scripts/stress/](../scripts/stress/)) evaluates the
-same formulas slowly, by explicit sums and without torch, in long doubles ({bits} bits of mantissa here) or, where those
-would not do (harmonics, thin faces, lights of high degree), in 256 bits. It takes each input as the renderer gets it,
-after its rounding to the number type, and which face a sample sees as the rasteriser says, which has tests of its own.
+How far the renderer is off, condition by condition. The reference
+([train/studies/accuracy/](../train/studies/accuracy/)) evaluates the same formulas slowly, by explicit sums and without
+torch, in long doubles ({bits} bits of mantissa here) or, where those would not do (harmonics, thin faces, lights of
+high degree), in 256 bits. It takes each input as the renderer gets it, after its rounding to the number type, and which
+face a sample sees as the rasteriser says, which has tests of its own.
 
 - *Error*: the largest difference anywhere in a picture or gradient, over the largest magnitude in it; in brackets, in
   units of ε, the spacing at 1 of the number type computed in (float64 2.2e-16, float32 1.2e-07, float16 9.8e-04,
@@ -48,19 +50,6 @@ class Table:
     rows: Sequence[Row]
 
 
-def measure(degree: int, subdivisions: int, size: int, slivers: int) -> list[Table]:
-    """Every table. degree: the highest of the harmonics. The others: how much of each, as in the configuration."""
-    return [
-        Table("Spherical harmonics", list(conditions.harmonics(degree))),
-        Table("Meshes", list(conditions.meshes(subdivisions))),
-        Table("Thin faces", list(conditions.thin_faces(slivers))),
-        Table("Lights", list(conditions.lights(degree))),
-        Table("Number types", list(conditions.number_types())),
-        Table("Pictures and cameras", list(conditions.pictures(size))),
-        Table("Radiance to picture", list(conditions.development())),
-    ]
-
-
 def page(tables: Sequence[Table], refusals: Sequence[Refusal], command: str) -> str:
     """Markdown."""
     introduction = INTRODUCTION.format(
@@ -72,8 +61,8 @@ def page(tables: Sequence[Table], refusals: Sequence[Refusal], command: str) -> 
         machine=platform.machine(),
     )
     refused = [[refusal.condition, refusal.error or "**nothing**"] for refusal in refusals]
-    parts = [f"## {table.title}\n\n{_errors(table.rows)}" for table in tables]
-    return "\n".join([introduction, *parts, f"## What is refused\n\n{_table(['input', 'error'], refused)}"])
+    sections = [block for table in tables for block in (f"## {table.title}", _errors(table.rows))]
+    return joined([introduction, *sections, "## What is refused", markdown(["input", "error"], refused)])
 
 
 def failures(tables: Sequence[Table], refusals: Sequence[Refusal]) -> list[str]:
@@ -90,7 +79,7 @@ def failures(tables: Sequence[Table], refusals: Sequence[Refusal]) -> list[str]:
 def _errors(rows: Sequence[Row]) -> str:
     quantities = list(dict.fromkeys(quantity for row in rows for quantity in row.errors))
     cells = [[row.condition, *(_cell(row.errors.get(name)) for name in quantities), row.behaviour] for row in rows]
-    return _table(["condition", *quantities, "what the code does"], cells)
+    return markdown(["condition", *quantities, "what the code does"], cells)
 
 
 def _cell(error: Error | None) -> str:
@@ -100,8 +89,3 @@ def _cell(error: Error | None) -> str:
         return "**not finite**"
     units = f"{error.units:.2g}" if error.units < 1000 else f"{error.units:.0e}"
     return f"{error.relative:.1e} ({units} ε)" if error.relative else "0"
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -14,8 +14,8 @@ from renderer.image import PictureSettings, develop
 from renderer.mesh import Mesh
 from renderer.shading import irradiance, radiance
 from renderer.transfer import build_operators
-from stress.measure import BACKEND, CAMERA, SETTINGS, light
-from stress.shapes import TRIANGLE
+from train.studies.accuracy.measure import BACKEND, CAMERA, SETTINGS, light
+from train.studies.accuracy.shapes import TRIANGLE
 
 
 @dataclass(frozen=True)

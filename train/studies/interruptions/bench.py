@@ -11,10 +11,10 @@ from pathlib import Path
 
 from numpy.random import Generator
 
-from torture.comparison import compare
-from torture.life import Ending, Life, Moment
-from torture.workshop import Workshop
 from train import checkpoint
+from train.studies.interruptions.comparison import compare
+from train.studies.interruptions.process import Ending, Moment, Process
+from train.studies.interruptions.small_run import SmallRun
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Outcome:
 class Bench:
     """runs: the folder of those to come. seconds: see `run_undisturbed`."""
 
-    workshop: Workshop
+    small: SmallRun
     runs: Path
     reference: Path
     half: Path
@@ -53,25 +53,25 @@ class Bench:
         return Moment(kind, rng.uniform(0, self.seconds[kind]))
 
 
-def prepare(workshop: Workshop) -> Bench:
+def prepare(small: SmallRun) -> Bench:
     """Run once undisturbed and once to the middle. RuntimeError where that does not end well."""
-    runs = workshop.folder / "runs"
+    runs = small.folder / "runs"
     reference, half = runs / "reference", runs / "half"
-    seconds = run_undisturbed(workshop, reference)
-    life = Life(workshop, half)
-    life.wait(Moment("half", 0))
-    life.send(signal.SIGTERM)
-    _expect(128 + signal.SIGTERM, life.end())
-    return Bench(workshop, runs, reference, half, seconds)
+    seconds = run_undisturbed(small, reference)
+    process = Process(small, half)
+    process.wait(Moment("half", 0))
+    process.send(signal.SIGTERM)
+    _expect(128 + signal.SIGTERM, process.end())
+    return Bench(small, runs, reference, half, seconds)
 
 
-def run_undisturbed(workshop: Workshop, folder: Path) -> dict[str, float]:
+def run_undisturbed(small: SmallRun, folder: Path) -> dict[str, float]:
     """The seconds from each kind of moment to the final scores."""
-    passed, life = {}, Life(workshop, folder)
+    passed, process = {}, Process(small, folder)
     for kind in ("start", "training", "scoring", "end"):
-        life.wait(Moment(kind, 0))
+        process.wait(Moment(kind, 0))
         passed[kind] = time.monotonic()
-    _expect(0, life.end())
+    _expect(0, process.end())
     return {kind: passed["end"] - then for kind, then in passed.items()}
 
 

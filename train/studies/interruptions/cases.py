@@ -6,9 +6,9 @@ from functools import partial
 
 from numpy.random import Generator
 
-from torture.bench import Bench, Outcome
-from torture.damages import DAMAGES, LIMITS, both_damaged, damaged, limited
-from torture.interruptions import ask, ask_then_kill, disk_filled, interrupted, kill
+from train.studies.interruptions.bench import Bench, Outcome
+from train.studies.interruptions.damages import DAMAGES, LIMITS, both_damaged, damaged, limited
+from train.studies.interruptions.disturbances import ask, ask_then_kill, disk_filled, interrupted, kill
 
 Case = Callable[[Bench, Generator], Outcome]
 

@@ -1,4 +1,4 @@
-"""What a tortured run left, beside what an undisturbed one did: bit for bit, apart from the seconds."""
+"""What an interrupted run left, beside what an undisturbed one did: bit for bit, apart from the seconds."""
 
 import logging
 from collections import Counter

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from numpy.random import Generator
 
-from torture.bench import Bench, Outcome, conclude, full_disk_faults
-from torture.life import Ending, Life
 from train import checkpoint
 from train.logs import METRICS
+from train.studies.interruptions.bench import Bench, Outcome, conclude, full_disk_faults
+from train.studies.interruptions.process import Ending, Process
 
 
 class Limit(NamedTuple):
@@ -45,12 +45,12 @@ def limited(case: str, limit: Limit, count: int, bench: Bench, rng: Generator) -
     outcome = Outcome(case)
     for _ in range(count):
         run = bench.copy_of_half(case)
-        ending = Life(bench.workshop, run, int(limit.size(run, rng))).end()
+        ending = Process(bench.small, run, int(limit.size(run, rng))).end()
         outcome.stops[limit.phase] += 1
         outcome.add("said", *(f"{run.name}: {fault}" for fault in full_disk_faults(ending, run)))
         if not ending.status or not limit.hit(run, ending):
             outcome.add("said", f"{run.name}: did not run out of room there: {ending.errors}")
-        conclude(outcome, bench, run, Life(bench.workshop, run).end())
+        conclude(outcome, bench, run, Process(bench.small, run).end())
     return outcome
 
 
@@ -97,7 +97,7 @@ def damaged(case: str, damage: Damage, count: int, bench: Bench, rng: Generator)
     for _ in range(count):
         run = bench.copy_of_half(case)
         damage.spoil(run / damage.file, rng)
-        ending = Life(bench.workshop, run).end()
+        ending = Process(bench.small, run).end()
         if damage.says not in ending.output:
             outcome.add("said", f"{run.name}: not {damage.says!r} but {ending.output}")
         conclude(outcome, bench, run, ending)
@@ -111,7 +111,7 @@ def both_damaged(case: str, bench: Bench, rng: Generator) -> Outcome:
         flip_bytes(run / name, rng)
     files = [run / name for name in (checkpoint.LAST, checkpoint.PREVIOUS, checkpoint.BEST, METRICS)]
     before = [path.read_bytes() for path in files]
-    ending = Life(bench.workshop, run).end()
+    ending = Process(bench.small, run).end()
     if not ending.is_one_sentence(str(run)):
         outcome.add("said", f"{run.name}: status {ending.status}: {ending.errors}")
     if [path.read_bytes() for path in files] != before:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 from numpy.random import Generator
 
-from torture.bench import Bench, Outcome, conclude, full_disk_faults
-from torture.life import FIT, START, Ending, Life
 from train import checkpoint
+from train.studies.interruptions.bench import Bench, Outcome, conclude, full_disk_faults
+from train.studies.interruptions.process import FIT, START, Ending, Process
 
 GRACE = 0.1  # seconds at most from SIGTERM to SIGKILL
 DISK = "64m"
@@ -27,7 +27,7 @@ class Stop(NamedTuple):
     faults: list[str]
 
 
-Interrupt = Callable[[Life, Generator], Stop]
+Interrupt = Callable[[Process, Generator], Stop]
 
 
 def interrupted(
@@ -43,31 +43,31 @@ def interrupted(
     while (left := count - outcome.stops.total()) > 0:
         run, ending = bench.folder(case), None
         for _ in range(left):
-            life = Life(bench.workshop, run)
-            if not life.wait(bench.moment(rng, since)):
-                ending = life.end()
+            process = Process(bench.small, run)
+            if not process.wait(bench.moment(rng, since)):
+                ending = process.end()
                 break
-            stop = interrupt(life, rng)
+            stop = interrupt(process, rng)
             outcome.add("said", *(f"{run.name}, {stop.phase}: {fault}" for fault in stop.faults))
             outcome.stops[stop.phase] += bool(stop.ending.status)  # it may have come too late
-            if life.reached("end"):  # what is left could only be scored once more
+            if process.reached("end"):  # what is left could only be scored once more
                 break
-        conclude(outcome, bench, run, ending or Life(bench.workshop, run).end())
+        conclude(outcome, bench, run, ending or Process(bench.small, run).end())
     return outcome
 
 
-def kill(life: Life, rng: Generator) -> Stop:
+def kill(process: Process, rng: Generator) -> Stop:
     """SIGKILL: the process can do nothing about it."""
-    phase = life.send(signal.SIGKILL)
-    ending = life.end()
+    phase = process.send(signal.SIGKILL)
+    ending = process.end()
     return Stop(phase, ending, [] if ending.terse else [f"said {ending.errors}"])
 
 
-def ask(number: signal.Signals, life: Life, rng: Generator) -> Stop:
+def ask(number: signal.Signals, process: Process, rng: Generator) -> Stop:
     """SIGTERM or SIGINT: within `fit` the process ends its step, writes and exits; else it dies as any other."""
-    before, phase = time.time_ns(), life.send(number)
-    ending = life.end()
-    return Stop(phase, ending, list(_answer_faults(ending, 128 + number, phase, life.run, before)))
+    before, phase = time.time_ns(), process.send(number)
+    ending = process.end()
+    return Stop(phase, ending, list(_answer_faults(ending, 128 + number, phase, process.run, before)))
 
 
 def _answer_faults(ending: Ending, status: int, phase: str, run: Path, before: int) -> Iterator[str]:
@@ -85,28 +85,28 @@ def _answer_faults(ending: Ending, status: int, phase: str, run: Path, before: i
             yield "wrote no checkpoint"
 
 
-def ask_then_kill(life: Life, rng: Generator) -> Stop:
+def ask_then_kill(process: Process, rng: Generator) -> Stop:
     """SIGTERM and soon after SIGKILL, as schedulers do; the phase is the one that SIGKILL found."""
-    life.send(signal.SIGTERM)
+    process.send(signal.SIGTERM)
     time.sleep(rng.uniform(0, GRACE))
-    return kill(life, rng)
+    return kill(process, rng)
 
 
-def fill_disk(life: Life, rng: Generator) -> Stop:
+def fill_disk(process: Process, rng: Generator) -> Stop:
     """Leave no room on the run's file system until the process has ended."""
-    phase, filler = life.phase(), life.run.parent / "filler"
+    phase, filler = process.phase(), process.run.parent / "filler"
     with open(filler, "wb", buffering=0) as file, suppress(OSError):
         while True:
             file.write(bytes(2**14))
-    ending = life.end()
+    ending = process.end()
     filler.unlink()
-    return Stop(phase, ending, list(full_disk_faults(ending, life.run)))
+    return Stop(phase, ending, list(full_disk_faults(ending, process.run)))
 
 
 @contextmanager
 def small_disk(bench: Bench) -> Iterator[Bench | None]:
     """The bench with its runs on a small file system of their own; None where the user may not mount one."""
-    folder = bench.workshop.folder / "disk"
+    folder = bench.small.folder / "disk"
     folder.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK}", "tmpfs", folder], capture_output=True).returncode:
         yield None

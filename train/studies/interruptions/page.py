@@ -1,4 +1,4 @@
-"""The table that a torture leaves: what was done to how many runs, when, and whether they ended as they should."""
+"""The page: what was done to how many runs, when, and whether they ended as they should."""
 
 import platform
 from collections import Counter
@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import torch
 
-from torture.bench import Bench, Outcome
-from torture.life import ORDER
+from train.studies.interruptions.bench import Bench, Outcome
+from train.studies.interruptions.process import ORDER
+from train.studies.page import joined
+from train.tables import markdown
 
 CONCERNS = {  # of faults, and the heads of their columns
     "checkpoints": "weights, optimiser",
@@ -49,7 +51,7 @@ def failures(outcomes: Sequence[Outcome]) -> list[str]:
 
 def page(outcomes: Sequence[Outcome], bench: Bench, command: str) -> str:
     """Markdown."""
-    seconds, epochs = bench.seconds, bench.workshop.epochs
+    seconds, epochs = bench.seconds, bench.small.epochs
     introduction = INTRODUCTION.format(
         command=command,
         torch=torch.__version__,
@@ -59,8 +61,7 @@ def page(outcomes: Sequence[Outcome], bench: Bench, command: str) -> str:
         start=seconds["start"] - seconds["training"],
     )
     header = ["case", "runs", "stops", "found in", *CONCERNS.values()]
-    rows = [header, ["---"] * len(header), *map(_row, outcomes)]
-    return introduction + "\n" + "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    return joined([introduction, markdown(header, map(_row, outcomes))])
 
 
 def _row(outcome: Outcome) -> list[str]:

@@ -1,32 +1,21 @@
 """One process of a training run: where it is, and how it ends by itself, by a signal or by an error."""
 
-import re
 import resource
 import signal
 import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 
-from torture.workshop import Workshop
 from train.cli import USER_ERROR
 from train.logs import METRICS
+from train.studies.interruptions.observed import NAMES
+from train.studies.interruptions.small_run import SmallRun
 
 PATIENCE = 300  # seconds after which a process that should have ended has hung
 POLL = 0.002
-OUTERMOST = "_run_module_as_main"  # function of every stack; the last to be written
-
-# By the innermost of these functions on the stack; None: any function of the file.
-PHASES = {
-    ("checkpoint.py", "save"): "checkpoint",
-    ("logs.py", None): "log",
-    ("fit.py", "_begin_epoch"): "attack",
-    ("fit.py", "_train"): "training",
-    ("fit.py", "_end_epoch"): "evaluation",
-    ("experiment.py", "_test_scores"): "scoring",
-    ("experiment.py", "_photograph_scores"): "scoring",
-    ("fit.py", "fit"): "training",
-}
 START, END = "start-up", "exit"
 FIT = ("attack", "training", "evaluation")
 ORDER = (START, *FIT, "log", "checkpoint", "scoring", END)
@@ -36,7 +25,6 @@ LINES = {
     "scoring": lambda epochs: epochs,
     "end": lambda epochs: epochs + 1,
 }
-FRAME = re.compile(r'File ".*/train/(\w+\.py)", line \d+ in (\w+)')
 
 
 @dataclass(frozen=True)
@@ -68,24 +56,26 @@ class Ending:
         return self.status == USER_ERROR and len(lines) == 1 and lines[0].startswith("error: ") and advice in lines[0]
 
 
-class Life:
-    """A process that begins or resumes `run`. limit: bytes that none of its files may exceed."""
+class Process:
+    """One that begins or resumes the run in a folder. limit: bytes that none of its files may exceed."""
 
-    def __init__(self, workshop: Workshop, run: Path, limit: int | None = None):
+    def __init__(self, small: SmallRun, run: Path, limit: int | None = None):
         self.run = run
-        self._epochs = workshop.epochs
-        self._boards = self._count_boards()  # of earlier lives
+        self._epochs = small.epochs
+        self._boards = self._count_boards()  # of earlier processes
+        with NamedTemporaryFile(dir=small.folder, prefix="phase_", delete=False) as file:
+            file.write(bytes(1))
+        self._phase = Path(file.name)
         self._process = subprocess.Popen(
-            workshop.command(run),
-            cwd=workshop.folder,
-            env=workshop.environment,
+            [sys.executable, "-m", "train.studies.interruptions.observed", self._phase, *small.overrides(run)],
+            cwd=small.folder,
+            env=small.environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
         if limit is not None:
             resource.prlimit(self._process.pid, resource.RLIMIT_FSIZE, (limit, limit))
-        self._stacks = workshop.stacks / f"{self._process.pid}.stacks"
 
     def wait(self, moment: Moment) -> bool:
         """Whether the process still runs when the moment comes."""
@@ -112,15 +102,8 @@ class Life:
         return phase
 
     def phase(self) -> str:
-        """Where the process is, by the stack that it writes when asked; START before it can be asked."""
-        before = self._stacks.stat().st_size if self._stacks.is_file() else 0
-        if not before:
-            return START
-        self._process.send_signal(signal.SIGUSR1)
-        deadline = time.monotonic() + 0.2  # a process that is ending may answer no more
-        while OUTERMOST not in (stack := self._stacks.read_text()[before:]) and time.monotonic() < deadline:
-            time.sleep(POLL)
-        return innermost_phase(stack) or (END if self.reached("training") else START)
+        """Where the process is, as it says itself."""
+        return NAMES[self._phase.read_bytes()[0]] or (END if self.reached("training") else START)
 
     def end(self) -> Ending:
         """Wait for the end; a process that hangs is killed and says so."""
@@ -130,7 +113,7 @@ class Life:
             self._process.kill()
             output, errors = self._process.communicate()
             errors += f"hung for {PATIENCE} s"
-        self._stacks.unlink(missing_ok=True)
+        self._phase.unlink()
         code = self._process.returncode
         return Ending(abs(code) + 128 * (code < 0), code >= 0, output, errors)
 
@@ -140,11 +123,3 @@ class Life:
     def _count_lines(self) -> int:
         path = self.run / METRICS
         return path.read_bytes().count(b"\n") if path.is_file() else 0
-
-
-def innermost_phase(stack: str) -> str | None:
-    """What `faulthandler` wrote, the innermost function first, as a phase; None outside them all."""
-    for file, function in FRAME.findall(stack):
-        if phase := PHASES.get((file, function)) or PHASES.get((file, None)):
-            return phase
-    return None

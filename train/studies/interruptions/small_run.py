@@ -1,14 +1,15 @@
-"""A small training run to torture: its data, its photographs, and the command that starts or resumes it."""
+"""A small training run to interrupt: its data, its photographs and its settings."""
 
 import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-ROOT = Path(__file__).parents[2]
+import train
+
+ROOT = Path(train.__file__).parents[1]  # of the installation that runs
 CLASSES = ["apple", "orange", "pear"]
 SETTINGS = [
     "train.resume=true", "data=npz", "data.validation=0.3", "compare=[]", "model.depth=10", "model.width=1",
@@ -18,50 +19,35 @@ SETTINGS = [
     "renderer.visibility=software", "renderer.samples=2",
 ]  # fmt: skip
 
-# Python imports a module of this name at every start. On SIGUSR1 the process then writes where it is, and goes on.
-SITECUSTOMIZE = """
-import faulthandler, os, pathlib, signal
-file = open(pathlib.Path(__file__).with_name(f"{os.getpid()}.stacks"), "w")
-faulthandler.register(signal.SIGUSR1, file)
-file.write("ready\\n")
-file.flush()
-"""
-
 
 @dataclass(frozen=True)
-class Workshop:
+class SmallRun:
     """A folder that holds all that the runs read and, under `runs`, all that they write. epochs: of every run."""
 
     folder: Path
     epochs: int
 
     @property
-    def stacks(self) -> Path:
-        """Where a process writes its stack, in a file named by its number."""
-        return self.folder / "site"
-
-    @property
     def environment(self) -> dict[str, str]:
-        paths = os.pathsep.join(map(str, (self.stacks, ROOT)))
-        return os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+        return os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
 
-    def command(self, run: Path) -> list[str]:
-        """`python -m train`, which goes on in the run's folder where it holds a checkpoint."""
+    def overrides(self, run: Path) -> list[str]:
+        """Of `python -m train`, which goes on in the run's folder where it holds a checkpoint."""
         here = [f"{key}={self.folder / name}" for key, name in (("data.path", "data.npz"), ("renderer.cache", "cache"))]
         named = [f"run={run}", f"train.epochs={self.epochs}", f"evaluate.photos={self.folder / 'photographs'}"]
-        return [sys.executable, "-m", "train", *named, *here, *SETTINGS]
+        return [*named, *here, *SETTINGS]
 
 
-def furnish(folder: Path, epochs: int) -> Workshop:
-    """Write the data, the photographs and what makes a process tell its stack into an empty folder."""
-    rng, workshop = np.random.default_rng(0), Workshop(folder, epochs)
-    train, test = np.repeat(np.arange(len(CLASSES)), 20), np.repeat(np.arange(len(CLASSES)), 10)
+def write_inputs(folder: Path, epochs: int) -> SmallRun:
+    """Write the data and the photographs into an empty folder."""
+    rng = np.random.default_rng(0)
+    trained, tested = np.repeat(np.arange(len(CLASSES)), 20), np.repeat(np.arange(len(CLASSES)), 10)
     np.savez(
         folder / "data.npz",
-        train_images=_coloured_noise(rng, train),
-        train_labels=train,
-        test_images=_coloured_noise(rng, test),
-        test_labels=test,
+        train_images=_coloured_noise(rng, trained),
+        train_labels=trained,
+        test_images=_coloured_noise(rng, tested),
+        test_labels=tested,
         classes=np.array(CLASSES),
     )
     for name in ("orange", "apple", "other_tomato"):
@@ -69,9 +55,7 @@ def furnish(folder: Path, epochs: int) -> Workshop:
         for number in range(3):
             pixels = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
             Image.fromarray(pixels).save(folder / "photographs" / name / f"{number}.png")
-    workshop.stacks.mkdir()
-    (workshop.stacks / "sitecustomize.py").write_text(SITECUSTOMIZE)
-    return workshop
+    return SmallRun(folder, epochs)
 
 
 def _coloured_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:

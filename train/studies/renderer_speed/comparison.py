@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.errors import Exact
-from benchmarks.panels import SAMPLES, Bench, Entries
-from benchmarks.results import Row
-from benchmarks.scenes import ALBEDO, CAMERA, View, coefficients
-from benchmarks.steps import shade_by_face, vertex_step
 from renderer import reference, shading
 from renderer.errors import InputError
 from renderer.transfer import DEGREE, Operator
+from train.studies.renderer_speed.errors import Exact
+from train.studies.renderer_speed.panels import SAMPLES, Bench, Entries
+from train.studies.renderer_speed.results import Row
+from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View, coefficients
+from train.studies.renderer_speed.steps import shade_by_face, vertex_step
 
 DIRECT, AUTOGRAD, WHOLE = "operator, direct", "operator, autograd", "operator, direct, whole pictures in and out"
 ANALYTIC, BY_FACE, BY_SAMPLE = "analytic", "plain autograd, face by face", "plain autograd, sample by sample"
@@ -32,8 +32,8 @@ Peers = Mapping[str, Callable]  # makers by name
 
 def installed_peers() -> tuple[dict[str, Callable], list[str]]:
     """(the peers that start here, by name, and a sentence about each that does not)."""
-    from peers.mitsuba_peer import MitsubaPeer
-    from peers.pytorch3d_peer import PyTorch3DPeer
+    from train.studies.peers.mitsuba import MitsubaPeer
+    from train.studies.peers.pytorch3d import PyTorch3DPeer
 
     peers, absent = {}, []
     for name, make in {MITSUBA: MitsubaPeer, PYTORCH3D: PyTorch3DPeer}.items():

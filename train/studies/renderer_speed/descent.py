@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from benchmarks.scenes import BACKGROUND, View
-from benchmarks.steps import Seen, seen
 from renderer import shading
 from renderer.image import develop
+from train.studies.renderer_speed.scenes import BACKGROUND, View
+from train.studies.renderer_speed.steps import Seen, seen
 
 STEP = 0.05  # L2 norm, over all coordinates
 

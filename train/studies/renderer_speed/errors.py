@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
-from benchmarks.measure import relative_error
-from benchmarks.reference import Converged, Irradiance
-from benchmarks.scenes import View, irradiance
-from benchmarks.steps import Shading, seen
 from renderer import shading
 from renderer.transfer import Operator
+from train.studies.renderer_speed.measure import relative_error
+from train.studies.renderer_speed.reference import Converged, Irradiance
+from train.studies.renderer_speed.scenes import View, irradiance
+from train.studies.renderer_speed.steps import Shading, seen
 
 
 class Exact:

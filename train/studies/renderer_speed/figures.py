@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.results import Row, pareto_front
-from benchmarks.scaling import Point
-from renderer.errors import InputError
+from train.studies.figures import pyplot, save
+from train.studies.renderer_speed.results import Row, pareto_front
+from train.studies.renderer_speed.scaling import Point
 
 RED = "#c62f2f"
 FEW = 12  # settings that can all be named in the figure
@@ -15,7 +15,7 @@ def draw_fronts(path: Path, panels: Sequence[Sequence[Row]]) -> None:
     """One set of axes per panel: all settings, by name or coloured by degree, their front and the default."""
     plt = pyplot()
     lines = -(-len(panels) // 3)
-    figure, axes = plt.subplots(lines, 3, figsize=(16, 5 * lines), squeeze=False)
+    figure, axes = plt.subplots(lines, 3, figsize=(16, 5 * lines), squeeze=False, layout="tight")
     for ax, rows in zip(axes.flat, panels, strict=False):
         _draw_front(ax, rows)
         if len(rows) > FEW:
@@ -28,7 +28,7 @@ def draw_fronts(path: Path, panels: Sequence[Sequence[Row]]) -> None:
         ax.legend(fontsize=8)
     for ax in axes.flat[len(panels) :]:
         ax.axis("off")
-    save(plt, figure, path)
+    save(figure, path, dpi=100)
 
 
 def _draw_front(ax, rows: Sequence[Row]) -> None:
@@ -48,8 +48,7 @@ def _draw_by_degree(ax, rows: Sequence[Row], colors) -> None:
 
 def draw_scaling(path: Path, points: Sequence[Point], workloads: Sequence[Sequence[Row]]) -> None:
     """Time and memory of a gradient by its variables, and time of each kind of work by size, vertices and lights."""
-    plt = pyplot()
-    figure, axes = plt.subplots(2, 3, figsize=(16, 10))
+    figure, axes = pyplot().subplots(2, 3, figsize=(16, 10), layout="tight")
     methods = list(dict.fromkeys(point.method for point in points))
     lines = {method: [point for point in points if point.method == method] for method in methods}
     for ax, quantity, unit in ((axes[0, 0], "time_ms", "milliseconds"), (axes[0, 1], "memory_mb", "peak MB allocated")):
@@ -64,7 +63,7 @@ def draw_scaling(path: Path, points: Sequence[Point], workloads: Sequence[Sequen
     stepping = [row for row in by_size if row.setting in ("light step", "vertex step, refreshed")]
     _draw_lines(axes[1, 2], _by_work(stepping), "size", "error")
     axes[1, 2].set(title=by_size[0].panel, xlabel="size", ylabel="relative error")
-    save(plt, figure, path)
+    save(figure, path, dpi=100)
 
 
 def _by_work(rows: Sequence[Row]) -> dict[str, list[Row]]:
@@ -91,22 +90,3 @@ def _logarithmic(ax, *names: str) -> None:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.12g}"))
         axis.set_minor_formatter(NullFormatter())
     ax.grid(alpha=0.3, which="both")
-
-
-def save(plt, figure, path: Path) -> None:
-    """Write the figure and let go of it."""
-    figure.tight_layout()
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
-def pyplot():
-    """matplotlib.pyplot without a display; InputError where it is not installed."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise InputError("matplotlib is not installed: pip install '.[benchmark]'") from error
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt

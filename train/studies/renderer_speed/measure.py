@@ -1,8 +1,6 @@
-"""Clocks and scales: medians of interleaved repeats, peak memory, and what machine it was."""
+"""Clocks and scales: medians of interleaved repeats, and peak memory."""
 
 import json
-import os
-import platform
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -83,21 +81,6 @@ def peak_bytes(call: Callable[[], object], device: torch.device) -> int:
         events = json.loads(trace.read_text())["traceEvents"]
     changes = sorted((event["ts"], event["args"]["Bytes"]) for event in events if event["name"] == "[memory]")
     return int(np.cumsum([0] + [change for _, change in changes]).max())
-
-
-def machine(device: torch.device) -> str:
-    """One line: GPU, where that is the device, processor, threads, versions, and how busy the machine was."""
-    gpu = f"{torch.cuda.get_device_name(device)}; " if device.type == "cuda" else ""
-    threads = torch.get_num_threads()
-    versions = f"Python {platform.python_version()}, torch {torch.__version__}, NumPy {np.__version__}"
-    load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores at the start"
-    return f"{gpu}{_processor()}, {threads} thread{'s' if threads > 1 else ''} of the CPU; {versions}; {load}"
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:

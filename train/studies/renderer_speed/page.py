@@ -3,9 +3,12 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from benchmarks.results import Row, Target, markdown, pareto_front, shown, targets_table, verdict
-from benchmarks.scaling import Point
-from benchmarks.skipping import Saving
+from train.studies.page import joined
+from train.studies.renderer_speed.results import Row, pareto_front, verdict
+from train.studies.renderer_speed.scaling import Point
+from train.studies.renderer_speed.skipping import Saving
+from train.studies.targets import Target, table_of
+from train.tables import markdown, shown
 
 HEADER = """# Time against error
 
@@ -72,24 +75,24 @@ def page(findings: Findings, command: str, machine: str) -> str:
     )
     sections = [
         header,
-        *(f"{note}\n" for note in findings.notes),
-        "## Targets\n",
-        targets_table(findings.targets),
+        *findings.notes,
+        "## Targets",
+        table_of(findings.targets),
         WHY_NOT,
-        "## Choices\n",
+        "## Choices",
         "The error that counts is the larger of the two. All settings, not only the fronts, are in "
-        "[renderer_pareto.csv](renderer_pareto.csv).\n",
-        "![Fronts of time and error](renderer_pareto.png)\n",
+        "[renderer_pareto.csv](renderer_pareto.csv).",
+        "![Fronts of time and error](renderer_pareto.png)",
         *_choices(findings.choices),
         *_descent(findings.descent),
-        "## Side by side\n",
+        "## Side by side",
         *_comparisons(findings.comparisons),
-        "## What a scene does not need\n",
+        "## What a scene does not need",
         _savings(findings.savings),
-        "## How it grows\n",
+        "## How it grows",
         *_growth(findings),
     ]
-    return "\n".join(sections)
+    return joined(sections)
 
 
 def verdicts(findings: Findings) -> list[str]:
@@ -101,28 +104,28 @@ def _choices(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
     for rows in panels:
         front = pareto_front(rows)
         shown_rows = sorted({*front, *(row for row in rows if row.default)}, key=lambda row: row.time_ms)
-        yield f"### {_title(rows)}\n"
-        yield f"{verdict(rows)}\n"
+        yield f"### {_title(rows)}"
+        yield verdict(rows)
         lines = [(row.setting, *_numbers(row), row in front, "default" if row.default else "") for row in shown_rows]
         yield markdown(["setting", "ms", "picture's error", "gradient's error", "front", ""], lines)
 
 
 def _descent(rows: Sequence[Row]) -> Iterator[str]:
-    yield f"### {_title(rows)}\n"
+    yield f"### {_title(rows)}"
     yield (
         "The vertices move until the picture looks lit from the other side, in unit steps of 0.05. The error is the "
-        "final picture's, against the descent whose visibility is refreshed in every step.\n"
+        "final picture's, against the descent whose visibility is refreshed in every step."
     )
     lines = [(row.setting, row.time_ms, row.image_error, row.cost) for row in rows]
     yield markdown(["visibility", "ms per step", "final picture's error", "share of the cost that is left"], lines)
 
 
 def _comparisons(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
-    yield "The light is cut after degree 6 in the reference too, since that is what all are given.\n"
+    yield "The light is cut after degree 6 in the reference too, since that is what all are given."
     for rows in panels:
         fastest = min(row.time_ms for row in rows)
         lines = [(row.setting, row.samples, *_numbers(row), f"{shown(row.time_ms / fastest)}×") for row in rows]
-        yield f"### {_title(rows)}\n"
+        yield f"### {_title(rows)}"
         header = ["who", "samples per pixel", "ms", "picture's error", "gradient's error", "of the fastest"]
         yield markdown(header, lines)
 
@@ -138,9 +141,9 @@ def _savings(savings: Sequence[Saving]) -> str:
 def _growth(findings: Findings) -> Iterator[str]:
     yield (
         "The paper's scaling figure, and every kind of work by size, by vertices and by lights; the numbers are in "
-        "[renderer_scaling.csv](renderer_scaling.csv) and [renderer_pareto.csv](renderer_pareto.csv).\n"
+        "[renderer_scaling.csv](renderer_scaling.csv) and [renderer_pareto.csv](renderer_pareto.csv)."
     )
-    yield "![How time and memory grow](renderer_scaling.png)\n"
+    yield "![How time and memory grow](renderer_scaling.png)"
     methods = list(dict.fromkeys(point.method for point in findings.scaling))
     header = ["variables", *(f"{method}: {unit}" for method in methods for unit in ("ms", "MB"))]
     by_count = {point.variables: {} for point in findings.scaling}
@@ -149,7 +152,7 @@ def _growth(findings: Findings) -> Iterator[str]:
     lines = [(count, *(value for method in methods for value in found[method])) for count, found in by_count.items()]
     yield markdown(header, lines)
     for rows in findings.workloads:
-        yield f"### {_title(rows)}\n"
+        yield f"### {_title(rows)}"
         lines = [(row.setting, row.size, row.vertices, row.samples, *_numbers(row)) for row in rows]
         yield markdown(
             ["work", "size", "vertices", "samples per pixel", "ms", "picture's error", "gradient's error"], lines

@@ -7,15 +7,15 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from benchmarks.descent import bend, lit_from_opposite
-from benchmarks.errors import Exact
-from benchmarks.measure import Clock, relative_error
-from benchmarks.results import Row
-from benchmarks.scenes import View, coefficients, ellipsoid
-from benchmarks.steps import LAYOUTS, laid_out, light_step, vertex_step
 from renderer.image import PictureSettings
 from renderer.transfer import DEGREE
 from renderer.visibility import Backend
+from train.studies.renderer_speed.descent import bend, lit_from_opposite
+from train.studies.renderer_speed.errors import Exact
+from train.studies.renderer_speed.measure import Clock, relative_error
+from train.studies.renderer_speed.results import Row
+from train.studies.renderer_speed.scenes import View, coefficients, ellipsoid
+from train.studies.renderer_speed.steps import LAYOUTS, laid_out, light_step, vertex_step
 
 SAMPLES = PictureSettings().samples
 DTYPES = (torch.float32, torch.bfloat16, torch.float64)  # the default first

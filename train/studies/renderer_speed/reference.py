@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.scenes import ALBEDO, CAMERA, View
 from renderer import reference
+from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View
 
 RESOLUTION = 2048  # samples per side and rasterisation, at most
 SAMPLES = 16  # of a pixel per side and rasterisation, at most

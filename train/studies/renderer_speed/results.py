@@ -1,4 +1,4 @@
-"""What a measurement leaves: rows of time and error, the front among them, targets, CSV files and Markdown tables."""
+"""What a measurement leaves: rows of time and error, the front among them, and CSV files."""
 
 import csv
 import math
@@ -39,16 +39,6 @@ class Row:
     def error(self) -> float:
         """The larger of the image's and the gradient's, to the three digits that the reference is good for."""
         return float(f"{max(error for error in (self.image_error, self.gradient_error) if error is not None):.3g}")
-
-
-@dataclass(frozen=True)
-class Target:
-    """What is asked, what this run found, and whether that is enough: None where it could not be measured."""
-
-    what: str
-    asked: str
-    found: str
-    passed: bool | None
 
 
 def dominators(row: Row, rows: Iterable[Row]) -> list[Row]:
@@ -93,29 +83,6 @@ def write_csv(path: Path, records: Sequence[dict]) -> None:
 def records(panels: Sequence[Sequence[Row]]) -> list[dict]:
     """The rows of panels for `write_csv`, with a column that tells who lies on the panel's front."""
     return [asdict(row) | {"front": row in pareto_front(rows)} for rows in panels for row in rows]
-
-
-def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
-    """A Markdown table."""
-    cells = [list(header), ["---"] * len(header), *([shown(cell) for cell in line] for line in lines)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in cells) + "\n"
-
-
-def targets_table(targets: Sequence[Target]) -> str:
-    """A Markdown table of targets, those that are missed in bold."""
-    lines = [(t.what, t.asked, t.found, "—" if t.passed is None else "yes" if t.passed else "**no**") for t in targets]
-    return markdown(["what", "asked", "found", "met"], lines)
-
-
-def shown(value: object) -> str:
-    """A value for people to read: three significant digits, nothing for None."""
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
-    return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def _plain(value: object) -> object:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchmarks.comparison import SHADINGS
-from benchmarks.measure import peak_bytes
-from benchmarks.panels import Bench
-from benchmarks.scenes import View
-from benchmarks.steps import seen
+from train.studies.renderer_speed.comparison import SHADINGS
+from train.studies.renderer_speed.measure import peak_bytes
+from train.studies.renderer_speed.panels import Bench
+from train.studies.renderer_speed.scenes import View
+from train.studies.renderer_speed.steps import seen
 
 
 @dataclass(frozen=True)

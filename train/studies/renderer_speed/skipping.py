@@ -7,9 +7,6 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from benchmarks.panels import SAMPLES, Bench
-from benchmarks.scenes import CAMERA, View
-from benchmarks.steps import light_step, seen
 from renderer import shading
 from renderer.cache import OperatorCache
 from renderer.camera import ring
@@ -17,6 +14,9 @@ from renderer.fragments import Fragments
 from renderer.image import PictureSettings
 from renderer.mesh import Mesh
 from renderer.transfer import COEFFICIENTS, Operator
+from train.studies.renderer_speed.panels import SAMPLES, Bench
+from train.studies.renderer_speed.scenes import CAMERA, View
+from train.studies.renderer_speed.steps import light_step, seen
 
 BACKGROUNDS, FIELD_OF_VIEW = 5, 2.2  # the paper's 100 examples are two meshes from ten views over five backgrounds
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from benchmarks.scenes import BACKGROUND, View
 from renderer import reference, shading
 from renderer.albedo import surface_albedo
 from renderer.fragments import Fragments
 from renderer.image import develop
 from renderer.transfer import Operator
+from train.studies.renderer_speed.scenes import BACKGROUND, View
 
 Shading = Callable[[Fragments, Tensor, Tensor, Tensor], Tensor]
 Seen = tuple[Fragments, Tensor, Tensor]  # with albedo (S, 3) and coverage (1, P)

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
-from benchmarks.comparison import (
+from renderer.cache import OperatorCache
+from renderer.mesh import Mesh
+from train.studies.renderer_speed.comparison import (
     ANALYTIC,
     BY_FACE,
     BY_SAMPLE,
@@ -14,12 +16,12 @@ from benchmarks.comparison import (
     REFRESHED,
     rasterised,
 )
-from benchmarks.panels import SAMPLES, Bench
-from benchmarks.results import Row, Target, shown
-from benchmarks.skipping import build_operators
-from benchmarks.steps import light_step, vertex_step
-from renderer.cache import OperatorCache
-from renderer.mesh import Mesh
+from train.studies.renderer_speed.panels import SAMPLES, Bench
+from train.studies.renderer_speed.results import Row
+from train.studies.renderer_speed.skipping import build_operators
+from train.studies.renderer_speed.steps import light_step, vertex_step
+from train.studies.targets import Target
+from train.tables import shown
 
 QUOTED = {32: 1.3, 224: 13.0}  # ms, PyTorch3D with its fragments kept, measured once on another machine
 

@@ -1,1 +1,1 @@
-"""What scripts/benchmark_training.py is made of: both arms, the plain loop, the matrix products, the page."""
+"""The speed of training: both arms, a plain loop and matrix products, in turns, and the page."""

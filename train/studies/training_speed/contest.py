@@ -9,16 +9,16 @@ from tempfile import TemporaryDirectory
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from benchmarks.training.arm import Arm
-from benchmarks.training.baseline import Baseline, build_loader
-from benchmarks.training.findings import ADVERSARIAL, BASELINE, PLAIN, PRODUCTS, Findings, Workload
-from benchmarks.training.peak import Products, forward_multiply_adds
-from benchmarks.training.turns import Contestant, Turn, take_turns
 from renderer.errors import InputError
 from train.data import DataSet, Split, channel_statistics, stratified_split
 from train.experiment import load_data
 from train.precision import choose_precision
 from train.settings import ExperimentSettings, read_settings
+from train.studies.training_speed.arm import Arm
+from train.studies.training_speed.baseline import Baseline, build_loader
+from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, PRODUCTS, Findings, Workload
+from train.studies.training_speed.peak import Products, forward_multiply_adds
+from train.studies.training_speed.turns import Contestant, Turn, take_turns
 from train.wideresnet import WideResNet
 
 PICTURES, CLASSES, SIZE = 50_000, 100, 32  # CIFAR-100's

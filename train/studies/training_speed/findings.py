@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from statistics import median
 
-from benchmarks.results import Target, shown
-from benchmarks.training.arm import EPOCH
-from benchmarks.training.peak import TRAINING
-from benchmarks.training.turns import Turn
 from train.batches import batch_count
 from train.epoch import PHASES
+from train.studies.targets import Target
+from train.studies.training_speed.arm import EPOCH
+from train.studies.training_speed.peak import TRAINING
+from train.studies.training_speed.turns import Turn
+from train.tables import shown
 
 PLAIN, ADVERSARIAL, BASELINE, PRODUCTS = "augment=none", "augment=adversarial", "baseline", "matrix products"
 REST = "everything else"

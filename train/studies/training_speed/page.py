@@ -4,11 +4,13 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.plots import pyplot, save
-from benchmarks.results import markdown, shown, targets_table
-from benchmarks.training.findings import ADVERSARIAL, BASELINE, PLAIN, REST, RUN, Findings, Spread, targets
-from benchmarks.training.peak import PRECISIONS
 from train.epoch import PHASES
+from train.studies.figures import pyplot, save
+from train.studies.page import joined
+from train.studies.targets import table_of
+from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, REST, RUN, Findings, Spread, targets
+from train.studies.training_speed.peak import PRECISIONS
+from train.tables import markdown, shown
 
 HEADER = """# Training speed
 
@@ -47,22 +49,21 @@ def page(findings: Findings, facts: dict[str, str], figure: str) -> str:
     """The whole page, in Markdown. facts: what the findings do not say: command, machine, network, data, workers."""
     sections = [
         _header(findings, facts),
-        "## Targets\n",
-        targets_table(targets(findings)),
-        "## Images per second\n",
+        "## Targets",
+        table_of(targets(findings)),
+        "## Images per second",
         _rates(findings),
         _peaks(findings),
-        "## Seconds per epoch\n",
+        "## Seconds per epoch",
         _seconds(findings),
-        f"![Seconds per epoch by phase]({figure})\n",
+        f"![Seconds per epoch by phase]({figure})",
     ]
-    return "\n".join(sections)
+    return joined(sections)
 
 
 def draw(path: Path, findings: Findings) -> None:
     """A bar for each arm and for the baseline's training, by phase."""
-    plt = pyplot()
-    figure, ax = plt.subplots(figsize=(9, 2.6))
+    figure, ax = pyplot().subplots(figsize=(9, 2.6), layout="tight")
     names = [BASELINE, ADVERSARIAL, PLAIN]
     bars = {name: {phase: spread.median for phase, spread in findings.seconds(name).items()} for name in names[1:]}
     bars[BASELINE] = {"training": findings.workload.pictures / findings.rate(BASELINE).median}
@@ -73,7 +74,7 @@ def draw(path: Path, findings: Findings) -> None:
         left = [start + width for start, width in zip(left, widths, strict=True)]
     ax.set_xlabel("seconds per epoch")
     ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
-    save(plt, figure, path)
+    save(figure, path, dpi=100)
 
 
 def _header(findings: Findings, facts: dict[str, str]) -> str:
