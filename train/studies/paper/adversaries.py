@@ -1,10 +1,9 @@
 """What Tables 3 and 4 share: attacks by light and by shape, random changes as large, and what a classifier answers."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from common import Subject, random_scene, recognised
 from torch import Tensor
 
 from augment.attack import DescentSettings, Goal, Part, Problem, descend
@@ -13,11 +12,10 @@ from augment.mesh_scene import MeshScene
 from augment.parameters import Geometry, Kind, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
-from renderer.subdivision import subdivide
+from renderer.errors import InputError
 from train.attacks.experiment import logits_of
-from train.photographs.shares import share
+from train.studies.paper.subjects import Subject, random_scene, recognised
 
-VERTICES = 10_000  # shapes have more (the paper's Section 4)
 STEPS = 30  # the paper's appendix C
 FURTHER = 10  # steps that an adversary goes on for
 PART = 10  # random examples held at once
@@ -36,11 +34,11 @@ class Attack:
         return Perturbation(scene, [self.kind(scene, self.step)])
 
 
+LIGHT = StepSettings("linf", None, "unit", 0.05)
+SHAPE = StepSettings("linf", 0.002, "sign", 0.0005)
 ATTACKS = {
-    "lighting": Attack(Lighting, StepSettings(step="unit", step_size=0.05), DescentSettings(STEPS)),
-    "geometry": Attack(
-        Geometry, StepSettings(radius=0.002, step="sign", step_size=0.0005), DescentSettings(STEPS, shorten=True)
-    ),
+    "lighting": Attack(Lighting, LIGHT, DescentSettings(STEPS)),
+    "geometry": Attack(Geometry, SHAPE, DescentSettings(STEPS, shorten=True)),
 }
 
 
@@ -99,17 +97,4 @@ def recognised_parts(
             yield scene, kept
         found, drawn = found + len(kept), drawn + len(scene)
         if found < LEAST_SHARE * drawn - PART:
-            raise SystemExit(f"{classifier.name} recognises only {found} of {drawn} pictures of {subject.name}")
-
-
-def finer(subject: Subject) -> Subject:
-    """The subject with enough vertices for an attack on its shape."""
-    return replace(subject, mesh=subdivide(subject.mesh, VERTICES))
-
-
-def percent(found: Sequence[bool]) -> str:
-    """A share in percent with its interval, as a cell of a table."""
-    if not found:
-        return "none of 0"
-    value, low, high = (100 * share(sum(found), len(found))[name] for name in ("value", "low", "high"))
-    return f"{value:.0f} % [{low:.0f}, {high:.0f}] of {len(found)}"
+            raise InputError(f"{classifier.name} recognises only {found} of {drawn} pictures of {subject.name}")

@@ -1,34 +1,31 @@
-r"""One attack of each kind as a picture (the paper's Section 4: skylight, several views, the illusion, and more).
-
-PYTHONPATH=. python scripts/paper/gallery.py --meshes solid:lamp:0 --label "table lamp" --targets candle joystick \
-    --orange FILE:GAIN
-"""
+"""One attack of each kind as a picture (the paper's Section 4: skylight, several views, the illusion, and more)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
-from common import arguments, command, table, versions, write_section
 from PIL import Image
 from torch import Tensor
 
 from augment.mesh_scene import Conditions
 from augment.parameters import StepSettings
 from augment.scene import ObjectSettings
+from renderer.errors import InputError
 from renderer.light_sphere import light_sphere
 from train.attacks.experiment import Attacked, attack_mesh
 from train.attacks.report_picture import Exhibit, answer_caption, report_picture
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings, AttackSettings, SkylightSettings
-from train.run_classifier import load_classifier
 from train.settings import RendererSettings
+from train.studies.paper.adversaries import LIGHT, SHAPE
+from train.studies.paper.section import Section, SectionSettings, Study
+from train.studies.paper.subjects import VERTICES
+from train.tables import markdown
 
-VERTICES = 10_000  # shapes that are attacked have more, as in the paper
 SPHERE = 224
 LIGHTS = {"lighting", "skylight"}
 LIMIT = 150_000  # bytes of a committed picture; above it the colours are reduced
-LIGHT = StepSettings("linf", None, "unit", 0.05)
-SHAPE = StepSettings("linf", 0.002, "sign", 0.0005)
 WIDER_SHAPE = StepSettings("linf", 0.01, "sign", 0.001)
 FREE_SHAPE = StepSettings("linf", None, "sign", 0.001)
 ALBEDO = StepSettings("linf", 0.1, "sign", 0.02)
@@ -48,10 +45,6 @@ that is attacked; the largest change is that of any parameter.
 {pictures}
 
 The pictures of the orange show "An Orange" by thisisepic (Sketchfab, CC BY-SA 4.0), `orange_sketchfab.glb`.
-
-{command}
-
-{versions}
 """
 FINDING = """
 - Light: {lighting}. One light for three views: {lighting_views}. Long descents depend on rounding: on two
@@ -65,6 +58,14 @@ FINDING = """
   tried, candle and joystick, and soap dispenser and joystick, succeeded within 7 steps, thimble and bell cote did not
   within 60 (1.00 and 0.02).
 """
+
+
+@dataclass
+class GallerySettings(SectionSettings):
+    """steps: at most. targets: of the illusion, a class per view."""
+
+    steps: int
+    targets: list[str]
 
 
 @dataclass(frozen=True)
@@ -226,38 +227,26 @@ def finding(numbers: Sequence[dict]) -> str:
     return FINDING.strip().format(**outcomes, reached=reached)
 
 
-def main() -> None:
-    parser = arguments(__doc__, steps=60, threads=1)
-    parser.add_argument("--targets", nargs="+", required=True, help="the illusion's, a class per view")
-    parser.add_argument("--orange", required=True, help="for the skylight, FILE or FILE:GAIN")
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
-    classifier, folder = load_classifier(options.classifier, options.weights), options.out / "paper"
-    folder.mkdir(parents=True, exist_ok=True)
-    lamp, (path, _, gain) = ObjectSettings(options.meshes[0], options.label), options.orange.partition(":")
-    orange = ObjectSettings(path, "orange", gain=float(gain or 1))
-    numbers, rows, pictures = [], [], []
-    for case in cases(lamp, orange, options.targets, options.steps):
-        settings = case.settings(options.light, options.seed)
-        attacked = attack_mesh(case.item, settings, classifier, torch.device("cpu"))
+def measure(study: Study, settings: GallerySettings) -> Section:
+    """Every case on the first of the meshes, but for the skylight's on the orange, which comes second."""
+    if len(study.items) != 2:
+        raise InputError("scene.meshes of section=gallery has two: the solid to attack, and the orange under the sky")
+    lamp, orange = study.items
+    numbers, rows, pictures, figures = [], [], [], {}
+    for case in cases(lamp, orange, settings.targets, settings.steps):
+        attacked = attack_mesh(case.item, case.settings(study.light, study.seed), study.classifier, torch.device("cpu"))
         numbers.append(record(case, attacked))
         rows.append(row(case, numbers[-1]))
-        save_small(attacked, folder / f"gallery_{case.name}.png")
+        figures[f"gallery_{case.name}.png"] = partial(save_small, attacked)
         pictures.append(f"### {case.title.capitalize()}\n\n![{case.title}](paper/gallery_{case.name}.png)")
     text = TEXT.format(
-        classifier=classifier.name,
+        classifier=study.classifier.name,
         mesh=Path(lamp.mesh).name,
         label=lamp.label,
         vertices=VERTICES,
-        steps=options.steps,
-        table=table(COLUMNS, rows),
+        steps=settings.steps,
+        table=markdown(COLUMNS, rows),
         finding=finding(numbers),
         pictures="\n\n".join(pictures),
-        command=command(),
-        versions=versions(),
     )
-    write_section(options.out, "gallery", "A gallery of attacks", text, numbers)
-
-
-if __name__ == "__main__":
-    main()
+    return Section("A gallery of attacks", text, numbers, figures)

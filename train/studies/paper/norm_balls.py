@@ -1,19 +1,13 @@
-"""Adversarial against random perturbations in norm-balls of light, shape and pixels (Section 4.1 and appendix A).
+"""Adversarial against random perturbations in norm-balls of light, shape and pixels (Section 4.1 and appendix A)."""
 
-PYTHONPATH=. python scripts/paper/norm_balls.py --meshes FILE FILE:GAIN
-"""
-
-import argparse
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from common import Subject, arguments, command, recognised_scene, scene_of, subjects, table, versions, write_section
 from torch import Tensor
 
 from augment.attack import DescentSettings, Goal, descend
@@ -23,13 +17,23 @@ from augment.parameters import KINDS, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.seeding import generator
-from renderer.subdivision import subdivide
 from train.attacks.experiment import logits_of
 from train.photographs.shares import share
-from train.run_classifier import load_classifier
+from train.studies.figures import panels_beside, pyplot, save
+from train.studies.paper.section import Section, SectionSettings, Study
+from train.studies.paper.shares import draw_shares, interval
+from train.studies.paper.subjects import Subject, finer, recognised_scene, scene_of
+from train.tables import markdown
 
-VERTICES = 10_000  # shapes have more, as in the paper
 PART = 10  # examples attacked at once
+
+
+@dataclass
+class NormBallSettings(SectionSettings):
+    """examples: of each mesh. steps: of a descent at most, and draws of a search."""
+
+    examples: int
+    steps: int
 
 
 @dataclass(frozen=True)
@@ -102,10 +106,6 @@ The paper shows its shares in a figure and prints none, so that only their order
   Under light a large part of the object changes as much; in pixels almost the whole picture does.
 
 Made in {minutes:.0f} minutes of processor time by
-
-{command}
-
-{versions}
 """
 
 
@@ -176,14 +176,15 @@ def parts(subject: Subject, scene: MeshScene, classifier: Classifier, light: str
         yield scene_of(subject, classifier, light, cameras, scene.backgrounds[examples, 0, 0])
 
 
-def outcomes(subject: Subject, classifier: Classifier, options: argparse.Namespace) -> dict[tuple[str, float], Outcome]:
+def outcomes(subject: Subject, study: Study, settings: NormBallSettings) -> dict[tuple[str, float], Outcome]:
     """All balls' outcomes over the same recognised examples of a subject."""
-    scene = recognised_scene(subject, classifier, options.light, options.examples, options.seed)
-    draws = {name: generator(options.seed, subject.name, name) for name in SPACES}
+    classifier = study.classifier
+    scene = recognised_scene(subject, classifier, study.light, settings.examples, study.seed)
+    draws = {name: generator(study.seed, subject.name, name) for name in SPACES}
     found = {(name, radius): [] for name, space in SPACES.items() for radius in space.radii}
-    for part in parts(subject, scene, classifier, options.light):
+    for part in parts(subject, scene, classifier, study.light):
         for (name, radius), outcome in found.items():
-            outcome.append(attack_ball(part, classifier, options.label, name, radius, options.steps, draws[name]))
+            outcome.append(attack_ball(part, classifier, study.label, name, radius, settings.steps, draws[name]))
     return {ball: joined(outcome) for ball, outcome in found.items()}
 
 
@@ -209,10 +210,6 @@ def record(mesh: str, name: str, radius: float, outcome: Outcome) -> dict:
         **shares,
         **{key: float(each.mean()) for key, each in means.items()},
     }
-
-
-def interval(found: dict) -> str:
-    return "{value:.2f} [{low:.2f}, {high:.2f}]".format(**found)
 
 
 def header(steps: int) -> list[str]:
@@ -250,26 +247,23 @@ def fineness(subject: Subject) -> str:
     return f"{len(mesh.vertices):,} with edges of {np.linalg.norm(edges, axis=2).mean():.3f} on average"
 
 
-def plot(pooled: Sequence[dict], steps: int, path: Path) -> None:
+def draw_success(pooled: Sequence[dict], steps: int, path: Path) -> None:
     """Success against radius, a panel per space; the paper's radii are dashed."""
-    figure, panels = plt.subplots(1, len(SPACES), figsize=(11, 4), sharey=True, layout="constrained")
+    figure, panels = panels_beside(len(SPACES), (3.7, 4), layout="constrained")
     for panel, (name, space) in zip(panels, SPACES.items(), strict=True):
         here = [each for each in pooled if each["space"] == name]
         for index, (method, style) in enumerate(STYLES.items()):
-            value, low, high = (torch.tensor([each[method][key] for each in here]) for key in ("value", "low", "high"))
             radii = [radius * 1.06 ** (index - 1) for radius in space.radii]  # beside each other
-            errors = torch.stack([value - low, high - value]).clamp(min=0)
-            panel.errorbar(radii, value, errors, label=METHODS[method].format(steps=steps), capsize=3, **style)
+            shares, name = [each[method] for each in here], METHODS[method].format(steps=steps)
+            draw_shares(panel, radii, shares, label=name, capsize=3, **style)
         for radius in space.paper:
             panel.axvline(radius, color="#bbbbbb", linestyle=(0, (4, 4)), linewidth=1, zorder=0)
         panel.set(xscale="log", title=space.title, xlabel=f"L∞ radius {space.axis}", ylim=(-0.03, 1.03))
         panel.set_xticks(space.radii, [f"{radius:g}" for radius in space.radii], fontsize=8)
         panel.set_xticks([], minor=True)
-        panel.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("share fooled")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(METHODS))
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save(figure, path)
 
 
 def most_comparable(found: dict[tuple[str, float], Outcome]) -> tuple[int, dict[tuple[str, str], float]]:
@@ -284,11 +278,11 @@ def most_comparable(found: dict[tuple[str, float], Outcome]) -> tuple[int, dict[
     return example, {key: SPACES[key[0]].radii[int(each[:, example].argmin())] for key, each in off.items()}
 
 
-def show(found: dict[tuple[str, float], Outcome], classifier: Classifier, label: str, path: Path) -> None:
+def draw_examples(found: dict[tuple[str, float], Outcome], classifier: Classifier, label: str, path: Path) -> None:
     """Adversaries of one example at about the same L∞ on the picture, a row per level, each beside its difference."""
     example, chosen = most_comparable(found)
     before = next(iter(found.values())).before[example]
-    figure, cells = plt.subplots(len(LEVELS), 1 + 2 * len(SPACES), figsize=(13, 6.9))
+    figure, cells = pyplot().subplots(len(LEVELS), 1 + 2 * len(SPACES), figsize=(13, 6.9), layout="tight")
     for cell in cells.flat:
         cell.set(xticks=[], yticks=[])
     for line, (level, wanted) in zip(cells, LEVELS.items(), strict=True):
@@ -304,9 +298,7 @@ def show(found: dict[tuple[str, float], Outcome], classifier: Classifier, label:
             picture.set_xlabel(f"{space.title}, radius {radius:g}", fontsize=8)
             change.imshow(array((outcome.images[example] - before) / 2 + 0.5))
             change.set_xlabel(f"change, L∞ {float(outcome.reach[example]):.2f}", fontsize=8)
-    figure.tight_layout(pad=0.6)
-    figure.savefig(path, dpi=75)
-    plt.close(figure)
+    save(figure, path, dpi=75)
 
 
 def array(image: Tensor) -> np.ndarray:
@@ -314,37 +306,31 @@ def array(image: Tensor) -> np.ndarray:
     return image.permute(1, 2, 0).numpy()
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    options = arguments(__doc__, examples=20, steps=10, threads=2).parse_args(words)
-    matplotlib.use("Agg")
-    torch.set_num_threads(options.threads)
+def measure(study: Study, settings: NormBallSettings) -> Section:
+    """All balls of all meshes."""
     begin = time.process_time()
-    classifier = load_classifier(options.classifier, options.weights)
-    chosen = [replace(subject, mesh=subdivide(subject.mesh, VERTICES)) for subject in subjects(options)]
-    found = {subject.name: outcomes(subject, classifier, options) for subject in chosen}
+    chosen = [finer(subject) for subject in study.subjects]
+    found = {subject.name: outcomes(subject, study, settings) for subject in chosen}
     pooled = {ball: joined([each[ball] for each in found.values()]) for ball in next(iter(found.values()))}
     records = [record(mesh, *ball, outcome) for mesh, balls in found.items() for ball, outcome in balls.items()]
     together = [record("all", *ball, outcome) for ball, outcome in pooled.items()]
+    before = next(iter(pooled.values())).before
     text = TEXT.format(
-        classifier=classifier.name,
-        label=options.label,
-        meshes=" and ".join(found),
-        count=options.examples * len(found),
-        examples=options.examples,
-        probe=options.light,
-        steps=options.steps,
-        table=table(header(options.steps), map(row, together)),
+        classifier=study.classifier.name,
+        label=study.label,
+        meshes=study.meshes,
+        count=settings.examples * len(found),
+        examples=settings.examples,
+        probe=study.light,
+        steps=settings.steps,
+        table=markdown(header(settings.steps), map(row, together)),
         **at_paper_radius(together),
-        confidence=median_confidence(next(iter(pooled.values())).before, classifier, options.label),
+        confidence=median_confidence(before, study.classifier, study.label),
         fineness=" and ".join(map(fineness, chosen)),
         minutes=(time.process_time() - begin) / 60,
-        command=command(),
-        versions=versions(),
     )
-    write_section(options.out, "norm_balls", "Adversarial against random perturbations", text, records + together)
-    plot(together, options.steps, options.out / "paper" / "norm_balls.png")
-    show(pooled, classifier, options.label, options.out / "paper" / "norm_balls.spaces.png")
-
-
-if __name__ == "__main__":
-    main()
+    figures = {
+        "norm_balls.png": partial(draw_success, together, settings.steps),
+        "norm_balls.spaces.png": partial(draw_examples, pooled, study.classifier, study.label),
+    }
+    return Section("Adversarial against random perturbations", text, records + together, figures)

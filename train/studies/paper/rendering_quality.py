@@ -1,40 +1,36 @@
-"""How surely a classifier recognises the renders (the paper's appendix "Evaluate Rendering Quality").
-
-PYTHONPATH=. python scripts/paper/rendering_quality.py --meshes FILE FILE:GAIN
-"""
+"""How surely a classifier recognises the renders (the paper's appendix "Evaluate Rendering Quality")."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from common import (
-    FIELDS_OF_VIEW,
-    GREYS,
-    Subject,
-    arguments,
-    command,
-    scene_of,
-    subjects,
-    table,
-    versions,
-    write_section,
-)
 
 from augment.classifiers import Classifier
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
 from train.attacks.experiment import logits_of
-from train.run_classifier import load_classifier
+from train.studies.figures import panels_beside, save
+from train.studies.paper.section import Section, SectionSettings, Study
+from train.studies.paper.subjects import FIELDS_OF_VIEW, GREYS, Subject, scene_of
+from train.tables import markdown
 
 LEAST_SHARE = 0.02  # recognised; below it the search for renders is given up
 BINS = np.linspace(0, 1, 21)
 RESAMPLES = 1000
+
+
+@dataclass
+class QualitySettings(SectionSettings):
+    """renders: recognised ones, of all meshes together."""
+
+    renders: int
+
 
 TEXT = """
 Confidence in the correct label over {recognised:,} correctly classified renders (of {rendered:,}), as softmax gives it,
@@ -48,7 +44,8 @@ Intervals are 95 % bootstrap intervals over cameras, since the {greys} renders o
 each other. Recognised by background: {by_grey}. By field of view: {by_field}.
 
 The paper shows its histogram over 10,000 correctly classified renders of 75 bought shapes, by ResNet-101, and prints no
-figure of it; it calls the classifier confident. {finding} What differs:
+figure of it; it calls the classifier confident. Here {above:.0%} of the
+recognised renders have a confidence above one half. What differs:
 
 - {meshes} instead of 75 shapes of many classes: many renders of two oranges say nothing about other shapes.
 - The azimuth is drawn uniformly for each camera, not one of 16, which would repeat the same 320 pictures.
@@ -57,10 +54,6 @@ figure of it; it calls the classifier confident. {finding} What differs:
 
 Polar angle 60°, field of view 2 or 3 and initial light `{light}` are the paper's; 2×2 samples a pixel and smooth
 normals are ours.
-
-{command}
-
-{versions}
 """
 
 
@@ -103,7 +96,7 @@ def enough_views(views: Iterator[View], renders: int) -> list[View]:
         found.append(next(views))
         recognised += len(found[-1].recognised)
         if len(found) * len(GREYS) > max(100, renders) / LEAST_SHARE:
-            raise SystemExit(f"{found[0].mesh}: only {recognised} of {len(found) * len(GREYS)} renders are recognised")
+            raise InputError(f"{found[0].mesh}: only {recognised} of {len(found) * len(GREYS)} renders are recognised")
     return found
 
 
@@ -167,51 +160,36 @@ def histograms(views: Sequence[View]) -> Iterator[dict]:
 
 def draw(found: dict[str, list[View]], path: Path) -> None:
     """A histogram per mesh, side by side, on one scale."""
-    figure, panels = plt.subplots(1, len(found), figsize=(3.6 * len(found), 2.8), sharey=True, squeeze=False)
-    for panel, (name, views) in zip(panels[0], found.items(), strict=True):
+    figure, panels = panels_beside(len(found), (3.6, 2.8))
+    for panel, (name, views) in zip(panels, found.items(), strict=True):
         panel.hist(np.concatenate([view.recognised for view in views]), BINS, color="#4269d0", edgecolor="white")
         panel.set(title=name, xlabel="confidence in the correct label", xlim=(0, 1))
-        panel.spines[["top", "right"]].set_visible(False)
-    panels[0, 0].set_ylabel("renders")
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    panels[0].set_ylabel("renders")
+    save(figure, path)
 
 
-def main() -> None:
-    options = arguments(__doc__, renders=10_000, threads=2).parse_args()
-    matplotlib.use("Agg")
-    torch.set_num_threads(options.threads)
-    classifier = load_classifier(options.classifier, options.weights)
-    chosen = subjects(options)
-    wanted = -(-options.renders // len(chosen))
+def measure(study: Study, settings: QualitySettings) -> Section:
+    """As many recognised renders as are asked for, of all meshes alike."""
+    wanted = -(-settings.renders // len(study.subjects))
     found = {
-        subject.name: enough_views(views_of(subject, classifier, options.light, options.seed), wanted)
-        for subject in chosen
+        subject.name: enough_views(views_of(subject, study.classifier, study.light, study.seed), wanted)
+        for subject in study.subjects
     }
     everything = [view for views in found.values() for view in views]
-    rows = [row(name, views, options.seed) for name, views in found.items()]
+    rows = [row(name, views, study.seed) for name, views in found.items()]
     if len(found) > 1:
-        rows.append(row("all", everything, options.seed))
-    low = share_above_half(everything)
+        rows.append(row("all", everything, study.seed))
     text = TEXT.format(
         recognised=sum(len(view.recognised) for view in everything),
         rendered=len(everything) * len(GREYS),
-        classifier=classifier.name,
-        label=options.label,
+        classifier=study.classifier.name,
+        label=study.label,
         greys=len(GREYS),
-        table=table(["mesh", "cameras", "recognised renders", *STATISTICS], rows),
+        table=markdown(["mesh", "cameras", "recognised renders", *STATISTICS], rows),
         by_grey=by_grey(everything),
         by_field=by_field(everything),
-        finding=f"Here {low:.0%} of the recognised renders have a confidence above one half.",
-        meshes=" and ".join(found),
-        light=options.light,
-        command=command(),
-        versions=versions(),
+        above=share_above_half(everything),
+        meshes=study.meshes,
+        light=study.light,
     )
-    write_section(options.out, "rendering_quality", "Rendering quality", text, histograms(everything))
-    draw(found, options.out / "paper" / "rendering_quality.png")
-
-
-if __name__ == "__main__":
-    main()
+    return Section("Rendering quality", text, histograms(everything), {"rendering_quality.png": partial(draw, found)})

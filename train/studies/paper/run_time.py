@@ -1,59 +1,39 @@
-"""What an iteration of an attack costs, and how many it takes (the paper's Section 4.2, "Runtime").
+"""What an iteration of an attack costs, and how many it takes (the paper's Section 4.2, "Runtime")."""
 
-PYTHONPATH=. python scripts/paper/run_time.py --meshes FILE FILE:GAIN
-"""
-
-import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from common import (
-    GREYS,
-    Subject,
-    arguments,
-    command,
-    recognised_scene,
-    scene_of,
-    subjects,
-    table,
-    versions,
-    write_section,
-)
 from torch import Tensor, nn
 
 from augment.attack import DescentSettings, Goal, descend
 from augment.cost import adversarial_cost
-from augment.mesh_scene import MeshScene
-from augment.parameters import Geometry, Lighting, StepSettings
-from augment.perturbation import Perturbation
 from augment.scene import ObjectSettings, Scene, SceneObject, load_object
 from augment.service import AugmentationService, AugmentationSettings, LightAttackSettings
 from renderer.camera import ring
 from renderer.image import PictureSettings
 from renderer.lights import load_light
-from renderer.subdivision import subdivide
 from renderer.transfer import build_operators
 from renderer.visibility import choose
 from train.photographs.shares import share
 from train.run_classifier import load_classifier
+from train.studies.figures import panels_beside, save
+from train.studies.paper.adversaries import ATTACKS
+from train.studies.paper.section import Section, SectionSettings, Study
+from train.studies.paper.shares import interval
+from train.studies.paper.subjects import GREYS, Subject, finer, recognised_scene, scene_of
+from train.tables import markdown
 
-VERTICES = 10_000
 FIELDS = (2.0, 2.8, 4.0, 5.7, 8.0)  # each halves the pixels of the one before
-KINDS = {
-    "lighting": (Lighting, StepSettings("linf", None, "unit", 0.05)),
-    "geometry": (Geometry, StepSettings("linf", 0.002, "sign", 0.0005)),
-}
 TARGETS = {"lighting": 1.05, "geometry": 1.3}
 TRAINING, TRAINING_TARGET = "the training's, 100 examples, 32², WideResNet-16-4", 1.03
-PRETRAINED = Path(__file__).parents[2] / "pretrained" / "none"
+PRETRAINED = "run:pretrained/none"
 SOLID = ObjectSettings("solid:orange", "orange")
 EXAMPLES, MANY_PASSES = 100, 2  # at once, as in training; so many take their time
 BATCH = 32  # pictures per pass through the classifier, as in conf/attack.yaml
@@ -109,11 +89,17 @@ gradient at unit length, at most {max_steps}, no limit to the norm. Seconds incl
 {distribution}
 
 {finding}
-
-{command}
-
-{versions}
 """
+
+
+@dataclass
+class RunTimeSettings(SectionSettings):
+    """examples: of each mesh that are attacked, in max_steps at most. passes: of a timed descent. turns: of them."""
+
+    examples: int
+    max_steps: int
+    passes: int
+    turns: int
 
 
 @dataclass(frozen=True)
@@ -204,27 +190,16 @@ def iteration(
 
 
 def stubborn(
-    setup: Setup, kind: str, classifier: nn.Module, field: float, passes: int, options: argparse.Namespace
+    setup: Setup, kind: str, classifier: nn.Module, light: str, field: float, passes: int, turns: int
 ) -> Iteration:
     """An attack that never succeeds, since its targets are the least likely classes."""
-    size, subject = classifier.size, setup.subject
     views = ring(setup.views, field)
     cameras, greys = zip(*product(views, setup.backgrounds), strict=True)
-    picture, count = PictureSettings(size, setup.samples, normals=setup.normals), len(cameras)
-    behind = torch.tensor(greys).view(-1, 1, 1, 1).expand(-1, 3, size, size)
-    scene = MeshScene(
-        subject.mesh,
-        [[camera] for camera in cameras],
-        behind,
-        load_light(options.light),
-        picture,
-        choose(),
-        subject.gain,
-    )
-    make, settings = KINDS[kind]
-    problem = Perturbation(scene, [make(scene, settings)])
+    before, count = [[camera] for camera in cameras], len(cameras)
+    scene = scene_of(setup.subject, classifier, light, before, torch.tensor(greys), setup.samples, setup.normals)
+    problem = ATTACKS[kind].problem(scene)
     images = problem.render(problem.start, torch.arange(count)).detach()[:, 0]
-    label = torch.full((count, 1), classifier.label(subject.label))
+    label = torch.full((count, 1), classifier.label(setup.subject.label))
     least_likely = torch.cat([classifier(part).argmin(1, keepdim=True) for part in images.split(BATCH)])
     descent = DescentSettings(passes - 1, shorten=kind == "geometry", batch_size=BATCH)
     return iteration(
@@ -237,29 +212,29 @@ def stubborn(
         lambda watch: descend(classifier, problem, Goal(label, least_likely), descent, watch),
         BATCH,
         passes,
-        options.turns,
+        turns,
     )
 
 
-def training_step(chosen: Sequence[Subject], options: argparse.Namespace) -> Iteration:
+def training_step(study: Study, settings: RunTimeSettings) -> Iteration:
     """The training's attack at 32² on 100 examples of two meshes."""
-    classifier = load_classifier(f"run:{PRETRAINED}")
-    label, views = classifier.label(options.label), EXAMPLES // len(chosen) // len(GREYS)
-    settings = PictureSettings(classifier.size)
+    classifier = load_classifier(PRETRAINED)
+    label, views = classifier.label(study.label), EXAMPLES // len(study.subjects) // len(GREYS)
+    pictures = PictureSettings(classifier.size)
     objects = [
-        SceneObject(item.label, build_operators(item.mesh, ring(views, 2.0), settings, choose(), item.gain))
-        for item in chosen
+        SceneObject(item.label, build_operators(item.mesh, ring(views, 2.0), pictures, choose(), item.gain))
+        for item in study.subjects
     ]
-    scene, light = Scene(objects, GREYS, settings), load_light(options.light)
+    scene, light = Scene(objects, GREYS, pictures), load_light(study.light)
     with torch.no_grad():
         classifier.function.head.bias[label] += 100
     labels = torch.full((len(scene),), label)
     attack = AugmentationSettings(
-        examples=len(scene), attack=LightAttackSettings(max_steps=options.passes - 1, batch_size=len(scene))
+        examples=len(scene), attack=LightAttackSettings(max_steps=settings.passes - 1, batch_size=len(scene))
     )
 
     def regenerate(watch: Stopwatch) -> None:
-        AugmentationService(attack, scene, labels, light, options.seed, watch).regenerate(classifier, 0)
+        AugmentationService(attack, scene, labels, light, study.seed, watch).regenerate(classifier, 0)
 
     images = scene.render(light.expand(len(scene), -1, -1))
     return iteration(
@@ -271,8 +246,8 @@ def training_step(chosen: Sequence[Subject], options: argparse.Namespace) -> Ite
         labels,
         regenerate,
         len(scene),
-        options.passes,
-        options.turns // 2,
+        settings.passes,
+        settings.turns // 2,
     )
 
 
@@ -281,20 +256,17 @@ def many(setup: Setup) -> Setup:
     return replace(setup, name=f"{setup.name}, {EXAMPLES} examples", views=EXAMPLES // len(GREYS), backgrounds=GREYS)
 
 
-def fine(subject: Subject) -> Subject:
-    return replace(subject, mesh=subdivide(subject.mesh, VERTICES))
-
-
-def attacks(subject: Subject, classifier: nn.Module, options: argparse.Namespace) -> Iterator[Attack]:
+def attacks(subject: Subject, study: Study, settings: RunTimeSettings) -> Iterator[Attack]:
     """Attack the light of recognised pictures, each on its own."""
-    scene = recognised_scene(subject, classifier, options.light, options.examples, options.seed)
+    classifier = study.classifier
+    scene = recognised_scene(subject, classifier, study.light, settings.examples, study.seed)
     goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
     for example in range(len(scene)):
-        one = scene_of(subject, classifier, options.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0])
+        one = scene_of(subject, classifier, study.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0])
         prepared = seconds(lambda one=one: one.operator(one.cameras[0][0]))
-        problem = Perturbation(one, [Lighting(one, KINDS["lighting"][1])])
+        problem = ATTACKS["lighting"].problem(one)
         start = time.process_time()
-        result = descend(classifier, problem, goal, DescentSettings(options.max_steps), Stopwatch())
+        result = descend(classifier, problem, goal, DescentSettings(settings.max_steps), Stopwatch())
         spent = time.process_time() - start
         yield Attack(subject.name, bool(result.fooled), int(result.steps), prepared + spent, prepared)
 
@@ -337,7 +309,7 @@ def distribution_rows(done: Sequence[Attack], names: Sequence[str]) -> Iterator[
         yield [
             name,
             str(len(group)),
-            f"{rate['value']:.2f} [{rate['low']:.2f}, {rate['high']:.2f}]",
+            interval(rate),
             *(f"{np.quantile(steps, q):.0f}" if steps else "-" for q in SHARES.values()),
             *(f"{np.quantile(spent, q):.2f}" if spent else "-" for q in SHARES.values()),
         ]
@@ -357,65 +329,55 @@ def finding(done: Sequence[Attack]) -> str:
 
 def draw(measured: Sequence[Iteration], path: Path) -> None:
     """A panel per kind: the classifier's share below the renderer's, against pixels."""
-    figure, panels = plt.subplots(1, len(KINDS), figsize=(8, 2.9), sharey=True)
-    for panel, kind in zip(panels, KINDS, strict=True):
+    figure, panels = panels_beside(len(ATTACKS), (4, 2.9))
+    for panel, kind in zip(panels, ATTACKS, strict=True):
         rows = sorted((each for each in measured if each.kind == kind), key=lambda each: each.pixels)
         parts = [[np.median(each.inside) for each in rows], [np.median(each.renderer) for each in rows]]
         panel.stackplot([each.pixels for each in rows], parts, labels=["classifier", "renderer"], colors=COLOURS)
         panel.set(title=kind, xlabel="pixels that need derivatives", xticks=range(0, 40_000, 10_000))
-        panel.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("ms per iteration")
     panels[0].set_ylim(0, 1.05 * max(np.median(each.whole) for each in measured))
     panels[0].legend(loc="upper left", frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save(figure, path)
 
 
-def main() -> None:
-    options = arguments(__doc__, examples=50, max_steps=30, passes=5, turns=20).parse_args()
-    matplotlib.use("Agg")
-    torch.set_num_threads(1)
-    chosen, classifier = subjects(options), load_classifier(options.classifier, options.weights)
+def measure(study: Study, settings: RunTimeSettings) -> Section:
+    """Iterations by pixels and against the classifier's pass, and whole attacks."""
+    first, solid = study.subjects[0], Subject("solid", load_object(SOLID), study.label)
     setups = (
-        Setup(f"{chosen[0].name}, textured, smooth, 2×2 samples", fine(chosen[0]), 2, "smooth"),
-        Setup("solid:orange, flat, 1 sample", fine(Subject("solid", load_object(SOLID), options.label)), 1, "flat"),
+        Setup(f"{first.name}, textured, smooth, 2×2 samples", finer(first), 2, "smooth"),
+        Setup("solid:orange, flat, 1 sample", finer(solid), 1, "flat"),
     )
-    measured = [
-        stubborn(setups[0], kind, classifier, field, options.passes, options) for kind in KINDS for field in FIELDS
-    ]
-    largest = {kind: next(each for each in measured if each.kind == kind) for kind in KINDS}
-    plain = [stubborn(setups[1], kind, classifier, FIELDS[0], options.passes, options) for kind in KINDS]
-    at_once = [
-        stubborn(many(setup), kind, classifier, FIELDS[0], MANY_PASSES, options)
-        for setup in reversed(setups)
-        for kind in KINDS
-    ]
-    training = training_step(chosen, options)
-    done = [each for subject in chosen for each in attacks(subject, classifier, options)]
+
+    def measured(setup: Setup, fields: Sequence[float], passes: int) -> list[Iteration]:
+        return [
+            stubborn(setup, kind, study.classifier, study.light, field, passes, settings.turns)
+            for kind in ATTACKS
+            for field in fields
+        ]
+
+    by_pixels = measured(setups[0], FIELDS, settings.passes)
+    largest = {kind: next(each for each in by_pixels if each.kind == kind) for kind in ATTACKS}
+    plain = measured(setups[1], FIELDS[:1], settings.passes)
+    at_once = [each for setup in reversed(setups) for each in measured(many(setup), FIELDS[:1], MANY_PASSES)]
+    training = training_step(study, settings)
+    done = [each for subject in study.subjects for each in attacks(subject, study, settings)]
     share_of = {kind: np.median(np.divide(each.inside, each.whole)) for kind, each in largest.items()}
     text = TEXT.format(
-        size=classifier.size,
-        classifier=classifier.name,
-        mesh=chosen[0].name,
+        size=study.classifier.size,
+        classifier=study.classifier.name,
+        mesh=first.name,
         vertices=len(setups[0].subject.mesh.vertices),
-        iterations=table(ITERATION_COLUMNS, iteration_rows(measured)),
+        iterations=markdown(ITERATION_COLUMNS, iteration_rows(by_pixels)),
         most=largest["lighting"].pixels,
         classifier_share=f"{share_of['lighting']:.0%}",
         geometry_share=f"{share_of['geometry']:.0%}",
-        ratios=table(RATIO_COLUMNS, map(ratio_row, (training, *at_once, *plain, *largest.values()))),
+        ratios=markdown(RATIO_COLUMNS, map(ratio_row, (training, *at_once, *plain, *largest.values()))),
         examples=len(done),
         batch=BATCH,
-        max_steps=options.max_steps,
-        distribution=table(ATTACK_COLUMNS, distribution_rows(done, [subject.name for subject in chosen])),
+        max_steps=settings.max_steps,
+        distribution=markdown(ATTACK_COLUMNS, distribution_rows(done, [subject.name for subject in study.subjects])),
         finding=finding(done),
-        command=command(),
-        versions=versions(),
     )
-    records = [asdict(each) for each in (*measured, *plain, *at_once, training, *done)]
-    write_section(options.out, "run_time", "Run time", text, records)
-    draw(measured, options.out / "paper" / "run_time.png")
-
-
-if __name__ == "__main__":
-    main()
+    records = [asdict(each) for each in (*by_pixels, *plain, *at_once, training, *done)]
+    return Section("Run time", text, records, {"run_time.png": partial(draw, by_pixels)})

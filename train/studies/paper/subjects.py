@@ -1,17 +1,10 @@
-"""What the scripts of the paper's tables share: recognised pictures to attack, and the page that they write."""
+"""Random pictures of a mesh that a classifier recognises, to be attacked."""
 
-import argparse
-import json
 import math
-import platform
-import re
-import sys
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from textwrap import fill
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,18 +13,17 @@ from augment.mesh_scene import MeshScene
 from augment.scene import ObjectSettings, load_object
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
 from renderer.image import PictureSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh
+from renderer.subdivision import subdivide
 from renderer.visibility import choose
 from train.attacks.experiment import logits_of
-from train.cli import command_line
 
-DOCS = Path(__file__).parents[2] / "docs"
+VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
 FIELDS_OF_VIEW = (2.0, 3.0)  # the paper's appendix on rendering quality
 GREYS = (0.0, 0.25, 0.5, 0.75, 1.0)
-AS_THEY_ARE = ("#", "|", "!", "```")  # headings, tables, pictures and code
-SECTIONS = ("norm_balls", "transfer", "unseen_views", "rendering_quality", "gallery", "run_time")
 
 
 @dataclass(frozen=True)
@@ -43,31 +35,15 @@ class Subject:
     label: str
     gain: float = 1.0
 
-
-def arguments(description: str, **defaults: int) -> argparse.ArgumentParser:
-    """The options that all scripts have, and whole numbers of their own."""
-    parser = argparse.ArgumentParser(description=description)
-    help_meshes = "files, FILE:GAIN for textures that are too dark, or solid:NAME:SEED"
-    parser.add_argument("--meshes", nargs="+", required=True, help=help_meshes)
-    parser.add_argument("--label", default="orange", help="the class that the meshes show")
-    parser.add_argument("--classifier", default="efficientnet_lite0")
-    parser.add_argument("--weights", default=None, help="the classifier's local weights file")
-    parser.add_argument("--light", default="grace")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of paper.md")
-    for name, value in defaults.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=value)
-    return parser
+    @classmethod
+    def load(cls, item: ObjectSettings) -> "Subject":
+        """InputError: as `load_object`."""
+        return cls(Path(item.mesh).stem, load_object(item), item.label, item.gain)
 
 
-def subjects(options: argparse.Namespace) -> list[Subject]:
-    """The meshes of the command line."""
-    found = []
-    for entry in options.meshes:
-        path, _, gain = (entry, "", "") if entry.startswith("solid:") else entry.partition(":")
-        item = ObjectSettings(path, options.label, gain=float(gain or 1))
-        found.append(Subject(Path(path).stem, load_object(item), options.label, item.gain))
-    return found
+def finer(subject: Subject) -> Subject:
+    """The subject with enough vertices for an attack on its shape."""
+    return replace(subject, mesh=subdivide(subject.mesh, VERTICES))
 
 
 def random_scene(subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator) -> MeshScene:
@@ -88,6 +64,8 @@ def scene_of(
     light: str,
     cameras: Sequence[Sequence[OrthographicCamera]],
     greys: Tensor,
+    samples: int = 2,
+    normals: str = "smooth",
 ) -> MeshScene:
     """A subject before cameras (E × V), each example on a grey (E,)."""
     size = classifier.size
@@ -96,7 +74,7 @@ def scene_of(
         cameras,
         greys.view(-1, 1, 1, 1).expand(-1, 3, size, size),
         load_light(light),
-        PictureSettings(size, samples=2, normals="smooth"),
+        PictureSettings(size, samples, normals=normals),
         choose(),
         subject.gain,
     )
@@ -120,56 +98,4 @@ def recognised_scene(subject: Subject, classifier: Classifier, light: str, count
         greys += [float(scene.backgrounds[index, 0, 0]) for index in kept]
         if len(cameras) >= count:
             return scene_of(subject, classifier, light, cameras[:count], torch.tensor(greys[:count]))
-    raise SystemExit(f"{classifier.name} recognises too few pictures of {subject.name}: {len(cameras)} of {20 * count}")
-
-
-def write_section(out: Path, name: str, title: str, text: str, records: Iterable[Mapping]) -> None:
-    """Write out/paper/NAME.jsonl and NAME.md, and paper.md anew from all sections that there are."""
-    folder = out / "paper"
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
-    (folder / f"{name}.md").write_text(f"## {title}\n\n{wrapped(text.strip())}\n")
-    there = [folder / f"{section}.md" for section in SECTIONS if (folder / f"{section}.md").is_file()]
-    head = (
-        "# The paper's tables and figures\n\nEach section is written by the script that it names; do not edit.\n"
-        'Renders of orange_sketchfab show "An Orange" by thisisepic, Sketchfab, CC BY-SA 4.0.\n'
-    )
-    (out / "paper.md").write_text("\n".join([head, *(path.read_text() for path in there)]))
-
-
-def wrapped(text: str) -> str:
-    """Markdown whose paragraphs and lists have lines of at most 120 characters."""
-    return "\n\n".join(
-        block if block.startswith(AS_THEY_ARE) else "\n".join(map(_filled, re.split("\n(?=- )", block)))
-        for block in text.split("\n\n")
-    )
-
-
-def _filled(paragraph: str) -> str:
-    hanging = "  " if paragraph.startswith("- ") else ""
-    return fill(
-        " ".join(paragraph.split()), 120, subsequent_indent=hanging, break_long_words=False, break_on_hyphens=False
-    )
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def command() -> str:
-    """This run's command line as Markdown, without where the page goes."""
-    words = sys.argv[1:]
-    if "--out" in words:
-        at = words.index("--out")
-        del words[at : at + 2]
-    return f"```bash\nPYTHONPATH=. {command_line(words)}\n```"
-
-
-def versions() -> str:
-    """What the numbers were made with, as a sentence."""
-    return (
-        f"Made with torch {torch.__version__} and NumPy {np.__version__} on {platform.machine()}, "
-        f"{torch.get_num_threads()} threads."
-    )
+    raise InputError(f"{classifier.name} recognises too few pictures of {subject.name}: {len(cameras)} of {20 * count}")

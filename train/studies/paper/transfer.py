@@ -1,36 +1,42 @@
-"""Do lights and shapes that fool one network fool others (Table 3)?
+"""Do lights and shapes that fool one network fool others (Table 3)?"""
 
-PYTHONPATH=. python scripts/paper/transfer.py --meshes FILE FILE:GAIN --squeezenet FILE
-"""
-
-import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
 import torch
-from adversaries import (
-    ATTACKS,
-    FURTHER,
-    STEPS,
-    adversaries,
-    answers,
-    finer,
-    percent,
-    recognised_parts,
-    with_random_signs,
-)
-from common import Subject, arguments, command, scene_of, subjects, table, versions, write_section
 from torch import Tensor
 
 from augment.attack import Part, Problem
 from augment.classifiers import Classifier
 from augment.seeding import generator
 from train.run_classifier import load_classifier
+from train.studies.figures import pyplot, save
+from train.studies.paper.adversaries import (
+    ATTACKS,
+    FURTHER,
+    STEPS,
+    adversaries,
+    answers,
+    recognised_parts,
+    with_random_signs,
+)
+from train.studies.paper.section import Section, SectionSettings, Study
+from train.studies.paper.shares import percent
+from train.studies.paper.subjects import Subject, finer, scene_of
+from train.tables import markdown
 
-TARGETS = ("efficientnet_lite2", "run:pretrained/none", "run:pretrained/random", "run:pretrained/adversarial")
+
+@dataclass
+class TransferSettings(SectionSettings):
+    """examples: of each mesh. targets: networks that are not attacked. squeezenet: weights of one more."""
+
+    examples: int
+    targets: list[str]
+    squeezenet: str | None
+
+
 STATES = ("before", "first", "first_random", "further", "further_random")
 COLUMNS = {
     "first": "adversary as found",
@@ -71,15 +77,11 @@ Where this differs from the paper's result, and why:
 - The paper's networks all learned ImageNet at 224 pixels. Here the `run:` networks learned CIFAR-100 at 32 pixels,
   where a shape's details are smaller than a pixel. `run:pretrained/random` and `run:pretrained/adversarial` have also
   learned from renders of these two meshes, the latter under lights that fooled it.
-- Two oranges instead of 75 shapes of many classes, and fewer examples: `--examples` sets how many per mesh.
+- Two oranges instead of 75 shapes of many classes, and fewer examples: `section.examples` sets how many per mesh.
 
 Lighting: steps of 0.05 of unit length, no bound. Geometry: signed steps of 0.0005 within 0.002 per axis, the paper's
 radius, over 10,000 vertices. Either: {steps} steps at most until the source is fooled. Views at 60° from the zenith at
 any azimuth, field of view 2 or 3, five greys, initial light `{light}`.
-
-{command}
-
-{versions}
 """
 
 
@@ -95,13 +97,12 @@ class Seen:
     answer: str
 
 
-def networks(options: argparse.Namespace) -> list[Classifier]:
+def networks(study: Study, settings: TransferSettings) -> list[Classifier]:
     """The source, and then the targets."""
-    source = load_classifier(options.classifier, options.weights)
-    targets = [load_classifier(name) for name in options.targets]
-    if options.squeezenet is not None:
-        targets.append(load_classifier("squeezenet_caffe", options.squeezenet))
-    return [source, *targets]
+    targets = [load_classifier(name) for name in settings.targets]
+    if settings.squeezenet is not None:
+        targets.append(load_classifier("squeezenet_caffe", settings.squeezenet))
+    return [study.classifier, *targets]
 
 
 def transfer(
@@ -168,7 +169,7 @@ def results(records: Sequence[Mapping], names: Sequence[str], label: str) -> str
             [name, *(percent(outcomes(of_kind, name, state, names[0], label)) for state in COLUMNS)]
             for name in names[1:]
         ]
-        parts += [f"**{kind.capitalize()}**", table(["network", *COLUMNS.values()], rows)]
+        parts += [f"**{kind.capitalize()}**", markdown(["network", *COLUMNS.values()], rows)]
     return "\n\n".join(parts)
 
 
@@ -198,8 +199,8 @@ def draw(seen: Sequence[Seen], label: str, path: Path) -> None:
     """A row per kind and mesh, a column per network."""
     columns = list(dict.fromkeys(each.network for each in seen))
     rows = list(dict.fromkeys((each.kind, each.mesh) for each in seen))
-    figure, panels = plt.subplots(
-        len(rows), len(columns), figsize=(1.7 * len(columns), 1.95 * len(rows)), squeeze=False
+    figure, panels = pyplot().subplots(
+        len(rows), len(columns), figsize=(1.7 * len(columns), 1.95 * len(rows)), squeeze=False, layout="tight"
     )
     for each in seen:
         row, column = rows.index((each.kind, each.mesh)), columns.index(each.network)
@@ -211,9 +212,7 @@ def draw(seen: Sequence[Seen], label: str, path: Path) -> None:
             panel.set_title(each.network.replace(":", ":\n").replace("_", "\n", 1), fontsize=8)
         if column == 0:
             panel.set_ylabel(f"{each.kind}\n{each.mesh}", fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save(figure, path)
 
 
 def _colour(seen: Seen, label: str) -> str:
@@ -222,43 +221,31 @@ def _colour(seen: Seen, label: str) -> str:
     return "#2e7d4f" if seen.answer == label else "#d03b3b"
 
 
-def main() -> None:
-    parser = arguments(__doc__, examples=20, threads=2)
-    parser.add_argument("--targets", nargs="+", default=TARGETS, help="networks that are not attacked")
-    parser.add_argument("--squeezenet", default=None, help="weights of squeezenet_caffe, for one more target")
-    options = parser.parse_args()
-    matplotlib.use("Agg")
-    torch.set_num_threads(options.threads)
-    seen_by, chosen = networks(options), subjects(options)
-    records, seen = [], {}
-    for subject in chosen:
-        draws = generator(options.seed, subject.name, "transfer")
-        for some, views in transfer(finer(subject), seen_by, options.examples, options.light, draws):
+def measure(study: Study, settings: TransferSettings) -> Section:
+    """Adversaries of every mesh and kind, before all networks."""
+    seen_by, records, seen = networks(study, settings), [], {}
+    for subject in study.subjects:
+        draws = generator(study.seed, subject.name, "transfer")
+        for some, views in transfer(finer(subject), seen_by, settings.examples, study.light, draws):
             records += some
             seen.setdefault((views[0].kind, subject.name), views)
-    names, source = [network.name for network in seen_by], seen_by[0].name
-    networks_of_paper = list(PAPER["lighting"])
+    names, source = [network.name for network in seen_by], study.classifier.name
+    of_paper = list(PAPER["lighting"])
     text = TEXT.format(
         source=source,
-        label=options.label,
-        tables=results(records, names, options.label),
+        label=study.label,
+        tables=results(records, names, study.label),
         further=FURTHER,
-        paper=table(
-            ["", *networks_of_paper],
-            [[kind, *(f"{row[name]} %" for name in networks_of_paper)] for kind, row in PAPER.items()],
+        paper=markdown(
+            ["", *of_paper], [[kind, *(f"{row[name]} %" for name in of_paper)] for kind, row in PAPER.items()]
         ),
         examples=len(records) // len(ATTACKS),
-        meshes=" and ".join(subject.name for subject in chosen),
-        source_success=source_success(records, source, options.label),
+        meshes=study.meshes,
+        source_success=source_success(records, source, study.label),
         distances=distances(records),
         steps=STEPS,
-        light=options.light,
-        command=command(),
-        versions=versions(),
+        light=study.light,
     )
-    write_section(options.out, "transfer", "Transfer to unseen networks", text, records)
-    draw([each for views in seen.values() for each in views], options.label, options.out / "paper" / "transfer.png")
-
-
-if __name__ == "__main__":
-    main()
+    pictures = [each for views in seen.values() for each in views]
+    figures = {"transfer.png": partial(draw, pictures, study.label)}
+    return Section("Transfer to unseen networks", text, records, figures)

@@ -1,30 +1,14 @@
-"""Does a light or a shape found in a few views fool a network in others (Table 4)?
-
-PYTHONPATH=. python scripts/paper/unseen_views.py --meshes FILE FILE:GAIN
-"""
+"""Does a light or a shape found in a few views fool a network in others (Table 4)?"""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from adversaries import (
-    ATTACKS,
-    FURTHER,
-    STEPS,
-    adversaries,
-    answers,
-    finer,
-    percent,
-    recognised_parts,
-    with_random_signs,
-)
-from common import Subject, arguments, command, recognised_scene, subjects, table, versions, write_section
 from torch import Tensor
 
 from augment.classifiers import Classifier
@@ -32,9 +16,32 @@ from augment.mesh_scene import MeshScene
 from augment.perturbation import Perturbation
 from augment.seeding import generator, stream_seed
 from train.photographs.shares import share
-from train.run_classifier import load_classifier
+from train.studies.figures import panels_beside, save
+from train.studies.paper.adversaries import (
+    ATTACKS,
+    FURTHER,
+    STEPS,
+    adversaries,
+    answers,
+    recognised_parts,
+    with_random_signs,
+)
+from train.studies.paper.section import Section, SectionSettings, Study
+from train.studies.paper.shares import draw_shares, percent
+from train.studies.paper.subjects import Subject, finer, recognised_scene
+from train.tables import markdown
 
 ATTACKED = (1, 5)
+
+
+@dataclass
+class UnseenViewSettings(SectionSettings):
+    """sets: of attacked views, of each mesh. views: unseen ones for each set."""
+
+    sets: int
+    views: int
+
+
 STATES = {
     "first": "adversary as found",
     "further": f"adversary {FURTHER} steps on",
@@ -66,7 +73,7 @@ vertical, with 95 % Wilson intervals.*
 Where this differs from the paper's result, and why:
 
 - The paper tests on 500 views of a shape; here each cell has {views}, {per_set} for each of {sets} sets of attacked
-  views, on {meshes}. `--views` and `--sets`, the latter per mesh, change it.
+  views, on {meshes}. `section.views` and `section.sets`, the latter per mesh, change it.
 - What a shape fools depends on how much of the attacked surface a view still sees: {far}.
   Where the paper's views lie is not said: if they spread over all directions, fewer are near an attacked one than on a
   ring of azimuths. A light reaches all views.
@@ -79,10 +86,6 @@ Where this differs from the paper's result, and why:
 Lighting: steps of 0.05 of unit length, no bound. Geometry: signed steps of 0.0005 within 0.002 per axis, the paper's
 radius, over 10,000 vertices. Either: {steps} steps at most until all attacked views are fooled. Initial light:
 `{light}`.
-
-{command}
-
-{versions}
 """
 
 
@@ -189,7 +192,7 @@ def results(records: Sequence[Mapping], label: str) -> str:
         for kind, by_views in PAPER.items()
         for views, paper in by_views.items()
     ]
-    return table(["", "views attacked", *STATES.values(), "the paper's"], rows)
+    return markdown(["", "views attacked", *STATES.values(), "the paper's"], rows)
 
 
 def attacked_success(records: Sequence[Mapping]) -> str:
@@ -219,20 +222,17 @@ def far(records: Sequence[Mapping], label: str) -> str:
 
 def draw(records: Sequence[Mapping], label: str, path: Path) -> None:
     """A panel per kind: success by angle, a line per number of attacked views."""
-    figure, panels = plt.subplots(1, len(ATTACKS), figsize=(4.2 * len(ATTACKS), 3.2), sharey=True, squeeze=False)
-    for panel, kind in zip(panels[0], ATTACKS, strict=True):
+    figure, panels = panels_beside(len(ATTACKS), (4.2, 3.2))
+    for panel, kind in zip(panels, ATTACKS, strict=True):
         for views in ATTACKED:
             _line(panel, records, kind, views, label)
         panel.set(title=kind, xlabel="degrees to the nearest attacked view", xlim=(0, 180), ylim=(-2, 102))
-        panel.spines[["top", "right"]].set_visible(False)
-    panels[0, 0].set_ylabel("unseen views fooled, %")
-    panels[0, -1].legend(frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    panels[0].set_ylabel("unseen views fooled, %")
+    panels[-1].legend(frameon=False)
+    save(figure, path)
 
 
-def _line(panel: plt.Axes, records: Sequence[Mapping], kind: str, views: int, label: str) -> None:
+def _line(panel, records: Sequence[Mapping], kind: str, views: int, label: str) -> None:
     angles = np.array([record["angle"][str(views)] for record in records])
     fooled = np.array(outcomes(records, kind, views, "further", label))
     places, shares = [], []
@@ -241,42 +241,30 @@ def _line(panel: plt.Axes, records: Sequence[Mapping], kind: str, views: int, la
         if here.any():
             places.append(angles[here].mean())
             shares.append(share(int(fooled[here].sum()), int(here.sum())))
-    value, low, high = (100 * np.array([each[name] for each in shares]) for name in ("value", "low", "high"))
-    errors = np.maximum([value - low, high - value], 0)  # rounding
     name = f"{views} view{'s' * (views > 1)} attacked"
-    panel.errorbar(places, value, errors, marker="o", capsize=2, color=COLOURS[views], label=name)
+    draw_shares(panel, places, shares, scale=100, marker="o", capsize=2, color=COLOURS[views], label=name)
 
 
-def main() -> None:
-    options = arguments(__doc__, sets=3, views=25, threads=2).parse_args()
-    matplotlib.use("Agg")
-    torch.set_num_threads(options.threads)
-    classifier, chosen = load_classifier(options.classifier, options.weights), subjects(options)
+def measure(study: Study, settings: UnseenViewSettings) -> Section:
+    """All sets of attacked views of every mesh."""
     records = [
         record
-        for subject in map(finer, chosen)
-        for index in range(options.sets)
-        for record in unseen(subject, classifier, index, options.views, options.light, options.seed)
+        for subject in map(finer, study.subjects)
+        for index in range(settings.sets)
+        for record in unseen(subject, study.classifier, index, settings.views, study.light, study.seed)
     ]
     text = TEXT.format(
-        classifier=classifier.name,
-        label=options.label,
-        table=results(records, options.label),
+        classifier=study.classifier.name,
+        label=study.label,
+        table=results(records, study.label),
         attacked=attacked_success(records),
-        far=far(records, options.label),
-        sets=options.sets * len(chosen),
-        per_set=options.views,
+        far=far(records, study.label),
+        sets=settings.sets * len(study.subjects),
+        per_set=settings.views,
         views=len(records),
-        meshes=" and ".join(subject.name for subject in chosen),
+        meshes=study.meshes,
         further=FURTHER,
         steps=STEPS,
-        light=options.light,
-        command=command(),
-        versions=versions(),
+        light=study.light,
     )
-    write_section(options.out, "unseen_views", "Unseen views", text, records)
-    draw(records, options.label, options.out / "paper" / "unseen_views.png")
-
-
-if __name__ == "__main__":
-    main()
+    return Section("Unseen views", text, records, {"unseen_views.png": partial(draw, records, study.label)})

@@ -1,30 +1,23 @@
 import json
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 import trimesh
 
-pytest.importorskip("matplotlib")
-ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "scripts" / "paper"))
-
-import adversaries  # noqa: E402
-import transfer  # noqa: E402
-import unseen_views  # noqa: E402
-from adversaries import ATTACKS, FURTHER, percent, recognised_parts, with_random_signs  # noqa: E402
-from common import Subject, scene_of  # noqa: E402
-
-from augment.attack import DescentSettings  # noqa: E402
-from augment.classifiers import Classifier  # noqa: E402
-from augment.parameters import Lighting, StepSettings  # noqa: E402
-from augment.seeding import generator  # noqa: E402
-from renderer.camera import OrthographicCamera, ring  # noqa: E402
-from renderer.mesh import Mesh  # noqa: E402
-from renderer.mesh_export import export_mesh  # noqa: E402
+from augment.attack import DescentSettings
+from augment.classifiers import Classifier
+from augment.parameters import Lighting, StepSettings
+from augment.seeding import generator
+from renderer.camera import OrthographicCamera, ring
+from renderer.errors import InputError
+from renderer.mesh import Mesh
+from renderer.mesh_export import export_mesh
+from train.studies.paper import adversaries, subjects, transfer, unseen_views
+from train.studies.paper.adversaries import ATTACKS, FURTHER, recognised_parts, with_random_signs
+from train.studies.paper.shares import percent
+from train.studies.paper.subjects import Subject, scene_of
 
 SIZE = 12
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
@@ -109,7 +102,7 @@ def test_examples_are_drawn_until_as_many_are_recognised_as_were_asked(monkeypat
     parts = list(recognised_parts(SUBJECT, by_brightness(), "grace", 5, generator(0, "test")))
     assert sum(len(kept) for _, kept in parts) == 5
     monkeypatch.setattr(adversaries, "LEAST_SHARE", 0.5)
-    with pytest.raises(SystemExit, match="always coal recognises only 0"):
+    with pytest.raises(InputError, match="always coal recognises only 0"):
         list(recognised_parts(SUBJECT, always("coal"), "grace", 1, generator(0, "test")))
 
 
@@ -205,26 +198,25 @@ def test_each_unseen_view_has_an_answer_for_each_attack(short):
 
 
 @pytest.mark.parametrize(
-    ("script", "words", "lines"),
+    ("section", "settings", "lines"),
     [
-        (transfer, ["--examples", "1", "--targets", "run:pretrained/random"], 2),
-        (unseen_views, ["--sets", "1", "--views", "2"], 2),
+        ("transfer", ["section.examples=1", "section.targets=[run:pretrained/random]"], 2),
+        ("unseen_views", ["section.sets=1", "section.views=2"], 2),
     ],
-    ids=["transfer", "unseen views"],
 )
-def test_a_script_writes_its_page_data_and_picture_without_folders(script, words, lines, short, tmp_path, monkeypatch):
-    monkeypatch.setattr(adversaries, "VERTICES", 0)
+def test_a_section_has_data_a_picture_and_text_without_folders(
+    section, settings, lines, short, tmp_path, monkeypatch, reproduce
+):
+    monkeypatch.setattr(subjects, "VERTICES", 0)
     monkeypatch.setattr(adversaries, "PART", 2)
+    monkeypatch.setattr(transfer, "load_classifier", lambda name: by_brightness(name=name))
     export_mesh(SUBJECT.mesh, tmp_path / "ball.glb")
-    monkeypatch.setattr(script, "load_classifier", lambda name, weights=None: by_brightness(name=name))
-    threads = torch.get_num_threads()
-    given = ["--meshes", str(tmp_path / "ball.glb"), "--out", str(tmp_path)]
-    name = Path(script.__file__).stem
-    monkeypatch.setattr(sys, "argv", [script.__file__, *given, *words, "--threads", str(threads)])
-    script.main()
+    meshes, out = f"scene.meshes=[{{mesh:{tmp_path}/ball.glb,gain:1.5}}]", f"out={tmp_path}"
+    reproduce(by_brightness(), f"section={section}", meshes, *settings, out)
     page = (tmp_path / "paper.md").read_text()
-    data = (tmp_path / "paper" / f"{name}.jsonl").read_text()
-    assert f"scripts/paper/{name}.py" in page and str(tmp_path) not in page + data
+    data = (tmp_path / "paper" / f"{section}.jsonl").read_text()
+    command = f"python scripts/reproduce_paper.py section={section} 'scene.meshes=[{{mesh:ball.glb,gain:1.5}}]'"
+    assert command in page and str(tmp_path) not in page + data
     assert len([json.loads(line) for line in data.splitlines()]) == lines
-    assert (tmp_path / "paper" / f"{name}.png").stat().st_size > 1000
-    assert "{" not in page and "nan" not in page.split("```")[0].lower().split()
+    assert (tmp_path / "paper" / f"{section}.png").stat().st_size > 1000
+    assert "{" not in page.replace(command, "") and "nan" not in page.split("```")[0].lower().split()

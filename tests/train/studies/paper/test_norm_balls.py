@@ -1,24 +1,17 @@
 import json
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 import trimesh
 
 from augment.classifiers import Classifier
+from renderer.camera import OrthographicCamera
 from renderer.mesh import Mesh
+from train.studies.paper import norm_balls, subjects
+from train.studies.paper.norm_balls import LEVELS, SPACES, Outcome, attack_ball, most_comparable, parts
+from train.studies.paper.subjects import Subject, scene_of
 
-ROOT = Path(__file__).parents[2]
 SIZE = 12
-
-sys.path.append(str(ROOT / "scripts" / "paper"))
-norm_balls = pytest.importorskip("norm_balls", reason="needs the benchmark extra", exc_type=ImportError)
-from common import Subject, scene_of  # noqa: E402
-from norm_balls import LEVELS, SPACES, Outcome, attack_ball, most_comparable, parts  # noqa: E402
-
-from renderer.camera import OrthographicCamera  # noqa: E402
-
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
 
 
@@ -95,12 +88,11 @@ def test_the_example_shown_is_the_one_nearest_to_the_levels_by_adversaries_alone
     }
 
 
-def test_the_script_writes_data_pictures_and_a_page_without_paths(tmp_path, monkeypatch):
-    monkeypatch.setattr(norm_balls, "load_classifier", lambda *_: mean_above(0.2))
-    monkeypatch.setattr(norm_balls, "VERTICES", 0)
-    monkeypatch.setattr(sys, "argv", ["norm_balls.py", "--meshes", str(tmp_path / "ball.ply")])
+def test_the_section_has_data_pictures_and_text_without_paths(tmp_path, monkeypatch, reproduce):
+    monkeypatch.setattr(subjects, "VERTICES", 0)
     BALL.export(tmp_path / "ball.ply")
-    norm_balls.main(["--meshes", str(tmp_path / "ball.ply"), "--examples", "2", "--steps", "1", "--out", str(tmp_path)])
+    settings = [f"scene.meshes=[{tmp_path}/ball.ply]", "section.examples=2", "section.steps=1", f"out={tmp_path}"]
+    reproduce(mean_above(0.2), "section=norm_balls", *settings)
     records = [json.loads(line) for line in (tmp_path / "paper" / "norm_balls.jsonl").read_text().splitlines()]
     balls = [(name, radius) for name, space in SPACES.items() for radius in space.radii]
     assert [(each["mesh"], each["space"], each["radius"]) for each in records] == [

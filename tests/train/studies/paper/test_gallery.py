@@ -1,11 +1,8 @@
-"""The scripts of the paper's rendering quality, gallery and run time."""
+"""The paper's rendering quality, gallery and run time."""
 
 import json
 import math
-import sys
-from argparse import Namespace
 from itertools import repeat
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,16 +12,13 @@ from PIL import Image
 from torch import nn
 
 from augment.classifiers import Classifier
+from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
 from renderer.mesh import Mesh
-
-ROOT = Path(__file__).parents[2]
-SIZE = 24
-
-sys.path.append(str(ROOT / "scripts" / "paper"))
-run_time = pytest.importorskip("run_time", reason="needs the benchmark extra", exc_type=ImportError)
-import gallery  # noqa: E402
-from common import GREYS, Subject, scene_of, wrapped  # noqa: E402
-from rendering_quality import (  # noqa: E402
+from train.studies.page import wrapped
+from train.studies.paper import gallery, run_time
+from train.studies.paper.adversaries import ATTACKS
+from train.studies.paper.rendering_quality import (
     View,
     bootstrap,
     enough_views,
@@ -34,10 +28,11 @@ from rendering_quality import (  # noqa: E402
     share_recognised,
     views_of,
 )
-from run_time import KINDS, Attack, Setup, Stopwatch  # noqa: E402
+from train.studies.paper.run_time import Attack, RunTimeSettings, Setup, Stopwatch
+from train.studies.paper.section import Study
+from train.studies.paper.subjects import GREYS, Subject, scene_of
 
-from renderer.camera import OrthographicCamera  # noqa: E402
-
+SIZE = 24
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
 CLASSES = ("orange", "candle", "joystick")
 
@@ -91,7 +86,7 @@ def test_views_are_drawn_until_enough_renders_are_recognised():
 
 
 def test_a_mesh_that_is_never_recognised_is_given_up():
-    with pytest.raises(SystemExit, match="only 0 of"):
+    with pytest.raises(InputError, match="only 0 of"):
         enough_views(repeat(view(*[None] * 5)), 7)
 
 
@@ -140,20 +135,13 @@ def test_paragraphs_and_lists_are_wrapped_and_tables_headings_and_code_are_not()
 # ---------------------------------------------------------------------------------------- run time
 
 
-@pytest.fixture
-def options():
-    return Namespace(light="grace", passes=2, turns=3, seed=0, examples=2, max_steps=5, label="orange")
-
-
 @pytest.mark.parametrize(("views", "backgrounds"), [(1, (0.5,)), (3, GREYS)])
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_iteration_holds_its_time_in_the_classifier_and_the_pixels_it_covers(
-    subject, options, kind, views, backgrounds
-):
+@pytest.mark.parametrize("kind", ATTACKS)
+def test_an_iteration_holds_its_time_in_the_classifier_and_the_pixels_it_covers(subject, kind, views, backgrounds):
     """A ball looks the same from all sides."""
     setup = Setup("ball", subject, 2, "smooth", views, backgrounds)
-    measured = run_time.stubborn(setup, kind, bright(), 4.0, options.passes, options)
-    assert len(measured.whole) == len(measured.bare) == len(measured.inside) == options.turns
+    measured = run_time.stubborn(setup, kind, bright(), "grace", 4.0, passes=2, turns=3)
+    assert len(measured.whole) == len(measured.bare) == len(measured.inside) == 3
     assert (measured.renderer > 0).all() and min(measured.inside) > 0
     # The unit ball fills π/16 of a picture that is 4 wide; its outline of 6π pixels counts whole.
     assert 0 < measured.pixels - math.pi / 16 * SIZE**2 < 6 * math.pi
@@ -186,26 +174,24 @@ def test_the_distribution_is_over_attacks_that_succeed():
     assert row[3:8] == ["3", "5", "7", "8", "9"] and row[8:] == ["0.30", "0.50", "0.70", "0.82", "0.90"]
 
 
-def test_each_picture_is_attacked_until_it_is_fooled(subject, options):
-    done = list(run_time.attacks(subject, bright(0.35), options))
-    assert len(done) == options.examples
+def test_each_picture_is_attacked_until_it_is_fooled(subject):
+    settings = RunTimeSettings("run_time", threads=1, examples=2, max_steps=5, passes=2, turns=3)
+    done = list(run_time.attacks(subject, Study(bright(0.35), [], "grace", "orange", seed=0), settings))
+    assert len(done) == settings.examples
     assert all(each.seconds > each.prepared > 0 for each in done)
-    assert all(each.fooled or each.steps == options.max_steps for each in done)
+    assert all(each.fooled or each.steps == settings.max_steps for each in done)
 
 
 # ---------------------------------------------------------------------------------------- gallery
 
 
-def test_the_gallery_has_a_small_picture_and_a_row_for_each_case(tmp_path, monkeypatch):
+def test_the_gallery_has_a_small_picture_and_a_row_for_each_case(tmp_path, monkeypatch, reproduce):
     BALL.export(tmp_path / "ball.ply")
-    ball = str(tmp_path / "ball.ply")
-    words = ["--meshes", ball, "--targets", "candle", "joystick", "--orange", ball]
-    monkeypatch.setattr(sys, "argv", ["gallery.py", *words, "--steps", "2", "--out", str(tmp_path / "docs")])
-    monkeypatch.setattr(gallery, "load_classifier", lambda *_: bright())
+    meshes = f"scene.meshes=[{tmp_path}/ball.ply,{tmp_path}/ball.ply]"
     monkeypatch.setattr(gallery, "VERTICES", 100)
     monkeypatch.setattr(gallery, "SPHERE", 16)
-    monkeypatch.setattr(torch, "set_num_threads", lambda threads: None)
-    gallery.main()
+    settings = ["section.targets=[candle,joystick]", "section.steps=2", f"out={tmp_path}/docs"]
+    reproduce(bright(), "section=gallery", meshes, *settings)
     folder = tmp_path / "docs" / "paper"
     text, lines = (folder / "gallery.md").read_text(), (folder / "gallery.jsonl").read_text().splitlines()
     assert str(tmp_path) not in text
@@ -217,3 +203,8 @@ def test_the_gallery_has_a_small_picture_and_a_row_for_each_case(tmp_path, monke
             assert np.asarray(picture.convert("RGB")).std() > 1
         assert len(numbers["before"]) == len(numbers["after"]) == numbers["views"]
     assert len(lines) == len(list(folder.glob("gallery_*.png"))) == 10
+
+
+def test_a_gallery_of_one_mesh_is_refused(tmp_path, reproduce):
+    with pytest.raises(InputError, match="scene.meshes of section=gallery has two"):
+        reproduce(bright(), "section=gallery", "scene.meshes=[a.ply]", "section.targets=[candle]", f"out={tmp_path}")

@@ -1,0 +1,80 @@
+"""A section of docs/paper.md: measured, written, and joined with all others that there are."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+
+from renderer.errors import InputError
+from train.cli import command_line
+from train.run_classifier import load_classifier
+from train.settings import read_object, read_settings
+from train.studies.figures import pyplot
+from train.studies.page import joined, versions, wrapped, write
+from train.studies.paper import gallery, norm_balls, rendering_quality, run_time, transfer, unseen_views
+from train.studies.paper.section import Section, Study
+
+SECTIONS = {  # in the order of the page
+    "norm_balls": (norm_balls.NormBallSettings, norm_balls.measure),
+    "transfer": (transfer.TransferSettings, transfer.measure),
+    "unseen_views": (unseen_views.UnseenViewSettings, unseen_views.measure),
+    "rendering_quality": (rendering_quality.QualitySettings, rendering_quality.measure),
+    "gallery": (gallery.GallerySettings, gallery.measure),
+    "run_time": (run_time.RunTimeSettings, run_time.measure),
+}
+HEAD = """# The paper's tables and figures
+
+Each section is written by the command that it names; do not edit.
+Renders of orange_sketchfab show "An Orange" by thisisepic, Sketchfab, CC BY-SA 4.0."""
+
+
+@dataclass
+class SceneSettings:
+    """meshes: as in training. light: where attacks begin."""
+
+    meshes: list
+    light: str
+
+
+@dataclass
+class PaperSettings:
+    """conf/reproduce_paper.yaml. section: a choice of conf/section. out: the folder of paper.md."""
+
+    section: dict[str, Any]
+    out: str
+    label: str
+    classifier: str
+    weights: str | None
+    seed: int
+    scene: SceneSettings
+
+
+def run(settings: PaperSettings) -> None:
+    """Measure a section, and write it, its data and its figures to out/paper, and out/paper.md anew."""
+    pyplot()  # a run without matplotlib would fail only at its end
+    name = settings.section.get("name")
+    if name not in SECTIONS:
+        raise InputError(f"section.name={name}: choose section={', '.join(SECTIONS)}")
+    kind, measure = SECTIONS[name]
+    section_settings = read_settings(kind, OmegaConf.create(settings.section), "section")
+    items = [read_object(item, settings.label, index) for index, item in enumerate(settings.scene.meshes)]
+    torch.set_num_threads(section_settings.threads)
+    classifier = load_classifier(settings.classifier, settings.weights)
+    study = Study(classifier, items, settings.scene.light, settings.label, settings.seed)
+    write_section(Path(settings.out), name, measure(study, section_settings))
+
+
+def write_section(out: Path, name: str, section: Section) -> None:
+    """Write out/paper/NAME.jsonl, NAME.md and its figures, and paper.md anew from all sections that there are."""
+    folder = out / "paper"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.jsonl").write_text("".join(json.dumps(record) + "\n" for record in section.records))
+    for figure, draw in section.figures.items():
+        draw(folder / figure)
+    command = f"```bash\n{command_line()}\n```"
+    write(folder / f"{name}.md", joined([f"## {section.title}", wrapped(section.text.strip()), command, versions()]))
+    there = [path for each in SECTIONS if (path := folder / f"{each}.md").is_file()]
+    write(out / "paper.md", joined([HEAD, *(path.read_text() for path in there)]))
