@@ -16,6 +16,7 @@ from train.experiment import CONFIG, PHOTOGRAPHS
 from train.logs import read_metrics
 from train.photographs import share
 from train.settings import decisive_settings
+from train.tables import aligned
 
 RECIPE = ("epochs", "batch_size", "learning_rate", "momentum", "weight_decay", "schedule", "precision")
 
@@ -78,7 +79,7 @@ def format_table(runs: Sequence[RunSummary]) -> str:
         for run in runs
     ]
     sheets = [run.folder / PHOTOGRAPHS / "contact_sheet.png" for run in runs if run.photographs]
-    return "\n".join([_markdown(header, rows), *(f"picture: {sheet}" for sheet in sheets)])
+    return "\n".join([aligned(header, rows), *(f"picture: {sheet}" for sheet in sheets)])
 
 
 def format_spread(runs: Sequence[RunSummary]) -> str:
@@ -98,7 +99,7 @@ def format_spread(runs: Sequence[RunSummary]) -> str:
         for group in groups.values()
         if len(group) > 1
     ]
-    return _markdown(header, rows) if rows else ""
+    return aligned(header, rows) if rows else ""
 
 
 def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str]) -> str:
@@ -151,7 +152,7 @@ def _accuracy_table(runs: Sequence[RunSummary]) -> str:
         ]
         for run in runs
     ]
-    return _markdown(header, rows)
+    return aligned(header, rows)
 
 
 def _source_table(runs: Sequence[RunSummary], figure: str, exclude: Sequence[str]) -> str:
@@ -165,7 +166,7 @@ def _source_table(runs: Sequence[RunSummary], figure: str, exclude: Sequence[str
     title = f"all but {', '.join(exclude)}" if exclude else "all"
     rows.append([title, *(_interval(_share_without(run.photographs, exclude, figure)) for run in runs)])
     header = ["source", *(f"{run.arm}, seed {run.config.seed}" for run in runs)]
-    return _markdown(header, [row for row in rows if set(row[1:]) != {"-"}])
+    return aligned(header, [row for row in rows if set(row[1:]) != {"-"}])
 
 
 def _share_without(photographs: dict, exclude: Sequence[str], figure: str) -> dict:
@@ -178,7 +179,7 @@ def _share_without(photographs: dict, exclude: Sequence[str], figure: str) -> di
 def _seconds_table(runs: Sequence[RunSummary]) -> str:
     """Means per epoch; the operators are built once a run. The own share is the attack outside the classifier."""
     header = ["augment", *PHASES, "attack's own share", "attack's share of the epoch", "operators, once"]
-    return _markdown(header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
+    return aligned(header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
 
 
 def _seconds_row(seconds: dict[str, float]) -> list[str]:
@@ -214,18 +215,10 @@ def _card(run: RunSummary, name: str) -> str:
     title = f"# {architecture}, augment={run.arm}"
     note = "Half-precision weights; images are RGB in [0, 1], normalised inside. Score photographs with"
     command = f"`python scripts/evaluate_photos.py run=pretrained/{name} photos=...`."
-    return f"{title}\n\n{note} {command}\n\n{_markdown(['what', 'value'], [list(row) for row in rows])}\n"
+    return f"{title}\n\n{note} {command}\n\n{aligned(['what', 'value'], [list(row) for row in rows])}\n"
 
 
 def _interval(figure: dict | None) -> str:
     if not figure or figure["value"] is None:
         return "-"
     return f"{figure['value']:.3f} [{figure['low']:.3f}, {figure['high']:.3f}]"
-
-
-def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
-    lines = [header, ["-" * width for width in widths], *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
-    )

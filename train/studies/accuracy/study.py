@@ -34,12 +34,13 @@ def run(settings: AccuracySettings) -> list[str]:
 
 def measure(settings: AccuracySettings) -> list[Table]:
     """Every table."""
-    return [
-        Table("Spherical harmonics", list(conditions.harmonics(settings.degree))),
-        Table("Meshes", list(conditions.meshes(settings.subdivisions))),
-        Table("Thin faces", list(conditions.thin_faces(settings.slivers))),
-        Table("Lights", list(conditions.lights(settings.degree))),
-        Table("Number types", list(conditions.number_types())),
-        Table("Pictures and cameras", list(conditions.pictures(settings.size))),
-        Table("Radiance to picture", list(conditions.development())),
-    ]
+    rows = {
+        "Spherical harmonics": conditions.harmonics(settings.degree),
+        "Meshes": conditions.meshes(settings.subdivisions),
+        "Thin faces": conditions.thin_faces(settings.slivers),
+        "Lights": conditions.lights(settings.degree),
+        "Number types": conditions.number_types(),
+        "Pictures and cameras": conditions.pictures(settings.size),
+        "Radiance to picture": conditions.development(),
+    }
+    return [Table(title, list(found)) for title, found in rows.items()]

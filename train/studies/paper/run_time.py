@@ -167,26 +167,17 @@ def classifier_pass(model: nn.Module, images: Tensor, labels: Tensor, batch_size
         torch.autograd.grad(adversarial_cost(model(pictures), label).sum(), pictures)
 
 
-def iteration(
-    setup: str,
-    kind: str,
-    pixels: int,
-    model: nn.Module,
-    images: Tensor,
-    labels: Tensor,
-    attack: Callable,
-    batch_size: int,
-    passes: int,
-    turns: int,
-) -> Iteration:
-    """attack: a descent of so many passes, given a stopwatch. The first turn is a rehearsal."""
+def milliseconds(
+    attack: Callable, model: nn.Module, images: Tensor, labels: Tensor, batch_size: int, passes: int, turns: int
+) -> list[tuple[float, ...]]:
+    """Bare, whole and inside of an `Iteration`. attack: of so many passes, given a stopwatch; the first rehearses."""
     rows = []
     for _ in range(turns + 1):
         watch = Stopwatch()
         whole = seconds(lambda watch=watch: attack(watch))
         bare = seconds(lambda: [classifier_pass(model, images, labels, batch_size) for _ in range(passes)])
         rows.append([1000 * value / passes for value in (bare, whole, watch.seconds)])
-    return Iteration(setup, kind, pixels, *(tuple(column) for column in zip(*rows[1:], strict=True)))
+    return [tuple(column) for column in zip(*rows[1:], strict=True)]
 
 
 def stubborn(
@@ -202,18 +193,13 @@ def stubborn(
     label = torch.full((count, 1), classifier.label(setup.subject.label))
     least_likely = torch.cat([classifier(part).argmin(1, keepdim=True) for part in images.split(BATCH)])
     descent = DescentSettings(passes - 1, shorten=kind == "geometry", batch_size=BATCH)
-    return iteration(
-        setup.name,
-        kind,
-        int(np.mean([len(scene.operator(camera).pixels) for camera in views])),
-        classifier,
-        images,
-        label[:, 0],
-        lambda watch: descend(classifier, problem, Goal(label, least_likely), descent, watch),
-        BATCH,
-        passes,
-        turns,
-    )
+
+    def attack(watch: Stopwatch) -> None:
+        descend(classifier, problem, Goal(label, least_likely), descent, watch)
+
+    pixels = int(np.mean([len(scene.operator(camera).pixels) for camera in views]))
+    found = milliseconds(attack, classifier, images, label[:, 0], BATCH, passes, turns)
+    return Iteration(setup.name, kind, pixels, *found)
 
 
 def training_step(study: Study, settings: RunTimeSettings) -> Iteration:
@@ -237,18 +223,8 @@ def training_step(study: Study, settings: RunTimeSettings) -> Iteration:
         AugmentationService(attack, scene, labels, light, study.seed, watch).regenerate(classifier, 0)
 
     images = scene.render(light.expand(len(scene), -1, -1))
-    return iteration(
-        TRAINING,
-        "lighting",
-        len(scene.pixels),
-        classifier,
-        images,
-        labels,
-        regenerate,
-        len(scene),
-        settings.passes,
-        settings.turns // 2,
-    )
+    found = milliseconds(regenerate, classifier, images, labels, len(scene), settings.passes, settings.turns // 2)
+    return Iteration(TRAINING, "lighting", len(scene.pixels), *found)
 
 
 def many(setup: Setup) -> Setup:

@@ -8,6 +8,7 @@ import torch
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.harmonics import basis
+from train.studies.peers import PeerScene
 
 MAP_ROWS, MAP_COLUMNS = 32, 64  # bilinear texels this wide dim band l by l(l + 1) (π / 31)² / 12: band 2 by 0.5 %
 TO_Z_UP = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]  # its maps have y up and +z in the middle
@@ -21,38 +22,27 @@ class MitsubaPeer:
     transpose, or moves the vertices and rebuilds the ray tracer's tree. Outlines count as fixed.
     """
 
-    name = "Mitsuba 3"
-
-    def __init__(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        albedo: np.ndarray,
-        light: np.ndarray,
-        camera: OrthographicCamera,
-        size: int,
-        samples: int,
-    ):
+    def __init__(self, scene: PeerScene):
         self._mi, self._dr = _mitsuba_on_one_thread()
-        self._positions = vertices.astype(np.float32).ravel()
-        self._light = light.astype(np.float32)
-        self._samples = samples
+        self._positions = scene.vertices.astype(np.float32).ravel()
+        self._light = scene.light.astype(np.float32)
+        self._samples = scene.samples
         numbered = self._mi.Bitmap(np.tile(np.arange(MAP_COLUMNS, dtype=np.float32)[:, None], (MAP_ROWS, 1, 3)))
-        scene = {
+        description = {
             "type": "scene",
             "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1, "hide_emitters": True},
             "light": {"type": "envmap", "bitmap": numbered, "to_world": self._mi.ScalarTransform4f(TO_Z_UP)},
-            "mesh": self._mesh(faces, albedo),
-            "sensor": self._sensor(camera, size),
+            "mesh": self._mesh(scene.faces, scene.albedo),
+            "sensor": self._sensor(scene.camera, scene.size),
         }
-        self._scene = self._mi.load_dict(scene)
+        self._scene = self._mi.load_dict(description)
         self._parameters = self._mi.traverse(self._scene)
         with_seam = np.array(self._parameters["light.data"])[0, :, 0].astype(int)  # its map repeats columns there
         self._basis = _texel_basis()[:, with_seam]
         self._parameters["light.data"] = self._mi.TensorXf(self._basis @ self._light)
         self._parameters.update()
 
-    def picture(self) -> np.ndarray:
+    def image(self) -> np.ndarray:
         return math.pi * np.array(self._render()).transpose(2, 0, 1)
 
     def light_gradient(self, image_gradient: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from torch import Tensor
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.harmonics import bands, lambertian_factors, live_coefficients, select_rows
+from train.studies.peers import PeerScene
 
 DISTANCE = 4.0  # of the camera from the origin: the whole mesh lies before it
 
@@ -20,37 +21,26 @@ DISTANCE = 4.0  # of the camera from the origin: the whole mesh lies before it
 class PyTorch3DPeer:
     """A mesh rasteriser with one face per sample, harmonics on each face's normal, and the mean of a pixel's samples.
 
-    The light's gradient, and `picture`, take the fragments that were rasterised once; that of the vertices rasterises
+    The light's gradient, and `image`, take the fragments that were rasterised once; that of the vertices rasterises
     on each call. The shader runs each time. Outlines count as fixed (its soft rasterisers move them).
     InputError: not installed, or a number of samples that is no square.
     """
 
-    name = "PyTorch3D"
-
-    def __init__(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        albedo: np.ndarray,
-        light: np.ndarray,
-        camera: OrthographicCamera,
-        size: int,
-        samples: int,
-    ):
-        self._side = math.isqrt(samples)
-        if self._side**2 != samples:
-            raise InputError(f"samples={samples} must be a square for PyTorch3D, such as {self._side**2}")
+    def __init__(self, scene: PeerScene):
+        self._side = math.isqrt(scene.samples)
+        if self._side**2 != scene.samples:
+            raise InputError(f"samples={scene.samples} must be a square for PyTorch3D, such as {self._side**2}")
         self._vertices, self._albedo, self._light = (
-            torch.tensor(a, dtype=torch.float32) for a in (vertices, albedo, light)
+            torch.tensor(a, dtype=torch.float32) for a in (scene.vertices, scene.albedo, scene.light)
         )
-        self._faces = torch.tensor(faces, dtype=torch.int64)
+        self._faces = torch.tensor(scene.faces, dtype=torch.int64)
         self._live = live_coefficients(6)
         self._factors = lambertian_factors(6)[bands(6)][self._live].float()
-        self._rasterizer = _rasterizer(camera, size * self._side)
+        self._rasterizer = _rasterizer(scene.camera, scene.size * self._side)
         self._meshes = self._mesh_of(self._vertices)
         self._fragments = self._rasterizer(self._meshes)
 
-    def picture(self) -> np.ndarray:
+    def image(self) -> np.ndarray:
         return self._shade(self._meshes, self._fragments, self._light).numpy()
 
     def light_gradient(self, image_gradient: np.ndarray) -> np.ndarray:

@@ -12,8 +12,9 @@ from torch import Tensor
 from renderer import reference, shading
 from renderer.errors import InputError
 from renderer.transfer import DEGREE, Operator
+from train.studies.peers import PeerScene
 from train.studies.renderer_speed.errors import Exact
-from train.studies.renderer_speed.panels import SAMPLES, Bench, Entries
+from train.studies.renderer_speed.panels import SAMPLES, Bench, Entries, row_of
 from train.studies.renderer_speed.results import Row
 from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View, coefficients
 from train.studies.renderer_speed.steps import shade_by_face, vertex_step
@@ -39,7 +40,7 @@ def installed_peers() -> tuple[dict[str, Callable], list[str]]:
     for name, make in {MITSUBA: MitsubaPeer, PYTORCH3D: PyTorch3DPeer}.items():
         triangle = np.eye(3), np.array([[0, 1, 2]])
         try:
-            make(*triangle, np.array(ALBEDO), np.zeros((49, 3)), CAMERA, 4, SAMPLES_OF[name])
+            make(PeerScene(*triangle, np.array(ALBEDO), np.zeros((49, 3)), CAMERA, 4, SAMPLES_OF[name]))
         except InputError as error:
             absent.append(f"{name} was not timed: {error}.")
         else:
@@ -53,13 +54,13 @@ def by_light(bench: Bench, size: int, peers: Peers) -> list[Row]:
     def entries() -> Entries:
         view, light = bench.view(bench.plan.mesh, size), bench.light()
         operator, exact = view.operator(SAMPLES), Exact(view, _irradiance)
-        row = _row(f"gradient by the light, {size}²", view, samples=SAMPLES**2, **exact.light_errors(operator, light))
+        row = row_of(view, f"gradient by the light, {size}²", "", SAMPLES, **exact.light_errors(operator, light))
         for name, call in _light_gradients(view, operator, light).items():
             yield replace(row, setting=name), call
         for name, peer in _set_up(view, peers):
             call = partial(peer.light_gradient, view.image_gradient.cpu().float().numpy())
             errors = exact.errors(
-                torch.from_numpy(peer.picture()), torch.from_numpy(call()), exact.by_light[: len(light)]
+                torch.from_numpy(peer.image()), torch.from_numpy(call()), exact.by_light[: len(light)]
             )
             yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
 
@@ -90,7 +91,7 @@ def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
     def entries() -> Entries:
         view, light = bench.view(bench.plan.mesh, size), bench.light()
         exact = Exact(view, _irradiance)
-        row = _row(f"gradient by the vertices, {size}²", view)
+        row = row_of(view, f"gradient by the vertices, {size}²", "", 1)
         for samples, name in (*product((1, COARSER), SHADINGS), (FINER, ANALYTIC)):
             shade = SHADINGS[name]
             found = replace(row, samples=samples**2, **exact.vertex_errors(view, samples, light, shade))
@@ -99,7 +100,7 @@ def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
             yield replace(found, setting=rasterised(name, samples)), vertex_step(view, samples, light, shade=shade)
         for name, peer in _set_up(view, peers):
             call = partial(peer.vertex_gradient, view.image_gradient.cpu().float().numpy())
-            errors = exact.errors(torch.from_numpy(peer.picture()), torch.from_numpy(call()), exact.by_vertices)
+            errors = exact.errors(torch.from_numpy(peer.image()), torch.from_numpy(call()), exact.by_vertices)
             yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
 
     return bench.timed(entries())
@@ -118,9 +119,5 @@ def _irradiance(normals: Tensor) -> Tensor:
 def _set_up(view: View, peers: Peers) -> Iterator[tuple[str, object]]:
     light = coefficients(DEGREE).float().numpy()
     for name, make in peers.items():
-        mesh = view.mesh
-        yield name, make(mesh.vertices, mesh.faces, np.array(ALBEDO), light, CAMERA, view.size, SAMPLES_OF[name])
-
-
-def _row(panel: str, view: View, **found) -> Row:
-    return Row(panel=panel, setting="", degree=DEGREE, dtype="float32", **view.axes(), **found)
+        mesh, samples = view.mesh, SAMPLES_OF[name]
+        yield name, make(PeerScene(mesh.vertices, mesh.faces, np.array(ALBEDO), light, CAMERA, view.size, samples))

@@ -83,6 +83,12 @@ class Bench:
         return [replace(row, time_ms=times[index]) for index, row in enumerate(rows)]
 
 
+def row_of(view: View, panel: str, setting: str, samples: int, **found) -> Row:
+    """Of a view with so many samples per side of a pixel, in float32 and at the default degree unless found says so."""
+    axes = {"degree": DEGREE, "dtype": "float32", "size": view.size, "vertices": len(view.mesh.vertices)}
+    return Row(panel=panel, setting=setting, samples=samples**2, **axes | found)
+
+
 def light_steps(bench: Bench, size: int) -> list[Row]:
     """A step of an attack on the light, by degree, dtype and layout of the operator."""
 
@@ -95,18 +101,11 @@ def light_steps(bench: Bench, size: int) -> list[Row]:
                 light = bench.light(degree, torch.promote_types(dtype, torch.float32))
                 for layout in LAYOUTS:
                     operator = laid_out(wide, layout, dtype)
-                    row = Row(
-                        panel=f"light step, {size}²",
-                        setting=f"degree {degree}, {_name(dtype)}, {layout}",
-                        default=(degree, dtype, layout) == (DEGREE, DTYPES[0], LAYOUTS[0]),
-                        degree=degree,
-                        samples=SAMPLES**2,
-                        dtype=_name(dtype),
-                        layout=layout,
-                        batch=1,
-                        **view.axes(),
-                        **exact.light_errors(operator, light),
-                    )
+                    setting = f"degree {degree}, {_name(dtype)}, {layout}"
+                    chosen = (degree, dtype, layout) == (DEGREE, DTYPES[0], LAYOUTS[0])
+                    axes = {"degree": degree, "dtype": _name(dtype), "layout": layout, "batch": 1}
+                    errors = exact.light_errors(operator, light)
+                    row = row_of(view, f"light step, {size}²", setting, SAMPLES, default=chosen, **axes, **errors)
                     yield row, light_step(view, operator, light)
 
     return bench.timed(entries(), share=3)
@@ -117,22 +116,16 @@ def builds(bench: Bench) -> list[Row]:
 
     def entries() -> Entries:
         view = bench.view(bench.plan.mesh, bench.plan.small)
-        exact = Exact(view)
+        exact, panel = Exact(view), f"building an operator, {view.size}²"
         for backend in bench.backends:
             drawn = replace(view, backend=backend)
             for samples in bench.plan.samples:
                 for degree in bench.plan.degrees:
-                    row = Row(
-                        panel=f"building an operator, {view.size}²",
-                        setting=f"{samples}² samples, degree {degree}, {backend.name}",
-                        default=(backend, samples, degree) == (bench.backends[0], SAMPLES, DEGREE),
-                        degree=degree,
-                        samples=samples**2,
-                        dtype=_name(DTYPES[0]),
-                        layout=LAYOUTS[0],
-                        **drawn.axes(rasterised=True),
-                        **exact.light_errors(drawn.operator(samples, degree), bench.light(degree)),
-                    )
+                    setting = f"{samples}² samples, degree {degree}, {backend.name}"
+                    chosen = (backend, samples, degree) == (bench.backends[0], SAMPLES, DEGREE)
+                    axes = {"degree": degree, "layout": LAYOUTS[0], "rasteriser": backend.name}
+                    errors = exact.light_errors(drawn.operator(samples, degree), bench.light(degree))
+                    row = row_of(view, panel, setting, samples, default=chosen, **axes, **errors)
                     yield row, partial(drawn.operator, samples, degree)
 
     return bench.timed(entries())
@@ -143,24 +136,18 @@ def vertex_steps(bench: Bench) -> list[Row]:
 
     def entries() -> Entries:
         view = bench.view(bench.plan.mesh, bench.plan.small)
-        exact = Exact(view)
+        exact, panel = Exact(view), f"vertex step, {view.size}²"
         for backend in bench.backends:
             drawn = replace(view, backend=backend)
             for samples in bench.plan.samples:
                 for degree in bench.plan.degrees[:4]:
                     for dtype in (torch.float32, torch.float64):
                         choice, light = (backend, samples, degree, dtype), bench.light(degree, dtype)
-                        row = Row(
-                            panel=f"vertex step, {view.size}²",
-                            setting=f"{samples}² samples, degree {degree}, {_name(dtype)}, {backend.name}",
-                            default=choice == (bench.backends[0], SAMPLES, DEGREE, DTYPES[0]),
-                            degree=degree,
-                            samples=samples**2,
-                            dtype=_name(dtype),
-                            refresh=1,
-                            **drawn.axes(rasterised=True),
-                            **exact.vertex_errors(drawn, samples, light),
-                        )
+                        setting = f"{samples}² samples, degree {degree}, {_name(dtype)}, {backend.name}"
+                        chosen = choice == (bench.backends[0], SAMPLES, DEGREE, DTYPES[0])
+                        axes = {"degree": degree, "dtype": _name(dtype), "refresh": 1, "rasteriser": backend.name}
+                        errors = exact.vertex_errors(drawn, samples, light)
+                        row = row_of(view, panel, setting, samples, default=chosen, **axes, **errors)
                         yield row, vertex_step(drawn, samples, light)
 
     return bench.timed(entries(), share=1 / 3)
@@ -179,17 +166,10 @@ def refreshes(bench: Bench) -> list[Row]:
     def entries() -> Entries:
         for every in bench.plan.refreshes:
             cost, picture = bend(view, SAMPLES, light, target, steps, every)
-            row = Row(
-                panel=f"vertex descent, {view.size}²",
-                setting=f"refreshed every {every} steps" if every > 1 else "refreshed in every step",
-                image_error=relative_error(picture, exact),
-                degree=DEGREE,
-                samples=SAMPLES**2,
-                dtype=_name(light.dtype),
-                refresh=every,
-                cost=cost / start,
-                **view.axes(rasterised=True),
-            )
+            setting = f"refreshed every {every} steps" if every > 1 else "refreshed in every step"
+            found = {"image_error": relative_error(picture, exact), "cost": cost / start}
+            axes = {"refresh": every, "rasteriser": view.backend.name}
+            row = row_of(view, f"vertex descent, {view.size}²", setting, SAMPLES, **axes, **found)
             yield row, partial(bend, view, SAMPLES, light, target, steps, every)
 
     return [replace(row, time_ms=row.time_ms / steps) for row in bench.timed(entries(), share=1 / 5)]
@@ -203,17 +183,8 @@ def batches(bench: Bench) -> list[Row]:
         operator = view.operator(SAMPLES)
         errors = Exact(view).light_errors(operator, light)
         for count in bench.plan.batches:
-            row = Row(
-                panel=f"light step by lights, {view.size}²",
-                setting=f"{count:,} lights" if count > 1 else "1 light",
-                degree=DEGREE,
-                samples=SAMPLES**2,
-                dtype=_name(light.dtype),
-                layout=LAYOUTS[0],
-                batch=count,
-                **view.axes(),
-                **errors,
-            )
+            setting, axes = f"{count:,} lights" if count > 1 else "1 light", {"layout": LAYOUTS[0], "batch": count}
+            row = row_of(view, f"light step by lights, {view.size}²", setting, SAMPLES, **axes, **errors)
             yield row, light_step(view, operator, light.expand(count, -1, -1))
 
     return [replace(row, time_ms=row.time_ms / row.batch) for row in bench.timed(entries())]
@@ -233,16 +204,7 @@ def workloads(bench: Bench, axis: str) -> list[Row]:
 def _works(bench: Bench, view: View, panel: str) -> Entries:
     samples, light = bench.plan.workload_samples, bench.light()
     exact, operator = Exact(view), view.operator(samples)
-    of_light = Row(
-        panel=panel,
-        setting="light step",
-        degree=DEGREE,
-        samples=samples**2,
-        dtype=_name(light.dtype),
-        batch=1,
-        **view.axes(),
-        **exact.light_errors(operator, light),
-    )
+    of_light = row_of(view, panel, "light step", samples, batch=1, **exact.light_errors(operator, light))
     yield of_light, light_step(view, operator, light)
     yield replace(of_light, setting="operator", rasteriser=view.backend.name), partial(view.operator, samples)
     of_vertices = replace(of_light, samples=1, **exact.vertex_errors(view, 1, light))

@@ -100,11 +100,6 @@ class View:
         empty = values.new_full((3, self.size**2), elsewhere)
         return empty.index_copy(1, pixels, values).unflatten(1, (self.size, self.size))
 
-    def axes(self, rasterised: bool = False) -> dict[str, int | str]:
-        """As fields of a `Row`, with the rasteriser where it is part of what is timed."""
-        axes = {"size": self.size, "vertices": len(self.mesh.vertices)}
-        return axes | {"rasteriser": self.backend.name} if rasterised else axes
-
     @cached_property
     def image_gradient(self) -> Tensor:
         return image_gradient(self.size).to(self.device)

@@ -206,5 +206,5 @@ def test_the_gallery_has_a_small_picture_and_a_row_for_each_case(tmp_path, monke
 
 
 def test_a_gallery_of_one_mesh_is_refused(tmp_path, reproduce):
-    with pytest.raises(InputError, match="scene.meshes of section=gallery has two"):
+    with pytest.raises(InputError, match="section=gallery has two"):
         reproduce(bright(), "section=gallery", "scene.meshes=[a.ply]", "section.targets=[candle]", f"out={tmp_path}")
