@@ -20,7 +20,7 @@ from train.recipe import TrainSettings
 from train.settings import ExperimentSettings, read_settings
 from train.studies.training_speed import peak
 from train.studies.training_speed.baseline import Baseline, build_loader, use_plain_dropout
-from train.studies.training_speed.contest import BenchmarkSettings, compete, measure
+from train.studies.training_speed.contest import BenchmarkSettings, compete, measure, take_turns
 from train.studies.training_speed.findings import (
     ADVERSARIAL,
     BASELINE,
@@ -33,7 +33,6 @@ from train.studies.training_speed.findings import (
 )
 from train.studies.training_speed.page import page
 from train.studies.training_speed.study import run as write_page
-from train.studies.training_speed.turns import take_turns
 from train.wideresnet import WideResNet
 
 ROOT = Path(__file__).parents[3]

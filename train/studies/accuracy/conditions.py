@@ -11,6 +11,7 @@ from renderer.camera import OrthographicCamera
 from renderer.image import PictureSettings
 from renderer.lights import ambient
 from renderer.mesh import Mesh, normalise
+from train.studies.accuracy import shapes
 from train.studies.accuracy.measure import (
     CAMERA,
     Errors,
@@ -25,17 +26,6 @@ from train.studies.accuracy.measure import (
     worst,
 )
 from train.studies.accuracy.reference import exact, unit_normals
-from train.studies.accuracy.shapes import (
-    TRIANGLE,
-    Chart,
-    box,
-    non_manifold,
-    opened,
-    painted,
-    slivers,
-    sphere,
-    with_faces_without_area,
-)
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 TOWARDS = CAMERA.axes()[2]
@@ -92,7 +82,7 @@ def harmonics(degree: int) -> Iterator[Row]:
 
 
 def meshes(subdivisions: int) -> Iterator[Row]:
-    ball = sphere()
+    ball = shapes.sphere()
     yield Row("a dented sphere of 320 faces, radius 1", by_both(Setup(ball, light())), "for comparison")
     scales = [10.0**power for power in (-6, -3, 3, 6)]
     yield Row(
@@ -120,7 +110,7 @@ def meshes(subdivisions: int) -> Iterator[Row]:
     )
     yield Row(
         "three faces without area beside each",
-        by_both(Setup(with_faces_without_area(ball), light())),
+        by_both(Setup(shapes.with_faces_without_area(ball), light())),
         "never drawn, gradient 0",
     )
     yield Row(
@@ -128,18 +118,18 @@ def meshes(subdivisions: int) -> Iterator[Row]:
         by_geometry(Setup(ball, light(), vertices=merged(ball))),
         "a normal of zero, gradient 0",
     )
-    twice = painted(ball.vertices, np.concatenate([ball.faces, ball.faces[:, ::-1]]))
+    twice = shapes.painted(ball.vertices, np.concatenate([ball.faces, ball.faces[:, ::-1]]))
     yield Row("every face twice", by_both(Setup(twice, light())), "depths tie: the lower index is seen")
-    inside_out = painted(ball.vertices, ball.faces[:, ::-1])
+    inside_out = shapes.painted(ball.vertices, ball.faces[:, ::-1])
     yield Row("inverted winding", by_both(Setup(inside_out, light())), "shaded on the side that is seen")
-    yield Row("open, its inside seen", by_both(Setup(opened(ball), light())), "shaded on the side that is seen")
+    yield Row("open, its inside seen", by_both(Setup(shapes.opened(ball), light())), "shaded on the side that is seen")
     yield Row(
         "not manifold: three faces on an edge, two solids in a point",
-        by_both(Setup(non_manifold(), light())),
+        by_both(Setup(shapes.non_manifold(), light())),
         "each face by itself",
     )
-    yield Row("a single triangle", by_both(Setup(TRIANGLE, light())), "each face by itself")
-    many, settings = sphere(subdivisions), PictureSettings(size=256, samples=1)
+    yield Row("a single triangle", by_both(Setup(shapes.TRIANGLE, light())), "each face by itself")
+    many, settings = shapes.sphere(subdivisions), PictureSettings(size=256, samples=1)
     yield Row(
         f"{len(many.faces):,} faces, thin ones, at 256²", by_both(Setup(many, light(), settings=settings)), SUMMED
     )
@@ -161,7 +151,7 @@ def of_nothing(mesh: Mesh) -> Errors:
 
 def placed(vertices: np.ndarray, dtype: torch.dtype = torch.float64) -> Setup:
     """The sphere with other vertices, rounded to a dtype: normalised where it is seen, as it is where it is shaded."""
-    mesh = rounded(replace(sphere(), vertices=vertices), dtype)
+    mesh = rounded(replace(shapes.sphere(), vertices=vertices), dtype)
     return Setup(normalise(mesh), light(), vertices=mesh.vertices, dtype=dtype)
 
 
@@ -176,14 +166,14 @@ def merged(mesh: Mesh) -> np.ndarray:
 def thin_faces(count: int) -> Iterator[Row]:
     def measured(mesh: Mesh, dtype: torch.dtype) -> Errors:
         settings = PictureSettings(size=ceil(sqrt(len(mesh.faces))), samples=1)
-        return by_both(Setup(mesh, light(), settings=settings, backend=Chart(), lift=exact, dtype=dtype))
+        return by_both(Setup(mesh, light(), settings=settings, backend=shapes.Chart(), lift=exact, dtype=dtype))
 
     for power in (2, 4, 6, 8, 10, 12):
-        thin = slivers(10.0**-power, count, TOWARDS)
+        thin = shapes.slivers(10.0**-power, count, TOWARDS)
         does = "rounding errors of differences and products are added back"
         yield Row(f"height / edge = {ten_to(-power)}", measured(thin, torch.float64), does)
     for power in (4, 6, 12):
-        thin = rounded(slivers(10.0**-power, count, TOWARDS), torch.float32)
+        thin = rounded(shapes.slivers(10.0**-power, count, TOWARDS), torch.float32)
         does = f"the same; in float32 normals would be off by {in_float32_arithmetic(thin):.1g}"
         yield Row(f"height / edge = {ten_to(-power)}, rounded to float32", measured(thin, torch.float32), does)
 
@@ -196,7 +186,7 @@ def in_float32_arithmetic(mesh: Mesh) -> float:
 
 
 def lights(degree: int) -> Iterator[Row]:
-    ball = rounded(sphere(), torch.float32)
+    ball = rounded(shapes.sphere(), torch.float32)
     negative = "radiance is negative; `develop` clamps"
     kinds = [(f"coefficients of {ten_to(n)}", light() * 10.0**n, "linear in the light") for n in (-8, -4, 4, 8, 11)] + [
         ("all coefficients negative", -light().abs(), negative),
@@ -206,7 +196,7 @@ def lights(degree: int) -> Iterator[Row]:
     for condition, coefficients, does in kinds:
         yield Row(condition, by_both(Setup(ball, coefficients, dtype=torch.float32)), does)
     for name in ("float64", "float32"):
-        mesh = rounded(box(), DTYPES[name])
+        mesh = rounded(shapes.box(), DTYPES[name])
         yield Row(
             f"lights of degree 0 to {degree} on a box, geometry in {name}",
             worst(by_both(Setup(mesh, light(l), dtype=DTYPES[name], lift=exact)) for l in range(degree + 1)),
@@ -216,14 +206,14 @@ def lights(degree: int) -> Iterator[Row]:
 
 def number_types() -> Iterator[Row]:
     for name, dtype in DTYPES.items():
-        setup = Setup(rounded(sphere(), dtype), light(), dtype=dtype)
+        setup = Setup(rounded(shapes.sphere(), dtype), light(), dtype=dtype)
         half = torch.finfo(dtype).bits == 16
         does = "operators in this type; normals in float64, harmonics in " + ("float32" if half else "this type")
         yield Row(name, by_operator(setup, dtype) | by_geometry(setup), does)
 
 
 def pictures(size: int) -> Iterator[Row]:
-    ball = sphere()
+    ball = shapes.sphere()
     for samples in (1, 16):
         settings = PictureSettings(size=1, samples=samples)
         yield Row(
@@ -245,7 +235,7 @@ def pictures(size: int) -> Iterator[Row]:
     yield Row("a mesh outside the frame", of_nothing(aside), "an empty picture: P = 0, gradients of 0")
     behind = replace(ball, vertices=ball.vertices + 10 * TOWARDS)
     yield Row("a mesh behind the camera", of_nothing(behind), "an empty picture")
-    edge_on = painted([-0.5 * TOWARDS, 0.5 * TOWARDS, 0.5 * CAMERA.axes()[1]], [[0, 1, 2]])
+    edge_on = shapes.painted([-0.5 * TOWARDS, 0.5 * TOWARDS, 0.5 * CAMERA.axes()[1]], [[0, 1, 2]])
     yield Row("a triangle seen edge on", of_nothing(edge_on), "an empty picture")
 
 

@@ -22,6 +22,16 @@ PART = 10  # random examples held at once
 LEAST_SHARE = 0.02  # recognised; below it the search for examples is given up
 
 
+class Unreachable(Goal):
+    """An error is wanted, and is never enough: the descent takes all of its steps."""
+
+    def of(self, examples: Tensor) -> "Unreachable":
+        return Unreachable(self.decrease[examples])
+
+    def reached(self, predicted: Tensor) -> Tensor:
+        return torch.zeros(len(predicted), dtype=torch.bool)
+
+
 @dataclass(frozen=True)
 class Attack:
     """What changes, by which steps, and for how long."""
@@ -33,6 +43,18 @@ class Attack:
     def problem(self, scene: MeshScene) -> Perturbation:
         return Perturbation(scene, [self.kind(scene, self.step)])
 
+    def adversaries(self, problem: Problem, classifier: Classifier, label: str, views: int) -> tuple[Tensor, Tensor]:
+        """(E, D) values where the descent first fools or ends, and (E, D) those `FURTHER` steps later.
+
+        views: of each example.
+        """
+        goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))
+        first = descend(classifier, problem, goal, self.descent, Phases())
+        onwards = Part(problem, torch.arange(len(first.values)), first.values)
+        longer = replace(self.descent, max_steps=FURTHER)
+        last = descend(classifier, onwards, Unreachable(goal.decrease), longer, Phases())
+        return first.values, last.values
+
 
 LIGHT = StepSettings("linf", None, "unit", 0.05)
 SHAPE = StepSettings("linf", 0.002, "sign", 0.0005)
@@ -40,31 +62,6 @@ ATTACKS = {
     "lighting": Attack(Lighting, LIGHT, DescentSettings(STEPS)),
     "geometry": Attack(Geometry, SHAPE, DescentSettings(STEPS, shorten=True)),
 }
-
-
-class Unreachable(Goal):
-    """An error is wanted, and is never enough: the descent takes all of its steps."""
-
-    def of(self, examples: Tensor) -> "Unreachable":
-        return Unreachable(self.decrease[examples])
-
-    def reached(self, predicted: Tensor) -> Tensor:
-        return torch.zeros(len(predicted), dtype=torch.bool)
-
-
-def adversaries(
-    attack: Attack, problem: Problem, classifier: Classifier, label: str, views: int
-) -> tuple[Tensor, Tensor]:
-    """(E, D) values where the descent first fools or ends, and (E, D) those `FURTHER` steps later.
-
-    views: of each example.
-    """
-    goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))
-    first = descend(classifier, problem, goal, attack.descent, Phases())
-    onwards = Part(problem, torch.arange(len(first.values)), first.values)
-    longer = replace(attack.descent, max_steps=FURTHER)
-    last = descend(classifier, onwards, Unreachable(goal.decrease), longer, Phases())
-    return first.values, last.values
 
 
 def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> Tensor:

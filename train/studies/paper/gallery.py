@@ -249,4 +249,4 @@ def measure(study: Study, settings: GallerySettings) -> Section:
         finding=finding(numbers),
         pictures="\n\n".join(pictures),
     )
-    return Section("A gallery of attacks", text, numbers, figures)
+    return Section(text, numbers, figures)

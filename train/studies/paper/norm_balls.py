@@ -333,4 +333,4 @@ def measure(study: Study, settings: NormBallSettings) -> Section:
         "norm_balls.png": partial(draw_success, together, settings.steps),
         "norm_balls.spaces.png": partial(draw_examples, pooled, study.classifier, study.label),
     }
-    return Section("Adversarial against random perturbations", text, records + together, figures)
+    return Section(text, records + together, figures)

@@ -192,4 +192,4 @@ def measure(study: Study, settings: QualitySettings) -> Section:
         meshes=study.meshes,
         light=study.light,
     )
-    return Section("Rendering quality", text, histograms(everything), {"rendering_quality.png": partial(draw, found)})
+    return Section(text, histograms(everything), {"rendering_quality.png": partial(draw, found)})

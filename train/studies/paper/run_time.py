@@ -356,4 +356,4 @@ def measure(study: Study, settings: RunTimeSettings) -> Section:
         finding=finding(done),
     )
     records = [asdict(each) for each in (*by_pixels, *plain, *at_once, training, *done)]
-    return Section("Run time", text, records, {"run_time.png": partial(draw, by_pixels)})
+    return Section(text, records, {"run_time.png": partial(draw, by_pixels)})

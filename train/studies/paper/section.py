@@ -1,7 +1,7 @@
 """What every section of docs/paper.md is measured with, and what it is."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -43,7 +43,6 @@ class Study:
 class Section:
     """text: Markdown. records: what was measured, a line each. figures: by file name, what draws each."""
 
-    title: str
     text: str
     records: Iterable[Mapping]
-    figures: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[Path], None]]

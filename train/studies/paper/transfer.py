@@ -13,15 +13,7 @@ from augment.classifiers import Classifier
 from augment.seeding import generator
 from train.run_classifier import load_classifier
 from train.studies.figures import pyplot, save
-from train.studies.paper.adversaries import (
-    ATTACKS,
-    FURTHER,
-    STEPS,
-    adversaries,
-    answers,
-    recognised_parts,
-    with_random_signs,
-)
+from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, recognised_parts, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
 from train.studies.paper.subjects import Subject, finer, scene_of
@@ -127,7 +119,7 @@ def _attacked(
 ) -> tuple[list[dict], list[Seen]]:
     """Attack the first network in the examples (A,) of its problem, and show what comes of it to all."""
     start = problems[0].start[kept]
-    first, further = adversaries(ATTACKS[kind], Part(problems[0], kept, start), seen_by[0], subject.label, views=1)
+    first, further = ATTACKS[kind].adversaries(Part(problems[0], kept, start), seen_by[0], subject.label, views=1)
     states = (start, first, with_random_signs(first, start, draws), further, with_random_signs(further, start, draws))
     records = [
         {
@@ -248,4 +240,4 @@ def measure(study: Study, settings: TransferSettings) -> Section:
     )
     pictures = [each for views in seen.values() for each in views]
     figures = {"transfer.png": partial(draw, pictures, study.label)}
-    return Section("Transfer to unseen networks", text, records, figures)
+    return Section(text, records, figures)

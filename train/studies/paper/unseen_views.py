@@ -17,15 +17,7 @@ from augment.perturbation import Perturbation
 from augment.seeding import generator, stream_seed
 from train.photographs.shares import share
 from train.studies.figures import panels_beside, save
-from train.studies.paper.adversaries import (
-    ATTACKS,
-    FURTHER,
-    STEPS,
-    adversaries,
-    answers,
-    recognised_parts,
-    with_random_signs,
-)
+from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, recognised_parts, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import draw_shares, percent
 from train.studies.paper.subjects import Subject, finer, recognised_scene
@@ -115,7 +107,7 @@ def attack_views(
 ) -> dict[str, Tensor]:
     """What one attack on all of a scene's examples, of one view each, ends with: (1, D) for each of STATES."""
     together = Together(ATTACKS[kind].problem(scene))
-    first, further = adversaries(ATTACKS[kind], together, classifier, label, views=len(scene))
+    first, further = ATTACKS[kind].adversaries(together, classifier, label, views=len(scene))
     random = with_random_signs(further, together.start, draws)
     return dict(zip(STATES, (first, further, random), strict=True))
 
@@ -267,4 +259,4 @@ def measure(study: Study, settings: UnseenViewSettings) -> Section:
         steps=STEPS,
         light=study.light,
     )
-    return Section("Unseen views", text, records, {"unseen_views.png": partial(draw, records, study.label)})
+    return Section(text, records, {"unseen_views.png": partial(draw, records, study.label)})

@@ -4,18 +4,7 @@ from collections.abc import Sequence
 
 from renderer.cache import OperatorCache
 from renderer.mesh import Mesh
-from train.studies.renderer_speed.comparison import (
-    ANALYTIC,
-    BY_FACE,
-    BY_SAMPLE,
-    COARSER,
-    DIRECT,
-    KEPT,
-    MITSUBA,
-    PYTORCH3D,
-    REFRESHED,
-    rasterised,
-)
+from train.studies.renderer_speed import comparison
 from train.studies.renderer_speed.panels import SAMPLES, Bench
 from train.studies.renderer_speed.results import Row
 from train.studies.renderer_speed.skipping import build_operators
@@ -30,13 +19,15 @@ def compared(panels: Sequence[Sequence[Row]]) -> list[Target]:
     """Of the panels of `comparison`: light at the small size, light at the large one, vertices at the large one."""
     small, large, vertices = ({row.setting: row for row in rows} for rows in panels)
     return [
-        *(_faster(rows, DIRECT, PYTORCH3D, least) for rows, least in ((large, 10), (small, 30))),
-        *(_faster(rows, DIRECT, MITSUBA, least) for rows, least in ((large, 300), (small, 400))),
-        _faster(vertices, rasterised(ANALYTIC, 1), MITSUBA, 30),
+        *(_faster(rows, comparison.DIRECT, comparison.PYTORCH3D, least) for rows, least in ((large, 10), (small, 30))),
+        *(_faster(rows, comparison.DIRECT, comparison.MITSUBA, least) for rows, least in ((large, 300), (small, 400))),
+        _faster(vertices, comparison.rasterised(comparison.ANALYTIC, 1), comparison.MITSUBA, 30),
         *(
-            _faster(vertices, rasterised(ANALYTIC, samples), rasterised(peer, samples), 3)
-            for peer in (BY_SAMPLE, BY_FACE)
-            for samples in (COARSER, 1)
+            _faster(
+                vertices, comparison.rasterised(comparison.ANALYTIC, samples), comparison.rasterised(peer, samples), 3
+            )
+            for peer in (comparison.BY_SAMPLE, comparison.BY_FACE)
+            for samples in (comparison.COARSER, 1)
         ),
     ]
 
@@ -48,7 +39,7 @@ def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Targe
     if other is None:
         return _unmeasured(own, what, asked, theirs)
     ratio, found = other.time_ms / own.time_ms, f"{shown(other.time_ms / own.time_ms)}×"
-    if theirs not in (MITSUBA, PYTORCH3D):
+    if theirs not in (comparison.MITSUBA, comparison.PYTORCH3D):
         return Target(what, asked, found, ratio >= least)
     accurate = own.image_error <= other.image_error and own.gradient_error <= other.gradient_error
     errors = f"errors of picture and gradient {_errors(own)} against {_errors(other)}"
@@ -56,7 +47,7 @@ def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Targe
 
 
 def _unmeasured(own: Row, what: str, asked: str, theirs: str) -> Target:
-    if theirs != PYTORCH3D or own.size not in QUOTED:
+    if theirs != comparison.PYTORCH3D or own.size not in QUOTED:
         return Target(what, asked, "not measured", None)
     quoted = QUOTED[own.size]
     found = f"not measured here; {shown(quoted / own.time_ms)}× against {quoted} ms on another machine"
@@ -89,12 +80,12 @@ def _geometry(bench: Bench) -> list[Target]:
     view, light = bench.view(bench.plan.mesh, bench.plan.large), bench.light()
     steps = {
         "light": light_step(view, view.operator(1), light),
-        KEPT: vertex_step(view, 1, light, kept=True),
-        REFRESHED: vertex_step(view, 1, light),
+        comparison.KEPT: vertex_step(view, 1, light, kept=True),
+        comparison.REFRESHED: vertex_step(view, 1, light),
     }
     times = bench.clock.medians(steps, 3 * bench.clock.rounds)
     targets = []
-    for visibility, most in ((KEPT, 8), (REFRESHED, 14)):
+    for visibility, most in ((comparison.KEPT, 8), (comparison.REFRESHED, 14)):
         ratio = times[visibility] / times["light"]
         found = f"{shown(ratio)}×, {shown(times[visibility])} ms against {shown(times['light'])} ms"
         what = f"vertex step against light step, {view.size}², {visibility}"

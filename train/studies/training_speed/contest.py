@@ -16,9 +16,8 @@ from train.precision import choose_precision
 from train.settings import ExperimentSettings, read_settings
 from train.studies.training_speed.arm import Arm
 from train.studies.training_speed.baseline import Baseline, build_loader
-from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, PRODUCTS, Findings, Workload
+from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, PRODUCTS, Findings, Turn, Workload
 from train.studies.training_speed.peak import Products, forward_multiply_adds
-from train.studies.training_speed.turns import Contestant, Turn, take_turns
 from train.wideresnet import WideResNet
 
 PICTURES, CLASSES, SIZE = 50_000, 100, 32  # CIFAR-100's
@@ -26,6 +25,8 @@ EPOCHS = {"cpu": 9, "cuda": 10}
 STEPS = {"cpu": 4, "cuda": 0}
 FEWER = 3
 MOST_WORKERS = 8
+
+Contestant = Callable[[], Turn]
 
 
 @dataclass
@@ -97,6 +98,17 @@ def compete(makers: Mapping[str, Callable[[], Contestant]], rounds: int, device:
     for name, make in makers.items():
         torch.compiler.reset()
         turns |= take_turns({name: make}, rounds)
+    return turns
+
+
+def take_turns(makers: Mapping[str, Callable[[], Contestant]], rounds: int) -> dict[str, list[Turn]]:
+    """What each contestant's turns returned: a first one, which warms up, and one per round; all take turns."""
+    contestants = {name: make() for name, make in makers.items()}
+    turns = {name: [] for name in makers}
+    for past in range(rounds + 1):
+        print(f"{', '.join(makers)}: {f'round {past} of {rounds}' if past else 'warming up'}", flush=True)
+        for name, contestant in contestants.items():
+            turns[name].append(contestant())
     return turns
 
 

@@ -1,6 +1,6 @@
 """What a run found out, from the seconds that turns took; and the targets."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import median
@@ -10,12 +10,13 @@ from train.epoch import PHASES
 from train.studies.targets import Target
 from train.studies.training_speed.arm import EPOCH
 from train.studies.training_speed.peak import TRAINING
-from train.studies.training_speed.turns import Turn
 from train.tables import shown
 
 PLAIN, ADVERSARIAL, BASELINE, PRODUCTS = "augment=none", "augment=adversarial", "baseline", "matrix products"
 REST = "everything else"
 RUN = 150  # epochs, of the paper
+
+Turn = Mapping[Hashable, float]  # what one took, by phase
 
 
 @dataclass(frozen=True)

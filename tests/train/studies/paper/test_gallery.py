@@ -30,6 +30,7 @@ from train.studies.paper.rendering_quality import (
 )
 from train.studies.paper.run_time import Attack, RunTimeSettings, Setup, Stopwatch
 from train.studies.paper.section import Study
+from train.studies.paper.study import with_section
 from train.studies.paper.subjects import GREYS, Subject, scene_of
 
 SIZE = 24
@@ -132,6 +133,15 @@ def test_paragraphs_and_lists_are_wrapped_and_tables_headings_and_code_are_not()
     assert [line[:2] for line in items.split("\n")] == ["- ", "  ", "  ", "- "] and items.endswith("- one item")
 
 
+def test_a_section_takes_the_place_of_its_title_in_the_order_of_the_page():
+    page = ""
+    for title in ("Run time", "Unseen views", "Run time"):
+        page = with_section(page, title, f"{title}\n\n### Part\n\nnumber {len(page)}\n")
+    parts = [block.splitlines() for block in page.split("\n## ")]
+    assert [part[0] for part in parts] == ["# The paper's tables and figures", "Unseen views", "Run time"]
+    assert page.count("number") == 2 and "number 0" not in page and page.endswith("\n") and "\n\n\n" not in page
+
+
 # ---------------------------------------------------------------------------------------- run time
 
 
@@ -193,7 +203,7 @@ def test_the_gallery_has_a_small_picture_and_a_row_for_each_case(tmp_path, monke
     settings = ["section.targets=[candle,joystick]", "section.steps=2", f"out={tmp_path}/docs"]
     reproduce(bright(), "section=gallery", meshes, *settings)
     folder = tmp_path / "docs" / "paper"
-    text, lines = (folder / "gallery.md").read_text(), (folder / "gallery.jsonl").read_text().splitlines()
+    text, lines = folder.with_suffix(".md").read_text(), (folder / "gallery.jsonl").read_text().splitlines()
     assert str(tmp_path) not in text
     for numbers in map(json.loads, lines):
         path = folder / f"gallery_{numbers['case']}.png"
