@@ -63,9 +63,9 @@ def test_every_error_is_rounding(tables):
 
 
 def test_what_is_not_finite_or_not_refused_fails_the_script():
-    row = Row("dark", {"picture": Error(math.inf, 1e-7), "gradient": Error(0.5, 1e-7)}, "")
+    row = Row("dark", {"image": Error(math.inf, 1e-7), "gradient": Error(0.5, 1e-7)}, "")
     assert failures([Table("Lights", [row])], [Refusal("NaN", None), Refusal("∞", "no")]) == [
-        "dark: picture is not finite",
+        "dark: image is not finite",
         "NaN: no error",
     ]
     text = page([Table("Lights", [row])], [Refusal("NaN", None)], "command")
@@ -115,18 +115,18 @@ def test_the_references_basis_gradient_is_its_difference_quotient(lift):
 
 
 @BOTH
-def test_the_references_gradients_are_those_of_its_picture(lift):
-    """By the light, in which the picture is linear; by the vertices, against a difference quotient (float64 vertices,
+def test_the_references_gradients_are_those_of_its_image(lift):
+    """By the light, in which the image is linear; by the vertices, against a difference quotient (float64 vertices,
     so off by 1e-16 over the step)."""
     rng, mesh = np.random.default_rng(1), sphere(1)
     setup = Setup(mesh, light(), lift=lift)
     view, coefficients = setup.view(), lift(light().numpy())
     upstream, move = lift(rng.normal(size=(len(view.pixels), 3))), rng.normal(size=mesh.vertices.shape)
     by_light = reference.light_gradient(view, upstream, 6)
-    loss = (upstream * reference.picture(view, coefficients)).sum()
+    loss = (upstream * reference.image(view, coefficients)).sum()
     assert abs((by_light * coefficients).sum() - loss) < 1e-14 * abs(loss)
 
     ahead, behind = (replace(setup, vertices=mesh.vertices + step * move).view() for step in (1e-6, -1e-6))
-    change = reference.picture(ahead, coefficients) - reference.picture(behind, coefficients)
+    change = reference.image(ahead, coefficients) - reference.image(behind, coefficients)
     gradient = reference.vertex_gradient(view, upstream, coefficients, len(mesh.vertices))
     assert float((gradient * move).sum()) == pytest.approx(float((upstream * change).sum()) / 2e-6, rel=1e-8)

@@ -149,11 +149,11 @@ def configured(small: SmallRun, folder: Path) -> DictConfig:
         pytest.param(show_again, "TensorBoard", r"train/loss at steps \[1, 2, 3, 3\]", id="a doubled event"),
         pytest.param(
             lambda run: rewrite(run / "renders" / "epoch_002.png", lambda content: content + b"0"),
-            "pictures", "renders/epoch_002.png", id="another picture",
+            "images", "renders/epoch_002.png", id="another image",
         ),
         pytest.param(
             lambda run: (run / "renders" / "epoch_002.png").unlink(),
-            "pictures", "renders/epoch_002.png", id="a lost picture",
+            "images", "renders/epoch_002.png", id="a lost image",
         ),
     ],
 )  # fmt: skip

@@ -55,7 +55,7 @@ def test_equal_settings_share_the_front():
 
 def test_the_error_is_the_larger_one_to_three_digits():
     assert row("any", 1, 0.123449).error == 0.123
-    assert Row("panel", "picture only", 1, image_error=0.25).error == 0.25
+    assert Row("panel", "image only", 1, image_error=0.25).error == 0.25
 
 
 @pytest.mark.parametrize(
@@ -116,14 +116,14 @@ def test_the_cut_light_approaches_the_whole_one():
         torch.testing.assert_close(error.square().mean(0), scenes.SUN**2 * cut, rtol=0.15, atol=0)
 
 
-def test_gradients_of_the_reference_are_those_of_its_picture(converged):
-    """The picture is linear in the light; by the vertices, central differences with coverage kept."""
+def test_gradients_of_the_reference_are_those_of_its_image(converged):
+    """The image is linear in the light; by the vertices, central differences with coverage kept."""
     light, image_gradient = scenes.coefficients(6), converged.view.image_gradient
 
     def loss(mesh) -> float:
         moved = copy.copy(converged)
         moved.view = replace(converged.view, mesh=mesh)
-        return float((moved.picture(shade) * image_gradient).sum())
+        return float((moved.image(shade) * image_gradient).sum())
 
     def shade(normals: torch.Tensor) -> torch.Tensor:
         return reference.irradiance(normals, light)
@@ -143,9 +143,9 @@ def test_more_samples_come_closer_to_the_reference(converged):
     light, errors = scenes.coefficients(6).float(), []
     for samples in (2, 8, 32):
         operator = converged.view.operator(samples)
-        picture = converged.view.canvas(operator.radiance(light), operator.pixels)
-        exact = converged.picture(lambda normals: reference.irradiance(normals, scenes.coefficients(6)))
-        errors.append(measure.relative_error(picture, exact))
+        image = converged.view.canvas(operator.radiance(light), operator.pixels)
+        exact = converged.image(lambda normals: reference.irradiance(normals, scenes.coefficients(6)))
+        errors.append(measure.relative_error(image, exact))
     assert all(finer < coarser / 4 for coarser, finer in itertools.pairwise(errors))
     assert errors[-1] > converged.uncertainty(scenes.irradiance)
 

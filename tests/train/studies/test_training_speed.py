@@ -90,8 +90,8 @@ def test_multiply_adds_are_those_of_the_formula(depth, width, classes, size):
 # ---------------------------------------------------------------------------- the baseline
 
 
-def test_the_baselines_loader_draws_the_same_pictures_as_ours():
-    """All 9² shifts, flipped or not, of one picture; 3,000 draws miss one of the 162 once in 10⁶ times."""
+def test_the_baselines_loader_draws_the_same_images_as_ours():
+    """All 9² shifts, flipped or not, of one image; 3,000 draws miss one of the 162 once in 10⁶ times."""
     images = torch.randint(0, 256, (1, 3, 32, 32), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     split = Split(images.expand(3000, -1, -1, -1), torch.zeros(3000, dtype=torch.int64))
     mean, std = (0.5, 0.4, 0.3), (0.2, 0.3, 0.4)
@@ -101,10 +101,10 @@ def test_the_baselines_loader_draws_the_same_pictures_as_ours():
     assert [part.shape for part in theirs[0]] == [part.shape for part in ours[0]]
 
     scale, offset = (torch.tensor(values).view(3, 1, 1) for values in (std, mean))
-    restored = [((pictures * scale + offset) * 255).round().to(torch.uint8) for pictures, _ in theirs]
+    restored = [((images * scale + offset) * 255).round().to(torch.uint8) for images, _ in theirs]
     seen, expected = (
-        {picture.numpy().tobytes() for picture in torch.cat(batches)}
-        for batches in (restored, [pictures for pictures, _ in ours])
+        {image.numpy().tobytes() for image in torch.cat(batches)}
+        for batches in (restored, [images for images, _ in ours])
     )
     assert seen == expected and len(seen) == 9**2 * 2
 
@@ -124,7 +124,7 @@ def test_a_turn_of_the_baseline_is_one_step_for_each_batch(npz):
     baseline = Baseline(network, build_loader(train, 32, (0, 0, 0), (1, 1, 1), 0, CPU), TrainSettings(), CPU)
     weights = network.head.weight.detach().clone()
     assert baseline()["training"] > 0
-    assert network.norm.num_batches_tracked == 3  # of 80 pictures
+    assert network.norm.num_batches_tracked == 3  # of 80 images
     assert not torch.equal(network.head.weight, weights)
 
 
@@ -191,7 +191,7 @@ WHOLE = findings(
 
 
 def test_shortened_turns_are_scaled_to_an_epoch():
-    """10 and 11 steps of 2, and 300 pictures of 200 to validate on."""
+    """10 and 11 steps of 2, and 300 images of 200 to validate on."""
     assert SHORTENED.epochs(PLAIN)[0] == pytest.approx(
         {"attack": 0, "training": 3, "evaluation": 0.75, "input_output": 0.5, "everything else": 0}
     )
@@ -206,7 +206,7 @@ def test_whole_turns_are_as_measured():
 
 
 def test_rates_and_shares_are_those_of_the_median_turn():
-    """200 pictures in 0.6 s; an operation is half a multiply-add, and a training step three forward passes."""
+    """200 images in 0.6 s; an operation is half a multiply-add, and a training step three forward passes."""
     assert SHORTENED.rate(PLAIN) == Spread(200 / 0.6, 200 / 0.8, 200 / 0.5)
     assert SHORTENED.rate(BASELINE).median == 100
     assert SHORTENED.operations(BASELINE) == pytest.approx(6e8)
@@ -234,7 +234,7 @@ def test_only_the_devices_own_targets_are_judged():
 
 @pytest.mark.parametrize(
     ("found", "says"),
-    [(SHORTENED, "shortened to 200 pictures, and 200 to validate on"), (WHOLE, "a whole epoch, 1,000 pictures")],
+    [(SHORTENED, "shortened to 200 images, and 200 to validate on"), (WHOLE, "a whole epoch, 1,000 images")],
     ids=["cpu", "gpu"],
 )
 def test_the_page_says_what_a_turn_was(found, says):
@@ -280,8 +280,8 @@ def test_a_tiny_run_writes_the_page_and_its_figure(tmp_path, npz, monkeypatch, c
     assert "nan" not in text and str(tmp_path) not in text
 
 
-def test_whole_epochs_count_every_picture(npz, one_thread, monkeypatch):
-    """72 pictures in training and 8 in validation, in 9 batches, and 11 with the 10 renders."""
+def test_whole_epochs_count_every_image(npz, one_thread, monkeypatch):
+    """72 images in training and 8 in validation, in 9 batches, and 11 with the 10 renders."""
     monkeypatch.setitem(peak.SIZES, "cpu", (32,))
     monkeypatch.setattr(peak, "BURST", 1e-9)
     config = settings("benchmark_training", *TINY, "data=npz", f"data.path={npz}", "epochs=2", "steps=0")

@@ -106,7 +106,7 @@ def meshes(subdivisions: int) -> Iterator[Row]:
     yield Row(
         "scaled or moved by 10⁶, not normalised",
         worst(of_nothing(replace(ball, vertices=v)) for v in (ball.vertices * 1e6, ball.vertices + 1e6)),
-        "beyond the frame's depth: an empty picture",
+        "beyond the frame's depth: an empty image",
     )
     yield Row(
         "three faces without area beside each",
@@ -191,7 +191,7 @@ def lights(degree: int) -> Iterator[Row]:
     kinds = [(f"coefficients of {ten_to(n)}", light() * 10.0**n, "linear in the light") for n in (-8, -4, 4, 8, 11)] + [
         ("all coefficients negative", -light().abs(), negative),
         ("radiance of −1 from everywhere", ambient(-torch.ones(3)), negative),
-        ("all coefficients zero", 0 * light(), "picture and vertex gradient exactly 0"),
+        ("all coefficients zero", 0 * light(), "image and vertex gradient exactly 0"),
     ]
     for condition, coefficients, does in kinds:
         yield Row(condition, by_both(Setup(ball, coefficients, dtype=torch.float32)), does)
@@ -212,7 +212,7 @@ def number_types() -> Iterator[Row]:
         yield Row(name, by_operator(setup, dtype) | by_geometry(setup), does)
 
 
-def pictures(size: int) -> Iterator[Row]:
+def images(size: int) -> Iterator[Row]:
     ball = shapes.sphere()
     for samples in (1, 16):
         settings = PictureSettings(size=1, samples=samples)
@@ -232,11 +232,11 @@ def pictures(size: int) -> Iterator[Row]:
     close = Setup(ball, light(), camera=framing(1e-3))
     yield Row("a mesh far larger than the frame", by_both(close), "cut at the frame")
     aside = replace(ball, vertices=ball.vertices + 10 * CAMERA.axes()[0])
-    yield Row("a mesh outside the frame", of_nothing(aside), "an empty picture: P = 0, gradients of 0")
+    yield Row("a mesh outside the frame", of_nothing(aside), "an empty image: P = 0, gradients of 0")
     behind = replace(ball, vertices=ball.vertices + 10 * TOWARDS)
-    yield Row("a mesh behind the camera", of_nothing(behind), "an empty picture")
+    yield Row("a mesh behind the camera", of_nothing(behind), "an empty image")
     edge_on = shapes.painted([-0.5 * TOWARDS, 0.5 * TOWARDS, 0.5 * CAMERA.axes()[1]], [[0, 1, 2]])
-    yield Row("a triangle seen edge on", of_nothing(edge_on), "an empty picture")
+    yield Row("a triangle seen edge on", of_nothing(edge_on), "an empty image")
 
 
 def development() -> Iterator[Row]:

@@ -23,8 +23,8 @@ from train.studies.accuracy.reference import exact, extended
 BACKEND = choose("software")
 CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, field_of_view=2.2)
 SETTINGS = PictureSettings(size=16, samples=2)
-PICTURE, LIGHT_GRADIENT = "picture", "light gradient"  # of an operator
-GEOMETRY, VERTEX_GRADIENT = "picture by geometry", "vertex gradient"  # of `renderer.shading`
+IMAGE, LIGHT_GRADIENT = "image", "light gradient"  # of an operator
+GEOMETRY, VERTEX_GRADIENT = "image by geometry", "vertex gradient"  # of `renderer.shading`
 
 
 @dataclass(frozen=True)
@@ -102,29 +102,29 @@ class Setup:
 
 
 def by_operator(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
-    """Of the picture and its gradient by the light, through an operator kept in `dtype`."""
+    """Of the image and its gradient by the light, through an operator kept in `dtype`."""
     [operator] = build_operators(
         setup.mesh, [setup.camera], setup.settings, setup.backend, degree=setup.degree, dtype=dtype
     )
     view, light = setup.view(), setup.light.to(dtype)
     upstream = _upstream(len(view.pixels))
-    wide = reference.picture(view, setup.lift(light.double().numpy()))
+    wide = reference.image(view, setup.lift(light.double().numpy()))
     gradient = reference.light_gradient(view, setup.lift(upstream.double().numpy()), setup.degree)
     return {
-        PICTURE: error(operator.radiance(light).T, wide),
+        IMAGE: error(operator.radiance(light).T, wide),
         LIGHT_GRADIENT: error(operator.light_gradient(upstream.to(dtype).T), gradient),
     }
 
 
 def by_geometry(setup: Setup) -> Errors:
-    """Of the picture and its gradient by the vertices."""
+    """Of the image and its gradient by the vertices."""
     view, vertices, light = setup.view(), setup.shaded().requires_grad_(), setup.light.to(setup.dtype)
     fragments, upstream = setup.fragments(), _upstream(len(view.pixels))
-    picture = radiance(fragments, vertices, light, _albedo(setup, fragments))
-    (gradient,) = torch.autograd.grad(picture, vertices, upstream.T.to(picture))
+    image = radiance(fragments, vertices, light, _albedo(setup, fragments))
+    (gradient,) = torch.autograd.grad(image, vertices, upstream.T.to(image))
     light, above = (setup.lift(part.double().numpy()) for part in (light, upstream))
     return {
-        GEOMETRY: error(picture.T, reference.picture(view, light)),
+        GEOMETRY: error(image.T, reference.image(view, light)),
         VERTEX_GRADIENT: error(gradient, reference.vertex_gradient(view, above, light, len(vertices))),
     }
 
@@ -138,18 +138,18 @@ def with_vertex_normals(setup: Setup) -> Errors:
     view, vertices, light = setup.view(), setup.shaded().requires_grad_(), setup.light.to(setup.dtype)
     fragments, upstream = setup.fragments(), _upstream(len(view.pixels))
     faces = torch.from_numpy(setup.mesh.faces)
-    picture = radiance(fragments, vertices, light, _albedo(setup, fragments), smooth_faces=faces)
-    (gradient,) = torch.autograd.grad(picture, vertices, upstream.T.to(picture))
+    image = radiance(fragments, vertices, light, _albedo(setup, fragments), smooth_faces=faces)
+    (gradient,) = torch.autograd.grad(image, vertices, upstream.T.to(image))
     move = _upstream(len(vertices), seed=1)
     parts = vertices.detach().double(), fragments.barycentric(), light.double(), upstream, move
     placed, barycentric, light, above, along = (extended(part.numpy()) for part in parts)
 
     def shade(vertices):
-        return reference.smooth_picture(view, vertices, setup.mesh.faces, barycentric, light)
+        return reference.smooth_image(view, vertices, setup.mesh.faces, barycentric, light)
 
     slope = (above * reference.derivative(shade(reference.stepped(placed, along)))).sum()
-    product = (gradient.double() * move).sum().to(picture)
-    return {GEOMETRY: error(picture.T, shade(placed)), VERTEX_GRADIENT: error(product, np.asarray(slope))}
+    product = (gradient.double() * move).sum().to(image)
+    return {GEOMETRY: error(image.T, shade(placed)), VERTEX_GRADIENT: error(product, np.asarray(slope))}
 
 
 def of_harmonics(directions: Tensor, degrees: Iterable[int]) -> Errors:
@@ -183,7 +183,7 @@ def of_harmonics(directions: Tensor, degrees: Iterable[int]) -> Errors:
 
 
 def of_development(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str) -> Errors:
-    """Of the picture's values and of their gradient by the radiance.
+    """Of the image's values and of their gradient by the radiance.
 
     At 0 and 1 themselves the clamp has no one gradient: torch's versions differ. There it only has to be finite.
     """
@@ -193,7 +193,7 @@ def of_development(radiance: Tensor, coverage: Tensor, background: Tensor, encod
     parts = radiance.detach(), coverage, background
     wide, slope, bounds = reference.develop(*(extended(part.double().numpy()) for part in parts), encoding)
     gradient = gradient.where(torch.from_numpy(~bounds), 0 * gradient)
-    return {"picture value": error(values, wide), "gradient by radiance": error(gradient, slope * ~bounds)}
+    return {"image value": error(values, wide), "gradient by radiance": error(gradient, slope * ~bounds)}
 
 
 def _upstream(rows: int, seed: int = 0) -> Tensor:

@@ -23,16 +23,16 @@ torch, in long doubles ({bits} bits of mantissa here) or, where those would not 
 high degree), in 256 bits. It takes each input as the renderer gets it, after its rounding to the number type, and which
 face a sample sees as the rasteriser says, which has tests of its own.
 
-- *Error*: the largest difference anywhere in a picture or gradient, over the largest magnitude in it; in brackets, in
+- *Error*: the largest difference anywhere in an image or gradient, over the largest magnitude in it; in brackets, in
   units of ε, the spacing at 1 of the number type computed in (float64 2.2e-16, float32 1.2e-07, float16 9.8e-04,
   bfloat16 7.8e-03).
-- *picture*, *light gradient*: through an operator (`renderer.transfer`) in float32, unless the row names a type.
-- *picture by geometry*, *vertex gradient*: `renderer.shading` in float64, unless the row names a type. With vertex
+- *image*, *light gradient*: through an operator (`renderer.transfer`) in float32, unless the row names a type.
+- *image by geometry*, *vertex gradient*: `renderer.shading` in float64, unless the row names a type. With vertex
   normals, the gradient's product with one random direction.
-- Gradients are of Σ upstream × picture with random upstream gradients of either sign in [-1, 1]; those of the
+- Gradients are of Σ upstream × image with random upstream gradients of either sign in [-1, 1]; those of the
   harmonics are each over its own largest component.
 
-Unless the row says otherwise: pictures of 16² pixels and 4 samples, a light of degree 6 with random coefficients in all
+Unless the row says otherwise: images of 16² pixels and 4 samples, a light of degree 6 with random coefficients in all
 49 places, a colour per face; under "Lights" the geometry is float32. Made by
 
 ```bash

@@ -44,7 +44,7 @@ class View:
 
 
 def view(ids, samples: int, placed, vertices, faces, albedo, towards, lift) -> View:
-    """Read a view off the ids (R, R) of a picture with samples² samples per pixel.
+    """Read a view off the ids (R, R) of an image with samples² samples per pixel.
 
     placed: vertices (V, 3) as the camera sees them. vertices: as they are shaded. towards: (3,) the camera's direction.
     """
@@ -64,14 +64,14 @@ def unit_normals(corners: np.ndarray) -> np.ndarray:
     return _unit(_cross(corners[1] - corners[0], corners[2] - corners[0]))
 
 
-def picture(view: View, light: np.ndarray) -> np.ndarray:
+def image(view: View, light: np.ndarray) -> np.ndarray:
     """(P, 3) radiance under a light ((degree + 1)², 3)."""
     radiance = irradiance(_normals(view), light) * view.albedo
     return _add(len(view.pixels), view.pixel, radiance[view.face]) / view.samples
 
 
 def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
-    """((degree + 1)², 3) of Σ upstream (P, 3) × picture."""
+    """((degree + 1)², 3) of Σ upstream (P, 3) × image."""
     weight = _face_weight(view, upstream)
     gradient = np.zeros(((degree + 1) ** 2, 3), dtype=weight.dtype)
     for index, value in _reflected(_normals(view), degree).items():
@@ -80,7 +80,7 @@ def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
 
 
 def vertex_gradient(view: View, upstream: np.ndarray, light: np.ndarray, vertices: int) -> np.ndarray:
-    """(V, 3) of Σ upstream (P, 3) × picture. Zero for a face without area."""
+    """(V, 3) of Σ upstream (P, 3) × image. Zero for a face without area."""
     weight = _face_weight(view, upstream)
 
     def loss(first, second):
@@ -93,7 +93,7 @@ def vertex_gradient(view: View, upstream: np.ndarray, light: np.ndarray, vertice
     return _add(vertices, view.corners.ravel(), by_corner.reshape(-1, 3))
 
 
-def smooth_picture(view: View, vertices, faces, barycentric, light) -> np.ndarray:
+def smooth_image(view: View, vertices, faces, barycentric, light) -> np.ndarray:
     """(P, 3) radiance with vertex normals, weighted with areas and interpolated to the samples (S, 3)."""
     first, second = _edges(vertices, faces)
     around = _add(len(vertices), faces.ravel(), _cross(first, second).T.repeat(3, axis=0))
@@ -110,7 +110,7 @@ def irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
 
 
 def develop(radiance, coverage, background, encoding: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Picture values over a background, their derivative by the radiance, and where the radiance is a clamp's bound.
+    """Image values over a background, their derivative by the radiance, and where the radiance is a clamp's bound.
 
     sRGB: IEC 61966-2-1.
     """
@@ -176,7 +176,7 @@ def _reflected(normals: np.ndarray, degree: int) -> dict[int, np.ndarray]:
 
 
 def _face_weight(view: View, upstream: np.ndarray) -> np.ndarray:
-    """(G, 3) what Σ upstream × picture gives for each unit of a face's irradiance."""
+    """(G, 3) what Σ upstream × image gives for each unit of a face's irradiance."""
     return _add(len(view.corners), view.face, upstream[view.pixel]) / view.samples * view.albedo
 
 

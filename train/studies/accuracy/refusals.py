@@ -72,7 +72,7 @@ def _degenerate_settings() -> dict[str, Callable[[], object]]:
         "a gain of NaN": lambda: _build(gain=nan),
         "a camera at NaN": lambda: _build(camera=OrthographicCamera(nan, 0, 2)),
         "a frame of no width": lambda: OrthographicCamera(0, 0, 0),
-        "a picture of no pixels": lambda: PictureSettings(size=0),
+        "an image of no pixels": lambda: PictureSettings(size=0),
     }
 
 

@@ -9,7 +9,7 @@ from renderer.mesh import Mesh, concatenate
 
 
 class Chart:
-    """A `renderer.visibility.Backend` whose every picture is a chart: sample i sees face i, however thin that is."""
+    """A `renderer.visibility.Backend` whose every image is a chart: sample i sees face i, however thin that is."""
 
     def rasterise(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
         ids = np.full((len(points), resolution**2), -1, dtype=np.int32)

@@ -40,7 +40,7 @@ def measure(settings: AccuracySettings) -> list[Table]:
         "Thin faces": conditions.thin_faces(settings.slivers),
         "Lights": conditions.lights(settings.degree),
         "Number types": conditions.number_types(),
-        "Pictures and cameras": conditions.pictures(settings.size),
-        "Radiance to picture": conditions.development(),
+        "Images and cameras": conditions.images(settings.size),
+        "Radiance to image": conditions.development(),
     }
     return [Table(title, list(found)) for title, found in rows.items()]

@@ -24,7 +24,7 @@ def compare(run: Path, reference: Path) -> dict[str, list[str]]:
         "checkpoints": list(checkpoint_differences(run, reference)),
         "metrics": list(metric_differences(run, reference)),
         "TensorBoard": list(board_differences(run, reference)),
-        "pictures": list(file_differences(run, reference)),
+        "images": list(file_differences(run, reference)),
     }
 
 
@@ -70,7 +70,7 @@ def metric_differences(run: Path, reference: Path) -> Iterator[str]:
 
 
 def board_differences(run: Path, reference: Path) -> Iterator[str]:
-    """Scalars and pictures that TensorBoard shows at other steps or with other values; seconds that are doubled."""
+    """Scalars and images that TensorBoard shows at other steps or with other values; seconds that are doubled."""
     found, expected = board(run), board(reference)
     for tag in sorted(found.keys() | expected.keys()):
         shown, wanted = found.get(tag, []), expected.get(tag, [])
@@ -93,7 +93,7 @@ def board(run: Path) -> dict[str, list[tuple[int, float | bytes]]]:
 
 
 def file_differences(run: Path, reference: Path) -> Iterator[str]:
-    """Pictures of renders, and files of the photographs' scores, that are missing, too many or of other bytes."""
+    """Images of renders, and files of the photographs' scores, that are missing, too many or of other bytes."""
     found, expected = (
         {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.glob("*/*")}
         for folder in (run, reference)

@@ -15,7 +15,7 @@ CONCERNS = {  # of faults, and the heads of their columns
     "checkpoints": "weights, optimiser",
     "metrics": "metrics",
     "TensorBoard": "TensorBoard",
-    "pictures": "pictures",
+    "images": "images",
     "said": "exit status and words",
 }
 INTRODUCTION = """\
@@ -26,7 +26,7 @@ after {start:.0f} s of start-up. Half of the moments are uniform over all of it,
 Every run is resumed until it ends by itself.
 
 - *Equal* to the undisturbed run, bit for bit and seconds aside: every tensor and value of `last.pt` and `best.pt`; the
-  lines of `metrics.jsonl` and what TensorBoard shows, each epoch once; all pictures and the photographs' scores.
+  lines of `metrics.jsonl` and what TensorBoard shows, each epoch once; all images and the photographs' scores.
 - *As it should*: a signal ends the run with 128 + its number, a full disk or damage to both checkpoints with 2 and one
   sentence; a run that falls back to the checkpoint before says so; nothing else is on stderr.
 """

@@ -59,7 +59,7 @@ def write_inputs(folder: Path, epochs: int) -> SmallRun:
 
 
 def _coloured_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
-    """Pictures (N, 3, 16, 16) uint8 whose channel `label` is a little brighter, so that accuracies move for long."""
+    """Images (N, 3, 16, 16) uint8 whose channel `label` is a little brighter, so that accuracies move for long."""
     images = rng.integers(0, 245, (len(labels), 3, 16, 16))
     images[np.arange(len(labels)), labels] += 10
     return images.astype(np.uint8)

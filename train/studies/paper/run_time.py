@@ -36,7 +36,7 @@ TRAINING, TRAINING_TARGET = "the training's, 100 examples, 32², WideResNet-16-4
 PRETRAINED = "run:pretrained/none"
 SOLID = ObjectSettings("solid:orange", "orange")
 EXAMPLES, MANY_PASSES = 100, 2  # at once, as in training; so many take their time
-BATCH = 32  # pictures per pass through the classifier, as in conf/attack.yaml
+BATCH = 32  # images per pass through the classifier, as in conf/attack.yaml
 FEWER = 10  # iterations, the paper's
 SHARES = {"quartile": 0.25, "median": 0.5, "third quartile": 0.75, "90 %": 0.9, "most": 1.0}
 ITERATION_COLUMNS = ["attack", "pixels", "classifier, ms", "renderer, ms", "iteration, ms"]
@@ -54,7 +54,7 @@ both, step, project.
 
 ### An iteration against the pixels that need derivatives
 
-One picture of {size}², {classifier}, the mesh {mesh} with {vertices:,} vertices, its texture, smooth normals and 2×2
+One image of {size}², {classifier}, the mesh {mesh} with {vertices:,} vertices, its texture, smooth normals and 2×2
 samples a pixel; the field of view sets how many pixels it covers. Lighting keeps what it rasterised; geometry
 rasterises anew at every step.
 
@@ -77,14 +77,14 @@ an iteration but the pass; the targets are judged by it.
 
 100 examples at 224² are 20 views on 5 backgrounds, {batch} per pass through {classifier}. At 32² a step is that of the
 training's attack: two meshes, 10 views and 5 backgrounds, WideResNet-16-4 as in `pretrained/none`, with its bias for
-the label raised so that no example leaves the batch. A single picture's iteration finds in the processor's cache what
-the classifier left there: a good part of its cost by light is reading the operator twice, which pictures of one view
+the label raised so that no example leaves the batch. A single image's iteration finds in the processor's cache what
+the classifier left there: a good part of its cost by light is reading the operator twice, which images of one view
 share.
 
 ### How many iterations, how many seconds
 
-An attack on the light of {examples} pictures that {classifier} recognises, one after the other: steps of 0.05 along the
-gradient at unit length, at most {max_steps}, no limit to the norm. Seconds include what is rendered once per picture.
+An attack on the light of {examples} images that {classifier} recognises, one after the other: steps of 0.05 along the
+gradient at unit length, at most {max_steps}, no limit to the norm. Seconds include what is rendered once per image.
 
 {distribution}
 
@@ -104,7 +104,7 @@ class RunTimeSettings(SectionSettings):
 
 @dataclass(frozen=True)
 class Setup:
-    """What the pictures show, every view on each background, and how they are drawn."""
+    """What the images show, every view on each background, and how they are drawn."""
 
     name: str
     subject: Subject
@@ -132,7 +132,7 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Attack:
-    """One picture's attack. prepared: seconds spent on what is rendered once."""
+    """One image's attack. prepared: seconds spent on what is rendered once."""
 
     mesh: str
     fooled: bool
@@ -161,10 +161,10 @@ def seconds(run: Callable[[], object]) -> float:
 
 
 def classifier_pass(model: nn.Module, images: Tensor, labels: Tensor, batch_size: int) -> None:
-    """Pictures' logits and the gradient of their cost."""
+    """Images' logits and the gradient of their cost."""
     for part, label in zip(images.split(batch_size), labels.split(batch_size), strict=True):
-        pictures = part.detach().requires_grad_(True)
-        torch.autograd.grad(adversarial_cost(model(pictures), label).sum(), pictures)
+        variable = part.detach().requires_grad_(True)
+        torch.autograd.grad(adversarial_cost(model(variable), label).sum(), variable)
 
 
 def milliseconds(
@@ -206,12 +206,12 @@ def training_step(study: Study, settings: RunTimeSettings) -> Iteration:
     """The training's attack at 32² on 100 examples of two meshes."""
     classifier = load_classifier(PRETRAINED)
     label, views = classifier.label(study.label), EXAMPLES // len(study.subjects) // len(GREYS)
-    pictures = PictureSettings(classifier.size)
+    drawn = PictureSettings(classifier.size)
     objects = [
-        SceneObject(item.label, build_operators(item.mesh, ring(views, 2.0), pictures, choose(), item.gain))
+        SceneObject(item.label, build_operators(item.mesh, ring(views, 2.0), drawn, choose(), item.gain))
         for item in study.subjects
     ]
-    scene, light = Scene(objects, GREYS, pictures), load_light(study.light)
+    scene, light = Scene(objects, GREYS, drawn), load_light(study.light)
     with torch.no_grad():
         classifier.function.head.bias[label] += 100
     labels = torch.full((len(scene),), label)
@@ -228,12 +228,12 @@ def training_step(study: Study, settings: RunTimeSettings) -> Iteration:
 
 
 def many(setup: Setup) -> Setup:
-    """The same for 100 pictures."""
+    """The same for 100 images."""
     return replace(setup, name=f"{setup.name}, {EXAMPLES} examples", views=EXAMPLES // len(GREYS), backgrounds=GREYS)
 
 
 def attacks(subject: Subject, study: Study, settings: RunTimeSettings) -> Iterator[Attack]:
-    """Attack the light of recognised pictures, each on its own."""
+    """Attack the light of recognised images, each on its own."""
     classifier = study.classifier
     scene = recognised_scene(subject, classifier, study.light, settings.examples, study.seed)
     goal = Goal(torch.tensor([[classifier.label(subject.label)]]))

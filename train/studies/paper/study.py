@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from renderer.errors import InputError
 from train.cli import command_line
 from train.run_classifier import load_classifier
-from train.settings import read_object, read_settings
+from train.settings import SceneSettings, read_object, read_settings
 from train.studies.figures import pyplot
 from train.studies.page import joined, versions, wrapped, write
 from train.studies.paper import gallery, norm_balls, rendering_quality, run_time, transfer, unseen_views
@@ -30,14 +30,6 @@ HEAD = """# The paper's tables and figures
 
 Each section is written by the command that it names; do not edit.
 Renders of orange_sketchfab show "An Orange" by thisisepic, Sketchfab, CC BY-SA 4.0."""
-
-
-@dataclass
-class SceneSettings:
-    """meshes: as in training. light: where attacks begin."""
-
-    meshes: list
-    light: str
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Random pictures of a mesh that a classifier recognises, to be attacked."""
+"""Random images of a mesh that a classifier recognises, to be attacked."""
 
 import math
 from collections.abc import Sequence
@@ -98,4 +98,4 @@ def recognised_scene(subject: Subject, classifier: Classifier, light: str, count
         greys += [float(scene.backgrounds[index, 0, 0]) for index in kept]
         if len(cameras) >= count:
             return scene_of(subject, classifier, light, cameras[:count], torch.tensor(greys[:count]))
-    raise InputError(f"{classifier.name} recognises too few pictures of {subject.name}: {len(cameras)} of {20 * count}")
+    raise InputError(f"{classifier.name} recognises too few images of {subject.name}: {len(cameras)} of {20 * count}")

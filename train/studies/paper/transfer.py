@@ -43,7 +43,7 @@ PAPER = {
 
 TEXT = """
 {source} is attacked on `{label}`, and what fools it is rendered for the other networks, each at its own size: the same
-camera, background, and light or shape. The share of those fooled, among the pictures that the network recognised
+camera, background, and light or shape. The share of those fooled, among the images that the network recognised
 before:
 
 {tables}
@@ -79,12 +79,12 @@ any azimuth, field of view 2 or 3, five greys, initial light `{light}`.
 
 @dataclass(frozen=True)
 class Seen:
-    """A picture (3, H, W) of an adversary as a network sees it, and its answers before and to it."""
+    """An image (3, H, W) of an adversary as a network sees it, and its answers before and to it."""
 
     kind: str
     mesh: str
     network: str
-    picture: Tensor
+    image: Tensor
     before: str
     answer: str
 
@@ -100,7 +100,7 @@ def networks(study: Study, settings: TransferSettings) -> list[Classifier]:
 def transfer(
     subject: Subject, seen_by: Sequence[Classifier], count: int, light: str, draws: torch.Generator
 ) -> Iterator[tuple[list[dict], list[Seen]]]:
-    """For some examples at a time and each kind of attack: a record per example, and pictures of the first."""
+    """For some examples at a time and each kind of attack: a record per example, and images of the first."""
     for scene, kept in recognised_parts(subject, seen_by[0], light, count, draws):
         greys = scene.backgrounds[:, 0, 0]
         scenes = [scene, *(scene_of(subject, target, light, scene.cameras, greys) for target in seen_by[1:])]
@@ -137,8 +137,8 @@ def _attacked(
             record["answers"][network.name] = dict(zip(STATES, said, strict=True))
         said = records[0]["answers"][network.name]
         with torch.no_grad():
-            picture = problem.render(further[:1], kept[:1])[0, 0]
-        seen.append(Seen(kind, subject.name, network.name, picture, said["before"], said["further"]))
+            image = problem.render(further[:1], kept[:1])[0, 0]
+        seen.append(Seen(kind, subject.name, network.name, image, said["before"], said["further"]))
     return records, seen
 
 
@@ -197,7 +197,7 @@ def draw(seen: Sequence[Seen], label: str, path: Path) -> None:
     for each in seen:
         row, column = rows.index((each.kind, each.mesh)), columns.index(each.network)
         panel = panels[row, column]
-        panel.imshow(each.picture.permute(1, 2, 0).clamp(0, 1).numpy(), interpolation="nearest")
+        panel.imshow(each.image.permute(1, 2, 0).clamp(0, 1).numpy(), interpolation="nearest")
         panel.set(xticks=[], yticks=[])
         panel.set_xlabel(each.answer, fontsize=9, color=_colour(each, label))
         if row == 0:
@@ -238,6 +238,6 @@ def measure(study: Study, settings: TransferSettings) -> Section:
         steps=STEPS,
         light=study.light,
     )
-    pictures = [each for views in seen.values() for each in views]
-    figures = {"transfer.png": partial(draw, pictures, study.label)}
+    images = [each for views in seen.values() for each in views]
+    figures = {"transfer.png": partial(draw, images, study.label)}
     return Section(text, records, figures)

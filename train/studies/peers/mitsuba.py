@@ -81,7 +81,7 @@ class MitsubaPeer:
 
     def _sensor(self, camera: OrthographicCamera, size: int) -> dict:
         _, up, back = camera.axes()
-        half = camera.field_of_view / 2  # its picture spans [-1, 1]
+        half = camera.field_of_view / 2  # its image spans [-1, 1]
         look = self._mi.ScalarTransform4f().look_at(origin=list(4 * back), target=[0, 0, 0], up=list(up))
         film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
         return {"type": "orthographic", "to_world": look.scale([half, half, 1]), "film": film}

@@ -45,14 +45,14 @@ class PyTorch3DPeer:
 
     def light_gradient(self, image_gradient: np.ndarray) -> np.ndarray:
         light = self._light.clone().requires_grad_()
-        picture = self._shade(self._meshes, self._fragments, light)
-        return _gradient(picture, light, image_gradient)
+        image = self._shade(self._meshes, self._fragments, light)
+        return _gradient(image, light, image_gradient)
 
     def vertex_gradient(self, image_gradient: np.ndarray) -> np.ndarray:
         vertices = self._vertices.clone().requires_grad_()
         meshes = self._mesh_of(vertices)
-        picture = self._shade(meshes, self._rasterizer(meshes), self._light)
-        return _gradient(picture, vertices, image_gradient)
+        image = self._shade(meshes, self._rasterizer(meshes), self._light)
+        return _gradient(image, vertices, image_gradient)
 
     def _mesh_of(self, vertices: Tensor):
         from pytorch3d.structures import Meshes
@@ -89,6 +89,6 @@ def _rasterizer(camera: OrthographicCamera, resolution: int):
     return MeshRasterizer(cameras, RasterizationSettings(image_size=resolution, faces_per_pixel=1))
 
 
-def _gradient(picture: Tensor, parameter: Tensor, image_gradient: np.ndarray) -> np.ndarray:
-    (gradient,) = torch.autograd.grad(picture, parameter, torch.from_numpy(image_gradient))
+def _gradient(image: Tensor, parameter: Tensor, image_gradient: np.ndarray) -> np.ndarray:
+    (gradient,) = torch.autograd.grad(image, parameter, torch.from_numpy(image_gradient))
     return gradient.numpy()

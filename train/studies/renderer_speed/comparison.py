@@ -19,7 +19,7 @@ from train.studies.renderer_speed.results import Row
 from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View, coefficients
 from train.studies.renderer_speed.steps import shade_by_face, vertex_step
 
-DIRECT, AUTOGRAD, WHOLE = "operator, direct", "operator, autograd", "operator, direct, whole pictures in and out"
+DIRECT, AUTOGRAD, WHOLE = "operator, direct", "operator, autograd", "operator, direct, whole images in and out"
 ANALYTIC, BY_FACE, BY_SAMPLE = "analytic", "plain autograd, face by face", "plain autograd, sample by sample"
 KEPT, REFRESHED = "visibility kept", "re-rasterised"
 MITSUBA, PYTORCH3D = "Mitsuba 3", "PyTorch3D"
@@ -86,7 +86,7 @@ def _light_gradients(view: View, operator: Operator, light: Tensor) -> dict[str,
 
 
 def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
-    """A picture, and the gradient of a scalar loss on it by the vertices."""
+    """An image, and the gradient of a scalar loss on it by the vertices."""
 
     def entries() -> Entries:
         view, light = bench.view(bench.plan.mesh, size), bench.light()

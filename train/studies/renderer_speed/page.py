@@ -22,9 +22,9 @@ HEADER = """# Time against error
   thread. **Error** is the root mean square of the difference to a converged reference, over the reference's root mean
   square: of the radiance before clamping, and of the gradient of Σ radiance × normal random numbers.
 - **The reference** is float64, differentiated by plain autograd, with the sun uncut and 64² samples per pixel at 32²
-  ({reference_samples}² at {reference_size}², where its own picture is still off by {uncertainty}). Visibility is fixed
+  ({reference_samples}² at {reference_size}², where its own image is still off by {uncertainty}). Visibility is fixed
   in every gradient, and a cut light's gradient is compared on the coefficients that the light has.
-- A **light step** is picture, clamp and gradient of a scalar loss by the light; a **vertex step** is the same by the
+- A **light step** is image, clamp and gradient of a scalar loss by the light; a **vertex step** is the same by the
   vertices, with visibility kept or the mesh projected and rasterised anew. There is no classifier in either.
 """
 
@@ -35,7 +35,7 @@ class Findings:
 
     choices: panels with a default. comparisons: with plain autograd and, where asked for, with other renderers.
     workloads: by size, vertices and lights. notes: what could not be measured. reference: (its samples per side, the
-    picture's size, its own relative error) of the large picture.
+    image's size, its own relative error) of the large image.
     """
 
     targets: Sequence[Target]
@@ -55,7 +55,7 @@ class Findings:
 
 
 WHY_NOT = """\
-At 32² one light's picture and gradient are some twenty operations on a few thousand numbers, whose cost is Python's and
+At 32² one light's image and gradient are some twenty operations on a few thousand numbers, whose cost is Python's and
 torch's for each operation and not the arithmetic; a light among 100 costs a fraction of it
 ([Light step by lights](#light-step-by-lights-32)). Plain autograd sample by sample is `renderer.reference`; face by
 face it shades each face once, as the analytic derivative does. Rasterising anew takes more than half of a vertex step
@@ -107,17 +107,17 @@ def _choices(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
         yield f"### {_title(rows)}"
         yield verdict(rows)
         lines = [(row.setting, *_numbers(row), row in front, "default" if row.default else "") for row in shown_rows]
-        yield markdown(["setting", "ms", "picture's error", "gradient's error", "front", ""], lines)
+        yield markdown(["setting", "ms", "image's error", "gradient's error", "front", ""], lines)
 
 
 def _descent(rows: Sequence[Row]) -> Iterator[str]:
     yield f"### {_title(rows)}"
     yield (
-        "The vertices move until the picture looks lit from the other side, in unit steps of 0.05. The error is the "
-        "final picture's, against the descent whose visibility is refreshed in every step."
+        "The vertices move until the image looks lit from the other side, in unit steps of 0.05. The error is the "
+        "final image's, against the descent whose visibility is refreshed in every step."
     )
     lines = [(row.setting, row.time_ms, row.image_error, row.cost) for row in rows]
-    yield markdown(["visibility", "ms per step", "final picture's error", "share of the cost that is left"], lines)
+    yield markdown(["visibility", "ms per step", "final image's error", "share of the cost that is left"], lines)
 
 
 def _comparisons(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
@@ -126,7 +126,7 @@ def _comparisons(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
         fastest = min(row.time_ms for row in rows)
         lines = [(row.setting, row.samples, *_numbers(row), f"{shown(row.time_ms / fastest)}×") for row in rows]
         yield f"### {_title(rows)}"
-        header = ["who", "samples per pixel", "ms", "picture's error", "gradient's error", "of the fastest"]
+        header = ["who", "samples per pixel", "ms", "image's error", "gradient's error", "of the fastest"]
         yield markdown(header, lines)
 
 
@@ -155,7 +155,7 @@ def _growth(findings: Findings) -> Iterator[str]:
         yield f"### {_title(rows)}"
         lines = [(row.setting, row.size, row.vertices, row.samples, *_numbers(row)) for row in rows]
         yield markdown(
-            ["work", "size", "vertices", "samples per pixel", "ms", "picture's error", "gradient's error"], lines
+            ["work", "size", "vertices", "samples per pixel", "ms", "image's error", "gradient's error"], lines
         )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -25,7 +26,7 @@ Entries = Iterator[tuple[Row, Callable[[], object]]]
 
 @dataclass(frozen=True)
 class Plan:
-    """Every axis that is measured. small, large, sizes: of pictures in pixels. samples: per side of a pixel. mesh and
+    """Every axis that is measured. small, large, sizes: of images in pixels. samples: per side of a pixel. mesh and
     vertices: how many of the latter a mesh has about. views: of each mesh whose operators are built."""
 
     small: int = 32
@@ -115,18 +116,17 @@ def builds(bench: Bench) -> list[Row]:
     """An operator for one view, by samples, degree and rasteriser."""
 
     def entries() -> Entries:
-        view = bench.view(bench.plan.mesh, bench.plan.small)
+        view, plan = bench.view(bench.plan.mesh, bench.plan.small), bench.plan
         exact, panel = Exact(view), f"building an operator, {view.size}²"
-        for backend in bench.backends:
+        for choice in product(bench.backends, plan.samples, plan.degrees):
+            backend, samples, degree = choice
             drawn = replace(view, backend=backend)
-            for samples in bench.plan.samples:
-                for degree in bench.plan.degrees:
-                    setting = f"{samples}² samples, degree {degree}, {backend.name}"
-                    chosen = (backend, samples, degree) == (bench.backends[0], SAMPLES, DEGREE)
-                    axes = {"degree": degree, "layout": LAYOUTS[0], "rasteriser": backend.name}
-                    errors = exact.light_errors(drawn.operator(samples, degree), bench.light(degree))
-                    row = row_of(view, panel, setting, samples, default=chosen, **axes, **errors)
-                    yield row, partial(drawn.operator, samples, degree)
+            setting = f"{samples}² samples, degree {degree}, {backend.name}"
+            chosen = choice == (bench.backends[0], SAMPLES, DEGREE)
+            axes = {"degree": degree, "layout": LAYOUTS[0], "rasteriser": backend.name}
+            errors = exact.light_errors(drawn.operator(samples, degree), bench.light(degree))
+            row = row_of(view, panel, setting, samples, default=chosen, **axes, **errors)
+            yield row, partial(drawn.operator, samples, degree)
 
     return bench.timed(entries())
 
@@ -135,20 +135,17 @@ def vertex_steps(bench: Bench) -> list[Row]:
     """A step of an attack on the vertices that rasterises anew, by samples, degree, dtype and rasteriser."""
 
     def entries() -> Entries:
-        view = bench.view(bench.plan.mesh, bench.plan.small)
+        view, plan = bench.view(bench.plan.mesh, bench.plan.small), bench.plan
         exact, panel = Exact(view), f"vertex step, {view.size}²"
-        for backend in bench.backends:
-            drawn = replace(view, backend=backend)
-            for samples in bench.plan.samples:
-                for degree in bench.plan.degrees[:4]:
-                    for dtype in (torch.float32, torch.float64):
-                        choice, light = (backend, samples, degree, dtype), bench.light(degree, dtype)
-                        setting = f"{samples}² samples, degree {degree}, {_name(dtype)}, {backend.name}"
-                        chosen = choice == (bench.backends[0], SAMPLES, DEGREE, DTYPES[0])
-                        axes = {"degree": degree, "dtype": _name(dtype), "refresh": 1, "rasteriser": backend.name}
-                        errors = exact.vertex_errors(drawn, samples, light)
-                        row = row_of(view, panel, setting, samples, default=chosen, **axes, **errors)
-                        yield row, vertex_step(drawn, samples, light)
+        for choice in product(bench.backends, plan.samples, plan.degrees[:4], (torch.float32, torch.float64)):
+            backend, samples, degree, dtype = choice
+            drawn, light = replace(view, backend=backend), bench.light(degree, dtype)
+            setting = f"{samples}² samples, degree {degree}, {_name(dtype)}, {backend.name}"
+            chosen = choice == (bench.backends[0], SAMPLES, DEGREE, DTYPES[0])
+            axes = {"degree": degree, "dtype": _name(dtype), "refresh": 1, "rasteriser": backend.name}
+            errors = exact.vertex_errors(drawn, samples, light)
+            row = row_of(view, panel, setting, samples, default=chosen, **axes, **errors)
+            yield row, vertex_step(drawn, samples, light)
 
     return bench.timed(entries(), share=1 / 3)
 
@@ -156,7 +153,7 @@ def vertex_steps(bench: Bench) -> list[Row]:
 def refreshes(bench: Bench) -> list[Row]:
     """A descent on the vertices with visibility refreshed every so many steps; time is per step.
 
-    The error is the final picture's, against that of the descent with visibility refreshed in every step.
+    The error is the final image's, against that of the descent with visibility refreshed in every step.
     """
     view, light, steps = bench.view(bench.plan.mesh, bench.plan.small), bench.light(), bench.plan.steps
     target = lit_from_opposite(view, SAMPLES, light)
@@ -165,9 +162,9 @@ def refreshes(bench: Bench) -> list[Row]:
 
     def entries() -> Entries:
         for every in bench.plan.refreshes:
-            cost, picture = bend(view, SAMPLES, light, target, steps, every)
+            cost, image = bend(view, SAMPLES, light, target, steps, every)
             setting = f"refreshed every {every} steps" if every > 1 else "refreshed in every step"
-            found = {"image_error": relative_error(picture, exact), "cost": cost / start}
+            found = {"image_error": relative_error(image, exact), "cost": cost / start}
             axes = {"refresh": every, "rasteriser": view.backend.name}
             row = row_of(view, f"vertex descent, {view.size}²", setting, SAMPLES, **axes, **found)
             yield row, partial(bend, view, SAMPLES, light, target, steps, every)
@@ -191,7 +188,7 @@ def batches(bench: Bench) -> list[Row]:
 
 
 def workloads(bench: Bench, axis: str) -> list[Row]:
-    """Four kinds of work by the picture's `size` or by the mesh's `vertices`, each kind in turns over the whole axis.
+    """Four kinds of work by the image's `size` or by the mesh's `vertices`, each kind in turns over the whole axis.
 
     Operators at `workload_samples`, geometry at one sample per pixel.
     """

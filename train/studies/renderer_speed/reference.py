@@ -1,4 +1,4 @@
-"""What the pictures and gradients of a view converge to: float64, many samples, plain autograd."""
+"""What the images and gradients of a view converge to: float64, many samples, plain autograd."""
 
 from collections.abc import Callable
 from itertools import product
@@ -34,13 +34,13 @@ class Converged:
         self._seen = torch.unique(self._face)
         self._faces = torch.from_numpy(view.mesh.faces)
 
-    def picture(self, irradiance: Irradiance) -> Tensor:
+    def image(self, irradiance: Irradiance) -> Tensor:
         """(3, size, size) radiance under a light given as its irradiance of unit normals (N, 3) → (N, 3)."""
-        return self._picture(irradiance, self._pixel, self._face, self._weight)
+        return self._image(irradiance, self._pixel, self._face, self._weight)
 
     def uncertainty(self, irradiance: Irradiance) -> float:
-        """The picture's own relative error, as half the difference between two halves of its samples."""
-        first, second = (self._picture(irradiance, *half) for half in self._halves)
+        """The image's own relative error, as half the difference between two halves of its samples."""
+        first, second = (self._image(irradiance, *half) for half in self._halves)
         return float((first - second).norm() / (first + second).norm())
 
     def light_gradient(self, degree: int = 20) -> Tensor:
@@ -61,7 +61,7 @@ class Converged:
         """(G, 3) of the faces seen; all of them face the camera, the mesh being closed."""
         return reference.unit(reference.doubled_area_vectors(vertices[self._faces[self._seen]]))
 
-    def _picture(self, irradiance: Irradiance, pixel: Tensor, face: Tensor, weight: Tensor) -> Tensor:
+    def _image(self, irradiance: Irradiance, pixel: Tensor, face: Tensor, weight: Tensor) -> Tensor:
         shade = torch.zeros(len(self._faces), 3, dtype=torch.float64)
         shade[self._seen] = irradiance(self._normals(self._vertices())) * torch.tensor(ALBEDO, dtype=torch.float64)
         size = self.view.size

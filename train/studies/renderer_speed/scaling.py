@@ -25,7 +25,7 @@ class Point:
 
 
 def measure(bench: Bench) -> list[Point]:
-    """Pictures of `plan.sizes[-1]`² pixels at one sample each, with a light of degree 6."""
+    """Images of `plan.sizes[-1]`² pixels at one sample each, with a light of degree 6."""
     points, size = [], bench.plan.sizes[-1]
     for variables in bench.plan.variables:
         view = bench.view(variables // 3, size)

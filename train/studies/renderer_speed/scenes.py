@@ -63,7 +63,7 @@ def irradiance(normals: Tensor) -> Tensor:
 
 
 def image_gradient(size: int) -> Tensor:
-    """(3, size, size) float64, what a loss answers to a picture: normal numbers, the same in every run."""
+    """(3, size, size) float64, what a loss answers to an image: normal numbers, the same in every run."""
     return torch.randn(3, size, size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
 

@@ -18,14 +18,14 @@ Seen = tuple[Fragments, Tensor, Tensor]  # with albedo (S, 3) and coverage (1, P
 
 
 def light_step(view: View, operator: Operator, lights: Tensor) -> Callable[[], Tensor]:
-    """Lights (..., 49, 3) → picture → gradient of a scalar loss by the lights, by autograd."""
+    """Lights (..., 49, 3) → image → gradient of a scalar loss by the lights, by autograd."""
     upstream = view.upstream(operator.pixels, lights.dtype)
     coverage, background = operator.coverage.to(lights.dtype)[None], lights.new_full((1, 1), BACKGROUND)
 
     def step() -> Tensor:
         variable = lights.clone().requires_grad_()
-        picture = develop(operator.radiance(variable), coverage, background)
-        return torch.autograd.grad((picture * upstream).sum(), variable)[0]
+        image = develop(operator.radiance(variable), coverage, background)
+        return torch.autograd.grad((image * upstream).sum(), variable)[0]
 
     return step
 
@@ -33,7 +33,7 @@ def light_step(view: View, operator: Operator, lights: Tensor) -> Callable[[], T
 def vertex_step(
     view: View, samples: int, light: Tensor, kept: bool = False, shade: Shading = shading.radiance
 ) -> Callable[[], Tensor]:
-    """Vertices (V, 3), in the light's dtype → picture → gradient of a scalar loss by the vertices.
+    """Vertices (V, 3), in the light's dtype → image → gradient of a scalar loss by the vertices.
 
     kept: visibility and albedo stay as they were at first; otherwise every step projects and rasterises the mesh anew.
     """
@@ -44,8 +44,8 @@ def vertex_step(
     def step() -> Tensor:
         variable = vertices.clone().requires_grad_()
         fragments, albedo, coverage = before if kept else seen(view, samples, variable)
-        picture = develop(shade(fragments, variable, light, albedo), coverage, background)
-        loss = (picture * image_gradient.index_select(1, fragments.pixels)).sum()
+        image = develop(shade(fragments, variable, light, albedo), coverage, background)
+        loss = (image * image_gradient.index_select(1, fragments.pixels)).sum()
         return torch.autograd.grad(loss, variable)[0]
 
     return step

@@ -13,7 +13,7 @@ from renderer.shapes import solid
 from renderer.visibility import Backend, choose
 from train.cli import command_line
 from train.device import choose_device
-from train.settings import read_object
+from train.settings import SceneSettings, read_object
 from train.studies.figures import pyplot
 from train.studies.page import machine, write
 from train.studies.renderer_speed import comparison, figures, panels, results, scaling, skipping, targets
@@ -27,15 +27,11 @@ MET = {None: "not measured", True: "met", False: "NOT MET"}
 
 
 @dataclass
-class SceneSettings:
-    """meshes: those whose operators are built; none: two solid oranges as they are, not normalised."""
-
-    meshes: list
-
-
-@dataclass
 class RendererSpeedSettings:
-    """conf/benchmark_renderer.yaml. out: a folder. peers: whether others are timed, too. quick: tiny settings, once."""
+    """conf/benchmark_renderer.yaml. out: a folder. peers: whether others are timed, too. quick: tiny settings, once.
+
+    scene.meshes: those whose operators are built; none: two solid oranges as they are, not normalised.
+    """
 
     out: str
     device: str

@@ -33,7 +33,7 @@ def compared(panels: Sequence[Sequence[Row]]) -> list[Target]:
 
 
 def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Target:
-    """Beside the ratio, for other renderers: no larger an error of the picture and of the gradient."""
+    """Beside the ratio, for other renderers: no larger an error of the image and of the gradient."""
     own, other = rows[ours], rows.get(theirs)
     what, asked = f"{own.panel}: {ours}, against {theirs}", f"at least {least}× faster"
     if other is None:
@@ -42,7 +42,7 @@ def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Targe
     if theirs not in (comparison.MITSUBA, comparison.PYTORCH3D):
         return Target(what, asked, found, ratio >= least)
     accurate = own.image_error <= other.image_error and own.gradient_error <= other.gradient_error
-    errors = f"errors of picture and gradient {_errors(own)} against {_errors(other)}"
+    errors = f"errors of image and gradient {_errors(own)} against {_errors(other)}"
     return Target(what, f"{asked}, error no larger", f"{found}, {errors}", ratio >= least and accurate)
 
 

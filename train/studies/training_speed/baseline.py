@@ -1,4 +1,4 @@
-"""The loop that one writes with torchvision: pictures through a DataLoader, eager float32, torch's own dropout."""
+"""The loop that one writes with torchvision: images through a DataLoader, eager float32, torch's own dropout."""
 
 from collections.abc import Sequence
 
@@ -16,8 +16,8 @@ from train.dropout import Dropout
 from train.recipe import TrainSettings
 
 
-class Pictures(Dataset):
-    """A split as torchvision.datasets.CIFAR100 holds it: uint8 arrays that become PIL pictures one by one."""
+class Images(Dataset):
+    """A split as torchvision.datasets.CIFAR100 holds it: uint8 arrays that become PIL images one by one."""
 
     def __init__(self, split: Split, transform):
         self._images = split.images.permute(0, 2, 3, 1).contiguous().numpy()
@@ -44,7 +44,7 @@ def build_loader(
         ]
     )
     return DataLoader(
-        Pictures(split, transform),
+        Images(split, transform),
         batch_size,
         shuffle=True,
         num_workers=workers,
@@ -62,7 +62,7 @@ def use_plain_dropout(network: nn.Module) -> None:
 
 
 class Baseline:
-    """Trains a network by itself; a turn is one pass over the loader's pictures."""
+    """Trains a network by itself; a turn is one pass over the loader's images."""
 
     def __init__(self, network: nn.Module, loader: DataLoader, settings: TrainSettings, device: torch.device):
         use_plain_dropout(network)

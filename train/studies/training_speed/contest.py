@@ -20,7 +20,7 @@ from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, 
 from train.studies.training_speed.peak import Products, forward_multiply_adds
 from train.wideresnet import WideResNet
 
-PICTURES, CLASSES, SIZE = 50_000, 100, 32  # CIFAR-100's
+IMAGES, CLASSES, SIZE = 50_000, 100, 32  # CIFAR-100's
 EPOCHS = {"cpu": 9, "cuda": 10}
 STEPS = {"cpu": 4, "cuda": 0}
 FEWER = 3
@@ -52,12 +52,12 @@ class BenchmarkSettings:
 
 
 def load(config: DictConfig) -> DataSet:
-    """The data that the configuration names or, without a path, random pictures like CIFAR-100's."""
+    """The data that the configuration names or, without a path, random images like CIFAR-100's."""
     if config.data.path:
         return load_data(config)
     draws = torch.Generator().manual_seed(0)
-    images = torch.randint(0, 256, (PICTURES, 3, SIZE, SIZE), dtype=torch.uint8, generator=draws)
-    split = Split(images, torch.arange(PICTURES) % CLASSES)
+    images = torch.randint(0, 256, (IMAGES, 3, SIZE, SIZE), dtype=torch.uint8, generator=draws)
+    split = Split(images, torch.arange(IMAGES) % CLASSES)
     classes = (config.label, *(f"class {index}" for index in range(1, CLASSES)))
     return DataSet(classes, split, split[:CLASSES])
 

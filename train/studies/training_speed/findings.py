@@ -38,9 +38,9 @@ class Spread:
 
 @dataclass(frozen=True)
 class Workload:
-    """Pictures of a whole epoch, and how many training steps a turn takes of it; None for all."""
+    """Images of a whole epoch, and how many training steps a turn takes of it; None for all."""
 
-    pictures: int
+    images: int
     validation: int
     renders: int
     batch_size: int
@@ -48,22 +48,22 @@ class Workload:
 
     def batches(self, name: str) -> int:
         """Of a whole epoch."""
-        return batch_count(self.pictures + (self.renders if name == ADVERSARIAL else 0), self.batch_size)
+        return batch_count(self.images + (self.renders if name == ADVERSARIAL else 0), self.batch_size)
 
     @property
     def trained(self) -> int:
-        """Pictures that a turn of the plain arm or of the baseline trains on."""
-        return self.pictures if self.steps is None else min(self.pictures, self.steps * self.batch_size)
+        """Images that a turn of the plain arm or of the baseline trains on."""
+        return self.images if self.steps is None else min(self.images, self.steps * self.batch_size)
 
     @property
     def beside_renders(self) -> int:
-        """Pictures that the adversarial arm trains on beside its renders; if shortened, in the fewest steps."""
+        """Images that the adversarial arm trains on beside its renders; if shortened, in the fewest steps."""
         batches = batch_count(self.renders + 1, self.batch_size)
-        return self.pictures if self.steps is None else min(self.pictures, batches * self.batch_size - self.renders)
+        return self.images if self.steps is None else min(self.images, batches * self.batch_size - self.renders)
 
     @property
     def validated(self) -> int:
-        """Pictures that a turn evaluates on: as few as it trains on, where it is shortened."""
+        """Images that a turn evaluates on: as few as it trains on, where it is shortened."""
         return self.validation if self.steps is None else min(self.validation, self.trained)
 
 
@@ -71,7 +71,7 @@ class Workload:
 class Findings:
     """What the turns of both arms, the baseline and the matrix products took; the first of each warmed up.
 
-    device: its kind, cpu or cuda. precision: of the arms. multiply_adds: of one picture's forward pass.
+    device: its kind, cpu or cuda. precision: of the arms. multiply_adds: of one image's forward pass.
     """
 
     device: str
@@ -110,7 +110,7 @@ class Findings:
         return {phase: Spread.of(epoch[phase] for epoch in epochs) for phase in (*PHASES, REST)}
 
     def rate(self, name: str) -> Spread:
-        """Images per second of the plain arm or the baseline, from stored pictures to updated weights."""
+        """Images per second of the plain arm or the baseline, from stored images to updated weights."""
         return Spread.of(self.workload.trained / turn["training"] for turn in self.turns[name][1:])
 
     def operations(self, name: str) -> float:

@@ -18,13 +18,13 @@ HEADER = """# Training speed
 
 {machine}.
 
-- **The network** is {network}: {multiply_adds:.1f} M multiply-adds in a picture's forward pass, counted as they
+- **The network** is {network}: {multiply_adds:.1f} M multiply-adds in an image's forward pass, counted as they
   are called. A training step is taken as three forward passes. The data are {data}.
 - **Ours** is `train.fit.Trainer`, as `python -m train` runs it, in {precision}, {compiled}, in batches of {batch_size}.
-- **The baseline** is the loop that one writes with torchvision: PIL pictures, `RandomCrop`, `RandomHorizontalFlip`,
+- **The baseline** is the loop that one writes with torchvision: PIL images, `RandomCrop`, `RandomHorizontalFlip`,
   `ToTensor` and `Normalize` in a `DataLoader` with {workers} workers, the same network with `nn.Dropout`, channels
   first, eager, in float32{on_gpu}, and `torch.optim.SGD`.
-- **Images per second** count from stored pictures to updated weights. **The peak** is the device's best in square
+- **Images per second** count from stored images to updated weights. **The peak** is the device's best in square
   matrix products of several sizes.
 - {turns}
 - Numbers are medians of {rounds} rounds ({attacked} of the adversarial arm), with the least and the most in brackets,
@@ -33,11 +33,11 @@ HEADER = """# Training speed
   sure of the class before each epoch: the most that the attack can cost, whatever the network has learnt.
 """
 
-SHORTENED = """A turn is an epoch shortened to {trained} pictures, and {validated} to validate on; the plain arm,
+SHORTENED = """A turn is an epoch shortened to {trained} images, and {validated} to validate on; the plain arm,
   the baseline and the matrix products take turns in every round, so that a busy machine disturbs all alike. The seconds
-  of a whole epoch, {pictures} pictures and {validation} to validate on, are scaled up from the plain arm's training and
+  of a whole epoch, {images} images and {validation} to validate on, are scaled up from the plain arm's training and
   evaluation, for both arms; attack, input and output are whole, and as measured."""
-WHOLE = """A turn is a whole epoch, {pictures} pictures and {validation} to validate on; one contestant comes after the
+WHOLE = """A turn is a whole epoch, {images} images and {validation} to validate on; one contestant comes after the
   other."""
 ON_GPU = (
     " (TF32 is {convolutions} in convolutions and {products} in matrix products, as torch leaves it; "
@@ -66,7 +66,7 @@ def draw(path: Path, findings: Findings) -> None:
     figure, ax = pyplot().subplots(figsize=(9, 2.6), layout="tight")
     names = [BASELINE, ADVERSARIAL, PLAIN]
     bars = {name: {phase: spread.median for phase, spread in findings.seconds(name).items()} for name in names[1:]}
-    bars[BASELINE] = {"training": findings.workload.pictures / findings.rate(BASELINE).median}
+    bars[BASELINE] = {"training": findings.workload.images / findings.rate(BASELINE).median}
     left = [0.0] * len(names)
     for phase in (*PHASES, REST):
         widths = [bars[name].get(phase, 0.0) for name in names]
@@ -79,7 +79,7 @@ def draw(path: Path, findings: Findings) -> None:
 
 def _header(findings: Findings, facts: dict[str, str]) -> str:
     work = findings.workload
-    counts = {name: f"{getattr(work, name):,}" for name in ("trained", "validated", "pictures", "validation")}
+    counts = {name: f"{getattr(work, name):,}" for name in ("trained", "validated", "images", "validation")}
     return HEADER.format(
         **facts,
         multiply_adds=findings.multiply_adds / 1e6,

@@ -14,10 +14,10 @@ TRAINING = 3  # forward passes that a training step costs: forward, and backward
 
 
 def forward_multiply_adds(network: nn.Module, size: int) -> int:
-    """Of one picture's forward pass, in convolutions and matrix products, counted as they are called."""
-    picture = torch.zeros(1, 3, size, size, device=next(network.parameters()).device)
+    """Of one image's forward pass, in convolutions and matrix products, counted as they are called."""
+    image = torch.zeros(1, 3, size, size, device=next(network.parameters()).device)
     with FlopCounterMode(display=False) as counter, torch.no_grad(), eval_mode(network):
-        network(picture)
+        network(image)
     return counter.get_total_flops() // 2
 
 

@@ -30,7 +30,7 @@ def run(config: DictConfig) -> None:
         "command": command_line(),
         "machine": description,
         "network": f"WideResNet-{config.model.depth}-{config.model.width} with dropout {config.model.dropout:g}",
-        "data": f"`data={config.data.name}`" if config.data.path else "random pictures like CIFAR-100's",
+        "data": f"`data={config.data.name}`" if config.data.path else "random images like CIFAR-100's",
         "compiled": "compiled" if compiles(config.train.compile, device) else "not compiled",
         "workers": settings.workers,
     }

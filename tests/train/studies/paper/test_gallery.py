@@ -39,7 +39,7 @@ CLASSES = ("orange", "candle", "joystick")
 
 
 class Bright(nn.Module):
-    """An orange where a picture's mean is above a threshold, else a candle where its left half is the brighter."""
+    """An orange where an image's mean is above a threshold, else a candle where its left half is the brighter."""
 
     def __init__(self, threshold: float):
         super().__init__()
@@ -153,7 +153,7 @@ def test_an_iteration_holds_its_time_in_the_classifier_and_the_pixels_it_covers(
     measured = run_time.stubborn(setup, kind, bright(), "grace", 4.0, passes=2, turns=3)
     assert len(measured.whole) == len(measured.bare) == len(measured.inside) == 3
     assert (measured.renderer > 0).all() and min(measured.inside) > 0
-    # The unit ball fills π/16 of a picture that is 4 wide; its outline of 6π pixels counts whole.
+    # The unit ball fills π/16 of an image that is 4 wide; its outline of 6π pixels counts whole.
     assert 0 < measured.pixels - math.pi / 16 * SIZE**2 < 6 * math.pi
 
 
@@ -184,7 +184,7 @@ def test_the_distribution_is_over_attacks_that_succeed():
     assert row[3:8] == ["3", "5", "7", "8", "9"] and row[8:] == ["0.30", "0.50", "0.70", "0.82", "0.90"]
 
 
-def test_each_picture_is_attacked_until_it_is_fooled(subject):
+def test_each_image_is_attacked_until_it_is_fooled(subject):
     settings = RunTimeSettings("run_time", threads=1, examples=2, max_steps=5, passes=2, turns=3)
     done = list(run_time.attacks(subject, Study(bright(0.35), [], "grace", "orange", seed=0), settings))
     assert len(done) == settings.examples
@@ -195,7 +195,7 @@ def test_each_picture_is_attacked_until_it_is_fooled(subject):
 # ---------------------------------------------------------------------------------------- gallery
 
 
-def test_the_gallery_has_a_small_picture_and_a_row_for_each_case(tmp_path, monkeypatch, reproduce):
+def test_the_gallery_has_a_small_image_and_a_row_for_each_case(tmp_path, monkeypatch, reproduce):
     BALL.export(tmp_path / "ball.ply")
     meshes = f"scene.meshes=[{tmp_path}/ball.ply,{tmp_path}/ball.ply]"
     monkeypatch.setattr(gallery, "VERTICES", 100)
@@ -209,8 +209,8 @@ def test_the_gallery_has_a_small_picture_and_a_row_for_each_case(tmp_path, monke
         path = folder / f"gallery_{numbers['case']}.png"
         assert f"(paper/{path.name})" in text
         assert path.stat().st_size <= gallery.LIMIT
-        with Image.open(path) as picture:
-            assert np.asarray(picture.convert("RGB")).std() > 1
+        with Image.open(path) as image:
+            assert np.asarray(image.convert("RGB")).std() > 1
         assert len(numbers["before"]) == len(numbers["after"]) == numbers["views"]
     assert len(lines) == len(list(folder.glob("gallery_*.png"))) == 10
 

@@ -16,7 +16,7 @@ BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
 
 
 def mean_above(threshold: float) -> Classifier:
-    """Calls a picture an orange if the mean of its values is above a threshold."""
+    """Calls an image an orange if the mean of its values is above a threshold."""
 
     def logits(images):
         margin = images.mean((1, 2, 3)) - threshold
@@ -74,7 +74,7 @@ def outcome_with(reach: list[float], adversarial: list[bool]) -> Outcome:
 
 
 def test_the_example_shown_is_the_one_nearest_to_the_levels_by_adversaries_alone():
-    """The second example reaches the levels best, but its nearest picture at the smallest radius fools nobody."""
+    """The second example reaches the levels best, but its nearest image at the smallest radius fools nobody."""
     found = {}
     for name, space in SPACES.items():
         levels = [*LEVELS.values(), *[2.0] * len(space.radii)]
@@ -88,7 +88,7 @@ def test_the_example_shown_is_the_one_nearest_to_the_levels_by_adversaries_alone
     }
 
 
-def test_the_section_has_data_pictures_and_text_without_paths(tmp_path, monkeypatch, reproduce):
+def test_the_section_has_datan_images_and_text_without_paths(tmp_path, monkeypatch, reproduce):
     monkeypatch.setattr(subjects, "VERTICES", 0)
     BALL.export(tmp_path / "ball.ply")
     settings = [f"scene.meshes=[{tmp_path}/ball.ply]", "section.examples=2", "section.steps=1", f"out={tmp_path}"]

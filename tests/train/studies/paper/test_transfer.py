@@ -36,7 +36,7 @@ def by_brightness(grey: float = 0.2, name: str = "source") -> Classifier:
 
 
 def always(answer: str) -> Classifier:
-    """Blind to pictures."""
+    """Blind to images."""
     sign = 1 if answer == "orange" else -1
     return Classifier(
         lambda images: images.mean((1, 2, 3))[:, None] * 0 + sign * torch.tensor([1.0, -1.0]),
@@ -59,7 +59,7 @@ def short(monkeypatch):
 
 
 class Line:
-    """Pictures of a value's grey."""
+    """Images of a value's grey."""
 
     start = torch.tensor([[0.42], [0.92]])
 
@@ -159,10 +159,10 @@ def test_views_together_have_the_sum_of_their_gradients(kind):
     together = unseen_views.Together(problem)
     shared = together.start.clone().requires_grad_(True)
     apart = problem.start.clone().requires_grad_(True)
-    views, pictures = together.render(shared, torch.tensor([0])), problem.render(apart, every)
-    assert torch.equal(views[0], pictures[:, 0])
+    views, images = together.render(shared, torch.tensor([0])), problem.render(apart, every)
+    assert torch.equal(views[0], images[:, 0])
     views.square().sum().backward()
-    pictures.square().sum().backward()
+    images.square().sum().backward()
     assert apart.grad.abs().amax() > 0
     # Float32 sums of three views in another order.
     torch.testing.assert_close(shared.grad[0], apart.grad.sum(0), rtol=1e-5, atol=1e-5 * float(apart.grad.abs().amax()))
@@ -204,7 +204,7 @@ def test_each_unseen_view_has_an_answer_for_each_attack(short):
         ("unseen_views", ["section.sets=1", "section.views=2"], 2),
     ],
 )
-def test_a_section_has_data_a_picture_and_text_without_folders(
+def test_a_section_has_data_an_image_and_text_without_folders(
     section, settings, lines, short, tmp_path, monkeypatch, reproduce
 ):
     monkeypatch.setattr(subjects, "VERTICES", 0)
