@@ -2,18 +2,15 @@
 
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
 from train.checkpoint import load_network
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import script
 from train.device import choose_device
 from train.photographs import evaluate_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="evaluate_photos")
-@one_sentence_errors
 def main(config: DictConfig) -> None:
     device = choose_device(config.device)
     network = load_network(Path(config.run), config.size)
@@ -33,4 +30,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    with_suggestions(main, "evaluate_photos")
+    script(main)

@@ -2,17 +2,14 @@
 
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
 from renderer.environment import negative_share, to_map, write_map
 from renderer.errors import InputError
 from renderer.lights import load_light
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import script
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="export_light")
-@one_sentence_errors
 def main(config: DictConfig) -> None:
     if not isinstance(config.height, int) or config.height < 1:
         raise InputError(f"height={config.height} is no number of rows: give a whole number, e.g. 256")
@@ -26,4 +23,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    with_suggestions(main, "export_light")
+    script(main)

@@ -2,17 +2,14 @@
 
 from pathlib import Path
 
-import hydra
 import torch
 from omegaconf import DictConfig
 from safetensors.torch import save_file
 
 from renderer.skylight import fit_error, fit_polynomials
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import script
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="fit_skylight")
-@one_sentence_errors
 def main(config: DictConfig) -> None:
     fit = fit_polynomials(config.zenith_degree, config.turbidity_degree).float()
     Path(config.out).parent.mkdir(parents=True, exist_ok=True)
@@ -22,4 +19,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    with_suggestions(main, "fit_skylight")
+    script(main)

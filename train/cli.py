@@ -5,15 +5,17 @@ import functools
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import hydra
 from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
 from renderer.errors import InputError
+from train.settings import read_settings
 
 USER_ERROR = 2
 FOLDERS = re.compile(r"(?<!\w)(~|\.{1,2})?/([^\s,:=]*/)?")  # of a path that does not begin in the clone
@@ -59,9 +61,26 @@ def with_suggestions(main: Callable[[], None], config_name: str) -> None:
         raise
 
 
-def command_line(arguments: Sequence[str]) -> str:
+def script(function: Callable, settings: type | None = None) -> None:
+    """Run a script of scripts/ under the configuration of its own name, read into a dataclass where one is given.
+
+    What the function returns are failures, in words, which the script ends with.
+    """
+    name = Path(sys.argv[0]).stem
+
+    @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
+    @one_sentence_errors
+    def main(config: DictConfig) -> None:
+        if failed := function(read_settings(settings, config) if settings else config):
+            sys.exit("\n".join(failed))
+
+    with_suggestions(main, name)
+
+
+def command_line() -> str:
     """The command of the running script in scripts/, from the clone's root and without the folders of this machine."""
-    script = Path(sys.argv[0]).resolve().as_posix().rpartition("/scripts/")[2]
+    name, *arguments = sys.argv
+    script = Path(name).resolve().as_posix().rpartition("/scripts/")[2]
     return shlex.join(FOLDERS.sub("", word) for word in ("python", f"scripts/{script}", *arguments))
 
 

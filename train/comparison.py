@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 from train.epoch import PHASES
 from train.evaluations import Evaluation, difference, have_same_seeds, read_evaluations
-from train.markdown import markdown
 from train.photographs import FIGURES, figure_title, find_figure, format_interval
 from train.report import RunSummary, group_by_settings, varied_settings
 from train.settings import PHOTOGRAPHS
+from train.tables import aligned
 
 
 def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str = PHOTOGRAPHS) -> str:
@@ -44,7 +44,7 @@ def _accuracy_table(runs: Sequence[RunSummary]) -> str:
         ]
         for run in runs
     ]
-    return markdown(header, rows)
+    return aligned(header, rows)
 
 
 def _figure_table(evaluations: Sequence[Evaluation], name: str, pooled: str) -> str:
@@ -54,7 +54,7 @@ def _figure_table(evaluations: Sequence[Evaluation], name: str, pooled: str) -> 
         for source in evaluations[0].pools
     ]
     header = ["source", *(f"{_name(run, evaluations)}, seed {run.seed}" for run in evaluations)]
-    return markdown(header, [row for row in rows if set(row[1:]) != {"-"}])
+    return aligned(header, [row for row in rows if set(row[1:]) != {"-"}])
 
 
 def _name(evaluation: Evaluation, evaluations: Sequence[Evaluation]) -> str:
@@ -77,7 +77,7 @@ def _difference_sections(evaluations: Sequence[Evaluation], pooled: str) -> list
         ]
         header = ["source", *(figure_title(name, evaluations[0].label) for name in FIGURES)]
         names = f"{_name(group[0], evaluations)} minus {_name(reference[0], evaluations)}"
-        sections.append((f"{names}, {_format_seeds(group, reference)}", markdown(header, rows)))
+        sections.append((f"{names}, {_format_seeds(group, reference)}", aligned(header, rows)))
     return sections
 
 
@@ -94,7 +94,7 @@ def _format_difference(figure: dict) -> str:
 def _seconds_table(runs: Sequence[RunSummary]) -> str:
     """Means per epoch; the operators are built once a run. The own share is the attack outside the classifier."""
     header = ["augment", *PHASES, "attack's own share", "attack's share of the epoch", "operators, once"]
-    return markdown(header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
+    return aligned(header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
 
 
 def _seconds_row(seconds: dict[str, float]) -> list[str]:

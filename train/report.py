@@ -14,9 +14,9 @@ from train import checkpoint
 from train.epoch import PHASES
 from train.experiment import CONFIG
 from train.logs import read_metrics
-from train.markdown import markdown
 from train.photographs import FIGURES, SUMMARY, figure_title, find_figure, format_interval
 from train.settings import decisive_settings
+from train.tables import aligned
 
 RECIPE = ("epochs", "batch_size", "learning_rate", "momentum", "weight_decay", "schedule", "precision")
 
@@ -127,7 +127,7 @@ def _identify(
 
 def _beside(names_header: list[str], names: list[list[str]], header: list[str], rows: list[list[str]]) -> str:
     """A Markdown table whose rows begin with names."""
-    return markdown([*names_header, *header], [[*name, *row] for name, row in zip(names, rows, strict=True)])
+    return aligned([*names_header, *header], [[*name, *row] for name, row in zip(names, rows, strict=True)])
 
 
 def _epoch_seconds(run: RunSummary) -> float:
@@ -180,4 +180,4 @@ def _card(run: RunSummary, name: str) -> str:
     title = f"# {architecture}, augment={run.arm}"
     note = "Half-precision weights; images are RGB in [0, 1], normalised inside. Score photographs with"
     command = f"`python scripts/evaluate_photos.py run=pretrained/{name} photos=...`."
-    return f"{title}\n\n{note} {command}\n\n{markdown(['what', 'value'], [list(row) for row in rows])}\n"
+    return f"{title}\n\n{note} {command}\n\n{aligned(['what', 'value'], [list(row) for row in rows])}\n"

@@ -160,14 +160,14 @@ def test_an_error_of_the_users_input_is_not_followed_by_suggestions(monkeypatch,
     "script, arguments, shown",
     [
         (
-            "/home/me/scripts/clone/scripts/torture.py",
+            "/home/me/scripts/clone/scripts/check_interruptions.py",
             ["out=docs/interruptions.md"],
-            "torture.py out=docs/interruptions.md",
+            "check_interruptions.py out=docs/interruptions.md",
         ),
         (
-            "scripts/paper/run_time.py",
+            "scripts/tools/run_time.py",
             ["--meshes", "/me/a.glb:3", "../b.glb"],
-            "paper/run_time.py --meshes a.glb:3 b.glb",
+            "tools/run_time.py --meshes a.glb:3 b.glb",
         ),
         (
             "scripts/attack.py",
@@ -185,5 +185,5 @@ def test_an_error_of_the_users_input_is_not_followed_by_suggestions(monkeypatch,
 def test_a_page_shows_its_command_as_it_can_be_typed_without_the_machines_folders(
     monkeypatch, script, arguments, shown
 ):
-    monkeypatch.setattr(sys, "argv", [script])
-    assert command_line(arguments) == f"python scripts/{shown}"
+    monkeypatch.setattr(sys, "argv", [script, *arguments])
+    assert command_line() == f"python scripts/{shown}"
