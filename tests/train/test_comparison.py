@@ -3,7 +3,6 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
-from scipy.stats import mannwhitneyu
 
 from renderer.errors import InputError
 from train.comparison import format_comparison
@@ -59,7 +58,7 @@ def test_a_comparison_shows_every_source_and_pools_all_but_some(scored_run, made
     folders = [scored_run("none", STUDIO_AND_WEB), scored_run("adversarial", other, "seed=1")]
     tables = compare(read_markdown, [*folders, made_up_run(tmp_path / "c", "random")], ["studio"])
     assert list(tables) == [
-        "Accuracy on the test set", *TITLES, "adversarial minus none, 1 and 1 other seeds", "Seconds per epoch",
+        "Accuracy on the test set", *TITLES, "adversarial minus none, different seeds (1 and 1)", "Seconds per epoch",
     ]  # fmt: skip
     assert tables["Accuracy on the test set"][1:] == [
         ["none", "0", "0.7654", "2", "0.7500"],
@@ -157,7 +156,7 @@ def arms(scored_run) -> tuple[list[Path], list[np.ndarray], list[np.ndarray]]:
 
 
 def auc(oranges: np.ndarray, others: np.ndarray) -> float:
-    return mannwhitneyu(oranges, others).statistic / (len(oranges) * len(others))
+    return (oranges[:, None] > others).mean()  # no two scores are equal
 
 
 def test_a_difference_is_that_of_the_means_over_seeds_with_the_interval_of_a_bootstrap_written_out(arms, read_markdown):
@@ -185,16 +184,6 @@ def test_a_difference_is_that_of_the_means_over_seeds_with_the_interval_of_a_boo
         told, low, high = read_difference(cell)
         assert told == pytest.approx(value, abs=5.1e-4)  # printed to three digits
         assert (low, high) == pytest.approx(tuple(reference), abs=0.02)
-
-
-def test_pairs_of_seeds_and_images_tell_small_differences_apart(arms, read_markdown):
-    """What all runs share, luck of a seed and hardness of an image, cancels in pairs and not between other seeds."""
-    folders, _, _ = arms
-    paired = compare(read_markdown, folders)["random minus none, 3 seeds in pairs"][1]
-    crossed = compare(read_markdown, [folders[0], *folders[4:]])["random minus none, 2 and 1 other seeds"]
-    assert len(crossed) == 3
-    _, low, high = read_difference(paired[1])
-    assert high - low < 0.2
 
 
 def test_an_arm_does_not_differ_from_itself(scored_run, read_markdown):
