@@ -84,7 +84,7 @@ def _difference_sections(evaluations: Sequence[Evaluation], pooled: str) -> list
 def _format_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> str:
     if have_same_seeds(group, reference):
         return f"{len(group)} seeds in pairs" if len(group) > 1 else "one seed"
-    return f"{len(group)} and {len(reference)} other seeds"
+    return f"different seeds ({len(group)} and {len(reference)})"
 
 
 def _format_difference(figure: dict) -> str:

@@ -1,7 +1,7 @@
 """Tables and model cards of finished runs, from the files in their folders."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -69,9 +69,9 @@ def format_table(runs: Sequence[RunSummary]) -> str:
 
     The first table has what the runs differ in, accuracy and time; one for each folder of photographs has its figures.
     """
-    header, names = _identify(
-        [[run] for run in runs], "seed", lambda group: group[0].config.seed, varied_settings(runs)
-    )
+    varied = varied_settings(runs)
+    header = ["augment", *varied, "seed"]
+    names = [[*_name(run, varied), str(run.config.seed)] for run in runs]
     scores = [[f"{run.scores['test/accuracy']:.3f}", f"{_epoch_seconds(run):.1f}"] for run in runs]
     tables = [_beside(header, names, ["test accuracy", "seconds per epoch"], scores)]
     for folder in _folders(runs):
@@ -86,7 +86,9 @@ def format_spread(runs: Sequence[RunSummary]) -> str:
     groups = [group for group in group_by_settings(runs) if len(group) > 1]
     if not groups:
         return ""
-    header, names = _identify(groups, "seeds", len, varied_settings(runs))
+    varied = varied_settings(runs)
+    header = ["augment", *varied, "seeds"]
+    names = [[*_name(group[0], varied), str(len(group))] for group in groups]
     accuracies = [[_spread([run.scores["test/accuracy"] for run in group])] for group in groups]
     tables = [_beside(header, names, ["test accuracy"], accuracies)]
     for folder in _folders(runs):
@@ -117,12 +119,8 @@ def publish_run(folder: Path, out: Path) -> None:
     (out / "README.md").write_text(_card(run, out.name))
 
 
-def _identify(
-    groups: Sequence[Sequence[RunSummary]], seeds: str, told: Callable[[Sequence[RunSummary]], int], varied: list[str]
-) -> tuple[list[str], list[list[str]]]:
-    """The first columns of a table with a row per group: header and cells of the arm, what varies and the seeds."""
-    names = [[group[0].arm, *(str(group[0].settings.get(key)) for key in varied), str(told(group))] for group in groups]
-    return ["augment", *varied, seeds], names
+def _name(run: RunSummary, varied: Sequence[str]) -> list[str]:
+    return [run.arm, *(str(run.settings.get(key)) for key in varied)]
 
 
 def _beside(names_header: list[str], names: list[list[str]], header: list[str], rows: list[list[str]]) -> str:

@@ -398,7 +398,7 @@ def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(fi
     assert last["model"].keys() == best["model"].keys() and "optimizer" not in best
     assert sorted(path.name for path in (finished / "renders").iterdir()) == [f"epoch_00{n}.png" for n in (1, 2, 3)]
     assert {path.name for path in (finished / "photographs").iterdir()} == {
-        "photographs.csv", "summary.json", "contact_sheet.png"
+        "photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png"
     }  # fmt: skip
     assert not list(finished.glob("*.tmp")) and list(finished.glob("events.out.tfevents.*"))
 
@@ -417,10 +417,25 @@ def test_metrics_have_each_epochs_losses_attack_and_seconds_and_the_final_scores
     summary = json.loads((finished / "photographs" / "summary.json").read_text())
     assert scores.keys() == {
         "test/accuracy", "test/accuracy_last", "test/epoch",
-        "photographs/recall", "photographs/top5", "photographs/false_alarms",
+        *(f"photographs/{name}" for name in ("recall", "top5", "false_alarms", "auc")),
+        *(f"photographs/recall_at/{rate}" for rate in ("0.05", "0.10", "0.20")),
     }  # fmt: skip
-    for name in ("recall", "top5", "false_alarms"):
+    for name in ("recall", "top5", "false_alarms", "auc"):
         assert scores[f"photographs/{name}"] == summary[name]["value"]
+    for rate, figure in summary["recall_at"].items():
+        assert scores[f"photographs/recall_at/{rate}"] == figure["value"]
+
+
+def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names(tiny, photos, tmp_path):
+    named = f"evaluate.photos={{lab: {photos}, wild-1: {photos / 'orange'}}}"
+    config = tiny("augment=none", "train.epochs=1", named)
+    run(config, load_data(config), tmp_path / "run")
+    scores = read_metrics(tmp_path / "run")[-1]
+    for name in ("lab", "wild-1"):
+        summary = json.loads((tmp_path / "run" / name / "summary.json").read_text())
+        assert scores[f"{name}/recall"] == summary["recall"]["value"]
+    assert "lab/auc" in scores and "wild-1/auc" not in scores  # a folder of oranges alone
+    assert not (tmp_path / "run" / "photographs").exists()
 
 
 def test_the_selected_network_is_the_best_on_validation_and_the_one_that_is_scored(finished, tiny):
@@ -556,6 +571,11 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["model.dropout=2"], "model.dropout=2"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["evaluate.photos=/no/such/folder"], "/no/such/folder does not exist"),
+        (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab does not exist"),
+        (["evaluate.photos={a/b: /x}"], r"evaluate\.photos\.a/b: name a sub-folder of the run, of letters"),
+        (["evaluate.photos={renders: /x}"], r"evaluate\.photos\.renders: name a sub-folder of the run"),
+        (["evaluate.photos=[/x]"], r"evaluate\.photos=\['/x'\] must be a folder, or a mapping of names to folders"),
+        (["evaluate.photos={lab: null}"], r"evaluate\.photos=\{'lab': None\} must be a folder, or a mapping"),
         (["evaluate.skip_unreadable=perhaps"], "evaluate.skip_unreadable: Value 'perhaps'"),
     ],
 )

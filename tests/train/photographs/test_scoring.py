@@ -119,6 +119,39 @@ def test_the_summary_written_is_the_summary_returned_in_strict_json(story, tmp_p
     assert json.loads(text, parse_constant=refuse) == summary
 
 
+def test_a_source_is_ranked_against_the_look_alikes_that_it_names(story, tmp_path):
+    """The oranges of the lab, of rank 1 and 2, against the pears of the shop, of rank 2 and 1: one win and two ties."""
+    _, _, folder = story
+    header, *rows = (folder / "photos.csv").read_text().splitlines()
+    paired = [f"{row},{'shop' if row.startswith('orange/a') else ''}" for row in rows]
+    (folder / "photos.csv").write_text("\n".join([f"{header},look_alikes", *paired]))
+    summary = evaluate_photographs(*story, "orange", tmp_path / "out")
+    lab = summary["by_source"]["lab"]
+    assert {key: lab["auc"][key] for key in ("value", "label", "others")} == {"value": 0.5, "label": 2, "others": 2}
+    assert lab["false_alarms"] == NOTHING  # its own
+    assert summary["auc"]["value"] == 0.34 and summary["by_source"]["street"]["auc"]["value"] == 0.25
+    table = {row["path"]: row["look_alikes"] for row in read_csv(tmp_path / "out" / "photographs.csv")}
+    assert {path: names for path, names in table.items() if names} == {"orange/a.png": "shop"}
+
+
+def test_look_alikes_that_cannot_be_read_are_left_out(story, tmp_path):
+    _, _, folder = story
+    (folder / "pear" / "broken.png").touch()
+    rows = ["path,source_tag,look_alikes", "orange/a.png,lab,wreck", "pear/broken.png,wreck,"]
+    (folder / "photos.csv").write_text("\n".join(rows))
+    summary = evaluate_photographs(*story, "orange", tmp_path / "out", skip_unreadable=True)
+    assert summary["by_source"]["lab"]["auc"]["others"] == 0
+
+
+def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(known_model, tmp_path):
+    logits = [[0, 100, 3], [0, -900, 3], [1, 2, 3]]
+    names = [f"{index}.png" for index in range(3)]
+    evaluate_photographs(*known_model(names, logits, ["a", "b", "c"]), "b", tmp_path)
+    told = [float(row["b_log_odds"]) for row in read_csv(tmp_path / "photographs.csv")]
+    expected = [100 - logsumexp([0, 3]), -900 - logsumexp([0, 3]), 2 - logsumexp([1, 3])]
+    assert told == pytest.approx(expected, rel=1e-15)
+
+
 def read_csv(path: Path) -> list[dict[str, str]]:
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
