@@ -3,7 +3,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, mannwhitneyu
 
@@ -20,12 +20,14 @@ def brute_force_recall(label: list[float], others: list[float], rate: str) -> tu
     return sum(score > threshold for score in label) / len(label), threshold
 
 
+@settings(deadline=None)
 @given(label=SCORES, others=SCORES)
 def test_auc_is_the_mann_whitney_statistic_with_ties_counted_half(label, others):
     expected = mannwhitneyu(label, others, method="asymptotic").statistic / (len(label) * len(others))
     assert Ranking(label, others).values()["auc"] == pytest.approx(expected, rel=0, abs=1e-12)
 
 
+@settings(deadline=None)
 @given(label=SCORES, others=SCORES)
 def test_recall_at_a_rate_is_that_of_the_lowest_threshold_that_keeps_the_rate(label, others):
     ranking = Ranking(label, others)
@@ -49,11 +51,13 @@ def test_an_image_tied_with_the_threshold_is_not_recalled():
     assert rank([2.0], [2.0] * 10)["recall_at"]["0.20"]["value"] == 0
 
 
+@settings(deadline=None)
 @given(label=SCORES, others=SCORES)
 def test_only_the_order_of_the_scores_counts(label, others):
     assert Ranking(label, others).values() == Ranking(np.exp(label) - 7, np.exp(others) - 7).values()
 
 
+@settings(deadline=None)
 @given(label=SCORES, others=SCORES)
 def test_with_the_roles_exchanged_auc_is_what_lacks_from_1(label, others):
     total = Ranking(label, others).values()["auc"] + Ranking(others, label).values()["auc"]
