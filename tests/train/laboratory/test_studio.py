@@ -11,7 +11,7 @@ from renderer.mesh import Mesh
 from renderer.shapes import solid
 from train.laboratory.props import corner_normals, split_parts
 from train.laboratory.shots import FIELD_OF_VIEW, Shot, draw_shots
-from train.laboratory.studio import photograph
+from train.laboratory.studio import ROUGHNESS, photograph
 
 pytest.importorskip("mitsuba")
 
@@ -53,9 +53,9 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
     """Beyond an object too small to see. A projector lights the planes that face it evenly: by 1 / z² at depth z."""
     [shot] = draw_shots(1, ["solid"], (1.5, 1.5), seed)
     shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
-    picture = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 16, 64, bounces=1, seed=0)
+    picture = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 8, 4096, bounces=1, seed=0)
 
-    rays = directions(shot, 16)
+    rays = directions(shot, 8)
     places = shot.camera - rays * (shot.camera[2] / rays[..., 2:])
     axis, ray = shot.centre - shot.projector, places - shot.projector
     depth = ray @ axis / np.linalg.norm(axis)
@@ -76,12 +76,23 @@ def test_a_texture_lies_upright_on_its_faces():
 
 
 def test_a_card_reflects_its_linear_albedo_times_the_gain_and_the_brightness():
-    """Facing projector and camera: its gloss of 4 % at normal incidence is spread over the half-sphere, too."""
+    """Facing projector and camera, with its gloss: 4 % of the light times the GGX peak, 1 / (4 α²) of a white card's."""
     grey = np.full((4, 4, 3), 128, dtype=np.uint8)  # linear 0.216
+    gloss = 0.04 / (4 * ROUGHNESS**4)  # α is the roughness's square
     for gain, brightness in [(1, 1), (2, 1), (1, 0.5)]:
         shot = frontal(brightness=brightness)
         picture = photograph(split_parts(card(grey), gain, "card"), shot, 8, 16, bounces=1, seed=0)
-        assert picture[3:5, 3:5].mean() == pytest.approx(0.216 * gain * brightness, abs=0.08 * brightness)
+        assert picture[3:5, 3:5].mean() == pytest.approx((0.216 * gain + gloss) * brightness, rel=0.05)
+
+
+def test_an_object_stands_on_the_table():
+    """A cube's front, lit by its surroundings, reaches from the table up to its height."""
+    cube = trimesh.creation.box((2, 2, 2))
+    shot = frontal(ambient=np.ones(3), brightness=1e-9)
+    picture = photograph(split_parts(Mesh.plain(cube.vertices, cube.faces), 1, "cube"), shot, 32, 64, bounces=1, seed=0)
+    ray = directions(shot, 32)[:, 15]
+    height = shot.camera[2] + ray[:, 2] * (5 / ray[:, 1])  # where it meets the plane of the front, y = -1
+    assert ((picture[:, 15] > 0.1).all(axis=1) == (height > 0))[height < 2].all()
 
 
 def test_an_object_stands_on_the_table():
@@ -95,9 +106,13 @@ def test_an_object_stands_on_the_table():
     assert ((picture[:, 15, 0] > 0.2) == ((at_front > 0) & (at_front < 2)))[at_front < 2].all()
 
 
-def test_sharp_edges_stay_sharp_and_round_ones_are_smooth():
+@pytest.mark.parametrize("divisions", [0, 1, 3])
+def test_right_angles_stay_sharp_and_round_surfaces_are_smooth(divisions):
     cube, ball = trimesh.creation.box((2, 2, 2)), trimesh.creation.icosphere(subdivisions=3)
-    mesh = Mesh.plain(cube.vertices, cube.faces)
+    vertices, faces = cube.vertices, cube.faces
+    for _ in range(divisions):
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+    mesh = Mesh.plain(vertices, faces)
     np.testing.assert_array_equal(corner_normals(mesh), mesh.face_normals()[:, None].repeat(3, axis=1))
     mesh = Mesh.plain(ball.vertices, ball.faces)
     np.testing.assert_allclose(corner_normals(mesh), mesh.vertices[mesh.faces], atol=0.01)
