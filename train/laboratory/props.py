@@ -10,7 +10,7 @@ from renderer.image import decode
 from renderer.mesh import Mesh
 from renderer.normals import vertex_normals
 
-SHARP = 0.7  # cosine of the angle off its neighbours beyond which a face keeps its own normal
+SHARP = 0.85  # cosine off the vertex normal beyond which a face keeps its own: a right-angled edge has at most 0.82
 
 
 @dataclass(frozen=True)
