@@ -44,9 +44,9 @@ def machine(device: torch.device) -> str:
     """One line: GPU, where that is the device, processor, threads, versions, and how busy the machine was."""
     gpu = f"{torch.cuda.get_device_name(device)}; " if device.type == "cuda" else ""
     threads = torch.get_num_threads()
-    versions = f"Python {platform.python_version()}, torch {torch.__version__}, NumPy {np.__version__}"
+    made = f"Python {platform.python_version()}, torch {torch.__version__}, NumPy {np.__version__}"
     load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores at the start"
-    return f"{gpu}{_processor()}, {threads} thread{'s' if threads > 1 else ''} of the CPU; {versions}; {load}"
+    return f"{gpu}{_processor()}, {threads} thread{'s' if threads > 1 else ''} of the CPU; {made}; {load}"
 
 
 def _processor() -> str:

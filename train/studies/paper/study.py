@@ -16,7 +16,7 @@ from train.settings import SceneSettings, read_object, read_settings
 from train.studies.figures import pyplot
 from train.studies.page import joined, versions, wrapped, write
 from train.studies.paper import gallery, norm_balls, rendering_quality, run_time, transfer, unseen_views
-from train.studies.paper.section import Study
+from train.studies.paper.section import Section, Study
 
 SECTIONS = {  # by their titles, in the order of the page
     "norm_balls": ("Adversarial against random perturbations", norm_balls.NormBallSettings, norm_balls.measure),
@@ -57,14 +57,17 @@ def run(settings: PaperSettings) -> None:
     torch.set_num_threads(section_settings.threads)
     classifier = load_classifier(settings.classifier, settings.weights)
     study = Study(classifier, items, settings.scene.light, settings.label, settings.seed)
-    section, folder = measure(study, section_settings), Path(settings.out) / "paper"
+    _write(Path(settings.out) / "paper", name, title, measure(study, section_settings))
+
+
+def _write(folder: Path, name: str, title: str, section: Section) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.jsonl").write_text("".join(json.dumps(record) + "\n" for record in section.records))
     for figure, draw in section.figures.items():
         draw(folder / figure)
     command = f"```bash\n{command_line()}\n```"
     page = folder.with_suffix(".md")
-    text = joined([f"{title}\n", wrapped(section.text.strip()), command, versions()])
+    text = joined([title, wrapped(section.text.strip()), command, versions()])
     write(page, with_section(page.read_text() if page.is_file() else "", title, text))
 
 

@@ -95,11 +95,6 @@ def page(findings: Findings, command: str, machine: str) -> str:
     return joined(sections)
 
 
-def verdicts(findings: Findings) -> list[str]:
-    """A sentence per panel of choices."""
-    return [f"{rows[0].panel}: {verdict(rows)}" for rows in findings.choices]
-
-
 def _choices(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
     for rows in panels:
         front = pareto_front(rows)

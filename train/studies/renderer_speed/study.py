@@ -18,12 +18,10 @@ from train.studies.figures import pyplot
 from train.studies.page import machine, write
 from train.studies.renderer_speed import comparison, figures, panels, results, scaling, skipping, targets
 from train.studies.renderer_speed.measure import Clock
-from train.studies.renderer_speed.page import Findings, page, verdicts
+from train.studies.renderer_speed.page import Findings, page
 from train.studies.renderer_speed.panels import QUICK, Bench, Plan
 from train.studies.renderer_speed.reference import Converged
 from train.studies.renderer_speed.scenes import irradiance
-
-MET = {None: "not measured", True: "met", False: "NOT MET"}
 
 
 @dataclass
@@ -51,10 +49,6 @@ def run(settings: RendererSpeedSettings) -> None:
     named = [read_object(item, "", index) for index, item in enumerate(settings.scene.meshes)]
     meshes = [load_object(item) for item in named] or [solid("orange", seed) for seed in (0, 1)]
     findings = _measure(bench, meshes, settings.peers)
-    for line in (*findings.notes, *verdicts(findings)):
-        print(line)
-    for target in findings.targets:
-        print(f"{MET[target.passed]}: {target.what}: {target.asked}; {target.found}")
     _write(Path(settings.out), findings, description)
 
 
@@ -106,7 +100,9 @@ def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
 
 
 def _write(folder: Path, findings: Findings, description: str) -> None:
-    write(folder / "performance_renderer.md", page(findings, command_line(), description))
+    text = page(findings, command_line(), description)
+    print(text)
+    write(folder / "performance_renderer.md", text)
     rows = [*results.records(findings.panels), *(asdict(row) for rows in findings.workloads for row in rows)]
     results.write_csv(folder / "renderer_pareto.csv", rows)
     results.write_csv(folder / "renderer_scaling.csv", [asdict(point) for point in findings.scaling])

@@ -36,6 +36,7 @@ def run(config: DictConfig) -> None:
     }
     out = Path(settings.out)
     figure = out.with_suffix(".png")
-    write(out, page(findings, facts, figure.name))
+    text = page(findings, facts, figure.name)
+    print(text)
+    write(out, text)
     draw(figure, findings)
-    print(out.read_text())
