@@ -59,7 +59,7 @@ def write_laboratory(settings: LabSettings) -> int:
         rows.append((path.as_posix(), shot.family, light, subject.mesh, f"{shot.brightness:.4f}"))
     with open(out / TABLE, "w", newline="") as file:
         csv.writer(file).writerows([COLUMNS, *sorted(rows)])
-    packages = ("mitsuba", "numpy", "torch", "parametric-norm-balls")
+    packages = ("mitsuba", "numpy", "torch")
     versions = {"python": platform.python_version(), **{name: version(name) for name in packages}}
     (out / DESCRIPTION).write_text(json.dumps({**asdict(settings), "versions": versions}, indent=2) + "\n")
     return len(rows)
