@@ -27,6 +27,7 @@ from train.photographs.folder import FOREIGN, TABLE
 from train.settings import read_object
 
 DESCRIPTION = "lab.json"
+PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may decide a pixel
 COLUMNS = ("path", "source_tag", "light", "mesh", "brightness")
 
 
@@ -49,18 +50,15 @@ def write_laboratory(settings: LabSettings) -> int:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out={out} is not an empty folder: name another, or delete it")
     subjects = [read_subject(item, index) for index, item in enumerate(settings.meshes)]
-    rows = []
-    for light, shot, subject in tqdm(
-        list(_sittings(subjects, settings)), desc="photographs", leave=False, disable=not sys.stderr.isatty()
-    ):
+    sittings, hidden, rows = _sittings(subjects, settings), not sys.stderr.isatty(), []
+    for light, shot, subject in tqdm(sittings, "photographs", 2 * settings.lights, leave=False, disable=hidden):
         path = Path(subject.label) / f"{light:04d}_{shot.family}.png"
         (out / path).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(_picture(subject, shot, light, settings)).save(out / path)
         rows.append((path.as_posix(), shot.family, light, subject.mesh, f"{shot.brightness:.4f}"))
     with open(out / TABLE, "w", newline="") as file:
         csv.writer(file).writerows([COLUMNS, *sorted(rows)])
-    packages = ("mitsuba", "numpy", "torch", "parametric-norm-balls")
-    versions = {"python": platform.python_version(), **{name: version(name) for name in packages}}
+    versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
     (out / DESCRIPTION).write_text(json.dumps({**asdict(settings), "versions": versions}, indent=2) + "\n")
     return len(rows)
 

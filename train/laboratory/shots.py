@@ -20,8 +20,7 @@ class Shot:
 
     brightness: radiance of a white surface that faces the projector where its image is white. pattern: the image
     (H, W, 3). ambient: radiance from everywhere (3,). table: albedo (3,). projector, camera: places (3,). centre,
-    aim: the points (3,) that they look at. half_width: half of what the camera sees there. turn: the object's rotation
-    (3, 3). scale: the object's largest coordinate.
+    aim: the points (3,) that they look at. turn: the object's rotation (3, 3). scale: the object's largest coordinate.
     """
 
     family: str
@@ -33,7 +32,6 @@ class Shot:
     camera: np.ndarray
     centre: np.ndarray
     aim: np.ndarray
-    half_width: float
     turn: np.ndarray
     scale: float
 
@@ -67,7 +65,6 @@ def draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:
         camera=aim + _place(azimuth, rng.uniform(18, 60), distance),
         centre=centre,
         aim=aim,
-        half_width=half_width,
         turn=_turn(2, rng.uniform(0, 360)) @ _turn(0, rng.uniform(0, 60)) @ _turn(2, rng.uniform(0, 360)),
         scale=scale,
     )

@@ -72,6 +72,6 @@ def test_half_divides_the_image_by_a_straight_line_through_the_object():
 
 
 def test_spots_light_about_a_half_on_average():
-    """Discs of 0.7 of the image's area in all leave exp(-0.7) dark, and a little more, as some reach beyond its edge."""
+    """Discs of 0.7 of the image's area in all leave exp(-0.7) dark, and more where they reach beyond its edge."""
     shares = [spots(lattice(2, 60) - 1, np.random.default_rng(seed)).mean() for seed in range(60)]
     assert 0.4 < np.mean(shares) < 1 - math.exp(-0.7) + 0.02
