@@ -43,10 +43,10 @@ from train.logs import NoLog, RunLog, console
 from train.photographs import evaluate_photographs, find_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
-from train.settings import ExperimentSettings, read_object, read_settings
+from train.run_folder import CONFIG
+from train.settings import ExperimentSettings, read_object, read_settings, require_same_settings
 from train.wideresnet import WideResNet
 
-CONFIG = "config.yaml"
 PHOTOGRAPHS = "photographs"
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -149,6 +149,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
             raise InputError(
                 f"run={folder} holds a run already: set train.resume=true to go on, or choose another run="
             )
+        require_same_settings(folder, config)
         trainer.resume()
         console.info("resumed %s after epoch %d%s", folder, trainer.epoch, trainer.part_of_epoch)
     elif trainer.settings.resume:

@@ -1,20 +1,22 @@
 """Tables and model cards of finished runs, from the files in their folders."""
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean, stdev
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 from renderer.errors import InputError
 from train import checkpoint
 from train.epoch import PHASES
-from train.experiment import CONFIG, PHOTOGRAPHS
-from train.logs import read_metrics
+from train.experiment import PHOTOGRAPHS
+from train.logs import METRICS, read_metrics
 from train.photographs import share
+from train.run_folder import CONFIG, read_config, read_json
 from train.settings import decisive_settings
 
 RECIPE = ("epochs", "batch_size", "learning_rate", "momentum", "weight_decay", "schedule", "precision")
@@ -46,19 +48,36 @@ def is_finished(folder: Path) -> bool:
 
 
 def summarise(folder: Path) -> RunSummary:
-    """Read a finished run; InputError for a folder that holds none."""
+    """Read a finished run; InputError for a folder that holds none, or whose files lack what the tables show."""
     if not is_finished(folder):
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")
     lines = read_metrics(folder)
     photographs = folder / PHOTOGRAPHS / "summary.json"
     phases = sorted({name for line in lines for name in line if name.startswith("seconds/")})
-    return RunSummary(
+    run = RunSummary(
         folder=folder,
-        config=OmegaConf.load(folder / CONFIG),
+        config=read_config(folder / CONFIG),
         scores=lines[-1],
         seconds={name.partition("/")[2]: fmean(line[name] for line in lines if name in line) for name in phases},
-        photographs=json.loads(photographs.read_text()) if photographs.is_file() else None,
+        photographs=read_json(photographs) if photographs.is_file() else None,
     )
+    with _complete(folder):
+        format_table([run])
+        format_comparison([run], exclude=[])
+    return run
+
+
+@contextmanager
+def _complete(folder: Path) -> Iterator[None]:
+    """InputError where what is shown of a run is not in its files, or of another kind there."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, OmegaConfBaseException) as error:
+        reason = f"{type(error).__name__}: {str(error).splitlines()[0]}" if str(error) else type(error).__name__
+        raise InputError(
+            f"{folder}: {CONFIG}, {METRICS} or {PHOTOGRAPHS}/summary.json is not as `python -m train` wrote it "
+            f"({reason}): use another run"
+        ) from error
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
@@ -119,9 +138,11 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str]) -> str
 def publish_run(folder: Path, out: Path) -> None:
     """Write a finished run's selected network as half-precision safetensors, and a card beside it."""
     run = summarise(folder)
+    with _complete(folder):
+        card = _card(run, out.name)
     out.mkdir(parents=True, exist_ok=True)
     checkpoint.publish(out / checkpoint.PUBLISHED, checkpoint.load(folder / checkpoint.BEST))
-    (out / "README.md").write_text(_card(run, out.name))
+    (out / "README.md").write_text(card)
 
 
 def _varied(runs: Sequence[RunSummary]) -> list[str]:

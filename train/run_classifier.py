@@ -8,8 +8,8 @@ from augment import classifiers
 from augment.classifiers import Classifier
 from renderer.errors import InputError
 from train.checkpoint import load_network
+from train.run_folder import CONFIG, read_config
 
-CONFIG = "config.yaml"  # not train.experiment's: an attack has no use for the trainer that comes with it
 SIZE = 32  # of the data sets whose configuration has no size, CIFAR-100 above all
 
 
@@ -34,8 +34,10 @@ def load_run(run: str, weights: Path | None = None) -> Classifier:
 
 def _size(run: Path) -> int:
     config = (run.parent if run.is_file() else run) / CONFIG
-    configured = OmegaConf.load(config) if config.is_file() else OmegaConf.create()
-    return OmegaConf.select(configured, "data.size", default=SIZE)
+    size = OmegaConf.select(read_config(config), "data.size", default=SIZE) if config.is_file() else SIZE
+    if not isinstance(size, int) or size < 1:
+        raise InputError(f"{config} has data.size={size}: it must be a whole number, the pixels per side")
+    return size
 
 
 SOURCES = {**classifiers.SOURCES, "run:": load_run}

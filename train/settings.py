@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -13,6 +14,7 @@ from augment.service import AugmentationSettings
 from renderer.errors import InputError
 from renderer.image import PictureSettings
 from train.recipe import TrainSettings
+from train.run_folder import CONFIG, read_config
 
 # Where, how and with what a run was made: these do not decide its result, nor name a sweep's cell.
 CIRCUMSTANCES = (
@@ -135,12 +137,34 @@ def read_settings(kind: type, config: DictConfig, parent: str = ""):
 def decisive_settings(config: DictConfig) -> dict[str, object]:
     """What decides a run's result, by dotted key: all but the circumstances, with `${run}` for its own folder."""
     settings = OmegaConf.to_container(config, resolve=True)
-    own = re.compile(f"^{re.escape(settings['run'])}(?=/|$)")
+    own = re.compile(f"^{re.escape(str(settings.get('run')))}(?=/|$)")
     return {
         key: own.sub("${run}", value) if isinstance(value, str) else value
         for key, value in _dotted(settings)
         if key not in CIRCUMSTANCES
     }
+
+
+def differing_settings(folder: Path, config: DictConfig) -> Iterator[tuple[str, object, object]]:
+    """The decisive keys in which the run in a folder and a configuration differ, with both values."""
+    found, asked = decisive_settings(read_config(folder / CONFIG)), decisive_settings(config)
+    for key in sorted(found.keys() | asked.keys()):
+        if found.get(key) != asked.get(key):
+            yield key, found.get(key), asked.get(key)
+
+
+def require_same_settings(folder: Path, config: DictConfig) -> None:
+    """InputError where the run in a folder cannot go on under a configuration; with more epochs it can.
+
+    Nor does what comes after training have to be the same.
+    """
+    for key, found, asked in differing_settings(folder, config):
+        longer = key == "train.epochs" and asked > found
+        if not longer and not key.startswith("evaluate."):
+            raise InputError(
+                f"run={folder} was trained with {key}={found}, and train.resume=true asks for {asked}: resume with the "
+                f"settings of {folder / CONFIG}, or start in another folder with run="
+            )
 
 
 def _dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:

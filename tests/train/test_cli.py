@@ -9,6 +9,7 @@ from renderer.errors import InputError
 from train.checkpoint import LAST
 from train.cli import USER_ERROR, command_line, one_sentence_errors, with_suggestions
 from train.experiment import load_data, prepare
+from train.run_folder import locked
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -64,6 +65,18 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
         assert (folder / LAST).is_file() and (folder / "photographs" / "contact_sheet.png").is_file()
     assert (tmp_path / "here" / "train.log").read_text() == done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
+
+
+@pytest.mark.parametrize("held", ["here", "here/none"])
+def test_two_commands_do_not_train_in_one_folder(tmp_path, tiny_npz, held):
+    (tmp_path / held).mkdir(parents=True)
+    with locked(tmp_path / held):
+        done = train(
+            tmp_path, "run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", *SMALL, "train.resume=true"
+        )
+    assert done.returncode == USER_ERROR
+    assert done.stderr.startswith(f"error: run={tmp_path / held} is in training elsewhere: let it end")
+    assert not list(tmp_path.rglob("config.yaml")) and not list(tmp_path.rglob("metrics.jsonl"))
 
 
 # ---------------------------------------------------------------------------------------- parts

@@ -21,7 +21,7 @@ from train.data import DataSet
 from train.experiment import load_data, prepare, run
 from train.interruption import Interrupted
 from train.logs import read_metrics
-from train.settings import ExperimentSettings, read_settings
+from train.settings import ExperimentSettings, read_settings, require_same_settings
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -301,11 +301,29 @@ def test_a_folder_that_holds_a_run_is_not_written_over(tiny, finished):
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("change", ["model.width=2", "model.depth=16", "model.dropout=0.1"])
-def test_resuming_with_another_architecture_is_refused(tiny, finished, change):
+@pytest.mark.parametrize("change", ["seed=8", "augment=none", "model.width=2", "train.epochs=2", "label=pear"])
+def test_resuming_with_other_settings_is_refused_by_name_and_changes_nothing(tiny, finished, change):
+    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
     config = tiny("train.resume=true", change)
-    with pytest.raises(InputError, match=r"checkpoint in .* is from another architecture.*config.yaml"):
+    key = {"augment=none": "augment.arm"}.get(change, change.partition("=")[0])
+    asked = change.partition("=")[2]
+    with pytest.raises(
+        InputError, match=rf"was trained with {key}=\S+, and train.resume=true asks for {asked}: resume"
+    ):
         prepare(config, load_data(config), finished)
+    assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
+
+
+def test_resuming_with_another_data_path_is_refused(tiny, finished, tiny_npz, tmp_path):
+    shutil.copy(tiny_npz, tmp_path / "other.npz")
+    config = tiny("train.resume=true", f"data.path={tmp_path / 'other.npz'}")
+    with pytest.raises(InputError, match=r"was trained with data.path="):
+        prepare(config, load_data(config), finished)
+
+
+def test_resuming_for_more_epochs_and_under_other_circumstances_is_no_change(tiny, finished):
+    for changes in (["train.epochs=4"], ["train.threads=1", "renderer.cache=null", "train.checkpoint_every=2"]):
+        require_same_settings(finished, tiny("train.resume=true", *changes))
 
 
 # ---------------------------------------------------------------------------------------- arms
