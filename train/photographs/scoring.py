@@ -12,7 +12,7 @@ import torch
 from renderer.errors import InputError
 from train.photographs.answers import Answer, ask, rank_classes
 from train.photographs.contact_sheet import choose_sections, draw_contact_sheet
-from train.photographs.folder import find_photographs, load_photographs
+from train.photographs.folder import find_photographs, left_out, load_photographs
 from train.photographs.shares import share
 
 WRONG_ANSWERS = 5  # how many of the most common wrong answers are named
@@ -39,7 +39,7 @@ def evaluate_photographs(
     empty for `other_*`); contact_sheet.png, hits, misses and false alarms; and summary.json, which is also
     returned:
 
-    - n: photographs, label, others, unreadable; label; unreadable: their paths;
+    - n: photographs, label, others, unreadable, left_out; label; unreadable, left_out: their paths (see `left_out`);
     - recall, top5: of the photographs of class `label`, with their most_common_wrong answers;
     - false_alarms: the share of all others that are called `label`;
     - by_class: n, recall, top5, called_label (the share called `label`) and most_common_wrong;
@@ -56,17 +56,17 @@ def evaluate_photographs(
     photographs, images, unreadable = load_photographs(folder, found, size, skip_unreadable)
     logits = ask(model, images, len(classes), batch_size, device)
     answers = rank_classes(photographs, logits, classes, label)
-    summary = _summarise(answers, label, unreadable)
+    summary = _summarise(answers, label, unreadable, [str(path) for path in left_out(folder)])
 
     out.mkdir(parents=True, exist_ok=True)
     _write_csv(out / "photographs.csv", answers, label)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    (out / "summary.json").write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     draw_contact_sheet(choose_sections(answers, images, label)).save(out / "contact_sheet.png")
     return summary
 
 
-def _summarise(answers: Sequence[Answer], label: str, unreadable: Sequence[str]) -> dict:
+def _summarise(answers: Sequence[Answer], label: str, unreadable: Sequence[str], others: Sequence[str]) -> dict:
     by_class, by_source = defaultdict(list), defaultdict(list)
     for answer in answers:
         by_class[answer.photograph.label].append(answer)
@@ -80,6 +80,7 @@ def _summarise(answers: Sequence[Answer], label: str, unreadable: Sequence[str])
             "label": len(mine),
             "others": len(answers) - len(mine),
             "unreadable": len(unreadable),
+            "left_out": len(others),
         },
         **_figures(answers, label),
         "most_common_wrong": _most_common_wrong(mine),
@@ -88,6 +89,7 @@ def _summarise(answers: Sequence[Answer], label: str, unreadable: Sequence[str])
         },
         "by_class": {name: _class_figures(group, label) for name, group in sorted(by_class.items())},
         "unreadable": list(unreadable),
+        "left_out": list(others),
     }
 
 
@@ -125,7 +127,7 @@ def _share_true(outcomes: Iterable[bool]) -> dict:
 
 def _write_csv(path: Path, answers: Sequence[Answer], label: str) -> None:
     header = ["path", "label", "source", "prediction", "probability", "true_probability", "true_rank"]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*header, f"{label}_probability", f"{label}_rank"])
         for answer in answers:

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+NAMED = 10  # how many of the files that were left out
+
 
 def format_summary(summary: dict) -> str:
     """The summary of `evaluate_photographs` as aligned plain text, without a newline at the end."""
@@ -32,6 +34,10 @@ def format_summary(summary: dict) -> str:
     ]
     if summary["unreadable"]:
         paragraphs.append(f"{n['unreadable']} unreadable: {', '.join(summary['unreadable'])}")
+    if summary["left_out"]:
+        shown = summary["left_out"][:NAMED]
+        rest = ", ..." if len(summary["left_out"]) > NAMED else ""
+        paragraphs.append(f"{n['left_out']} left out, of kinds that are not read: {', '.join(shown)}{rest}")
     return "\n\n".join(paragraphs)
 
 

@@ -22,7 +22,7 @@ NOTHING = {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
 
 STORY_SUMMARY = {
     "label": "orange",
-    "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0},
+    "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0, "left_out": 0},
     "recall": share(1, 5),
     "top5": share(4, 5),
     "false_alarms": share(2, 5),
@@ -56,6 +56,7 @@ STORY_SUMMARY = {
         },
     },
     "unreadable": [],
+    "left_out": [],
 }
 
 
@@ -159,7 +160,7 @@ def test_skipped_photographs_are_counted_and_named_but_not_scored(story, tmp_pat
         evaluate_photographs(*story, "orange", tmp_path)
     summary = evaluate_photographs(*story, "orange", tmp_path, skip_unreadable=True)
     assert summary["unreadable"] == ["orange/broken.jpg"]
-    assert summary["n"] == {"photographs": 10, "label": 5, "others": 5, "unreadable": 1}
+    assert summary["n"] == {"photographs": 10, "label": 5, "others": 5, "unreadable": 1, "left_out": 0}
     assert format_summary(summary).endswith("1 unreadable: orange/broken.jpg")
 
 
