@@ -55,6 +55,12 @@ def read_map(path: Path) -> Tensor:
     return torch.from_numpy(radiance)
 
 
+def check_map_name(path: Path) -> None:
+    """InputError where the suffix is not one of `SUFFIXES`."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path} is no name for an environment map: give one that ends in {', '.join(SUFFIXES)}")
+
+
 def write_map(path: Path, radiance: Tensor) -> None:
     """Write a map's radiance (H, W, 3) as float32 to an .npy or .exr file, or as RGBE to an .hdr file.
 
@@ -62,9 +68,8 @@ def write_map(path: Path, radiance: Tensor) -> None:
     much that is), the rest is off by up to 2⁻⁸ of its texel's largest channel. The other two keep negative radiance.
     InputError where the suffix is another or the file cannot be written.
     """
+    check_map_name(path)
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"{path} is no name for an environment map: give one that ends in {', '.join(SUFFIXES)}")
     radiance = radiance.detach().cpu().float()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

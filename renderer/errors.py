@@ -13,6 +13,12 @@ class InputError(ValueError):
     """
 
 
+def require_range(name: str, value: float | None, least: float, most: float) -> None:
+    """InputError naming a setting that lies outside of what can be meant, NaN included; None is not set."""
+    if value is not None and not least <= value <= most:
+        raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}")
+
+
 def require_finite(**tensors: Tensor) -> None:
     """InputError naming the first tensor that holds NaN or infinity."""
     for name, tensor in tensors.items():

@@ -59,7 +59,7 @@ def load_light(light: str) -> Tensor:
 def save_light(path: Path, coefficients: Tensor) -> None:
     """Write coefficients (49, 3) as JSON, a row [r, g, b] each. `load_light` reads float32 back to the bit."""
     rows = ",\n".join(json.dumps(row, allow_nan=False) for row in coefficients.tolist())
-    path.write_text(f"[\n{rows}\n]\n")
+    path.write_text(f"[\n{rows}\n]\n", encoding="utf-8")
 
 
 def probe(name: str) -> Tensor:
@@ -125,7 +125,7 @@ def _read_coefficients(path: Path) -> Tensor:
     if not path.is_file():
         raise InputError(f"light {path} does not exist: give the path of a .json file of coefficients")
     try:
-        coefficients = torch.tensor(json.loads(path.read_text()), dtype=torch.float32)
+        coefficients = torch.tensor(json.loads(path.read_text(encoding="utf-8")), dtype=torch.float32)
     except (ValueError, TypeError, RuntimeError, OverflowError, OSError) as error:
         raise InputError(f"light {path} is not a readable list of coefficients: {error}") from error
     if coefficients.shape != (COEFFICIENTS, 3) or not coefficients.isfinite().all():

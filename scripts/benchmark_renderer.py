@@ -23,6 +23,7 @@ from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
 from renderer.visibility import Backend, choose
 from train.cli import command_line, one_sentence_errors
+from train.outputs import writable_folder
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -30,6 +31,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 @one_sentence_errors
 def main() -> None:
     arguments = _arguments()
+    writable_folder(arguments.out, "--out")
     torch.set_num_threads(1)
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software OpenGL, too, on the one thread
     device, plan = torch.device(arguments.device), QUICK if arguments.quick else Plan()
@@ -109,7 +111,7 @@ def _write(folder: Path, findings: Findings, description: str) -> None:
     plots.draw_fronts(folder / "renderer_pareto.png", findings.panels)
     plots.draw_scaling(folder / "renderer_scaling.png", findings.scaling, findings.workloads)
     command = command_line(sys.argv[1:])
-    (folder / "performance_renderer.md").write_text(report.page(findings, command, description))
+    (folder / "performance_renderer.md").write_text(report.page(findings, command, description), encoding="utf-8")
 
 
 if __name__ == "__main__":

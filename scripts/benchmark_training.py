@@ -5,7 +5,6 @@ Writes docs/performance.md and a figure beside it. conf/benchmark_training.yaml 
 
 import sys
 from dataclasses import fields
-from pathlib import Path
 
 import hydra
 from benchmarks.measure import machine
@@ -17,7 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 from train.cli import command_line, one_sentence_errors, with_suggestions
 from train.device import choose_device, set_deterministic, set_threads
 from train.graphs import compiles
-from train.settings import read_settings
+from train.outputs import writable_file
+from train.settings import ExperimentSettings, read_settings
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="benchmark_training")
@@ -31,7 +31,10 @@ def write_page(config: DictConfig) -> None:
     pyplot()  # a run without matplotlib would fail only at its end
     own = [field.name for field in fields(BenchmarkSettings)]
     settings = read_settings(BenchmarkSettings, OmegaConf.masked_copy(config, own))
+    out = writable_file(settings.out, "out")
+    figure = writable_file(out.with_suffix(".png"), "out")
     config = OmegaConf.masked_copy(config, [key for key in config if key not in own])
+    read_settings(ExperimentSettings, config)
     device = choose_device(config.train.device)
     set_threads(config.train.threads)
     set_deterministic(config.train.deterministic)
@@ -45,12 +48,11 @@ def write_page(config: DictConfig) -> None:
         "compiled": "compiled" if compiles(config.train.compile, device) else "not compiled",
         "workers": settings.workers,
     }
-    out = Path(settings.out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure = out.with_suffix(".png")
     draw(figure, findings)
-    out.write_text(page(findings, facts, figure.name))
-    print(f"\n{out.read_text()}\nwritten: {out} and {figure}")
+    text = page(findings, facts, figure.name)
+    out.write_text(text, encoding="utf-8")
+    print(f"\n{text}\nwritten: {out} and {figure}")
 
 
 if __name__ == "__main__":

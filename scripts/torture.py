@@ -7,7 +7,7 @@ import signal
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,13 +19,36 @@ from torture.cases import Case, all_cases
 from torture.page import failures, merged, page
 from torture.workshop import furnish
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 from train.cli import command_line, one_sentence_errors, with_suggestions
+from train.outputs import writable_file, writable_folder
+from train.settings import read_settings
+
+
+@dataclass
+class Settings:
+    """conf/torture.yaml."""
+
+    out: str | None
+    kills: int
+    signals: int
+    draws: int
+    epochs: int
+    seed: int
+    jobs: int
+    keep: str | None
+
+    def __post_init__(self):
+        for name, least in [("kills", 0), ("signals", 0), ("draws", 0), ("epochs", 1), ("seed", 0), ("jobs", 1)]:
+            require_range(name, getattr(self, name), least, 10**6)
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="torture")
 @one_sentence_errors
 def main(config: DictConfig) -> None:
+    config = read_settings(Settings, config)
+    if config.out:
+        writable_file(config.out, "out")
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # inherited by processes that cannot answer yet
     with nullcontext(config.keep) if config.keep else TemporaryDirectory() as folder:
         bench = prepare(furnish(_empty(Path(folder).absolute()), config.epochs))
@@ -36,7 +59,8 @@ def main(config: DictConfig) -> None:
     text = page(outcomes, bench, command_line(sys.argv[1:]))
     print(text)
     if config.out:
-        Path(config.out).write_text(text)
+        Path(config.out).parent.mkdir(parents=True, exist_ok=True)
+        Path(config.out).write_text(text, encoding="utf-8")
     if failed := failures(outcomes):
         sys.exit("\n".join(failed))
 
@@ -49,7 +73,7 @@ def _conduct(case: Case, bench: Bench, seed: int, number: int) -> Outcome:
 
 
 def _empty(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
+    writable_folder(folder, "keep").mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(f"keep={folder} is not empty: choose another folder")
     return folder

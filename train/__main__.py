@@ -12,7 +12,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import one_sentence_errors, quoted, with_suggestions
 from train.data import DataSet
 from train.distributed import announce, announced, first_process_first, process_group
 from train.experiment import load_data, prepare, write_pictures
@@ -78,7 +78,7 @@ def start() -> None:
     with process_group():
         if processes.index() > 0:
             console.setLevel("WARNING")
-            sys.argv.append(f"run='{announced()}'")
+            sys.argv.append(f"run={quoted(announced())}")
         with_suggestions(main, "train")
 
 

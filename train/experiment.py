@@ -1,6 +1,5 @@
 """One run from its configuration: data, scene, network, training, scores on the test set and on photographs."""
 
-import errno
 import os
 import platform
 import time
@@ -27,6 +26,7 @@ from renderer.transfer import COEFFICIENTS, DEGREE
 from renderer.visibility import choose
 from train import checkpoint
 from train.classes import class_index
+from train.cli import NO_ROOM
 from train.data import (
     DataSet,
     channel_statistics,
@@ -48,7 +48,6 @@ from train.settings import ExperimentSettings, read_object, read_settings, requi
 from train.wideresnet import WideResNet
 
 PHOTOGRAPHS = "photographs"
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def load_data(config: DictConfig) -> DataSet:

@@ -62,7 +62,7 @@ def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None
     settings = replace(SETTINGS, size=size)
     split = _render_split(HELD_OUT_PER_CLASS, seed, "held out", hard_light, settings, cache or TensorCache())
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "photos.csv", "w", newline="") as file:
+    with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["path", "source_tag"])
         for number, (image, label) in enumerate(zip(split.images, split.labels, strict=True)):

@@ -142,7 +142,7 @@ def publish_run(folder: Path, out: Path) -> None:
         card = _card(run, out.name)
     out.mkdir(parents=True, exist_ok=True)
     checkpoint.publish(out / checkpoint.PUBLISHED, checkpoint.load(folder / checkpoint.BEST))
-    (out / "README.md").write_text(card)
+    (out / "README.md").write_text(card, encoding="utf-8")
 
 
 def _varied(runs: Sequence[RunSummary]) -> list[str]:

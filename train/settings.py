@@ -23,6 +23,9 @@ CIRCUMSTANCES = (
 )
 
 
+LARGEST_SIZE = 4096  # pixels per side
+
+
 @dataclass
 class DataSettings:
     """What the choices of conf/data set between them; see the loader of each."""

@@ -103,7 +103,7 @@ def run_cell(config: DictConfig, folder: Path) -> None:
         try:
             _train(config, folder)
         except Exception as error:
-            (folder / FAILURE).write_text(_reason(error) + "\n")
+            (folder / FAILURE).write_text(_reason(error) + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def _train(config: DictConfig, folder: Path) -> None:
@@ -213,4 +213,8 @@ def _state(folder: Path) -> str:
         if not ours:
             return "in training"
     failure = folder / FAILURE
-    return f"failed: {failure.read_text().strip()}" if failure.exists() else "interrupted"
+    return (
+        f"failed: {failure.read_text(encoding='utf-8', errors='replace').strip()}"
+        if failure.exists()
+        else "interrupted"
+    )
