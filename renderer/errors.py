@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+FACTOR = 1e5  # the largest that multiplies a light or an albedo, so that it stays below LARGEST
 LARGEST = 1e12  # products of three such float32 values do not overflow; infinity minus infinity would be NaN
 
 

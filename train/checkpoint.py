@@ -48,11 +48,12 @@ def load(path: Path) -> dict[str, Any]:
         raise InputError(f"checkpoint {path} does not exist: give a run folder that holds one")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
+        whole = isinstance(state, dict) and state.pop(HASH, None) == content_hash(state)
     except Exception as error:  # torch raises many kinds for a damaged or foreign file
         raise InputError(f"checkpoint {path} is damaged or no checkpoint; use another one of the run") from error
     if not isinstance(state, dict) or not {"model", "architecture"} <= state.keys():
         raise InputError(f"checkpoint {path} lacks its model or architecture: give one that `python -m train` wrote")
-    if state.pop(HASH, None) != content_hash(state):
+    if not whole:
         raise InputError(f"checkpoint {path} is damaged: its content is not what its hash says; use another one")
     return state
 
@@ -109,6 +110,8 @@ def _sync_folder(folder: Path) -> None:
 
 def load_weights(network: nn.Module, weights: Mapping[str, torch.Tensor], path: Path) -> None:
     """Fill the network; InputError naming the file where the weights belong to another architecture."""
+    if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise InputError(f"checkpoint {path} holds other things than weights under model: use another one")
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in weights.items()}
     if expected != found:
@@ -130,9 +133,9 @@ def load_network(run: Path) -> tuple[WideResNet, tuple[str, ...]]:
     state = _load_published(path) if path.suffix == ".safetensors" else load(path)
     try:
         shape = dict(state["architecture"])
-        classes = tuple(shape.pop("classes"))
+        classes = tuple(map(str, shape.pop("classes")))
         network = WideResNet(len(classes), **shape)
-    except (TypeError, ValueError, KeyError) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, RuntimeError) as error:
         raise InputError(f"checkpoint {path} is from another architecture than this WideResNet: {error}") from error
     load_weights(network, state["model"], path)
     return network.eval(), classes
@@ -154,5 +157,5 @@ def _load_published(path: Path) -> dict[str, Any]:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
         return {"model": weights, "architecture": json.loads(metadata["architecture"])}
-    except (SafetensorError, KeyError, ValueError, OSError) as error:
+    except (SafetensorError, KeyError, ValueError, RecursionError, OSError) as error:
         raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error

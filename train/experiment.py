@@ -44,7 +44,14 @@ from train.photographs import evaluate_photographs, find_photographs, format_sum
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
-from train.settings import ExperimentSettings, read_object, read_settings, require_same_settings
+from train.settings import (
+    LARGEST_SIZE,
+    SMALLEST_SIZE,
+    ExperimentSettings,
+    read_object,
+    read_settings,
+    require_same_settings,
+)
 from train.wideresnet import WideResNet
 
 PHOTOGRAPHS = "photographs"
@@ -64,7 +71,13 @@ def load_data(config: DictConfig) -> DataSet:
         raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")
     console.info("data: %s", data.name)
     with first_process_first():
-        return loaders[data.name]()
+        loaded = loaders[data.name]()
+    if not SMALLEST_SIZE <= loaded.size <= LARGEST_SIZE:
+        raise InputError(
+            f"data.path={data.path} has pictures of {loaded.size} pixels per side: give {SMALLEST_SIZE} to "
+            f"{LARGEST_SIZE}"
+        )
+    return loaded
 
 
 def write_pictures(config: DictConfig, size: int) -> None:

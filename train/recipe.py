@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 from train.batches import FLIPS
 from train.graphs import COMPILE
 from train.schedule import SCHEDULES
@@ -34,9 +34,8 @@ class TrainSettings:
         for name, choices in {"schedule": SCHEDULES, "flips": FLIPS, "compile": COMPILE}.items():
             if getattr(self, name) not in choices:
                 raise InputError(f"train.{name}={getattr(self, name)}: choose one of {', '.join(choices)}")
-        for name in ("epochs", "batch_size", "checkpoint_every", "threads"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise InputError(f"train.{name}={value} must be at least 1")
+        for name, most in {"epochs": 10**6, "batch_size": 10**6, "checkpoint_every": 10**6, "threads": 1024}.items():
+            require_range(f"train.{name}", getattr(self, name), 1, most)
         for name in ("momentum", "label_smoothing", "averaging"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")

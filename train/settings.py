@@ -1,6 +1,5 @@
 """conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
 
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from augment.scene import ObjectSettings, count_views
 from augment.service import AugmentationSettings
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import PictureSettings
 from train.recipe import TrainSettings
 from train.run_folder import CONFIG, read_config
@@ -23,7 +22,8 @@ CIRCUMSTANCES = (
 )
 
 
-LARGEST_SIZE = 4096  # pixels per side
+SMALLEST_SIZE, LARGEST_SIZE = 5, 4096  # pixels per side: 4 are padded by reflection
+MOST_PICTURES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
 
 
 @dataclass
@@ -41,8 +41,10 @@ class DataSettings:
     pictures: str | None = None
 
     def __post_init__(self):
-        if self.size < 1 or self.seed < 0:
-            raise InputError(f"data.size={self.size} must be at least 1 and data.seed={self.seed} not negative")
+        require_range("data.size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
+        require_range("data.seed", self.seed, 0, LARGEST_SEED)
+        for name in ("train_per_class", "test_per_class"):
+            require_range(f"data.{name}", getattr(self, name), 1, MOST_PICTURES)
 
 
 @dataclass
@@ -57,8 +59,8 @@ class SceneSettings:
     exposure: float = 1.0
 
     def __post_init__(self):
-        if not 0 < self.exposure < math.inf:
-            raise InputError(f"scene.exposure={self.exposure} must be positive")
+        require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
+        require_range("scene.views", self.views, 1, MOST_VIEWS)
 
 
 @dataclass
@@ -114,8 +116,7 @@ class ExperimentSettings:
     evaluate: EvaluationSettings = field(default_factory=EvaluationSettings)
 
     def __post_init__(self):
-        if self.seed < 0:
-            raise InputError(f"seed={self.seed} must not be negative")
+        require_range("seed", self.seed, 0, LARGEST_SEED)
         if self.augment.renders:
             _ = self.views  # fails on an inconsistent product before any data is read
 

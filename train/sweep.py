@@ -14,6 +14,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -103,7 +104,9 @@ def run_cell(config: DictConfig, folder: Path) -> None:
         try:
             _train(config, folder)
         except Exception as error:
-            (folder / FAILURE).write_text(_reason(error) + "\n", encoding="utf-8", errors="backslashreplace")
+            with suppress(OSError):  # where there is no room for it, the console alone says it
+                reason = _reason(error) + "\n"
+                (folder / FAILURE).write_text(reason, encoding="utf-8", errors="backslashreplace")
 
 
 def _train(config: DictConfig, folder: Path) -> None:

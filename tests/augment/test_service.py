@@ -211,7 +211,7 @@ def test_continued_lights_of_another_number_of_examples_are_refused(serve):
         (lambda: AugmentationSettings(lights="stay"), r"augment\.lights=stay: choose one of restart, continue"),
         (lambda: AugmentationSettings(examples=-1), r"augment\.examples=-1"),
         (lambda: LightAttackSettings("newton"), r"augment\.attack\.step=newton: choose one of unit, raw, sign"),
-        (lambda: LightAttackSettings(step_size=0.0), r"augment\.attack\.step_size=0\.0 must be positive"),
+        (lambda: LightAttackSettings(step_size=0.0), r"augment\.attack\.step_size=0\.0 must be at least"),
         (lambda: LightAttackSettings(max_steps=-1), r"attack: max_steps=-1"),
         (lambda: LightAttackSettings(batch_size=0), r"batch_size=0 at least 1"),
         (lambda: RandomLights(amplitude=0.0), r"augment\.random\.amplitude=0\.0"),

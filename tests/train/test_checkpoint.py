@@ -198,12 +198,34 @@ def test_a_network_loads_from_its_file_or_its_run_folder(network, tmp_path):
         ["fig", "lime"],
         {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1},
         {"classes": ["fig", "lime"], "depth": 10, "width": 2},
+        {"classes": ["fig", "lime"], "depth": 6 * 10**9 + 4, "width": 1},
+        {"classes": ["fig", "lime"], "depth": 10, "width": 10**9},
+        {"classes": ["fig", "lime"], "depth": 10.0, "width": 1},
+        {"classes": ["fig", "lime"], "depth": 10, "width": 1, "mean": [0.5]},
+        {"classes": 2, "depth": 10, "width": 1},
+        "WideResNet",
     ],
 )
 def test_a_checkpoint_of_another_network_is_one_error(network, tmp_path, architecture):
     save(tmp_path / BEST, state_of(network) | {"architecture": architecture})
     with pytest.raises(InputError, match=r"best.pt is from another architecture"):
         load_network(tmp_path)
+
+
+@pytest.mark.parametrize("model", [None, 3, ["stem"], {"stem.weight": 1}, {}])
+def test_a_checkpoint_of_other_things_than_weights_is_one_error(network, tmp_path, model):
+    save(tmp_path / BEST, state_of(network) | {"model": model})
+    with pytest.raises(InputError, match=r"checkpoint .*best\.pt (holds other things|is from another architecture)"):
+        load_network(tmp_path)
+
+
+def test_a_checkpoint_nested_beyond_reason_is_one_error(network, tmp_path):
+    nested = []
+    for _ in range(3000):
+        nested = [nested]
+    torch.save(state_of(network) | {"more": nested}, tmp_path / BEST)
+    with pytest.raises(InputError, match=r"best\.pt is damaged"):
+        load(tmp_path / BEST)
 
 
 def test_a_folder_without_a_network_is_one_error(tmp_path):

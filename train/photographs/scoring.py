@@ -5,7 +5,7 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import torch
 
@@ -15,6 +15,7 @@ from train.photographs.contact_sheet import choose_sections, draw_contact_sheet
 from train.photographs.folder import find_photographs, left_out, load_photographs
 from train.photographs.shares import share
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
 WRONG_ANSWERS = 5  # how many of the most common wrong answers are named
 
 
@@ -129,7 +130,13 @@ def _write_csv(path: Path, answers: Sequence[Answer], label: str) -> None:
     header = ["path", "label", "source", "prediction", "probability", "true_probability", "true_rank"]
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*header, f"{label}_probability", f"{label}_rank"])
+        writer.writerow(map(_cell, [*header, f"{label}_probability", f"{label}_rank"]))
         for answer in answers:
             photograph, *figures = astuple(answer)
-            writer.writerow([*photograph, *figures])
+            writer.writerow(map(_cell, [*photograph, *figures]))
+
+
+def _cell(value: object) -> object:
+    """A name that a spreadsheet would take for a formula, and run, begins with an apostrophe: it is text then."""
+    is_formula = isinstance(value, str | PurePath) and str(value).startswith(FORMULA)
+    return f"'{value}" if is_formula else value

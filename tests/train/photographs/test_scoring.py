@@ -219,3 +219,16 @@ def test_scores_are_never_written_among_the_photographs(story, tmp_path, out):
 def test_scores_may_be_written_beside_or_above_the_photographs(story, tmp_path, out):
     evaluate_photographs(*story, "orange", tmp_path / out)
     assert (tmp_path / out / "summary.json").is_file()
+
+
+def test_names_that_a_spreadsheet_would_run_are_text_and_numbers_stay_numbers(known_model, tmp_path):
+    names = ["other_x/=1+1.png", "=HYPERLINK/a.png", "@b/-2.png"]
+    classes = ["=HYPERLINK", "@b", "orange"]
+    logits = [[-9.0, 0.0, 1.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
+    evaluate_photographs(*known_model(names, logits, classes), "orange", tmp_path / "out")
+    with open(tmp_path / "out" / "photographs.csv", newline="", encoding="utf-8") as file:
+        _, *rows = csv.reader(file)
+    cells = [cell for row in rows for cell in row]
+    assert {row[0] for row in rows} == {"other_x/=1+1.png", "'=HYPERLINK/a.png", "'@b/-2.png"}
+    assert {row[3] for row in rows} == {"orange", "'=HYPERLINK", "'@b"}
+    assert all(cell[:1] not in ("=", "+", "-", "@") for cell in cells)
