@@ -23,7 +23,7 @@ from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
 from renderer.visibility import Backend, choose
 from train.cli import command_line, one_sentence_errors
-from train.outputs import writable_folder
+from train.outputs import save_page, writable_folder
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -104,14 +104,13 @@ def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
 
 
 def _write(folder: Path, findings: Findings, description: str) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
+    command = command_line(sys.argv[1:])
+    save_page(folder / "performance_renderer.md", report.page(findings, command, description))
     rows = [*results.records(findings.panels), *(asdict(row) for rows in findings.workloads for row in rows)]
     results.write_csv(folder / "renderer_pareto.csv", rows)
     results.write_csv(folder / "renderer_scaling.csv", [asdict(point) for point in findings.scaling])
     plots.draw_fronts(folder / "renderer_pareto.png", findings.panels)
     plots.draw_scaling(folder / "renderer_scaling.png", findings.scaling, findings.workloads)
-    command = command_line(sys.argv[1:])
-    (folder / "performance_renderer.md").write_text(report.page(findings, command, description), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from train.cli import command_line, one_sentence_errors, with_suggestions
 from train.device import choose_device, set_deterministic, set_threads
 from train.graphs import compiles
-from train.outputs import writable_file
+from train.outputs import save_page, writable_file
 from train.settings import ExperimentSettings, read_settings
 
 
@@ -48,10 +48,9 @@ def write_page(config: DictConfig) -> None:
         "compiled": "compiled" if compiles(config.train.compile, device) else "not compiled",
         "workers": settings.workers,
     }
-    out.parent.mkdir(parents=True, exist_ok=True)
-    draw(figure, findings)
     text = page(findings, facts, figure.name)
-    out.write_text(text, encoding="utf-8")
+    save_page(out, text)
+    draw(figure, findings)
     print(f"\n{text}\nwritten: {out} and {figure}")
 
 

@@ -11,7 +11,7 @@ from stress.refusals import refusals
 
 from renderer.errors import require_range
 from train.cli import command_line, one_sentence_errors, with_suggestions
-from train.outputs import writable_file
+from train.outputs import save_page, writable_file
 from train.settings import read_settings
 
 
@@ -38,8 +38,7 @@ def main(config: DictConfig) -> None:
     torch.set_num_threads(1)
     tables = measure(config.degree, config.subdivisions, config.size, config.slivers)
     refused = list(refusals())
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(page(tables, refused, command_line(sys.argv[1:])), encoding="utf-8")
+    save_page(out, page(tables, refused, command_line(sys.argv[1:])))
     print(f"{out}: {sum(len(table.rows) for table in tables)} conditions and {len(refused)} refusals")
     if failed := failures(tables, refused):
         sys.exit("\n".join(failed))

@@ -21,7 +21,7 @@ from torture.workshop import furnish
 
 from renderer.errors import InputError, require_range
 from train.cli import command_line, one_sentence_errors, with_suggestions
-from train.outputs import writable_file, writable_folder
+from train.outputs import save_page, writable_file, writable_folder
 from train.settings import read_settings
 
 
@@ -59,8 +59,7 @@ def main(config: DictConfig) -> None:
     text = page(outcomes, bench, command_line(sys.argv[1:]))
     print(text)
     if config.out:
-        Path(config.out).parent.mkdir(parents=True, exist_ok=True)
-        Path(config.out).write_text(text, encoding="utf-8")
+        save_page(Path(config.out), text)
     if failed := failures(outcomes):
         sys.exit("\n".join(failed))
 

@@ -41,7 +41,7 @@ def run_arms(config: DictConfig, folder: Path) -> None:
     """Train the arms to compare with and the arm itself, and print their table."""
     OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
     data = load_data(config)
-    arms = {folder / arm: OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
+    arms = {folder / str(arm): OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
     arms[folder] = config
     with sole_writer(*arms) if processes.index() == 0 else nullcontext():
         with first_process_first():

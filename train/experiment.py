@@ -86,7 +86,7 @@ def write_pictures(config: DictConfig, size: int) -> None:
         console.info("writing held-out renders in hard light (not photographs) to %s", config.data.pictures)
         cache = TensorCache(cache_folder(config.renderer.cache))
         with _one_error_without_room(config.data.pictures):
-            write_held_out(Path(config.data.pictures), size, config.data.seed, cache)
+            write_held_out(Path(str(config.data.pictures)), size, config.data.seed, cache)
 
 
 def run(config: DictConfig, data: DataSet, folder: Path) -> None:
