@@ -145,6 +145,8 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     if not placed:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = _weld(concatenate(placed))
+    if not (np.abs(mesh.vertices) <= LARGEST).all():  # where its nodes put it; NaN is not
+        raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
     if not mesh.face_areas().sum() > 0:
         raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
     return _transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh

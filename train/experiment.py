@@ -181,6 +181,8 @@ def _write_config(config: DictConfig, folder: Path) -> None:
     }
     temporary = folder / "config.tmp"  # so that the old file is whole where the new one finds no room
     OmegaConf.save(OmegaConf.create(resolved), temporary)
+    with open(temporary, "rb+") as file:
+        os.fsync(file.fileno())  # a run goes on with these settings alone, also after a loss of power
     os.replace(temporary, folder / CONFIG)
 
 

@@ -64,8 +64,14 @@ class Folders(Callback):
     @one_sentence_errors
     def on_run_start(self, config: DictConfig, **_) -> None:
         if processes.index() == 0:
-            writable_folder(config.hydra.run.dir, "run")
+            _try_setting(config.hydra.run.dir, "run")
 
     @one_sentence_errors
     def on_multirun_start(self, config: DictConfig, **_) -> None:
-        writable_folder(config.hydra.sweep.dir, "sweep")
+        _try_setting(config.hydra.sweep.dir, "sweep")
+
+
+def _try_setting(folder: object, key: str) -> None:
+    if not isinstance(folder, str | int | float):
+        raise InputError(f"{key}={folder} is no folder's name: give one")
+    writable_folder(str(folder), key)

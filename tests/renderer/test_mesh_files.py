@@ -231,6 +231,19 @@ def test_a_colour_that_is_no_number_names_the_file(tmp_path, color):
             load_mesh(path)
 
 
+@pytest.mark.filterwarnings("ignore:.* encountered in:RuntimeWarning")  # trimesh's, on what is then refused
+@pytest.mark.parametrize("node", [{"scale": [1e30, 1, 1]}, {"matrix": [float("nan")] * 16}])
+def test_a_node_that_puts_its_mesh_beyond_reason_names_the_file(tmp_path, node):
+    path = gltf(tmp_path)
+    (tmp_path / "peel.png").write_bytes(png())
+    tree = json.loads(path.read_text())
+    tree["nodes"] = [{"mesh": 0, **node}]
+    tree["scenes"] = [{"nodes": [0]}]
+    path.write_text(json.dumps(tree))
+    with pytest.raises(InputError, match=r"mesh\.gltf has coordinates that are not finite or beyond"):
+        load_mesh(path)
+
+
 def test_an_archive_is_refused(tmp_path):
     (tmp_path / "mesh.zip").write_bytes(b"PK")
     with pytest.raises(InputError, match=r"mesh\.zip has no known mesh format"):

@@ -7,11 +7,13 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.checkpoint import LAST
 from train.cli import USER_ERROR, command_line, one_sentence_errors, quoted, with_suggestions
 from train.experiment import load_data, prepare
+from train.outputs import Folders
 from train.run_folder import locked
 
 ROOT = Path(__file__).parents[2]
@@ -70,12 +72,22 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
 
 
-@pytest.mark.parametrize("folder", ["/proc/none", "file/run"])
-def test_a_run_folder_that_cannot_be_written_is_one_line(tmp_path, folder):
+def test_a_run_folder_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "file").touch()
-    done = train(tmp_path, f"run={folder}")
+    done = train(tmp_path, "run=file/run")
     assert (done.returncode, done.stdout) == (USER_ERROR, "")
-    assert done.stderr.startswith(f"error: run={folder} cannot be written to (") and done.stderr.count("\n") == 1
+    assert done.stderr == "error: run=file/run cannot be written to (Not a directory): choose another folder\n"
+
+
+@pytest.mark.parametrize("start", [Folders().on_run_start, Folders().on_multirun_start])
+@pytest.mark.parametrize("folder", ["/proc/none", ["a", "b"], {"a": "b"}])
+def test_a_folder_for_runs_that_cannot_be_meant_or_written_is_one_line(capsys, start, folder):
+    config = OmegaConf.create({"hydra": {"run": {"dir": folder}, "sweep": {"dir": folder}}})
+    with pytest.raises(SystemExit) as stop:
+        start(config)
+    printed = capsys.readouterr()
+    assert stop.value.code == USER_ERROR and printed.err.startswith(("error: run=", "error: sweep="))
+    assert printed.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("held", ["here", "here/none"])

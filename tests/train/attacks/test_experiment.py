@@ -205,7 +205,7 @@ def test_an_unreadable_background_is_named(tmp_path):
 
 REFUSED = [
     (["attack=[lighting,skylight]"], r"attack: lighting and skylight both set the light: choose one of them"),
-    (["attack.lighting.radius=-1"], r"attack: radius=-1.0 must not be below zero"),
+    (["attack.lighting.radius=-1"], r"attack: radius=-1.0 must be at least 0"),
     (["attack.lighting.norm=l3"], r"attack: norm=l3: choose one of linf, l2"),
     (["attack.lighting.step=long"], r"step=long: choose one of unit, raw, sign"),
     (["attack.lighting.step_size=0"], r"step_size=0.0 must be at least"),
