@@ -213,7 +213,7 @@ def test_continued_lights_of_another_number_of_examples_are_refused(serve):
         (lambda: LightAttackSettings("newton"), r"augment\.attack\.step=newton: choose one of unit, raw, sign"),
         (lambda: LightAttackSettings(step_size=0.0), r"augment\.attack\.step_size=0\.0 must be at least"),
         (lambda: LightAttackSettings(max_steps=-1), r"attack: max_steps=-1"),
-        (lambda: LightAttackSettings(batch_size=0), r"batch_size=0 at least 1"),
+        (lambda: LightAttackSettings(batch_size=0), r"attack: batch_size=0 must be at least 1"),
         (lambda: RandomLights(amplitude=0.0), r"augment\.random\.amplitude=0\.0"),
         (lambda: RandomLights(amplitude=math.nan), r"augment\.random\.amplitude=nan"),
         (lambda: RandomLights(radius=0.0), r"augment\.random\.radius=0\.0"),
