@@ -1,4 +1,4 @@
-"""The augmentation service: each epoch, a fresh batch of labelled renders made against the current weights."""
+"""The augmentation service: fresh labelled renders, made against the current weights whenever they are asked for."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,6 +20,7 @@ ARMS = ("none", "random", "adversarial")
 STARTS = ("light", "random")
 SCHEDULES = ("restart", "continue")
 MOST_EXAMPLES = 10**6  # at 32 × 32 pixels they take 12 GB
+MOST_EVERY = 10**9
 
 
 @dataclass
@@ -58,14 +59,16 @@ class LightAttackSettings:
 
 @dataclass
 class AugmentationSettings:
-    """What is regenerated each epoch.
+    """What is regenerated, and when.
 
+    every: after how many training images the renders are made anew, counted within an epoch; None: each epoch.
     start: where an attack begins, the scene's light or a random perturbation of it. lights: "restart" begins there
-    each epoch, "continue" begins where the last epoch's attack ended.
+    each time, "continue" begins where the last attack ended.
     """
 
     arm: str = "adversarial"
     examples: int = 100
+    every: int | None = None
     start: str = "light"
     lights: str = "restart"
     random: RandomLights = field(default_factory=RandomLights)
@@ -80,6 +83,7 @@ class AugmentationSettings:
             if value not in choices:
                 raise InputError(f"augment.{name}={value}: choose one of {', '.join(choices)}")
         require_range("augment.examples", self.examples, 0, MOST_EXAMPLES)
+        require_range("augment.every", self.every, 1, MOST_EVERY)
 
     @property
     def renders(self) -> bool:
@@ -89,7 +93,7 @@ class AugmentationSettings:
 
 @dataclass(frozen=True)
 class Renders:
-    """An epoch's examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers."""
+    """Labelled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers."""
 
     images: Tensor
     labels: Tensor
@@ -97,7 +101,7 @@ class Renders:
 
 
 class AugmentationService:
-    """Holds the scene and, where lights continue, the adversaries' lights from epoch to epoch.
+    """Holds the scene and, where lights continue, the adversaries' lights from one regeneration to the next.
 
     Where several processes train together, each attacks its share of the examples, and all get all renders.
     """
@@ -121,18 +125,19 @@ class AugmentationService:
         self._continued: Tensor | None = None
 
     def __len__(self) -> int:
-        """Examples per epoch."""
+        """Examples per regeneration."""
         return len(self._labels) if self.settings.renders else 0
 
-    def regenerate(self, model: nn.Module, epoch: int) -> Renders:
-        """This epoch's examples for the model's current weights; the model is left as it was found.
+    def regenerate(self, model: nn.Module, number: int) -> Renders:
+        """Fresh examples for the model's current weights; the model is left as it was found.
 
-        The draw depends on the seed and the epoch alone, so a resumed run repeats it.
+        number: counts the regenerations of a run from 0. The draw depends on it and the seed alone, so a resumed run
+        repeats it.
         """
         if not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
         make = self._random if self.settings.arm == "random" else self._adversarial
-        return make(model, epoch)
+        return make(model, number)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The adversaries' lights, where they continue; empty otherwise."""
@@ -149,8 +154,8 @@ class AugmentationService:
             )
         self._continued = state["lights"].to(self._labels.device)
 
-    def _random(self, model: nn.Module, epoch: int) -> Renders:
-        lights = self._perturbed(epoch)
+    def _random(self, model: nn.Module, number: int) -> Renders:
+        lights = self._perturbed(number)
         images = self._scene.render(lights)
         with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
             logits = torch.cat([model(batch) for batch in images.split(self.settings.attack.batch_size)])
@@ -160,9 +165,9 @@ class AugmentationService:
         }
         return Renders(images, self._labels, diagnostics | self._light_diagnostics(lights))
 
-    def _adversarial(self, model: nn.Module, epoch: int) -> Renders:
+    def _adversarial(self, model: nn.Module, number: int) -> Renders:
         attack, goal = self.settings.attack, Goal(self._labels[:, None])
-        problem = _SceneLights(self._scene, self._starting_lights(epoch), attack)
+        problem = _SceneLights(self._scene, self._starting_lights(number), attack)
         mine = processes.share(len(self._scene)).to(self._light.device)
         part = Part(problem, mine, problem.start[mine])
         result = descend(model, part, goal.of(mine), attack.descent(), self._phases)
@@ -173,15 +178,15 @@ class AugmentationService:
         diagnostics = self._attack_diagnostics(result) | self._light_diagnostics(lights)
         return Renders(result.images.flatten(0, 1), self._labels, diagnostics)
 
-    def _starting_lights(self, epoch: int) -> Tensor:
+    def _starting_lights(self, number: int) -> Tensor:
         if self._continued is not None:
             return self._continued
         if self.settings.start == "random":
-            return self._perturbed(epoch)
+            return self._perturbed(number)
         return self._light.expand(len(self._scene), -1, -1)
 
-    def _perturbed(self, epoch: int) -> Tensor:
-        random, draws = self.settings.random, generator(self._seed, epoch, "lights")
+    def _perturbed(self, number: int) -> Tensor:
+        random, draws = self.settings.random, generator(self._seed, number, "lights")
         lights = perturb(self._light.cpu(), len(self._scene), random.amplitude, random.radius, draws)
         return lights.to(self._light.device)
 

@@ -3,15 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import hydra
-from omegaconf import DictConfig
-
 from renderer.environment import check_map_name, negative_share, to_map, write_map
 from renderer.errors import require_range
 from renderer.lights import load_light
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import script
 from train.outputs import writable_file
-from train.settings import read_settings
 
 LARGEST_HEIGHT = 8192  # of a map that fits in memory: 3 GB
 
@@ -28,14 +24,11 @@ class Settings:
         require_range("height", self.height, 1, LARGEST_HEIGHT)
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="export_light")
-@one_sentence_errors
-def main(config: DictConfig) -> None:
-    config = read_settings(Settings, config)
-    light, out = load_light(config.light), Path(config.out)
+def main(settings: Settings) -> None:
+    light, out = load_light(settings.light), Path(settings.out)
     check_map_name(out)
     writable_file(out, "out")
-    radiance = to_map(light, config.height)
+    radiance = to_map(light, settings.height)
     write_map(out, radiance)
     fate = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"
     print(
@@ -45,4 +38,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    with_suggestions(main, "export_light")
+    script(main, Settings)

@@ -3,13 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import hydra
-from omegaconf import DictConfig
-
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import script
 from train.outputs import writable_folder
 from train.report import publish_run
-from train.settings import read_settings
 
 
 @dataclass
@@ -20,13 +16,10 @@ class Settings:
     out: str
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="publish")
-@one_sentence_errors
-def main(config: DictConfig) -> None:
-    config = read_settings(Settings, config)
-    publish_run(Path(config.run), writable_folder(config.out, "out"))
-    print(f"published in {config.out}")
+def main(settings: Settings) -> None:
+    publish_run(Path(settings.run), writable_folder(settings.out, "out"))
+    print(f"published in {settings.out}")
 
 
 if __name__ == "__main__":
-    with_suggestions(main, "publish")
+    script(main, Settings)

@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
@@ -16,9 +16,11 @@ from PIL import Image
 from renderer.environment import read_map, write_map
 from renderer.errors import InputError
 from renderer.lights import load_light, probe, save_light
-from train.checkpoint import BEST, PUBLISHED, load_network, publish, save
+from train.checkpoint import BEST, PUBLISHED, describe, load_network, publish, save
 from train.data import load_npz
-from train.photographs import find_photographs, load_photographs
+from train.photographs import Photograph, find_photographs, load_photographs
+from train.photographs.answers import Answer
+from train.photographs.answers_table import ANSWERS, read_answers, write_answers
 from train.run_folder import read_config, read_json, read_numbers
 from train.wideresnet import WideResNet
 
@@ -39,8 +41,14 @@ def write_npz(path: Path) -> None:
 
 def network_state() -> dict:
     torch.manual_seed(0)
-    architecture = {"classes": CLASSES, "depth": 10, "width": 1, "dropout": 0.0}
-    return {"model": WideResNet(2, 10, 1, 0.0).state_dict(), "architecture": architecture}
+    network = WideResNet(2, 10, 1, 0.0)
+    architecture = describe(network, CLASSES, 8, "srgb", depth=10, width=1, dropout=0.0)
+    return {"model": network.state_dict(), "architecture": architecture}
+
+
+def write_scores(path: Path) -> None:
+    asked = Answer(Photograph(PurePosixPath("a.png"), "fig", "web"), "fig", 0.5, 0.5, 1, 0.5, 1, 0.0)
+    write_answers(path, [asked], "fig")
 
 
 def write_table(path: Path) -> None:
@@ -72,6 +80,7 @@ DOORS = [
     Door("config.yaml", lambda path: path.write_text("seed: 1\ndata: {path: '${a}', size: [1, 2]}\n"), read_config),
     Door("metrics.jsonl", lambda path: path.write_text('{"epoch": 1}\n{"test/accuracy": 0.5}\n'), read_numbers),
     Door("summary.json", lambda path: path.write_text(json.dumps({"recall": {"value": None, "n": 0}})), read_json),
+    Door(ANSWERS, write_scores, lambda path: read_answers(path, "fig")),
     Door("photos.csv", write_table, read_photographs),
     Door("photo.png", lambda path: Image.new("RGB", (1, 2)).save(path), read_photographs),
     Door("photo.jpg", lambda path: Image.new("RGB", (2, 1)).save(path), read_photographs),

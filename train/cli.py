@@ -9,33 +9,25 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import hydra
 from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
 from renderer.errors import InputError
+from train.settings import read_settings
 
 USER_ERROR = 2
 LONGEST_NAME = 200  # characters
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-TEXTS = (
-    "run",
-    "sweep",
-    "out",
-    "keep",
-    "photos",
-    "path",
-    "pictures",
-    "cache",
-    "weights",
-    "light",
-    "label",
-    "classifier",
-)
+TEXTS = {  # keys of names and folders
+    *("run", "sweep", "init_from", "out", "keep", "photos", "photographs", "path", "pictures", "cache"),
+    *("weights", "light", "label", "classifier"),
+}
 NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false", re.IGNORECASE)
 SYNTAX = re.compile(r"""[\[\]{}(),'"$\\]""")  # of Hydra's lists, mappings, functions, choices and quotes
 FOLDERS = re.compile(r"(?<!\w)(~|\.{1,2})?/([^\s,:=]*/)?")  # of a path that does not begin in the clone
@@ -116,12 +108,30 @@ def _as_text(argument: str) -> str:
     """The override, quoted where its value is text that Hydra would take for a number, or not at all: 1.10, schäl."""
     key, _, value = argument.partition("=")
     mistaken = NUMBER.fullmatch(value) or (not value.isascii() and not SYNTAX.search(value))
-    return f"{key}={quoted(value)}" if key.lstrip("+").rpartition(".")[2] in TEXTS and mistaken else argument
+    is_text = not TEXTS.isdisjoint(key.lstrip("+").split("."))
+    return f"{key}={quoted(value)}" if is_text and mistaken else argument
 
 
-def command_line(arguments: Sequence[str]) -> str:
+def script(function: Callable, settings: type | None = None) -> None:
+    """Run a script of scripts/ under the configuration of its own name, read into a dataclass where one is given.
+
+    What the function returns are failures, in words, which the script ends with.
+    """
+    name = Path(sys.argv[0]).stem
+
+    @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
+    @one_sentence_errors
+    def main(config: DictConfig) -> None:
+        if failed := function(read_settings(settings, config) if settings else config):
+            sys.exit("\n".join(failed))
+
+    with_suggestions(main, name)
+
+
+def command_line() -> str:
     """The command of the running script in scripts/, from the clone's root and without the folders of this machine."""
-    script = Path(sys.argv[0]).resolve().as_posix().rpartition("/scripts/")[2]
+    name, *arguments = sys.argv
+    script = Path(name).resolve().as_posix().rpartition("/scripts/")[2]
     return shlex.join(FOLDERS.sub("", word) for word in ("python", f"scripts/{script}", *arguments))
 
 

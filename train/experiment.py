@@ -40,7 +40,7 @@ from train.distributed import first_process_first
 from train.evaluation import evaluate
 from train.fit import Trainer
 from train.logs import NoLog, RunLog, console
-from train.photographs import evaluate_photographs, find_photographs, format_summary
+from train.photographs import FIGURES, evaluate_photographs, find_figure, find_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
@@ -53,8 +53,6 @@ from train.settings import (
     require_same_settings,
 )
 from train.wideresnet import WideResNet
-
-PHOTOGRAPHS = "photographs"
 
 
 def load_data(config: DictConfig) -> DataSet:
@@ -97,8 +95,8 @@ def run(config: DictConfig, data: DataSet, folder: Path) -> None:
 def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], None]:
     """Everything of `run` that comes before the first epoch, where wrong input shows; the result is the rest of it."""
     settings = read_settings(ExperimentSettings, config)
-    if settings.evaluate.photos:
-        find_photographs(Path(settings.evaluate.photos), data.classes, settings.label)
+    for photographs in settings.evaluate.folders.values():
+        find_photographs(photographs, data.classes, settings.label)
     device = choose_device(settings.train.device)
     set_threads(settings.train.threads)
     set_deterministic(settings.train.deterministic)
@@ -144,13 +142,16 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
     phases = Phases(device)
     precision = choose_precision(settings.train.precision, device)
     mean, std = channel_statistics(data.train.images)
-    architecture = asdict(settings.model)
+    shape = asdict(settings.model)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
-    network = WideResNet(len(data.classes), **architecture, mean=mean, std=std).to(device)
+    network = WideResNet(len(data.classes), **shape, mean=mean, std=std)
+    facts = {"classes": data.classes, "size": data.size, "encoding": settings.renderer.encoding, **shape}
+    if settings.train.init_from:
+        checkpoint.start_from(network, checkpoint.describe(network, **facts), Path(settings.train.init_from))
     service = _build_service(settings, data, device, phases)
-    model = MixedPrecision(network, precision)
-    checkpointed = {"classes": list(data.classes), **architecture}
-    return Trainer(settings.train, model, checkpointed, service, phases, folder, settings.seed)
+    model = MixedPrecision(network.to(device), precision)
+    described = checkpoint.describe(network, **facts)
+    return Trainer(settings.train, model, described, service, phases, folder, settings.seed)
 
 
 def _open_folder(trainer: Trainer, config: DictConfig) -> None:
@@ -240,10 +241,11 @@ def _log_skipped(scene: Scene, cache: OperatorCache, seconds: float) -> None:
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
     """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
     test = data.test.to(device)
-    last = evaluate(trainer.selected, test)["accuracy"]
+    last = selected = evaluate(trainer.selected, test)["accuracy"]
     best = checkpoint.load(trainer.folder / checkpoint.BEST)
-    trainer.selected.network.load_state_dict(best["model"])
-    selected = evaluate(trainer.selected, test)["accuracy"]
+    if best["epoch"] != trainer.epoch:
+        trainer.selected.network.load_state_dict(best["model"])
+        selected = evaluate(trainer.selected, test)["accuracy"]
     console.info("test accuracy %.4f (epoch %d, selected on validation), %.4f (last)", selected, best["epoch"], last)
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 
@@ -251,19 +253,19 @@ def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[
 def _photograph_scores(
     settings: ExperimentSettings, trainer: Trainer, data: DataSet, device: torch.device
 ) -> dict[str, float]:
-    """The network's shares on the folder of photographs; empty without one."""
-    if not settings.evaluate.photos or processes.index():
-        return {}
-    summary = evaluate_photographs(
-        trainer.selected,
-        data.classes,
-        Path(settings.evaluate.photos),
-        settings.label,
-        trainer.folder / PHOTOGRAPHS,
-        size=data.size,
-        skip_unreadable=settings.evaluate.skip_unreadable,
-        device=device,
-    )
-    console.info("%s", format_summary(summary))
-    shares = {f"photographs/{name}": summary[name]["value"] for name in ("recall", "top5", "false_alarms")}
-    return {name: value for name, value in shares.items() if value is not None}
+    """The network's figures on each folder of photographs, as NAME/FIGURE; empty without one."""
+    scores = {}
+    for name, photographs in settings.evaluate.folders.items() if processes.index() == 0 else ():
+        summary = evaluate_photographs(
+            trainer.selected,
+            data.classes,
+            photographs,
+            settings.label,
+            trainer.folder / name,
+            size=data.size,
+            skip_unreadable=settings.evaluate.skip_unreadable,
+            device=device,
+        )
+        console.info("%s: %s", name, format_summary(summary))
+        scores |= {f"{name}/{figure}": find_figure(summary, figure)["value"] for figure in ("top5", *FIGURES)}
+    return {name: value for name, value in scores.items() if value is not None}

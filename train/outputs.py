@@ -37,16 +37,6 @@ def writable_file(file: str | Path, key: str) -> Path:
     return file
 
 
-def save_page(file: Path, text: str) -> None:
-    """Write what was found, in a folder that is made where it is not there; print it where it cannot be written."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text, encoding="utf-8")
-    except OSError:
-        print(text)
-        raise
-
-
 def _try_folder(folder: Path) -> None:
     """Nothing is left behind: the folder is tried, or the nearest above it in which it would be made."""
     there = next(each for each in (folder, *folder.absolute().parents) if each.exists())

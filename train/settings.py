@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -20,8 +21,8 @@ CIRCUMSTANCES = (
     *("run", "sweep", "launcher", "compare", "versions", "renderer.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
-
-
+PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
+RESERVED = ("renders", "rendered_pictures", "test")  # other sub-folders and scores of a run
 SMALLEST_SIZE, LARGEST_SIZE = 5, 4096  # pixels per side: 4 are padded by reflection
 MOST_PICTURES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
 
@@ -92,10 +93,30 @@ class ModelSettings:
 
 @dataclass
 class EvaluationSettings:
-    """photos: a folder of photographs to score the network on. skip_unreadable: pass over those that are broken."""
+    """photos: a folder of photographs to score the network on, or several by name. skip_unreadable: pass over those
+    that are broken.
+    """
 
-    photos: str | None = None
+    photos: Any = None  # str | dict[str, str] | None, a union that OmegaConf has no type for
     skip_unreadable: bool = False
+
+    def __post_init__(self):
+        given = self.photos
+        named = isinstance(given, dict) and all(isinstance(folder, str) for folder in given.values())
+        if not (given is None or isinstance(given, str) or named):
+            raise InputError(f"evaluate.photos={given} must be a folder, or a mapping of names to folders")
+        for name in self.folders:
+            if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
+                raise InputError(
+                    f"evaluate.photos.{name}: name a sub-folder of the run, of letters, digits, _ and -, and none of "
+                    f"{', '.join(RESERVED)}"
+                )
+
+    @property
+    def folders(self) -> dict[str, Path]:
+        """The folders of photographs by the name of the run's sub-folder that gets their scores."""
+        named = self.photos if isinstance(self.photos, dict) else {PHOTOGRAPHS: self.photos} if self.photos else {}
+        return {str(name): Path(folder) for name, folder in named.items()}
 
 
 @dataclass
@@ -150,8 +171,12 @@ def decisive_settings(config: DictConfig) -> dict[str, object]:
 
 
 def differing_settings(folder: Path, config: DictConfig) -> Iterator[tuple[str, object, object]]:
-    """The decisive keys in which the run in a folder and a configuration differ, with both values."""
-    found, asked = decisive_settings(read_config(folder / CONFIG)), decisive_settings(config)
+    """The decisive keys in which the run in a folder and a configuration differ, with both values.
+
+    A key that the run is older than has its default.
+    """
+    defaults = decisive_settings(OmegaConf.structured(ExperimentSettings))
+    found, asked = ({**defaults, **decisive_settings(each)} for each in (read_config(folder / CONFIG), config))
     for key in sorted(found.keys() | asked.keys()):
         if found.get(key) != asked.get(key):
             yield key, found.get(key), asked.get(key)
@@ -163,7 +188,7 @@ def require_same_settings(folder: Path, config: DictConfig) -> None:
     Nor does what comes after training have to be the same.
     """
     for key, found, asked in differing_settings(folder, config):
-        longer = key == "train.epochs" and asked > found
+        longer = key == "train.epochs" and isinstance(found, int) and asked > found
         if not longer and not key.startswith("evaluate."):
             raise InputError(
                 f"run={folder} was trained with {key}={found}, and train.resume=true asks for {asked}: resume with the "
@@ -179,7 +204,7 @@ def _dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
             yield prefix + key, value
 
 
-def read_object(item: str | dict, label: str, index: int) -> ObjectSettings:
-    """An entry of scene.meshes: a file or solid of the class `label`, or a mapping that may name its own."""
+def read_object(item: str | dict, label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
+    """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own."""
     keys = item if isinstance(item, dict) else {"mesh": item}
-    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"scene.meshes[{index}]")
+    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")

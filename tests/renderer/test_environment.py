@@ -1,7 +1,7 @@
-import importlib.util
 import io
 import math
 import re
+import runpy
 import struct
 import sys
 from pathlib import Path
@@ -413,15 +413,12 @@ def test_a_map_of_few_texels_is_the_light_of_its_mean(tmp_path, size):
 @pytest.fixture
 def export(monkeypatch, capsys):
     """`python scripts/export_light.py ...` in this process: its exit status, output and errors."""
-    path = ROOT / "scripts" / "export_light.py"
-    spec = importlib.util.spec_from_file_location("export_light", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    path = str(ROOT / "scripts" / "export_light.py")
 
     def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", [str(path), *arguments])
+        monkeypatch.setattr(sys, "argv", [path, *arguments])
         try:
-            module.main()
+            runpy.run_path(path, run_name="__main__")
         except SystemExit as stop:
             return stop.code, *capsys.readouterr()
         return 0, *capsys.readouterr()

@@ -58,7 +58,9 @@ EXPORT = ["export_light", "light=grace", "height=4"]
 def test_folders_whose_names_look_like_numbers_or_have_no_utf_8_are_scored(call, here, capsys):
     assert call(*EVALUATE, "out=1e3") == 0
     assert "1 pictures of orange, 1 of other things" in capsys.readouterr().out
-    assert {path.name for path in (here / "1e3").iterdir()} == {"photographs.csv", "summary.json", "contact_sheet.png"}
+    assert {path.name for path in (here / "1e3").iterdir()} == {
+        *("photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png")
+    }
     assert r"other_\udcff/a.png" in (here / "1e3" / "photographs.csv").read_text(encoding="utf-8")
 
 
@@ -78,8 +80,11 @@ WRONG = [
     ([*EXPORT, "height=1000000000", "out=a.hdr"], "height=1000000000 must be at least 1 and at most 8192"),
     (["publish", "run=[a]", "out=out"], "run: "),
     (["fit_skylight", "zenith_degree=many", "out=a.safetensors"], "zenith_degree: "),
-    (["stress_renderer", "degree=-1", "out=a.md"], "degree=-1 must be at least"),
-    (["torture", "kills=1.5", "out=a.md"], "kills: "),
+    (["check_accuracy", "degree=-1", "out=a.md"], "degree=-1 must be at least"),
+    (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
+    (["check_interruptions", "jobs=0", "out=a.md"], "jobs=0 must be at least 1"),
+    (["lab", "size=0", "out=a"], "size=0 must be at least 1"),
+    (["benchmark_training", "steps=-1", "out=a.md"], "steps=-1 must be at least 0"),
 ]
 
 
@@ -95,7 +100,9 @@ def test_a_setting_of_another_type_or_beyond_its_range_is_one_line(call, here, c
 @pytest.mark.parametrize(
     ("command", "out"),
     [(EXPORT, "/proc/none/out"), (EXPORT, "file/out"), (EXPORT, "x" * 300), (EVALUATE, "/dev/full/out"),
-     (["publish", "run=1.10"], "file/out"), (["fit_skylight"], "file/out"), (["stress_renderer"], "file/out")],
+     (["publish", "run=1.10"], "file/out"), (["fit_skylight"], "file/out"), (["check_accuracy"], "file/out"),
+     (["check_interruptions"], "file/out"), (["benchmark_training"], "file/out"), (["benchmark_renderer"], "file/out"),
+     (["reproduce_paper", "section=run_time", "scene.meshes=[a.glb]"], "file/out"), (["lab"], "file/out")],
 )  # fmt: skip
 def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, capsys, command, out, monkeypatch):
     def work(*arguments, **more):

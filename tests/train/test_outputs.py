@@ -1,11 +1,10 @@
 import io
-from pathlib import Path
 
 import pytest
 
 from renderer.errors import InputError
 from train import outputs
-from train.outputs import save_page, writable_file, writable_folder
+from train.outputs import writable_file, writable_folder
 
 
 def test_what_can_be_written_is_left_as_it_was(tmp_path):
@@ -37,11 +36,3 @@ def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(outputs.tempfile, "TemporaryFile", lambda dir: io.FileIO("/dev/full", "w"))
     with pytest.raises(InputError, match=rf"out={tmp_path} cannot be written to \(No space left on device\)"):
         writable_folder(tmp_path, "out")
-
-
-def test_what_was_found_is_printed_where_it_cannot_be_written(tmp_path, capsys):
-    save_page(tmp_path / "a" / "page.md", "found ×\n")
-    assert (tmp_path / "a" / "page.md").read_text(encoding="utf-8") == "found ×\n" and capsys.readouterr().out == ""
-    with pytest.raises(OSError, match="No space left"):
-        save_page(Path("/dev/full"), "found\n")
-    assert "found\n" in capsys.readouterr().out

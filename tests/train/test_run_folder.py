@@ -11,7 +11,8 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
-from train.report import format_comparison, format_table, publish_run, summarise
+from train.comparison import format_comparison
+from train.report import format_table, publish_run, summarise
 from train.run_folder import LOCK, read_config, read_numbers, sole_writer
 
 SCORES = {"test/accuracy": 0.5, "test/accuracy_last": 0.4, "test/epoch": 1}
@@ -107,7 +108,9 @@ def test_a_last_line_that_was_cut_short_is_no_damage(tmp_path):
     assert read_numbers(tmp_path / "lines") == [{"epoch": 1}]
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"recall": 1}', '{"recall": {}, "by_source": []}', "\ud800"])
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{}", '{"recall": 1}', '{"recall": {"value": 0.5}}', '{"auc": {"value": "a"}}', "\ud800"]
+)
 def test_a_damaged_summary_of_photographs_is_one_sentence_that_names_it(run, content):
     (run / "photographs" / "summary.json").write_bytes(content.encode("utf-8", "surrogatepass"))
     with pytest.raises(InputError, match=r"summary\.json") as caught:

@@ -18,17 +18,22 @@ from train.classes import class_index, nearest_class
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 FOREIGN = "other_"  # starts the name of a folder whose class the model lacks
 TABLE = "photos.csv"
+SEPARATOR = ";"  # between the sources in a cell of its look_alikes
 SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training) to skip them"
 DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the final size
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture: its path relative to the folder, its class (or `other_*`) and, where known, its source."""
+    """A picture: its path relative to the folder, its class (or `other_*`) and, where known, its source.
+
+    look_alikes: the sources of the other things that it is ranked against, besides its own.
+    """
 
     path: PurePosixPath
     label: str
     source: str | None
+    look_alikes: tuple[str, ...] = ()
 
 
 def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[Photograph]:
@@ -38,18 +43,24 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
     class the model lacks), or holds pictures only, which are then all of class `label`. Sub-folders are
     searched to any depth, also where they are symbolic links; hidden files are passed over, and so are other kinds of
     file, which `left_out` tells. `photos.csv` in the folder, if there, gives sources by its columns `path` and
-    `source_tag`.
+    `source_tag`, and by `look_alikes`, if it has that, the other sources, separated by `;`, whose pictures of other
+    things a picture is ranked against.
 
     Raises InputError for a folder that is missing, unreadable, empty or mixes both layouts, for a sub-folder or `label`
-    that is no class, and for a `photos.csv` without those columns or that names none of the pictures.
+    that is no class, for a `photos.csv` without those columns or that names none of the pictures, and for look-alikes
+    of a source that is nowhere.
     """
     class_index(classes, label, "label")
     paths = _picture_paths(folder)
     has_class_folders = _check_layout(folder, paths, classes)
-    sources = _read_sources(folder / TABLE)
-    if sources and not sources.keys() & set(paths):
+    rows = _read_table(folder / TABLE)
+    if rows and rows.keys().isdisjoint(paths):
         raise InputError(f"{folder / TABLE} names none of the photographs: give paths such as {paths[0]}")
-    return [Photograph(path, path.parts[0] if has_class_folders else label, sources.get(path)) for path in paths]
+    photographs = [
+        Photograph(path, path.parts[0] if has_class_folders else label, *rows.get(path, (None, ()))) for path in paths
+    ]
+    _check_look_alikes(folder / TABLE, photographs)
+    return photographs
 
 
 def left_out(folder: Path) -> list[PurePosixPath]:
@@ -110,17 +121,39 @@ def _check_layout(folder: Path, paths: Sequence[PurePosixPath], classes: Sequenc
     return bool(names)
 
 
-def _read_sources(table: Path) -> dict[PurePosixPath, str]:
+def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str, ...]]]:
+    """Source and look-alikes by path; nothing without a table."""
     if not table.is_file():
         return {}
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
-            header, *rows = csv.reader(file)
+            header, *lines = csv.reader(file)
         path, tag = header.index("path"), header.index("source_tag")
     except (ValueError, csv.Error, OSError) as error:  # no header, a column missing, not UTF-8, or not a table
         raise InputError(f"{table} cannot be used: make it UTF-8 with the columns path and source_tag") from error
-    named = [(row[path].replace("\\", "/"), row[tag]) for row in rows if len(row) > max(path, tag)]
-    return {PurePosixPath(name): source for name, source in named if source}
+    rows = [dict(zip(header, line, strict=False)) for line in lines if len(line) > max(path, tag)]
+    return {
+        PurePosixPath(row["path"].replace("\\", "/")): (
+            row["source_tag"] or None,
+            split_sources(row.get("look_alikes", "")),
+        )
+        for row in rows
+    }
+
+
+def split_sources(text: str) -> tuple[str, ...]:
+    """The sources that a cell of `look_alikes` names."""
+    return tuple(name.strip() for name in text.split(SEPARATOR) if name.strip())
+
+
+def _check_look_alikes(table: Path, photographs: Sequence[Photograph]) -> None:
+    sources = {photograph.source for photograph in photographs} - {None}
+    for photograph in photographs:
+        if unknown := set(photograph.look_alikes) - sources:
+            raise InputError(
+                f"{table} pairs {photograph.path} with look_alikes of source {min(unknown)!r}, of which there is no "
+                f"picture: name one of {', '.join(sorted(sources))}"
+            )
 
 
 def load_photographs(

@@ -138,6 +138,30 @@ def test_sources_come_from_photos_csv_whatever_its_other_columns_and_rows(tmp_pa
     assert [photograph.source for photograph in found] == ["web", None, "shop"]
 
 
+def test_look_alikes_are_the_sources_named_in_photos_csv(tmp_path):
+    touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "other_lemon/c.jpg", "other_lemon/d.jpg", "other_lemon/e.jpg")
+    rows = ["look_alikes,path,source_tag", "lab; web,orange/a.jpg,sun", ",orange/b.jpg,web", ",other_lemon/c.jpg,lab"]
+    (tmp_path / "photos.csv").write_text("\n".join([*rows, ",other_lemon/d.jpg,web", ";,other_lemon/e.jpg,sun"]))
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    assert [photograph.source for photograph in found] == ["sun", "web", "lab", "web", "sun"]
+    assert [photograph.look_alikes for photograph in found] == [("lab", "web"), (), (), (), ()]
+
+
+def test_look_alikes_of_a_source_without_pictures_are_refused_by_name(tmp_path):
+    touch(tmp_path, "orange/a.jpg", "other_lemon/b.jpg")
+    rows = [
+        "path,source_tag,look_alikes",
+        "orange/a.jpg,web,lib",
+        "other_lemon/b.jpg,lab,",
+        "other_lemon/gone.jpg,lib,",
+    ]
+    (tmp_path / "photos.csv").write_text("\n".join(rows))
+    with pytest.raises(
+        InputError, match=r"photos\.csv pairs orange/a\.jpg with .* source 'lib', .* name one of lab, web$"
+    ):
+        find_photographs(tmp_path, CLASSES, "orange")
+
+
 @pytest.mark.parametrize("table", [b"", b"path,source\na.jpg,web\n", b"path,source_tag\n\xff.jpg,web\n"])
 def test_a_photos_csv_without_its_columns_is_refused_by_name(tmp_path, table):
     touch(tmp_path, "a.jpg")

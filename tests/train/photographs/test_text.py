@@ -13,6 +13,12 @@ lab      1/2 = 0.500 [0.095, 0.905]  2/2 = 1.000 [0.342, 1.000]                 
 shop                              -                           -  1/2 = 0.500 [0.095, 0.905]
 street   0/2 = 0.000 [0.000, 0.658]  1/2 = 0.500 [0.095, 0.905]  1/2 = 0.500 [0.095, 0.905]
 
+                          AUC  recall at 5% false alarms  recall at 10% false alarms  recall at 20% false alarms
+overall  0.340 [0.060, 0.680]       0.000 [0.000, 0.200]        0.000 [0.000, 0.200]        0.000 [0.000, 0.400]
+lab                         -                          -                           -                           -
+shop                        -                          -                           -                           -
+street   0.250 [0.000, 1.000]       0.000 [0.000, 1.000]        0.000 [0.000, 1.000]        0.000 [0.000, 1.000]
+
 class        n  recall  top-5  called orange  most common wrong answers
 orange       5   0.200  0.800          0.200  pear 2, apple 1, plum 1
 other_lemon  2       -      -          0.500  lime 1, orange 1
