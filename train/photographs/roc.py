@@ -31,7 +31,7 @@ def draw_roc(rankings: Mapping[str, Ranking], label: str) -> "Figure":
     """The curves over each other, their AUC in the legend, and lines at RATES; needs no display."""
     from matplotlib.figure import Figure  # half a second that only this takes
 
-    figure = Figure(figsize=(8, 6), layout="constrained")
+    figure = Figure(figsize=(7, 7), layout="constrained")
     axes = figure.subplots()
     axes.axline((0, 0), slope=1, color="0.8", linewidth=1)  # chance
     for rate in map(float, RATES):
@@ -44,5 +44,5 @@ def draw_roc(rankings: Mapping[str, Ranking], label: str) -> "Figure":
     axes.set(xlabel=f"other things called {label}", ylabel=f"{label} recognised", xlim=(-0.01, 1), ylim=(0, 1.01))
     axes.set_aspect("equal")
     if rankings:
-        figure.legend(loc="outside right upper")
+        axes.legend(loc="lower right")  # where only a network worse than chance has a curve
     return figure

