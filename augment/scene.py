@@ -8,7 +8,7 @@ from torch import Tensor
 
 from renderer.cache import OperatorCache
 from renderer.camera import ring
-from renderer.errors import InputError, require_bounded
+from renderer.errors import FACTOR, InputError, require_bounded, require_range
 from renderer.harmonics import live_coefficients
 from renderer.image import PictureSettings, behind, clamped, develop_composite
 from renderer.mesh import Mesh, load_mesh, normalise
@@ -31,8 +31,7 @@ class ObjectSettings:
     gain: float = 1.0
 
     def __post_init__(self):
-        if not self.gain > 0:
-            raise InputError(f"scene.meshes: gain={self.gain} of {self.mesh} must be positive")
+        require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,14 @@ from augment.parameters.kind import check_step, direction
 from augment.phases import Phases
 from augment.scene import Scene
 from augment.seeding import generator
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.lights import perturb
 
 ARMS = ("none", "random", "adversarial")
 STARTS = ("light", "random")
 SCHEDULES = ("restart", "continue")
+MOST_EXAMPLES = 10**6  # at 32 × 32 pixels they take 12 GB
+MOST_EVERY = 10**9
 
 
 @dataclass
@@ -29,10 +31,8 @@ class RandomLights:
     radius: float | None = None
 
     def __post_init__(self):
-        if not self.amplitude > 0:
-            raise InputError(f"augment.random.amplitude={self.amplitude} must be positive")
-        if self.radius is not None and not self.radius > 0:
-            raise InputError(f"augment.random.radius={self.radius} must be positive, or null for ±amplitude")
+        for name in ("amplitude", "radius"):  # no radius: null
+            require_range(f"augment.random.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
 
 
 @dataclass
@@ -82,10 +82,8 @@ class AugmentationSettings:
         ]:
             if value not in choices:
                 raise InputError(f"augment.{name}={value}: choose one of {', '.join(choices)}")
-        if self.examples < 0:
-            raise InputError(f"augment.examples={self.examples} must not be negative")
-        if self.every is not None and self.every < 1:
-            raise InputError(f"augment.every={self.every} must be at least 1 training image, or null for each epoch")
+        require_range("augment.examples", self.examples, 0, MOST_EXAMPLES)
+        require_range("augment.every", self.every, 1, MOST_EVERY)
 
     @property
     def renders(self) -> bool:

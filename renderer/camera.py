@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from renderer.errors import InputError
+from renderer.errors import LARGEST, InputError, require_range
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,7 @@ class OrthographicCamera:
     field_of_view: float
 
     def __post_init__(self):
-        if not 0 < self.field_of_view < math.inf:
-            raise InputError(f"scene.field_of_view={self.field_of_view} must be positive and finite")
+        require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
 

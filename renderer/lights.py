@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from renderer.environment import SUFFIXES, read_map
-from renderer.errors import InputError, require_bounded
+from renderer.errors import FACTOR, InputError, require_bounded
 from renderer.harmonics import basis, live_coefficients, project, rotate
 from renderer.transfer import COEFFICIENTS, DEGREE
 
@@ -59,7 +59,7 @@ def load_light(light: str) -> Tensor:
 def save_light(path: Path, coefficients: Tensor) -> None:
     """Write coefficients (49, 3) as JSON, a row [r, g, b] each. `load_light` reads float32 back to the bit."""
     rows = ",\n".join(json.dumps(row, allow_nan=False) for row in coefficients.tolist())
-    path.write_text(f"[\n{rows}\n]\n")
+    path.write_text(f"[\n{rows}\n]\n", encoding="utf-8")
 
 
 def probe(name: str) -> Tensor:
@@ -118,19 +118,22 @@ def _read_light_map(path: Path) -> Tensor:
     luminance = mean_luminance(coefficients)
     if not luminance > 0:
         raise InputError(f"environment map {path} has a mean luminance of {luminance:g}: give a map with light in it")
-    return coefficients * (mean_luminance(probe("grace")) / luminance)
+    scaled = coefficients * (mean_luminance(probe("grace")) / luminance)
+    if not (scaled.abs() <= FACTOR).all():
+        raise InputError(f"environment map {path} is nearly as negative as it is bright: give a map with light in it")
+    return scaled
 
 
 def _read_coefficients(path: Path) -> Tensor:
     if not path.is_file():
         raise InputError(f"light {path} does not exist: give the path of a .json file of coefficients")
     try:
-        coefficients = torch.tensor(json.loads(path.read_text()), dtype=torch.float32)
-    except (ValueError, TypeError, RuntimeError, OverflowError, OSError) as error:
+        coefficients = torch.tensor(json.loads(path.read_text(encoding="utf-8")), dtype=torch.float32)
+    except (ValueError, TypeError, RuntimeError, OverflowError, RecursionError, OSError) as error:
         raise InputError(f"light {path} is not a readable list of coefficients: {error}") from error
-    if coefficients.shape != (COEFFICIENTS, 3) or not coefficients.isfinite().all():
+    if coefficients.shape != (COEFFICIENTS, 3) or not (coefficients.abs() <= FACTOR).all():  # NaN is not
         raise InputError(
             f"light {path} has shape {tuple(coefficients.shape)}: it must hold {COEFFICIENTS} rows [r, g, b] of finite "
-            "numbers"
+            f"numbers, no larger than {FACTOR:g}"
         )
     return coefficients

@@ -15,6 +15,7 @@ from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
 from train.cli import one_sentence_errors, script
 from train.device import choose_device
+from train.outputs import writable_folder
 from train.run_classifier import load_classifier
 from train.settings import read_object, read_settings
 
@@ -25,7 +26,7 @@ def main(config: DictConfig) -> None:
     settings.attack.require_kinds()
     device = choose_device(settings.device)
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
-    out = Path(settings.out)
+    out = writable_folder(settings.out, "out")
     for index, item in enumerate(settings.scene.meshes):
         named = read_object(item, settings.label, index)
         attacked = attack_mesh(named, settings, classifier, device)

@@ -1,33 +1,52 @@
 """Score a trained network on a folder of photographs: python scripts/evaluate_photos.py run=... photos=..."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from omegaconf import DictConfig
-
+from renderer.errors import require_range
 from train.checkpoint import load_network
 from train.cli import script
 from train.device import choose_device
+from train.outputs import writable_folder
 from train.photographs import evaluate_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
+from train.settings import LARGEST_SIZE
 
 
-def main(config: DictConfig) -> None:
-    device = choose_device(config.device)
-    network = load_network(Path(config.run), config.size)
-    model = MixedPrecision(network.module.to(device), choose_precision(config.precision, device))
+@dataclass
+class Settings:
+    """conf/evaluate_photos.yaml."""
+
+    run: str
+    photos: str
+    label: str
+    out: str
+    skip_unreadable: bool
+    size: int | None
+    precision: str
+    device: str
+
+    def __post_init__(self):
+        require_range("size", self.size, 1, LARGEST_SIZE)
+
+
+def main(settings: Settings) -> None:
+    device = choose_device(settings.device)
+    network = load_network(Path(settings.run), settings.size)
+    model = MixedPrecision(network.module.to(device), choose_precision(settings.precision, device))
     summary = evaluate_photographs(
         model,
         network.classes,
-        Path(config.photos),
-        config.label,
-        Path(config.out),
+        Path(settings.photos),
+        settings.label,
+        writable_folder(settings.out, "out"),
         size=network.size,
-        skip_unreadable=config.skip_unreadable,
+        skip_unreadable=settings.skip_unreadable,
         device=device,
     )
     print(format_summary(summary))
-    print(f"\ntable, scores and picture: {config.out}")
+    print(f"\ntable, scores and picture: {settings.out}")
 
 
 if __name__ == "__main__":
-    script(main)
+    script(main, Settings)

@@ -1,17 +1,25 @@
 """Write a run's network as half-precision safetensors with a card: python scripts/publish.py run=... out=..."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from omegaconf import DictConfig
-
 from train.cli import script
+from train.outputs import writable_folder
 from train.report import publish_run
 
 
-def main(config: DictConfig) -> None:
-    publish_run(Path(config.run), Path(config.out))
-    print(f"published in {config.out}")
+@dataclass
+class Settings:
+    """conf/publish.yaml."""
+
+    run: str
+    out: str
+
+
+def main(settings: Settings) -> None:
+    publish_run(Path(settings.run), writable_folder(settings.out, "out"))
+    print(f"published in {settings.out}")
 
 
 if __name__ == "__main__":
-    script(main)
+    script(main, Settings)

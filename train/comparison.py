@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from train.epoch import PHASES
 from train.evaluations import Evaluation, difference, have_same_seeds, read_evaluations
 from train.photographs import FIGURES, figure_title, find_figure, format_interval
-from train.report import RunSummary, group_by_settings, varied_settings
+from train.report import RunSummary, complete, group_by_settings, varied_settings
 from train.settings import PHOTOGRAPHS
 from train.tables import aligned
 
@@ -16,8 +16,11 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photog
     Runs that differ only in the seed are a group; a table for each group shows how far it is from the first one.
     exclude: sources that the pooled figures leave out; photographs: the sub-folder of each run with its scores.
 
-    InputError as of `read_evaluations`.
+    InputError as of `read_evaluations`, and for a run whose files lack what is shown.
     """
+    for run in runs:
+        with complete(run.folder):
+            _accuracy_table([run]), _seconds_table([run])
     sections = [("Accuracy on the test set", _accuracy_table(runs)), ("Seconds per epoch", _seconds_table(runs))]
     if evaluations := read_evaluations(runs, exclude, photographs):
         pooled = f"all but {', '.join(exclude)}" if exclude else "all"

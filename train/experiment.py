@@ -1,6 +1,5 @@
 """One run from its configuration: data, scene, network, training, scores on the test set and on photographs."""
 
-import errno
 import os
 import platform
 import time
@@ -27,6 +26,7 @@ from renderer.transfer import COEFFICIENTS, DEGREE
 from renderer.visibility import choose
 from train import checkpoint
 from train.classes import class_index
+from train.cli import NO_ROOM
 from train.data import (
     DataSet,
     channel_statistics,
@@ -43,11 +43,16 @@ from train.logs import NoLog, RunLog, console
 from train.photographs import FIGURES, evaluate_photographs, find_figure, find_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
-from train.settings import ExperimentSettings, read_object, read_settings
+from train.run_folder import CONFIG
+from train.settings import (
+    LARGEST_SIZE,
+    SMALLEST_SIZE,
+    ExperimentSettings,
+    read_object,
+    read_settings,
+    require_same_settings,
+)
 from train.wideresnet import WideResNet
-
-CONFIG = "config.yaml"
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def load_data(config: DictConfig) -> DataSet:
@@ -64,7 +69,13 @@ def load_data(config: DictConfig) -> DataSet:
         raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")
     console.info("data: %s", data.name)
     with first_process_first():
-        return loaders[data.name]()
+        loaded = loaders[data.name]()
+    if not SMALLEST_SIZE <= loaded.size <= LARGEST_SIZE:
+        raise InputError(
+            f"data.path={data.path} has pictures of {loaded.size} pixels per side: give {SMALLEST_SIZE} to "
+            f"{LARGEST_SIZE}"
+        )
+    return loaded
 
 
 def write_pictures(config: DictConfig, size: int) -> None:
@@ -73,7 +84,7 @@ def write_pictures(config: DictConfig, size: int) -> None:
         console.info("writing held-out renders in hard light (not photographs) to %s", config.data.pictures)
         cache = TensorCache(cache_folder(config.renderer.cache))
         with _one_error_without_room(config.data.pictures):
-            write_held_out(Path(config.data.pictures), size, config.data.seed, cache)
+            write_held_out(Path(str(config.data.pictures)), size, config.data.seed, cache)
 
 
 def run(config: DictConfig, data: DataSet, folder: Path) -> None:
@@ -151,6 +162,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
             raise InputError(
                 f"run={folder} holds a run already: set train.resume=true to go on, or choose another run="
             )
+        require_same_settings(folder, config)
         trainer.resume()
         console.info("resumed %s after epoch %d%s", folder, trainer.epoch, trainer.part_of_epoch)
     elif trainer.settings.resume:
@@ -170,6 +182,8 @@ def _write_config(config: DictConfig, folder: Path) -> None:
     }
     temporary = folder / "config.tmp"  # so that the old file is whole where the new one finds no room
     OmegaConf.save(OmegaConf.create(resolved), temporary)
+    with open(temporary, "rb+") as file:
+        os.fsync(file.fileno())  # a run goes on with these settings alone, also after a loss of power
     os.replace(temporary, folder / CONFIG)
 
 

@@ -118,6 +118,11 @@ class Trainer:
     def resume(self) -> None:
         """Go on from the folder's newest whole checkpoint; InputError where it is from another architecture."""
         state, problem = checkpoint.load_newest(self.folder)
+        if missing := self.state_dict().keys() - state.keys():
+            raise InputError(
+                f"the checkpoint in {self.folder} has a network and no run to go on with ({min(missing)} is missing): "
+                f"restore {checkpoint.LAST}, or start in another folder with run="
+            )
         if checkpoint.contradiction(state["architecture"], self.architecture):
             raise InputError(
                 f"the checkpoint in {self.folder} is from another architecture or other classes: resume with the "

@@ -3,11 +3,13 @@
 import math
 from dataclasses import dataclass
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 from train.batches import FLIPS
 from train.distortions import DISTORTIONS
 from train.graphs import COMPILE
 from train.schedule import SCHEDULES
+
+MOST = {"epochs": 10**6, "images_per_epoch": 10**9, "batch_size": 10**6, "checkpoint_every": 10**6, "threads": 1024}
 
 
 @dataclass
@@ -39,9 +41,8 @@ class TrainSettings:
         for name, choices in choices_of.items():
             if getattr(self, name) not in choices:
                 raise InputError(f"train.{name}={getattr(self, name)}: choose one of {', '.join(choices)}")
-        for name in ("epochs", "images_per_epoch", "batch_size", "checkpoint_every", "threads"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise InputError(f"train.{name}={value} must be at least 1")
+        for name, most in MOST.items():
+            require_range(f"train.{name}", getattr(self, name), 1, most)
         for name in ("momentum", "label_smoothing", "averaging"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")

@@ -73,7 +73,7 @@ def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None
     part = Part("held out", hard_light, same_for_all=True)
     split = _render_split(HELD_OUT_PER_CLASS, seed, part, settings, cache or TensorCache())
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "photos.csv", "w", newline="") as file:
+    with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["path", "source_tag", "light"])
         for number, (image, label) in enumerate(zip(split.images, split.labels, strict=True)):

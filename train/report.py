@@ -1,20 +1,21 @@
 """Tables and model cards of finished runs, from the files in their folders."""
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean, stdev
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
 from renderer.errors import InputError
 from train import checkpoint
 from train.epoch import PHASES
-from train.experiment import CONFIG
-from train.logs import read_metrics
+from train.logs import METRICS, read_metrics
 from train.photographs import FIGURES, SUMMARY, figure_title, find_figure, format_interval
+from train.run_folder import CONFIG, read_config, read_json
 from train.settings import decisive_settings
 from train.tables import aligned
 
@@ -59,18 +60,34 @@ def is_finished(folder: Path) -> bool:
 
 
 def summarise(folder: Path) -> RunSummary:
-    """Read a finished run; InputError for a folder that holds none."""
+    """Read a finished run; InputError for a folder that holds none, or whose files lack what the tables show."""
     if not is_finished(folder):
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")
     lines = read_metrics(folder)
     phases = sorted({name for line in lines for name in line if name.startswith("seconds/")})
-    return RunSummary(
+    run = RunSummary(
         folder=folder,
-        config=OmegaConf.load(folder / CONFIG),
+        config=read_config(folder / CONFIG),
         scores=lines[-1],
         seconds={name.partition("/")[2]: fmean(line[name] for line in lines if name in line) for name in phases},
-        photographs={path.parent.name: json.loads(path.read_text()) for path in sorted(folder.glob(f"*/{SUMMARY}"))},
+        photographs={path.parent.name: read_json(path) for path in sorted(folder.glob(f"*/{SUMMARY}"))},
     )
+    with complete(folder):
+        format_table([run])
+    return run
+
+
+@contextmanager
+def complete(folder: Path) -> Iterator[None]:
+    """InputError where what is shown of a run is not in its files, or of another kind there."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, OmegaConfBaseException) as error:
+        reason = f"{type(error).__name__}: {str(error).splitlines()[0]}" if str(error) else type(error).__name__
+        raise InputError(
+            f"{folder}: {CONFIG}, {METRICS} or a {SUMMARY} is not as `python -m train` wrote it "
+            f"({reason}): use another run"
+        ) from error
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
@@ -123,9 +140,11 @@ def varied_settings(runs: Sequence[RunSummary]) -> list[str]:
 def publish_run(folder: Path, out: Path) -> None:
     """Write a finished run's selected network as half-precision safetensors, and a card beside it."""
     run = summarise(folder)
+    with complete(folder):
+        card = _card(run, out.name)
     out.mkdir(parents=True, exist_ok=True)
     checkpoint.publish(out / checkpoint.PUBLISHED, checkpoint.load(folder / checkpoint.BEST))
-    (out / "README.md").write_text(_card(run, out.name))
+    (out / "README.md").write_text(card, encoding="utf-8")
 
 
 def _name(run: RunSummary, varied: Sequence[str]) -> list[str]:

@@ -1,6 +1,5 @@
 """conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
 
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,9 +11,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from augment.scene import ObjectSettings, count_views
 from augment.service import AugmentationSettings
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import PictureSettings
 from train.recipe import TrainSettings
+from train.run_folder import CONFIG, read_config
 
 # Where, how and with what a run was made: these do not decide its result, nor name a sweep's cell.
 CIRCUMSTANCES = (
@@ -23,6 +23,8 @@ CIRCUMSTANCES = (
 )
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "rendered_pictures", "test")  # other sub-folders and scores of a run
+SMALLEST_SIZE, LARGEST_SIZE = 5, 4096  # pixels per side: 4 are padded by reflection
+MOST_PICTURES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
 
 
 @dataclass
@@ -40,8 +42,10 @@ class DataSettings:
     pictures: str | None = None
 
     def __post_init__(self):
-        if self.size < 1 or self.seed < 0:
-            raise InputError(f"data.size={self.size} must be at least 1 and data.seed={self.seed} not negative")
+        require_range("data.size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
+        require_range("data.seed", self.seed, 0, LARGEST_SEED)
+        for name in ("train_per_class", "test_per_class"):
+            require_range(f"data.{name}", getattr(self, name), 1, MOST_PICTURES)
 
 
 @dataclass
@@ -56,8 +60,8 @@ class SceneSettings:
     exposure: float = 1.0
 
     def __post_init__(self):
-        if not 0 < self.exposure < math.inf:
-            raise InputError(f"scene.exposure={self.exposure} must be positive")
+        require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
+        require_range("scene.views", self.views, 1, MOST_VIEWS)
 
 
 @dataclass
@@ -133,8 +137,7 @@ class ExperimentSettings:
     evaluate: EvaluationSettings = field(default_factory=EvaluationSettings)
 
     def __post_init__(self):
-        if self.seed < 0:
-            raise InputError(f"seed={self.seed} must not be negative")
+        require_range("seed", self.seed, 0, LARGEST_SEED)
         if self.augment.renders:
             _ = self.views  # fails on an inconsistent product before any data is read
 
@@ -159,12 +162,38 @@ def read_settings(kind: type, config: DictConfig, parent: str = ""):
 def decisive_settings(config: DictConfig) -> dict[str, object]:
     """What decides a run's result, by dotted key: all but the circumstances, with `${run}` for its own folder."""
     settings = OmegaConf.to_container(config, resolve=True)
-    own = re.compile(f"^{re.escape(settings['run'])}(?=/|$)")
+    own = re.compile(f"^{re.escape(str(settings.get('run')))}(?=/|$)")
     return {
         key: own.sub("${run}", value) if isinstance(value, str) else value
         for key, value in _dotted(settings)
         if key not in CIRCUMSTANCES
     }
+
+
+def differing_settings(folder: Path, config: DictConfig) -> Iterator[tuple[str, object, object]]:
+    """The decisive keys in which the run in a folder and a configuration differ, with both values.
+
+    A key that the run is older than has its default.
+    """
+    defaults = decisive_settings(OmegaConf.structured(ExperimentSettings))
+    found, asked = ({**defaults, **decisive_settings(each)} for each in (read_config(folder / CONFIG), config))
+    for key in sorted(found.keys() | asked.keys()):
+        if found.get(key) != asked.get(key):
+            yield key, found.get(key), asked.get(key)
+
+
+def require_same_settings(folder: Path, config: DictConfig) -> None:
+    """InputError where the run in a folder cannot go on under a configuration; with more epochs it can.
+
+    Nor does what comes after training have to be the same.
+    """
+    for key, found, asked in differing_settings(folder, config):
+        longer = key == "train.epochs" and isinstance(found, int) and asked > found
+        if not longer and not key.startswith("evaluate."):
+            raise InputError(
+                f"run={folder} was trained with {key}={found}, and train.resume=true asks for {asked}: resume with the "
+                f"settings of {folder / CONFIG}, or start in another folder with run="
+            )
 
 
 def _dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from augment.mesh_scene import Conditions, MeshScene
 from augment.norm_ball import NormBall
-from renderer.errors import InputError
+from renderer.errors import FACTOR, LARGEST, InputError, require_range
 
 STEPS = ("unit", "raw", "sign")
 
@@ -35,8 +35,7 @@ def check_step(step: str, step_size: float, prefix: str = "") -> None:
     """InputError unless the rule is known and the size positive. prefix: of the settings' names."""
     if step not in STEPS:
         raise InputError(f"{prefix}step={step}: choose one of {', '.join(STEPS)}")
-    if not step_size > 0:
-        raise InputError(f"{prefix}step_size={step_size} must be positive")
+    require_range(f"{prefix}step_size", step_size, 1 / LARGEST, FACTOR)
 
 
 def direction(gradient: Tensor, step: str) -> Tensor:

@@ -2,6 +2,7 @@ import errno
 import os
 import pickle
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -215,6 +216,30 @@ def test_an_old_network_that_does_not_say_its_size_has_32_or_the_one_asked_for(n
     assert load_network(tmp_path, 64).size == 64
 
 
+@pytest.mark.parametrize(
+    "key, value", [("version", "2"), ("version", None), ("size", "32"), ("size", 0), ("size", 1e3), ("size", 10**9),
+                   ("encoding", 3), ("encoding", ["srgb"]), ("classes", 3), ("depth", "10"), ("mean", "a")]
+)  # fmt: skip
+def test_a_network_that_says_what_cannot_be_meant_is_refused_in_one_sentence(network, tmp_path, key, value):
+    state = state_of(network)
+    state["architecture"] = state["architecture"] | {key: value}
+    save(tmp_path / BEST, state)
+    publish(tmp_path / PUBLISHED, state)
+    for name in (BEST, PUBLISHED):
+        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} [^\n]+$"):
+            load_network(tmp_path / name)
+
+
+@pytest.mark.parametrize("architecture", [None, [], "orange", 3])
+def test_a_network_without_a_description_is_refused_by_name(network, tmp_path, architecture):
+    state = state_of(network) | {"architecture": architecture}
+    save(tmp_path / BEST, state)
+    publish(tmp_path / PUBLISHED, state)
+    for name in (BEST, PUBLISHED):
+        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} .*lacks its .*architecture"):
+            load_network(tmp_path / name)
+
+
 def test_a_network_of_a_later_version_is_refused(network, tmp_path):
     save(tmp_path / BEST, state_of(network, version=99))
     with pytest.raises(InputError, match=r"best.pt was written by a later version"):
@@ -256,15 +281,40 @@ def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, cha
         {"classes": ["fig", "lime"], "depth": 10, "heads": 3},
         {"depth": 10},
         {"classes": None},
-        ["fig", "lime"],
         {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1},
         {"classes": ["fig", "lime"], "depth": 10, "width": 2},
+        {"classes": ["fig", "lime"], "depth": 6 * 10**9 + 4, "width": 1},
+        {"classes": ["fig", "lime"], "depth": 10, "width": 10**9},
+        {"classes": ["fig", "lime"], "depth": 10.0, "width": 1},
+        {"classes": ["fig", "lime"], "depth": 10, "width": 1, "mean": [0.5]},
+        {"classes": 2, "depth": 10, "width": 1},
     ],
 )
 def test_a_checkpoint_of_another_network_is_one_error(network, tmp_path, architecture):
     save(tmp_path / BEST, state_of(network) | {"architecture": architecture})
     with pytest.raises(InputError, match=r"best.pt is from another architecture"):
         load_network(tmp_path)
+
+
+@pytest.mark.parametrize("model", [None, 3, ["stem"], {"stem.weight": 1}, {}])
+def test_a_checkpoint_of_other_things_than_weights_is_one_error(network, tmp_path, model):
+    save(tmp_path / BEST, state_of(network) | {"model": model})
+    with pytest.raises(InputError, match=r"checkpoint .*best\.pt (holds other things|is from another architecture)"):
+        load_network(tmp_path)
+
+
+def test_a_checkpoint_nested_beyond_reason_is_one_error(network, tmp_path):
+    nested = []
+    for _ in range(3000):
+        nested = [nested]
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(20_000)  # whoever forges one has as much
+    try:
+        torch.save(state_of(network) | {"more": nested}, tmp_path / BEST)
+    finally:
+        sys.setrecursionlimit(limit)
+    with pytest.raises(InputError, match=r"best\.pt is damaged"):
+        load(tmp_path / BEST)
 
 
 def test_a_folder_without_a_network_is_one_error(tmp_path):

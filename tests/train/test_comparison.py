@@ -32,7 +32,8 @@ def scored_run(tmp_path, made_up_run):
     """Makes a finished run with scores: by source, those of oranges and of other things."""
 
     def make(arm: str, scores: dict[str | None, tuple], *overrides: str, name: str = "photographs") -> Path:
-        folder = made_up_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", arm, {name: {}}, *overrides)
+        summaries = {name: {"label": "orange"}}
+        folder = made_up_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", arm, summaries, *overrides)
         kinds = [
             (label, source, score)
             for source, pair in scores.items()

@@ -21,7 +21,7 @@ from train.data import DataSet
 from train.experiment import load_data, prepare, run
 from train.interruption import Interrupted
 from train.logs import read_metrics
-from train.settings import ExperimentSettings, read_settings
+from train.settings import ExperimentSettings, read_settings, require_same_settings
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -301,11 +301,38 @@ def test_a_folder_that_holds_a_run_is_not_written_over(tiny, finished):
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("change", ["model.width=2", "model.depth=16", "model.dropout=0.1"])
-def test_resuming_with_another_architecture_is_refused(tiny, finished, change):
+@pytest.mark.parametrize("change", ["seed=8", "augment=none", "model.width=2", "train.epochs=2", "label=pear"])
+def test_resuming_with_other_settings_is_refused_by_name_and_changes_nothing(tiny, finished, change):
+    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
     config = tiny("train.resume=true", change)
-    with pytest.raises(InputError, match=r"checkpoint in .* is from another architecture.*config.yaml"):
+    key = {"augment=none": "augment.arm"}.get(change, change.partition("=")[0])
+    asked = change.partition("=")[2]
+    with pytest.raises(
+        InputError, match=rf"was trained with {key}=\S+, and train.resume=true asks for {asked}: resume"
+    ):
         prepare(config, load_data(config), finished)
+    assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
+
+
+def test_resuming_with_another_data_path_is_refused(tiny, finished, tiny_npz, tmp_path):
+    shutil.copy(tiny_npz, tmp_path / "other.npz")
+    config = tiny("train.resume=true", f"data.path={tmp_path / 'other.npz'}")
+    with pytest.raises(InputError, match=r"was trained with data.path="):
+        prepare(config, load_data(config), finished)
+
+
+def test_a_network_alone_is_no_run_to_go_on_with(tiny, finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    shutil.copy(folder / checkpoint.BEST, folder / checkpoint.LAST)
+    (folder / checkpoint.PREVIOUS).unlink()
+    config = tiny("train.resume=true")
+    with pytest.raises(InputError, match=r"has a network and no run to go on with \(\S+ is missing\)"):
+        prepare(config, load_data(config), folder)
+
+
+def test_resuming_for_more_epochs_and_under_other_circumstances_is_no_change(tiny, finished):
+    for changes in (["train.epochs=4"], ["train.threads=1", "renderer.cache=null", "train.checkpoint_every=2"]):
+        require_same_settings(finished, tiny("train.resume=true", *changes))
 
 
 # ---------------------------------------------------------------------------------------- rounds and starts
@@ -545,7 +572,7 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
 @pytest.mark.parametrize(
     "overrides, fault",
     [
-        (["seed=-1"], "seed=-1 must not be negative"),
+        (["seed=-1"], "seed=-1 must be at least 0"),
         (["seed=abc"], "seed: Value 'abc' of type 'str' could not be converted to Integer"),
         (["train.epochs=abc"], "train.epochs: Value 'abc'"),
         (["train.epochs=0"], "train.epochs=0"),
@@ -563,7 +590,17 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], r"scene.meshes\[0\].lable: Key 'lable'"),
         (["scene.meshes=[{label: orange}]", "augment.examples=2"], r"mesh"),
         (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
-        (["scene.exposure=0"], "scene.exposure=0.0 must be positive"),
+        (["scene.exposure=0"], "scene.exposure=0.0 must be at least"),
+        (["scene.exposure=1e30"], r"scene.exposure=1e\+30 must be at least 1e-05 and at most 100000"),
+        (["scene.views=1000000000000"], "scene.views=1000000000000 must be at least 1 and at most 100000"),
+        (["train.threads=100000"], "train.threads=100000 must be at least 1 and at most 1024"),
+        (["augment.examples=1000000000000"], "augment.examples=1000000000000 must be at least 0"),
+        (["augment.random.amplitude=1e30"], r"augment.random.amplitude=1e\+30 must be"),
+        (["augment.attack.step_size=nan"], "augment.attack.step_size=nan must be"),
+        (["renderer.samples=100000"], "renderer.samples=100000 for each of 16 pixels in a row are more than 32768"),
+        (["model.width=100000"], "model.depth=10, model.width=100000 make"),
+        (["model.depth=1000000"], "model.depth=1000000, model.width=1 make"),
+        (["+data.size=1"], "data.size=1 must be at least 5"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=ornage"], r"label of scene.meshes\[0\]: 'ornage' is not a class of the model: did you mean 'orange'"),
         (["renderer.samples=0"], "renderer.samples=0"),

@@ -105,6 +105,8 @@ def background(choice: float | str, size: int) -> Tensor:
 
 def _picture(path: Path, size: int) -> Tensor:
     try:
+        if not path.is_file():  # a pipe would be waited for
+            raise ValueError("there is no such file")
         square = read_square(path, size)
     except Exception as error:  # Pillow's decoders raise almost anything at a broken file
         raise InputError(

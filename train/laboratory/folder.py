@@ -23,6 +23,7 @@ from train.laboratory.props import Part, split_parts
 from train.laboratory.settings import LabSettings
 from train.laboratory.shots import Shot, draw_shots
 from train.laboratory.studio import photograph
+from train.outputs import writable_folder
 from train.photographs.folder import FOREIGN, TABLE
 from train.settings import read_object
 
@@ -49,6 +50,7 @@ def write_laboratory(settings: LabSettings) -> int:
     out = Path(settings.out)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out={out} is not an empty folder: name another, or delete it")
+    writable_folder(out, "out")
     subjects = [read_subject(item, index) for index, item in enumerate(settings.meshes)]
     sittings, hidden, rows = _sittings(subjects, settings), not sys.stderr.isatty(), []
     for light, shot, subject in tqdm(sittings, "photographs", 2 * settings.lights, leave=False, disable=hidden):
@@ -56,10 +58,10 @@ def write_laboratory(settings: LabSettings) -> int:
         (out / path).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(_picture(subject, shot, light, settings)).save(out / path)
         rows.append((path.as_posix(), shot.family, light, subject.mesh, f"{shot.brightness:.4f}"))
-    with open(out / TABLE, "w", newline="") as file:
+    with open(out / TABLE, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([COLUMNS, *sorted(rows)])
     versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
-    (out / DESCRIPTION).write_text(json.dumps({**asdict(settings), "versions": versions}, indent=2) + "\n")
+    (out / DESCRIPTION).write_text(json.dumps({**asdict(settings), "versions": versions}, indent=2) + "\n", "utf-8")
     return len(rows)
 
 

@@ -3,8 +3,11 @@
 import math
 from dataclasses import dataclass, field
 
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from train.laboratory.patterns import FAMILIES
+from train.settings import LARGEST_SEED, LARGEST_SIZE
+
+MOST_LIGHTS = 10**6
 
 
 @dataclass
@@ -34,8 +37,7 @@ class LabSettings:
             raise InputError(f"lights={self.lights} must be a positive multiple of the {len(self.patterns)} patterns")
         if len(self.brightness) != 2 or not 0 < self.brightness[0] <= self.brightness[1] < math.inf:
             raise InputError(f"brightness={self.brightness} must be two positive numbers, the dimmer one first")
-        if not 0 < self.exposure < math.inf:
-            raise InputError(f"exposure={self.exposure} must be positive")
-        for name, least in (("size", 1), ("samples", 1), ("bounces", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}={getattr(self, name)} must be at least {least}")
+        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
+        require_range("seed", self.seed, 0, LARGEST_SEED)
+        for name, most in {"lights": MOST_LIGHTS, "size": LARGEST_SIZE, "samples": 10**5, "bounces": 1000}.items():
+            require_range(name, getattr(self, name), 1, most)

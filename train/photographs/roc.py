@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from train.photographs.cells import as_cell
 from train.photographs.figures import OVERALL, Pool
 from train.photographs.ranking import RATES, Ranking
 
@@ -19,11 +20,11 @@ def rank_pools(pools: Mapping[str, Pool]) -> dict[str, Ranking]:
 
 def write_roc_csv(path: Path, rankings: Mapping[str, Ranking]) -> None:
     """source, false_alarm_rate, recall and threshold: a row per point, where what exceeds the threshold is called."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["source", "false_alarm_rate", "recall", "threshold"])
         for source, ranking in rankings.items():
-            writer.writerows((source, *map(float, point)) for point in zip(*ranking.curve(), strict=True))
+            writer.writerows((as_cell(source), *map(float, point)) for point in zip(*ranking.curve(), strict=True))
 
 
 def draw_roc(rankings: Mapping[str, Ranking], label: str) -> "Figure":

@@ -12,7 +12,7 @@ from train.photographs.answers import Answer, ask, rank_classes
 from train.photographs.answers_table import ANSWERS, write_answers
 from train.photographs.contact_sheet import choose_sections, draw_contact_sheet
 from train.photographs.figures import OVERALL, Pool, figures, pool_answers, share_true
-from train.photographs.folder import find_photographs, load_photographs
+from train.photographs.folder import find_photographs, left_out, load_photographs
 from train.photographs.roc import draw_roc, rank_pools, write_roc_csv
 
 SUMMARY = "summary.json"
@@ -40,7 +40,8 @@ def evaluate_photographs(
     empty for `other_*`); contact_sheet.png, hits, misses and false alarms; roc.csv and roc.png, the ROC curves
     overall and of each source that has both kinds; and summary.json, which is also returned:
 
-    - n: photographs, label, others, unreadable; label; size; unreadable: their paths;
+    - n: photographs, label, others, unreadable, left_out; label; size; unreadable, left_out: their paths (see
+      `left_out`);
     - recall, top5: of the photographs of class `label`, with their most_common_wrong answers;
     - false_alarms: the share of all others that are called `label`;
     - auc, recall_at: how well the log-odds of `label` tell its photographs from all others, as `rank` returns them;
@@ -60,12 +61,13 @@ def evaluate_photographs(
     logits = ask(model, images, len(classes), batch_size, device)
     answers = rank_classes(photographs, logits, classes, label)
     pools = pool_answers(answers, label)
-    summary = _summarise(answers, pools, label, size, unreadable)
+    others = [str(path) for path in left_out(folder)]
+    summary = _summarise(answers, pools, label, size, unreadable, others)
 
     out.mkdir(parents=True, exist_ok=True)
     write_answers(out / ANSWERS, answers, label)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
-    (out / SUMMARY).write_text(text + "\n", encoding="utf-8")
+    (out / SUMMARY).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     draw_contact_sheet(choose_sections(answers, images, label)).save(out / "contact_sheet.png")
     rankings = rank_pools(pools)
     write_roc_csv(out / "roc.csv", rankings)
@@ -74,7 +76,12 @@ def evaluate_photographs(
 
 
 def _summarise(
-    answers: Sequence[Answer], pools: Mapping[str, Pool], label: str, size: int, unreadable: Sequence[str]
+    answers: Sequence[Answer],
+    pools: Mapping[str, Pool],
+    label: str,
+    size: int,
+    unreadable: Sequence[str],
+    others: Sequence[str],
 ) -> dict:
     by_class = defaultdict(list)
     for answer in answers:
@@ -88,6 +95,7 @@ def _summarise(
             "label": len(whole.mine),
             "others": len(whole.others),
             "unreadable": len(unreadable),
+            "left_out": len(others),
         },
         **figures(whole, label),
         "most_common_wrong": _most_common_wrong(whole.mine),
@@ -98,6 +106,7 @@ def _summarise(
         },
         "by_class": {name: _class_figures(group, label) for name, group in sorted(by_class.items())},
         "unreadable": list(unreadable),
+        "left_out": list(others),
     }
 
 

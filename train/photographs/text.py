@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from train.photographs.figures import RANKED, figure_title, find_figure
 
 COUNTED = ("recall", "top5", "false_alarms")
+NAMED = 10  # how many of the files that were left out
 
 
 def format_summary(summary: dict) -> str:
@@ -42,6 +43,10 @@ def format_summary(summary: dict) -> str:
     ]
     if summary["unreadable"]:
         paragraphs.append(f"{n['unreadable']} unreadable: {', '.join(summary['unreadable'])}")
+    if summary["left_out"]:
+        shown = summary["left_out"][:NAMED]
+        rest = ", ..." if len(summary["left_out"]) > NAMED else ""
+        paragraphs.append(f"{n['left_out']} left out, of kinds that are not read: {', '.join(shown)}{rest}")
     return "\n\n".join(paragraphs)
 
 

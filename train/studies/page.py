@@ -34,9 +34,10 @@ def _filled(paragraph: str) -> str:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a page, and say where."""
+    """Print a page, which is not lost then where it cannot be written, write it, and say where."""
+    print(text)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     print(f"written: {path}")
 
 

@@ -107,7 +107,7 @@ REFUSED = [
     ({"patterns": ["stripe"]}, "patterns: 'stripe' is not known: choose from solid, gradient, stripes"),
     ({"brightness": [2.0, 1.0]}, r"brightness=\[2.0, 1.0\] must be two positive numbers, the dimmer one first"),
     ({"brightness": [1.0]}, r"brightness=\[1.0\] must be two positive numbers"),
-    ({"exposure": 0.0}, "exposure=0.0 must be positive"),
+    ({"exposure": 0.0}, "exposure=0.0 must be at least 1e-05"),
     ({"size": 0}, "size=0 must be at least 1"),
     ({"seed": -1}, "seed=-1 must be at least 0"),
 ]

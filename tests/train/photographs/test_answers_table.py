@@ -21,7 +21,7 @@ def test_what_was_written_is_read_bit_by_bit(tmp_path):
     assert read_answers(tmp_path / "a.csv", "orange") == ANSWERS
 
 
-@pytest.mark.parametrize("text", [None, "path,label\na.png,orange\n", "\xff\n"])
+@pytest.mark.parametrize("text", [None, "", "path,label\na.png,orange\n", "\xff\n"])
 def test_a_table_of_another_kind_is_refused(tmp_path, text):
     write_answers(tmp_path / "a.csv", ANSWERS, "pear" if text is None else "orange")
     if text is not None:

@@ -1,5 +1,6 @@
 import csv
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.stats import binomtest
 
 from renderer.errors import InputError
 from train.photographs import evaluate_photographs, format_summary
+from train.photographs.answers_table import read_answers
 
 
 def share(hits: int, n: int) -> dict:
@@ -41,7 +43,7 @@ def ranked(auc: float | None, label: int, others: int) -> dict:
 STORY_SUMMARY = {
     "label": "orange",
     "size": 32,
-    "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0},
+    "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0, "left_out": 0},
     "recall": share(1, 5),
     "top5": share(4, 5),
     "false_alarms": share(2, 5),
@@ -82,6 +84,7 @@ STORY_SUMMARY = {
         },
     },
     "unreadable": [],
+    "left_out": [],
 }
 
 
@@ -227,7 +230,7 @@ def test_skipped_photographs_are_counted_and_named_but_not_scored(story, tmp_pat
         evaluate_photographs(*story, "orange", tmp_path)
     summary = evaluate_photographs(*story, "orange", tmp_path, skip_unreadable=True)
     assert summary["unreadable"] == ["orange/broken.jpg"]
-    assert summary["n"] == {"photographs": 10, "label": 5, "others": 5, "unreadable": 1}
+    assert summary["n"] == {"photographs": 10, "label": 5, "others": 5, "unreadable": 1, "left_out": 0}
     assert format_summary(summary).endswith("1 unreadable: orange/broken.jpg")
 
 
@@ -286,3 +289,19 @@ def test_scores_are_never_written_among_the_photographs(story, tmp_path, out):
 def test_scores_may_be_written_beside_or_above_the_photographs(story, tmp_path, out):
     evaluate_photographs(*story, "orange", tmp_path / out)
     assert (tmp_path / out / "summary.json").is_file()
+
+
+def test_names_that_a_spreadsheet_would_run_are_text_and_numbers_stay_numbers(known_model, tmp_path):
+    names = ["other_x/=1+1.png", "=HYPERLINK/a.png", "@b/-2.png"]
+    classes = ["=HYPERLINK", "@b", "orange"]
+    logits = [[-9.0, 0.0, 1.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
+    evaluate_photographs(*known_model(names, logits, classes), "orange", tmp_path / "out")
+    with open(tmp_path / "out" / "photographs.csv", newline="", encoding="utf-8") as file:
+        _, *rows = csv.reader(file)
+    assert {row[0] for row in rows} == {"other_x/=1+1.png", "'=HYPERLINK/a.png", "'@b/-2.png"}
+    assert {row[4] for row in rows} == {"orange", "'=HYPERLINK", "'@b"}
+    names, numbers = ([cell for row in rows for cell in row[part]] for part in (slice(5), slice(5, None)))
+    assert all(cell[:1] not in ("=", "+", "-", "@") for cell in names)
+    assert all(math.isfinite(float(cell)) for cell in numbers if cell)
+    answers = read_answers(tmp_path / "out" / "photographs.csv", "orange")
+    assert [answer.photograph.label for answer in answers] == ["=HYPERLINK", "@b", "other_x"]

@@ -24,3 +24,15 @@ orange       5   0.200  0.800          0.200  pear 2, apple 1, plum 1
 other_lemon  2       -      -          0.500  lime 1, orange 1
 pear         3   0.333  0.667          0.333  apple 1, orange 1"""
     )
+
+
+def test_files_that_were_left_out_are_counted_and_named(story, tmp_path):
+    _, _, folder = story
+    for number in range(12):
+        (folder / "orange" / f"{number:02d}.HEIC").touch()
+    summary = evaluate_photographs(*story, "orange", tmp_path / "out")
+    assert summary["n"]["left_out"] == 12 and summary["left_out"][:2] == ["orange/00.HEIC", "orange/01.HEIC"]
+    last = format_summary(summary).splitlines()[-1]
+    assert last.startswith("12 left out, of kinds that are not read: orange/00.HEIC, ") and last.endswith(
+        "09.HEIC, ..."
+    )

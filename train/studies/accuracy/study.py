@@ -1,11 +1,12 @@
 """Every condition measured and every refusal tried, once."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
+from renderer.errors import require_range
 from train.cli import command_line
+from train.outputs import writable_file
 from train.studies.accuracy import conditions
 from train.studies.accuracy.page import Table, failures, page
 from train.studies.accuracy.refusals import refusals
@@ -22,12 +23,17 @@ class AccuracySettings:
     size: int
     slivers: int
 
+    def __post_init__(self):
+        for name, least, most in [("degree", 1, 20), ("subdivisions", 0, 9), ("size", 1, 16384), ("slivers", 1, 10**4)]:
+            require_range(name, getattr(self, name), least, most)
+
 
 def run(settings: AccuracySettings) -> list[str]:
     """Write the page; everything that was not finite or not refused, in words."""
+    out = writable_file(settings.out, "out")
     torch.set_num_threads(1)
     tables, refused = measure(settings), list(refusals())
-    write(Path(settings.out), page(tables, refused, command_line()))
+    write(out, page(tables, refused, command_line()))
     print(f"{sum(len(table.rows) for table in tables)} conditions and {len(refused)} refusals")
     return failures(tables, refused)
 

@@ -46,9 +46,9 @@ class Ending:
 
     @property
     def terse(self) -> bool:
-        """Whether stderr holds nothing, or one line on how to go on."""
+        """Whether stderr holds nothing, or one line on how to go on or that there is nothing to go on with."""
         lines = self.errors.splitlines()
-        return not lines or (len(lines) == 1 and "train.resume=true" in lines[0])
+        return not lines or (len(lines) == 1 and ("train.resume=true" in lines[0] or lines == ["ended by SIGINT"]))
 
     def is_one_sentence(self, advice: str) -> bool:
         """Whether the process ended with an error that its user can mend, which says this."""

@@ -13,8 +13,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.random import Generator
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 from train.cli import command_line
+from train.outputs import writable_file, writable_folder
 from train.studies.interruptions.bench import Bench, Outcome, prepare
 from train.studies.interruptions.damages import DAMAGES, LIMITS, both_damaged, damaged, limited
 from train.studies.interruptions.disturbances import ask, ask_then_kill, disk_filled, interrupted, kill
@@ -38,9 +39,14 @@ class InterruptionSettings:
     jobs: int
     keep: str | None
 
+    def __post_init__(self):
+        for name, least in [("kills", 0), ("signals", 0), ("draws", 0), ("epochs", 1), ("seed", 0), ("jobs", 1)]:
+            require_range(name, getattr(self, name), least, 10**6)
+
 
 def run(settings: InterruptionSettings) -> list[str]:
     """Print the page, and write it where it is asked for; everything that was not as it should be, in words."""
+    out = writable_file(settings.out, "out") if settings.out else None
     with nullcontext(settings.keep) if settings.keep else TemporaryDirectory() as folder:
         bench = prepare(write_inputs(_empty(Path(folder).absolute()), settings.epochs))
         cases = all_cases(settings)
@@ -48,9 +54,10 @@ def run(settings: InterruptionSettings) -> list[str]:
             started = [pool.submit(_conduct, case, bench, settings.seed, number) for number, case in enumerate(cases)]
         outcomes = merged([future.result() for future in started])
     text = page(outcomes, bench, command_line())
-    print(text)
-    if settings.out:
-        write(Path(settings.out), text)
+    if out:
+        write(out, text)
+    else:
+        print(text)
     return failures(outcomes)
 
 
@@ -78,7 +85,7 @@ def _conduct(case: Case, bench: Bench, seed: int, number: int) -> Outcome:
 
 
 def _empty(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
+    writable_folder(folder, "keep").mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(f"keep={folder} is not empty: choose another folder")
     return folder

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.cli import command_line
+from train.outputs import writable_folder
 from train.run_classifier import load_classifier
 from train.settings import SceneSettings, read_object, read_settings
 from train.studies.figures import pyplot
@@ -47,6 +48,7 @@ class PaperSettings:
 
 def run(settings: PaperSettings) -> None:
     """Measure a section, write its data and its figures to out/paper, and put its text into out/paper.md."""
+    out = writable_folder(settings.out, "out")
     pyplot()  # a run without matplotlib would fail only at its end
     name = settings.section.get("name")
     if name not in SECTIONS:
@@ -57,18 +59,18 @@ def run(settings: PaperSettings) -> None:
     torch.set_num_threads(section_settings.threads)
     classifier = load_classifier(settings.classifier, settings.weights)
     study = Study(classifier, items, settings.scene.light, settings.label, settings.seed)
-    _write(Path(settings.out) / "paper", name, title, measure(study, section_settings))
+    _write(out / "paper", name, title, measure(study, section_settings))
 
 
 def _write(folder: Path, name: str, title: str, section: Section) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.jsonl").write_text("".join(json.dumps(record) + "\n" for record in section.records))
+    (folder / f"{name}.jsonl").write_text("".join(json.dumps(record) + "\n" for record in section.records), "utf-8")
     for figure, draw in section.figures.items():
         draw(folder / figure)
     command = f"```bash\n{command_line()}\n```"
     page = folder.with_suffix(".md")
     text = joined([title, wrapped(section.text.strip()), command, versions()])
-    write(page, with_section(page.read_text() if page.is_file() else "", title, text))
+    write(page, with_section(page.read_text("utf-8") if page.is_file() else "", title, text))
 
 
 def with_section(page: str, title: str, text: str) -> str:

@@ -13,6 +13,7 @@ from renderer.shapes import solid
 from renderer.visibility import Backend, choose
 from train.cli import command_line
 from train.device import choose_device
+from train.outputs import writable_folder
 from train.settings import SceneSettings, read_object
 from train.studies.figures import pyplot
 from train.studies.page import machine, write
@@ -40,6 +41,7 @@ class RendererSpeedSettings:
 
 def run(settings: RendererSpeedSettings) -> None:
     """Measure, and write the page, its figures and its numbers."""
+    out = writable_folder(settings.out, "out")
     pyplot()  # a run without matplotlib would fail only at its end
     torch.set_num_threads(1)
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software OpenGL, too, on the one thread
@@ -49,7 +51,7 @@ def run(settings: RendererSpeedSettings) -> None:
     named = [read_object(item, "", index) for index, item in enumerate(settings.scene.meshes)]
     meshes = [load_object(item) for item in named] or [solid("orange", seed) for seed in (0, 1)]
     findings = _measure(bench, meshes, settings.peers)
-    _write(Path(settings.out), findings, description)
+    _write(out, findings, description)
 
 
 def _backends() -> tuple[Backend, ...]:
@@ -101,7 +103,6 @@ def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
 
 def _write(folder: Path, findings: Findings, description: str) -> None:
     text = page(findings, command_line(), description)
-    print(text)
     write(folder / "performance_renderer.md", text)
     rows = [*results.records(findings.panels), *(asdict(row) for rows in findings.workloads for row in rows)]
     results.write_csv(folder / "renderer_pareto.csv", rows)

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from renderer.errors import InputError
+from renderer.errors import require_range
 from train.data import DataSet, Split, channel_statistics, stratified_split
 from train.experiment import load_data
 from train.precision import choose_precision
@@ -39,9 +39,8 @@ class BenchmarkSettings:
     workers: int | None = None
 
     def __post_init__(self):
-        for name, least in (("epochs", 1), ("steps", 0), ("workers", 0)):
-            if (value := getattr(self, name)) is not None and value < least:
-                raise InputError(f"{name}={value} must be at least {least}")
+        for name, least, most in (("epochs", 1, 10**6), ("steps", 0, 10**6), ("workers", 0, 1024)):
+            require_range(name, getattr(self, name), least, most)
 
     def on(self, device: torch.device) -> "BenchmarkSettings":
         """With a number for each None."""

@@ -1,14 +1,14 @@
 """Training's speed against a plain loop over torchvision's DataLoader, in one run."""
 
 from dataclasses import fields
-from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
 from train.cli import command_line
 from train.device import choose_device, set_deterministic, set_threads
 from train.graphs import compiles
-from train.settings import read_settings
+from train.outputs import writable_file
+from train.settings import ExperimentSettings, read_settings
 from train.studies.figures import pyplot
 from train.studies.page import machine, write
 from train.studies.training_speed.contest import BenchmarkSettings, load, measure
@@ -20,7 +20,10 @@ def run(config: DictConfig) -> None:
     pyplot()  # a run without matplotlib would fail only at its end
     own = [field.name for field in fields(BenchmarkSettings)]
     settings = read_settings(BenchmarkSettings, OmegaConf.masked_copy(config, own))
+    out = writable_file(settings.out, "out")
+    figure = writable_file(out.with_suffix(".png"), "out")
     config = OmegaConf.masked_copy(config, [key for key in config if key not in own])
+    read_settings(ExperimentSettings, config)
     device = choose_device(config.train.device)
     set_threads(config.train.threads)
     set_deterministic(config.train.deterministic)
@@ -34,9 +37,5 @@ def run(config: DictConfig) -> None:
         "compiled": "compiled" if compiles(config.train.compile, device) else "not compiled",
         "workers": settings.workers,
     }
-    out = Path(settings.out)
-    figure = out.with_suffix(".png")
-    text = page(findings, facts, figure.name)
-    print(text)
-    write(out, text)
+    write(out, page(findings, facts, figure.name))
     draw(figure, findings)
