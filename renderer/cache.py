@@ -20,10 +20,8 @@ from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import PictureSettings
 from renderer.mesh import Mesh
-from renderer.transfer import DEGREE, Operator, build_operator
+from renderer.transfer import DEGREE, TENSORS, Operator, build_operator
 from renderer.visibility import Backend
-
-TENSORS = ("transfer", "albedo", "coverage", "pixels")  # of an operator
 
 
 def cache_folder(choice: str | None) -> Path | None:
@@ -170,7 +168,7 @@ class OperatorCache(TensorCache):
                 views[camera] = _pack(mesh, seen, build_operator(mesh, seen, settings, gain, degree, dtype))
                 self.write(keys[camera], views[camera])
         self.tally.add(built=len(missing), views=views.values())
-        return [_unpack(views[camera], degree) for camera in cameras]
+        return [_unpack(views[camera], settings, degree) for camera in cameras]
 
 
 def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
@@ -178,5 +176,5 @@ def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
     return {name: getattr(operator, name) for name in TENSORS} | {"counts": counts}
 
 
-def _unpack(view: Mapping[str, Tensor], degree: int) -> Operator:
-    return Operator(**{name: view[name] for name in TENSORS}, degree=degree)
+def _unpack(view: Mapping[str, Tensor], settings: PictureSettings, degree: int) -> Operator:
+    return Operator(**{name: view[name] for name in TENSORS}, settings=settings, degree=degree)

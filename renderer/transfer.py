@@ -5,7 +5,7 @@ radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactl
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -18,7 +18,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import irradiance_basis, live_coefficients
-from renderer.image import PictureSettings
+from renderer.image import PictureSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.shading import smooth_normals
@@ -26,6 +26,7 @@ from renderer.visibility import Backend
 
 DEGREE = 6
 COEFFICIENTS = (DEGREE + 1) ** 2
+TENSORS = ("transfer", "albedo", "coverage", "pixels")  # of an operator
 BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 
 
@@ -37,15 +38,25 @@ class Operator:
     and the time, where no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
     albedo: (3, P), what the one channel is multiplied with; ones where there are three.
     coverage: (P,) in (0, 1], the share of a pixel's samples that the mesh covers.
-    pixels: (P,) int64, row-major indices of the covered pixels; row 0 is the top of the picture.
-    degree: of the lights.
+    pixels: (P,) int64, row-major indices of the covered pixels; row 0 is the top of the image.
+    settings: of the image that they are pixels of. degree: of the lights.
     """
 
     transfer: Tensor
     albedo: Tensor
     coverage: Tensor
     pixels: Tensor
+    settings: PictureSettings
     degree: int = DEGREE
+
+    def image(self, lights: Tensor, background: float | Tensor = 0.5) -> Tensor:
+        """Images (..., 3, size, size) in [0, 1] under lights (..., (degree + 1)², 3); differentiable in them.
+
+        background: see `renderer.image.as_background`. InputError: as `radiance`, and for a background that is none.
+        """
+        behind = as_background(background, self.settings.size, lights)
+        coverage = self.coverage.to(lights)
+        return compose(self.radiance(lights), coverage, self.pixels, behind, self.settings.encoding)
 
     def radiance(self, lights: Tensor) -> Tensor:
         """Linear radiance (..., 3, P) under lights (..., (degree + 1)², 3); differentiable, by `light_gradient`.
@@ -74,8 +85,7 @@ class Operator:
 
     def to(self, device: torch.device | str) -> "Operator":
         """The same on another device."""
-        names = [field.name for field in fields(self) if field.name != "degree"]
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+        return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS})
 
     # Kept, since at 32² even an index or a look at a dtype counts.
 
@@ -159,6 +169,7 @@ def build_operator(
         albedo=factor.T.to(dtype).contiguous(),
         coverage=fragments.coverage.to(dtype),
         pixels=fragments.pixels,
+        settings=settings,
         degree=degree,
     )
 

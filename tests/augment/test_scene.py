@@ -34,6 +34,7 @@ def random_operator(seed: int, count: int) -> Operator:
         albedo=torch.ones(3, count),
         coverage=coverage,
         pixels=torch.randperm(SIZE**2, generator=draws)[:count].sort().values,
+        settings=PictureSettings(size=SIZE),
     )
 
 
@@ -118,13 +119,13 @@ def test_the_gradient_is_the_transfer_where_nothing_clamps():
 
 def test_the_clamped_share_counts_covered_values_alone():
     """Radiance ±L₀₀ at three pixels of coverage 1, 1/2 and 1; a second view covers a fourth pixel, always in range."""
-    unit = torch.zeros(3, 31, 3)
+    unit, settings = torch.zeros(3, 31, 3), PictureSettings(size=2)
     unit[:, 0] = torch.tensor([1.0, 0.5, -1.0])
     views = [
-        Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2])),
-        Operator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3])),
+        Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2]), settings),
+        Operator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3]), settings),
     ]
-    scene = Scene([SceneObject("orange", views)], [0.0, 1.0], PictureSettings(size=2))
+    scene = Scene([SceneObject("orange", views)], [0.0, 1.0], settings)
     lights = torch.zeros(4, 49, 3)
     lights[:, 0] = torch.tensor([0.9, 1.6, 2.4])
     # Over black: 0.9, 1.6, 2.4; 0.45, 0.8, 1.2; all negative: 2 + 1 + 3 clamped. Over white, half of it at the second

@@ -12,7 +12,7 @@ import safetensors.torch
 import torch
 
 from renderer import cache as cache_module
-from renderer import visibility
+from renderer import transfer, visibility
 from renderer.cache import OperatorCache, TensorCache, cache_folder, content_key, source_key
 from renderer.camera import OrthographicCamera, ring
 from renderer.image import PictureSettings
@@ -54,8 +54,8 @@ MESHES = {
 def same(first: list[Operator], second: list[Operator]) -> bool:
     return all(
         a.degree == b.degree
-        and all(torch.equal(getattr(a, name), getattr(b, name)) for name in cache_module.TENSORS)
-        and all(getattr(a, name).dtype == getattr(b, name).dtype for name in cache_module.TENSORS)
+        and all(torch.equal(getattr(a, name), getattr(b, name)) for name in transfer.TENSORS)
+        and all(getattr(a, name).dtype == getattr(b, name).dtype for name in transfer.TENSORS)
         for a, b in zip(first, second, strict=True)
     )
 
