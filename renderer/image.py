@@ -60,7 +60,7 @@ def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor
     if values.ndim < 2:
         values = values.view(-1, 1, 1).expand(-1, size, size)
     if values.ndim >= 3 and values.shape[-3:] in ((1, size, size), (3, size, size)):
-        if not (0 <= values.min() and values.max() <= 1):
+        if not (values.min() >= 0 and values.max() <= 1):
             raise InputError("background holds values beyond [0, 1]: give a grey value, a colour or an image in [0, 1]")
         return values.expand(*values.shape[:-3], 3, size, size)
     raise InputError(
