@@ -1,18 +1,21 @@
 """The augmentation service: each epoch, a fresh batch of labelled renders made against the current weights."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
 
 import torch
 from torch import Tensor, nn
 
 from augment import processes
-from augment.attack import AttackResult, DescentSettings, Goal, Part, descend
+from augment.attack import AttackResult, Goal, Part, descend_repeatedly
+from augment.attack_settings import AttackSettings
 from augment.model_state import as_found
-from augment.parameters.kind import check_step, direction
+from augment.parameters import Lighting, StepSettings
+from augment.perturbation import Perturbation
 from augment.phases import Phases
-from augment.scene import Scene
+from augment.scene import Conditions, Scene
 from augment.seeding import generator
+from augment.variation import VariationSettings, vary
 from renderer.errors import InputError
 from renderer.lights import perturb
 
@@ -36,41 +39,37 @@ class RandomLights:
 
 
 @dataclass
-class LightAttackSettings:
-    """The paper's appendix C: 0.05 along the gradient's direction, at most 30 steps.
+class TrainingAttackSettings(AttackSettings):
+    """Unless kinds are named, the paper's appendix C: 0.05 along the gradient's direction of the light, 30 steps.
 
-    step: what "along the direction" means: the gradient at unit L2 norm per example, as it is, or its sign.
-    batch_size: examples per pass through the classifier.
+    step, step_size: those of that light; see `StepSettings` for what "along the direction" means.
     """
 
     step: str = "unit"
     step_size: float = 0.05
-    max_steps: int = 30
     batch_size: int = 128
 
-    def __post_init__(self):
-        check_step(self.step, self.step_size, "augment.attack.")
-        self.descent()
-
-    def descent(self) -> DescentSettings:
-        """How long it lasts."""
-        return DescentSettings(self.max_steps, batch_size=self.batch_size)
+    @property
+    def kinds(self) -> dict[str, StepSettings]:
+        return super().kinds or {Lighting.name: StepSettings(step=self.step, step_size=self.step_size)}
 
 
 @dataclass
 class AugmentationSettings:
     """What is regenerated each epoch.
 
-    start: where an attack begins, the scene's light or a random perturbation of it. lights: "restart" begins there
-    each epoch, "continue" begins where the last epoch's attack ended.
+    start: where an attack begins, the scene as it is ("light") or a random perturbation of it: of the light by
+    `random`, of all else uniform in its norm-ball. lights: "restart" begins there each epoch, "continue" begins where
+    the last epoch's attack ended. vary: what is drawn afresh in each epoch's scene.
     """
 
     arm: str = "adversarial"
     examples: int = 100
     start: str = "light"
     lights: str = "restart"
+    vary: VariationSettings = field(default_factory=VariationSettings)
     random: RandomLights = field(default_factory=RandomLights)
-    attack: LightAttackSettings = field(default_factory=LightAttackSettings)
+    attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
 
     def __post_init__(self):
         for name, value, choices in [
@@ -82,6 +81,10 @@ class AugmentationSettings:
                 raise InputError(f"augment.{name}={value}: choose one of {', '.join(choices)}")
         if self.examples < 0:
             raise InputError(f"augment.examples={self.examples} must not be negative")
+        if self.arm == "random" or self.start == "random":
+            for name, settings in self.attack.kinds.items():
+                if name != Lighting.name and settings.radius is None:
+                    raise InputError(f"augment.attack.{name}.radius=null has no random draw: set a radius")
 
     @property
     def renders(self) -> bool:
@@ -99,25 +102,16 @@ class Renders:
 
 
 class AugmentationService:
-    """Holds the scene and, where lights continue, the adversaries' lights from epoch to epoch.
+    """Holds the scene and, where lights continue, the adversaries' values from epoch to epoch.
 
     Where several processes train together, each attacks its share of the examples, and all get all renders.
     """
 
-    def __init__(
-        self,
-        settings: AugmentationSettings,
-        scene: Scene | None,
-        labels: Tensor,
-        light: Tensor,
-        seed: int,
-        phases: Phases,
-    ):
-        """scene: None where nothing is rendered. labels: (E,) int64 classes. light: (49, 3), where lights begin."""
+    def __init__(self, settings: AugmentationSettings, scene: Scene | None, labels: Tensor, seed: int, phases: Phases):
+        """scene: None where nothing is rendered; one view per example. labels: (E,) int64 classes."""
         self.settings = settings
         self._scene = scene
         self._labels = labels
-        self._light = light
         self._seed = seed
         self._phases = phases
         self._continued: Tensor | None = None
@@ -134,92 +128,91 @@ class AugmentationService:
         if not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
         make = self._random if self.settings.arm == "random" else self._adversarial
-        return make(model, epoch)
+        scene = vary(self._scene, self.settings.vary, generator(self._seed, epoch, "rows"))
+        return make(model, self.settings.attack.problem(scene), epoch)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The adversaries' lights, where they continue; empty otherwise."""
-        return {} if self._continued is None else {"lights": self._continued.cpu()}
+        """The adversaries' values (E, D), where they continue; empty otherwise."""
+        return {} if self._continued is None else {"values": self._continued.cpu()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore what `state_dict` gave; InputError where it is from another number of examples."""
-        if "lights" not in state:
+        if "values" not in state:
             return
-        if len(state["lights"]) != len(self._labels):
+        if len(state["values"]) != len(self._labels):
             raise InputError(
-                f"augment.examples: the checkpoint continues {len(state['lights'])} lights and the scene has "
+                f"augment.examples: the checkpoint continues {len(state['values'])} examples and the scene has "
                 f"{len(self._labels)}; resume with the settings of the run"
             )
-        self._continued = state["lights"].to(self._labels.device)
+        self._continued = state["values"].to(self._labels.device)
 
-    def _random(self, model: nn.Module, epoch: int) -> Renders:
-        lights = self._perturbed(epoch)
-        images = self._scene.render(lights)
+    def _random(self, model: nn.Module, problem: Perturbation, epoch: int) -> Renders:
+        values = self._perturbed(problem, epoch)
+        with torch.no_grad():
+            images = problem.render(values, problem.everything)[:, 0]
         with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
             logits = torch.cat([model(batch) for batch in images.split(self.settings.attack.batch_size)])
         diagnostics = {
             "fooled": _mean(logits.argmax(1) != self._labels),
             "loss": _mean(nn.functional.cross_entropy(logits, self._labels)),
         }
-        return Renders(images, self._labels, diagnostics | self._light_diagnostics(lights))
+        return Renders(images, self._labels, diagnostics | _changes(problem, values))
 
-    def _adversarial(self, model: nn.Module, epoch: int) -> Renders:
+    def _adversarial(self, model: nn.Module, problem: Perturbation, epoch: int) -> Renders:
         attack, goal = self.settings.attack, Goal(self._labels[:, None])
-        problem = _SceneLights(self._scene, self._starting_lights(epoch), attack)
-        mine = processes.share(len(self._scene)).to(self._light.device)
-        part = Part(problem, mine, problem.start[mine])
-        result = descend(model, part, goal.of(mine), attack.descent(), self._phases)
-        result = result.merged(mine, len(self._scene))
-        lights = result.values.unflatten(1, (-1, 3))
+        mine = processes.share(len(problem.start)).to(problem.start.device)
+        part = Part(problem, mine, self._start(problem, epoch)[mine])
+        draws = generator(self._seed, epoch, "restart")
+        restarts = (problem.sample(draws)[mine] for _ in range(attack.restarts))
+        result = descend_repeatedly(model, part, goal.of(mine), attack.descent(), self._phases, restarts)
+        result = result.merged(mine, len(problem.start))
         if self.settings.lights == "continue":
-            self._continued = lights
-        diagnostics = self._attack_diagnostics(result) | self._light_diagnostics(lights)
-        return Renders(result.images.flatten(0, 1), self._labels, diagnostics)
+            self._continued = result.values
+        diagnostics = self._attack_diagnostics(result) | _changes(problem, result.values)
+        return Renders(result.images[:, 0], self._labels, diagnostics)
 
-    def _starting_lights(self, epoch: int) -> Tensor:
+    def _start(self, problem: Perturbation, epoch: int) -> Tensor:
         if self._continued is not None:
             return self._continued
-        if self.settings.start == "random":
-            return self._perturbed(epoch)
-        return self._light.expand(len(self._scene), -1, -1)
+        return self._perturbed(problem, epoch) if self.settings.start == "random" else problem.start
 
-    def _perturbed(self, epoch: int) -> Tensor:
+    def _perturbed(self, problem: Perturbation, epoch: int) -> Tensor:
+        """Random values (E, D), within the norm-balls."""
+        values = torch.cat(list(self._perturbed_parts(problem, epoch)), dim=1)
+        return problem.project(values, problem.everything)
+
+    def _perturbed_parts(self, problem: Perturbation, epoch: int) -> Iterator[Tensor]:
         random, draws = self.settings.random, generator(self._seed, epoch, "lights")
-        lights = perturb(self._light.cpu(), len(self._scene), random.amplitude, random.radius, draws)
-        return lights.to(self._light.device)
+        for kind, start in zip(problem.kinds, problem.split(problem.start), strict=True):
+            if isinstance(kind, Lighting):
+                none = torch.zeros_like(problem.scene.lights[0], device="cpu")
+                offsets = perturb(none, len(start), random.amplitude, random.radius, draws)
+                yield start + offsets.flatten(1).to(start)
+            else:
+                yield kind.sample(generator(self._seed, epoch, kind.name), problem.everything).to(start)
 
     def _attack_diagnostics(self, result: AttackResult) -> dict[str, float]:
+        attack = self.settings.attack
         return {
             "fooled_before": _mean(result.fooled_before),
             "fooled": _mean(result.fooled),
             "steps": _mean(result.steps),
-            "used_all_steps": _mean(result.steps == self.settings.attack.max_steps),
+            "used_all_steps": _mean(result.steps == attack.max_steps * (1 + attack.restarts)),
             "loss_before": -_mean(result.cost_before),
             "loss": -_mean(result.cost),
             "zero_gradient": _mean(result.zero_gradient),
         }
 
-    def _light_diagnostics(self, lights: Tensor) -> dict[str, float]:
-        return {
-            "light_change": _mean((lights - self._light).flatten(1).norm(dim=1)),
-            "clamped": _mean(self._scene.clamped_share(lights)),
-        }
 
-
-class _SceneLights:
-    """A light of its own for each example of a scene. See `augment.attack.Problem`."""
-
-    def __init__(self, scene: Scene, start: Tensor, settings: LightAttackSettings):
-        """start: (E, 49, 3)."""
-        self.start, self._scene, self._settings = start.flatten(1), scene, settings
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self._scene.render(values.unflatten(1, (-1, 3)), examples)[:, None]
-
-    def step(self, gradient: Tensor) -> Tensor:
-        return self._settings.step_size * direction(gradient, self._settings.step)
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return values
+def _changes(problem: Perturbation, values: Tensor) -> dict[str, float]:
+    """The mean L2 norm of what changed of each condition, and the share of values that are clamped."""
+    before, after = (problem.conditions(each, problem.everything) for each in (problem.start, values))
+    changes = {
+        f"{part.name}_change": _mean((value - getattr(before, part.name)).flatten(1).norm(dim=1))
+        for part in fields(Conditions)
+        if (value := getattr(after, part.name)) is not None
+    }
+    return changes | {"clamped": _mean(problem.scene.clamped_share(after, problem.everything))}
 
 
 def _mean(values: Tensor) -> float:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from augment.scene import ObjectSettings, count_views
+from augment.objects import ObjectSettings
+from augment.scene import count_views
 from augment.service import AugmentationSettings
 from renderer.errors import InputError
 from renderer.image import PictureSettings

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from augment.attack import DescentSettings, Goal, Part, Problem, descend
 from augment.classifiers import Classifier
-from augment.mesh_scene import MeshScene
 from augment.parameters import Geometry, Kind, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
+from augment.scene import Scene
 from renderer.subdivision import subdivide
 from train.attacks.experiment import logits_of
 from train.photographs.shares import share
@@ -32,7 +32,7 @@ class Attack:
     step: StepSettings
     descent: DescentSettings
 
-    def problem(self, scene: MeshScene) -> Perturbation:
+    def problem(self, scene: Scene) -> Perturbation:
         return Perturbation(scene, [self.kind(scene, self.step)])
 
 
@@ -89,7 +89,7 @@ def answers(problem: Problem, values: Tensor, examples: Tensor, classifier: Clas
 
 def recognised_parts(
     subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator
-) -> Iterator[tuple[MeshScene, Tensor]]:
+) -> Iterator[tuple[Scene, Tensor]]:
     """Random scenes, each with those of its examples (A,) that the classifier recognises: `count` in all."""
     found = drawn = 0
     while found < count:

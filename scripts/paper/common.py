@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from augment.classifiers import Classifier
-from augment.mesh_scene import MeshScene
-from augment.scene import ObjectSettings, load_object
+from augment.objects import ObjectSettings, load_object
+from augment.scene import Scene
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
 from renderer.image import PictureSettings
@@ -66,11 +66,11 @@ def subjects(options: argparse.Namespace) -> list[Subject]:
     for entry in options.meshes:
         path, _, gain = (entry, "", "") if entry.startswith("solid:") else entry.partition(":")
         item = ObjectSettings(path, options.label, gain=float(gain or 1))
-        found.append(Subject(Path(path).stem, load_object(item), options.label, item.gain))
+        found.append(Subject(Path(path).stem, load_object(item).mesh, options.label, item.gain))
     return found
 
 
-def random_scene(subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator) -> MeshScene:
+def random_scene(subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator) -> Scene:
     """Views at π/3 off the zenith (the paper's) and any azimuth, with a field of view of 2 or 3, on a grey."""
     azimuths = (2 * math.pi * torch.rand(count, generator=draws)).tolist()
     fields = torch.randint(len(FIELDS_OF_VIEW), (count,), generator=draws).tolist()
@@ -88,10 +88,10 @@ def scene_of(
     light: str,
     cameras: Sequence[Sequence[OrthographicCamera]],
     greys: Tensor,
-) -> MeshScene:
+) -> Scene:
     """A subject before cameras (E × V), each example on a grey (E,)."""
     size = classifier.size
-    return MeshScene(
+    return Scene.of_mesh(
         subject.mesh,
         cameras,
         greys.view(-1, 1, 1, 1).expand(-1, 3, size, size),
@@ -102,7 +102,7 @@ def scene_of(
     )
 
 
-def recognised(scene: MeshScene, classifier: Classifier, label: str) -> Tensor:
+def recognised(scene: Scene, classifier: Classifier, label: str) -> Tensor:
     """(E,) whether the classifier gives all views of an example the label."""
     examples = torch.arange(len(scene))
     with torch.no_grad():
@@ -110,7 +110,7 @@ def recognised(scene: MeshScene, classifier: Classifier, label: str) -> Tensor:
     return (logits_of(classifier, images, 32).argmax(2) == classifier.label(label)).all(1)
 
 
-def recognised_scene(subject: Subject, classifier: Classifier, light: str, count: int, seed: int) -> MeshScene:
+def recognised_scene(subject: Subject, classifier: Classifier, light: str, count: int, seed: int) -> Scene:
     """`count` random examples of a subject that the classifier recognises, drawn until there are as many."""
     draws, cameras, greys = generator(seed, subject.name), [], []
     for _ in range(20):

@@ -13,9 +13,9 @@ from common import arguments, command, table, versions, write_section
 from PIL import Image
 from torch import Tensor
 
-from augment.mesh_scene import Conditions
+from augment.objects import ObjectSettings
 from augment.parameters import StepSettings
-from augment.scene import ObjectSettings
+from augment.scene import Conditions
 from renderer.light_sphere import light_sphere
 from train.attacks.experiment import Attacked, attack_mesh
 from train.attacks.report_picture import Exhibit, answer_caption, report_picture

@@ -30,17 +30,17 @@ from common import (
 from torch import Tensor, nn
 
 from augment.attack import DescentSettings, Goal, descend
+from augment.backgrounds import load_backgrounds
 from augment.cost import adversarial_cost
-from augment.mesh_scene import MeshScene
+from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.parameters import Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
-from augment.scene import ObjectSettings, Scene, SceneObject, load_object
-from augment.service import AugmentationService, AugmentationSettings, LightAttackSettings
+from augment.scene import Scene
+from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from renderer.camera import ring
 from renderer.image import PictureSettings
 from renderer.lights import load_light
 from renderer.subdivision import subdivide
-from renderer.transfer import build_operators
 from renderer.visibility import choose
 from train.photographs.shares import share
 from train.run_classifier import load_classifier
@@ -209,13 +209,12 @@ def stubborn(
     """An attack that never succeeds, since its targets are the least likely classes."""
     size, subject = classifier.size, setup.subject
     views = ring(setup.views, field)
-    cameras, greys = zip(*product(views, setup.backgrounds), strict=True)
+    cameras, behind = zip(*product(views, setup.backgrounds), strict=True)
     picture, count = PictureSettings(size, setup.samples, normals=setup.normals), len(cameras)
-    behind = torch.tensor(greys).view(-1, 1, 1, 1).expand(-1, 3, size, size)
-    scene = MeshScene(
+    scene = Scene.of_mesh(
         subject.mesh,
         [[camera] for camera in cameras],
-        behind,
+        load_backgrounds(behind, size),
         load_light(options.light),
         picture,
         choose(),
@@ -230,7 +229,7 @@ def stubborn(
     return iteration(
         setup.name,
         kind,
-        int(np.mean([len(scene.operator(camera).pixels) for camera in views])),
+        covered(scene),
         classifier,
         images,
         label[:, 0],
@@ -245,27 +244,25 @@ def training_step(chosen: Sequence[Subject], options: argparse.Namespace) -> Ite
     """The training's attack at 32² on 100 examples of two meshes."""
     classifier = load_classifier(f"run:{PRETRAINED}")
     label, views = classifier.label(options.label), EXAMPLES // len(chosen) // len(GREYS)
-    settings = PictureSettings(classifier.size)
-    objects = [
-        SceneObject(item.label, build_operators(item.mesh, ring(views, 2.0), settings, choose(), item.gain))
-        for item in chosen
-    ]
-    scene, light = Scene(objects, GREYS, settings), load_light(options.light)
+    objects = [SceneObject(item.label, item.mesh, item.gain) for item in chosen]
+    behind, settings = load_backgrounds(GREYS, classifier.size), PictureSettings(classifier.size)
+    scene = Scene.grid(objects, ring(views, 2.0), behind, load_light(options.light), settings, choose())
     with torch.no_grad():
         classifier.function.head.bias[label] += 100
     labels = torch.full((len(scene),), label)
     attack = AugmentationSettings(
-        examples=len(scene), attack=LightAttackSettings(max_steps=options.passes - 1, batch_size=len(scene))
+        examples=len(scene), attack=TrainingAttackSettings(max_steps=options.passes - 1, batch_size=len(scene))
     )
 
     def regenerate(watch: Stopwatch) -> None:
-        AugmentationService(attack, scene, labels, light, options.seed, watch).regenerate(classifier, 0)
+        AugmentationService(attack, scene, labels, options.seed, watch).regenerate(classifier, 0)
 
-    images = scene.render(light.expand(len(scene), -1, -1))
+    everything = torch.arange(len(scene))
+    images = scene.render(scene.conditions(everything), everything)[:, 0]
     return iteration(
         TRAINING,
         "lighting",
-        len(scene.pixels),
+        len(scene.stacks[0].pixels),
         classifier,
         images,
         labels,
@@ -274,6 +271,11 @@ def training_step(chosen: Sequence[Subject], options: argparse.Namespace) -> Ite
         options.passes,
         options.turns // 2,
     )
+
+
+def covered(scene: Scene) -> int:
+    """Pixels of a view that the mesh covers, on average."""
+    return int(np.mean([int((each > 0).sum()) for stack in scene.stacks for each in stack.coverage]))
 
 
 def many(setup: Setup) -> Setup:
@@ -291,7 +293,7 @@ def attacks(subject: Subject, classifier: nn.Module, options: argparse.Namespace
     goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
     for example in range(len(scene)):
         one = scene_of(subject, classifier, options.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0])
-        prepared = seconds(lambda one=one: one.operator(one.cameras[0][0]))
+        prepared = seconds(lambda one=one: one.stacks)
         problem = Perturbation(one, [Lighting(one, KINDS["lighting"][1])])
         start = time.process_time()
         result = descend(classifier, problem, goal, DescentSettings(options.max_steps), Stopwatch())
@@ -377,9 +379,10 @@ def main() -> None:
     matplotlib.use("Agg")
     torch.set_num_threads(1)
     chosen, classifier = subjects(options), load_classifier(options.classifier, options.weights)
+    solid = Subject("solid", load_object(SOLID).mesh, options.label)
     setups = (
         Setup(f"{chosen[0].name}, textured, smooth, 2×2 samples", fine(chosen[0]), 2, "smooth"),
-        Setup("solid:orange, flat, 1 sample", fine(Subject("solid", load_object(SOLID), options.label)), 1, "flat"),
+        Setup("solid:orange, flat, 1 sample", fine(solid), 1, "flat"),
     )
     measured = [
         stubborn(setups[0], kind, classifier, field, options.passes, options) for kind in KINDS for field in FIELDS

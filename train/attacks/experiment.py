@@ -1,30 +1,25 @@
 """An attack from its configuration: classifier, scene, what the classifier sees at first, descent, checks, files."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from augment.attack import AttackResult, Goal, descend_repeatedly
+from augment.backgrounds import load_backgrounds
 from augment.classifiers import Classifier
-from augment.mesh_scene import MeshScene
-from augment.parameters import KINDS, Kind, Skylight
+from augment.objects import ObjectSettings, load_object
 from augment.perturbation import Perturbation
 from augment.phases import Phases
-from augment.scene import ObjectSettings, load_object
+from augment.scene import Scene
 from augment.seeding import generator
 from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.lights import load_light
-from renderer.subdivision import subdivide
 from renderer.visibility import choose
 from train.attacks.settings import AttackExperimentSettings
-from train.photographs.folder import read_square
 
 LEAST_LIKELY = "least_likely"
 
@@ -54,9 +49,8 @@ def attack_mesh(
     InputError also where the classifier does not recognise it to begin with.
     """
     scene = build_scene(item, settings, classifier.size, device)
-    problem = Perturbation(scene, list(build_kinds(scene, settings)))
-    everything = torch.arange(len(scene), device=problem.start.device)
-    images = problem.render(problem.start, everything).detach()
+    problem = settings.attack.problem(scene)
+    images = problem.render(problem.start, problem.everything).detach()
     before = logits_of(classifier, images, settings.attack.batch_size)
     label = classifier.label(item.label)
     if not settings.attack.force:
@@ -72,55 +66,19 @@ def attack_mesh(
     return Attacked(problem, classifier, goal, images, before, after, result, phases.take())
 
 
-def build_scene(item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device) -> MeshScene:
-    """Backgrounds × views, as an example each or, where the views share what is attacked, an example per background."""
+def build_scene(item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device) -> Scene:
+    """Views × backgrounds, as an example each or, where the views share what is attacked, an example per background."""
     scene, renderer = settings.scene, settings.renderer
-    cameras = ring(scene.views, scene.field_of_view, math.radians(scene.polar))
-    views = [cameras] if settings.attack.shared else [[camera] for camera in cameras]
-    behind = torch.stack([background(choice, size) for choice in scene.backgrounds])
-    return MeshScene(
-        subdivide(load_object(item), scene.vertices),
-        [each for _ in behind for each in views],
-        behind.repeat_interleave(len(views), dim=0).to(device),
+    return Scene.grid(
+        [load_object(item, scene.vertices)],
+        ring(scene.views, scene.field_of_view, math.radians(scene.polar)),
+        load_backgrounds(scene.backgrounds, size),
         (load_light(scene.light) * scene.exposure).to(device),
         renderer.pictures(size),
         choose(renderer.visibility),
-        item.gain,
         OperatorCache(cache_folder(renderer.cache)),
+        shared=settings.attack.shared,
     )
-
-
-def background(choice: float | str, size: int) -> Tensor:
-    """A grey value, or a picture's centre square, as (3, size, size) in [0, 1]."""
-    try:
-        grey = float(choice)
-    except ValueError:
-        return _picture(Path(choice), size)
-    except TypeError:
-        grey = math.nan
-    if not 0 <= grey <= 1:
-        raise InputError(f"scene.backgrounds={choice}: give grey values in [0, 1] or picture files")
-    return torch.full((3, size, size), grey)
-
-
-def _picture(path: Path, size: int) -> Tensor:
-    try:
-        square = read_square(path, size)
-    except Exception as error:  # Pillow's decoders raise almost anything at a broken file
-        raise InputError(
-            f"scene.backgrounds: {path} cannot be read ({error}): give grey values or picture files"
-        ) from error
-    return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
-
-
-def build_kinds(scene: MeshScene, settings: AttackExperimentSettings) -> Iterator[Kind]:
-    """What the attack changes."""
-    for name, chosen in settings.attack.kinds.items():
-        if name == Skylight.name:
-            angles = math.radians(chosen.zenith), math.radians(chosen.azimuth)
-            yield Skylight(scene, chosen, *angles, chosen.turbidity)
-        else:
-            yield KINDS[name](scene, chosen)
 
 
 @torch.no_grad()

@@ -2,11 +2,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from PIL import Image
 from torch import Tensor
 
 from augment.attack import DescentSettings, descend_repeatedly
@@ -18,7 +16,7 @@ from renderer.errors import InputError
 from renderer.lights import probe
 from train.attacks import experiment
 from train.attacks.checks import Checks, check
-from train.attacks.experiment import Attacked, attack_mesh, background
+from train.attacks.experiment import Attacked, attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
 from train.settings import read_object, read_settings
@@ -85,12 +83,12 @@ def test_a_gpu_attacks_as_a_cpu_does_to_rounding(kinds):
     assert torch.equal(found.fooled.cpu(), expected.fooled)
 
 
-def test_examples_are_all_views_before_each_background_at_equal_azimuths():
+def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
     done = attacked("scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "attack.max_steps=0")
     cameras = ring(3, 2.0, math.pi / 2)
-    assert done.problem.scene.cameras == [[camera] for camera in cameras] * 2
-    assert done.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(grey)] * 3 for grey in [0.2] * 3 + [0.6] * 3]
-    assert torch.equal(done.problem.scene.light, probe("grace"))
+    assert done.problem.scene.cameras == [(camera,) for camera in cameras for _ in range(2)]
+    assert done.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(grey)] * 3 for grey in [0.2, 0.6] * 3]
+    assert torch.equal(done.problem.scene.lights, probe("grace").expand(6, -1, -1))
 
 
 def test_shared_views_are_one_example_with_one_light():
@@ -110,8 +108,8 @@ def test_exposure_multiplies_the_light_and_gain_the_surface():
 
 
 def test_subdivision_gives_more_vertices_than_asked_for():
-    before = len(attacked("attack.max_steps=0").problem.scene.vertices)
-    after = len(attacked("attack.max_steps=0", f"scene.vertices={before}").problem.scene.vertices)
+    before = len(attacked("attack.max_steps=0").problem.scene.mesh(0).vertices)
+    after = len(attacked("attack.max_steps=0", f"scene.vertices={before}").problem.scene.mesh(0).vertices)
     assert after > before
 
 
@@ -172,32 +170,6 @@ def test_a_target_is_reached():
 def test_a_class_whose_name_is_a_number_is_a_target():
     done = attacked("target=7", "attack.max_steps=1", classifier=by_colour(("orange", "7", "8", "9")))
     assert done.goal.increase.tolist() == [[1]]
-
-
-# ---------------------------------------------------------------------------------------- backgrounds
-
-
-def test_a_background_is_grey_or_a_pictures_centre_square(tmp_path):
-    assert torch.equal(background(0.25, 4), torch.full((3, 4, 4), 0.25))
-    assert torch.equal(background("0.25", 4), background(0.25, 4))
-    pixels = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "wide.png")
-    square = torch.from_numpy(pixels[:, 1:5]).permute(2, 0, 1) / 255
-    assert torch.equal(background(str(tmp_path / "wide.png"), 4), square)
-
-
-@pytest.mark.parametrize("choice", [-0.1, 1.1, math.nan, None, [0.5]])
-def test_greys_outside_0_to_1_and_what_is_no_background_are_refused(choice):
-    with pytest.raises(InputError, match=r"scene.backgrounds=.*give grey values in \[0, 1\] or picture files"):
-        background(choice, 4)
-
-
-def test_an_unreadable_background_is_named(tmp_path):
-    broken = tmp_path / "broken.png"
-    broken.write_bytes(b"no picture")
-    for path in (broken, tmp_path / "absent.png", tmp_path):
-        with pytest.raises(InputError, match=f"scene.backgrounds: {path} cannot be read .*: give grey values"):
-            background(str(path), 4)
 
 
 # ---------------------------------------------------------------------------------------- bad input

@@ -77,7 +77,7 @@ def test_the_light_is_read_back_to_the_bit_and_as_a_map_to_its_precision(tmp_pat
 def test_the_shape_is_read_back_where_the_attack_left_it(tmp_path, suffix, up):
     done = attacked("attack=[geometry]")
     (line,) = written(done, tmp_path)
-    mesh = done.problem.scene.mesh
+    mesh = done.problem.scene.mesh(0)
     moved = mesh.vertices + done.result.values[0].unflatten(0, (-1, 3)).double().numpy()
     found = load_mesh(tmp_path / f"example_000_shape{suffix}", up=up)
     # Half of float32's step below 1, and the file's axes are turned exactly.
