@@ -28,11 +28,12 @@ class ObjectSettings:
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A mesh that spans [-1, 1], the name of its class, and what multiplies its albedo."""
+    """A mesh that spans [-1, 1], the name of its class, what multiplies its albedo, and its own name in messages."""
 
     label: str
     mesh: Mesh
     gain: float = 1.0
+    name: str = "the mesh"
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
@@ -40,7 +41,7 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
 
     InputError: as `load_mesh` and `solid`.
     """
-    return SceneObject(item.label, subdivide(_load(item), vertices), item.gain)
+    return SceneObject(item.label, subdivide(_load(item), vertices), item.gain, item.mesh)
 
 
 def _load(item: ObjectSettings) -> Mesh:

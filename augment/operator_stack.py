@@ -41,8 +41,9 @@ class OperatorStack:
         grid = kept.new_zeros(len(used) * slots, *kept.shape[1:]).index_copy(0, cell, kept)
         everything = len(used) == len(self.transfer)
         transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
-        radiance = apply_transfer(grid.unflatten(0, (len(used), slots)), transfer, albedo)
-        return radiance.flatten(0, 1).index_select(0, cell)
+        radiance = apply_transfer(grid.unflatten(0, (len(used), slots)), transfer, albedo).flatten(0, 1)
+        no_gaps = len(cell) == len(grid) and (cell.diff() == 1).all()
+        return radiance if no_gaps else radiance.index_select(0, cell)
 
 
 def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:

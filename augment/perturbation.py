@@ -10,7 +10,7 @@ from augment.scene import Conditions, Scene
 
 
 class Perturbation:
-    """Kinds side by side: values (E, D) are theirs, one after the other. See `augment.attack.Problem`."""
+    """Kinds side by side: values (E, D) are theirs, one after the other. See `augment.descent.Problem`."""
 
     def __init__(self, scene: Scene, kinds: Sequence[Kind]):
         self.scene, self.kinds = scene, kinds

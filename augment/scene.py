@@ -211,7 +211,8 @@ class Scene:
         """By one product per stack of operators."""
         views = torch.arange(self.views, device=examples.device)
         images = (examples[:, None] * self.views + views).flatten()
-        light = light.repeat_interleave(self.views, dim=0)
+        if self.views > 1:
+            light = light.repeat_interleave(self.views, dim=0)
         if len(self._distinct) <= self._per_stack:
             yield self._relit_layer(0, None, light, images)
             return

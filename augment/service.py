@@ -1,14 +1,17 @@
 """The augmentation service: each epoch, a fresh batch of labelled renders made against the current weights."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
+from torch.utils.data import Dataset
 
 from augment import processes
-from augment.attack import AttackResult, Goal, Part, descend_repeatedly
-from augment.attack_settings import AttackSettings
+from augment.attacks.settings import AttackSettings
+from augment.build import Shown, build_scene
+from augment.descent import AttackResult, Goal, Part, descend_repeatedly
 from augment.model_state import as_found
 from augment.parameters import Lighting, StepSettings
 from augment.perturbation import Perturbation
@@ -49,9 +52,13 @@ class TrainingAttackSettings(AttackSettings):
     step_size: float = 0.05
     batch_size: int = 128
 
+    def __post_init__(self):
+        self._light = StepSettings(step=self.step, step_size=self.step_size)
+        super().__post_init__()
+
     @property
     def kinds(self) -> dict[str, StepSettings]:
-        return super().kinds or {Lighting.name: StepSettings(step=self.step, step_size=self.step_size)}
+        return super().kinds or {Lighting.name: self._light}
 
 
 @dataclass
@@ -93,12 +100,21 @@ class AugmentationSettings:
 
 
 @dataclass(frozen=True)
-class Renders:
-    """An epoch's examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers."""
+class Renders(Dataset):
+    """An epoch's examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
+
+    As a data set, pairs of an image on the CPU and its label as a number: `data + renders` is both.
+    """
 
     images: Tensor
     labels: Tensor
     diagnostics: Mapping[str, float]
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, int]:
+        return self.images[index].cpu(), int(self.labels[index])
 
 
 class AugmentationService:
@@ -115,6 +131,31 @@ class AugmentationService:
         self._seed = seed
         self._phases = phases
         self._continued: Tensor | None = None
+
+    @classmethod
+    def from_meshes(
+        cls,
+        meshes: Sequence[tuple[Shown, int]],
+        size: int,
+        settings: AugmentationSettings | None = None,
+        *,
+        views: int = 10,
+        backgrounds: Sequence[float | str | Path] = (0.0, 0.25, 0.5, 0.75, 1.0),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        **of_scene,
+    ) -> "AugmentationService":
+        """For any training loop: meshes × views × backgrounds renders, as the paper has them unless told otherwise.
+
+        meshes: (file, solid:NAME or `Mesh`; the index of its class) each. size: pixels per side. of_scene: further
+        arguments of `build_scene`; as in the paper, 8 × 8 samples per pixel and flat shading are the default.
+        """
+        named = [(mesh, str(label)) for mesh, label in meshes]
+        choices = {"samples": 8, "normals": "flat", "backgrounds": backgrounds, "device": device, **of_scene}
+        scene = build_scene(named, size, views, **choices)
+        labels = torch.tensor([int(label) for label in scene.labels], device=device)
+        settings = replace(settings or AugmentationSettings(), examples=len(scene))
+        return cls(settings, scene, labels, seed, Phases(device))
 
     def __len__(self) -> int:
         """Examples per epoch."""

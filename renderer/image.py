@@ -135,3 +135,8 @@ def check_encoding(encoding: str) -> None:
     """InputError unless the encoding is known."""
     if encoding not in ENCODINGS:
         raise InputError(f"renderer.encoding={encoding}: choose one of {', '.join(ENCODINGS)}")
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """Image values in [0, 1] to uint8, rounded."""
+    return (image * 255).round().to(torch.uint8)

@@ -1,36 +1,73 @@
 """README's Python, block by block, in a folder that holds what it reads."""
 
+import json
 import re
 from pathlib import Path
 
 import pytest
+import torch
 import trimesh
+from torch import nn
+from torch.utils.data import TensorDataset
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
-BLOCKS = re.findall(r"### ([^\n]+)\n(?:(?!\n#).)*?```python\n(.*?)```", README, re.DOTALL)
-
-
-def run(title: str) -> dict[str, object]:
-    """The names that the only block under a heading leaves behind."""
-    (block,) = [block for heading, block in BLOCKS if heading == title]
-    names = {}
-    exec(block, names)
-    return names
+HEADINGS = re.split(r"^#{2,3} (.*)$", README, flags=re.MULTILINE)
+BLOCKS = {
+    heading: "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+    for heading, text in zip(HEADINGS[1::2], HEADINGS[2::2], strict=True)
+    if "```python" in text
+}
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch) -> Path:
     trimesh.creation.icosphere(2).export(tmp_path / "orange.glb")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path
 
 
-def test_every_block_of_python_stands_under_a_heading_that_is_tested():
+def run(heading: str, **names) -> dict[str, object]:
+    """The names that the block under a heading leaves behind, given those of its reader."""
+    exec(BLOCKS[heading], names)
+    return names
+
+
+def test_every_block_of_python_is_run_here():
+    assert BLOCKS.keys() == {"Attack a classifier", "In your own training loop", "The renderer by itself"}
     assert README.count("```python") == len(BLOCKS)
-    assert {heading for heading, _ in BLOCKS} == {"The renderer by itself"}
 
 
 def test_the_renderer_by_itself():
     names = run("The renderer by itself")
     assert names["images"].shape == (10, 3, 224, 224) and names["image"].shape == (3, 224, 224)
     assert names["light"].grad.any()
+
+
+class Brightness(nn.Module):
+    """Bright is an orange, dark a plum."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        mean = 30 * images.mean((1, 2, 3))
+        return torch.stack([mean, 20.5 - mean], dim=1)
+
+
+def test_attack_a_classifier(folder, capsys):
+    names = run("Attack a classifier", network=Brightness(), CLASSES=["orange", "plum"])
+    attacked = names["attacked"]
+    assert capsys.readouterr().out and names["after"].shape == names["before"].shape == (1, 3, 3, 224, 224)
+    assert 0 < float((names["lights"] - attacked.problem.scene.lights).norm()) <= 1 + 1e-5
+    assert attacked.result.cost < attacked.result.cost_before
+    (line,) = [json.loads(line) for line in (folder / "adversaries" / "attack.jsonl").read_text().splitlines()]
+    assert line["fooled"] == bool(attacked.success) and (folder / "adversaries" / "example_000_light.hdr").is_file()
+
+
+def test_in_your_own_training_loop():
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
+    data = TensorDataset(torch.rand(8, 3, 32, 32), torch.arange(8))
+    before = network[1].weight.detach().clone()
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
+    names = run("In your own training loop", torch=torch, network=network, data=data, optimizer=optimizer)
+    assert len(names["renders"]) == 10 and names["renders"].labels.eq(53).all()
+    assert names["renders"].images.shape == (10, 3, 32, 32) and not torch.equal(network[1].weight, before)

@@ -22,12 +22,11 @@ from augment.seeding import generator
 from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.image import PictureSettings
+from renderer.image import PictureSettings, to_bytes
 from renderer.lights import ambient, directional
 from renderer.mesh import normalise
 from renderer.shapes import SOLIDS, solid
 from renderer.visibility import Backend, choose
-from train.batches import to_bytes
 from train.data import DataSet, Split
 from train.logs import console
 

@@ -7,14 +7,14 @@ import torch
 from common import Subject, random_scene, recognised
 from torch import Tensor
 
-from augment.attack import DescentSettings, Goal, Part, Problem, descend
+from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
+from augment.descent import DescentSettings, Goal, Part, Problem, descend
 from augment.parameters import Geometry, Kind, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene
 from renderer.subdivision import subdivide
-from train.attacks.experiment import logits_of
 from train.photographs.shares import share
 
 VERTICES = 10_000  # shapes have more (the paper's Section 4)

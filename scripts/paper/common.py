@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings, load_object
 from augment.scene import Scene
@@ -24,7 +25,6 @@ from renderer.image import PictureSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh
 from renderer.visibility import choose
-from train.attacks.experiment import logits_of
 from train.cli import command_line
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -16,15 +16,15 @@ import torch
 from common import Subject, arguments, command, recognised_scene, scene_of, subjects, table, versions, write_section
 from torch import Tensor
 
-from augment.attack import DescentSettings, Goal, descend
+from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
+from augment.descent import DescentSettings, Goal, descend
 from augment.parameters import KINDS, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene
 from augment.seeding import generator
 from renderer.subdivision import subdivide
-from train.attacks.experiment import logits_of
 from train.photographs.shares import share
 from train.run_classifier import load_classifier
 

@@ -26,10 +26,10 @@ from common import (
     write_section,
 )
 
+from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
-from train.attacks.experiment import logits_of
 from train.run_classifier import load_classifier
 
 LEAST_SHARE = 0.02  # recognised; below it the search for renders is given up

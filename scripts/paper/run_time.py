@@ -29,9 +29,9 @@ from common import (
 )
 from torch import Tensor, nn
 
-from augment.attack import DescentSettings, Goal, descend
 from augment.backgrounds import load_backgrounds
 from augment.cost import adversarial_cost
+from augment.descent import DescentSettings, Goal, descend
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.parameters import Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation

@@ -25,8 +25,8 @@ from adversaries import (
 from common import Subject, arguments, command, scene_of, subjects, table, versions, write_section
 from torch import Tensor
 
-from augment.attack import Part, Problem
 from augment.classifiers import Classifier
+from augment.descent import Part, Problem
 from augment.seeding import generator
 from train.run_classifier import load_classifier
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from augment import scene as scene_module
-from augment.attack import DescentSettings, Goal, descend
+from augment.descent import DescentSettings, Goal, descend
 from augment.parameters import KINDS, Albedo, Geometry, Kind, Lighting, Pixels, Skylight, StepSettings
 from augment.parameters.kind import STEPS, direction
 from augment.perturbation import Perturbation

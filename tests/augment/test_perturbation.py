@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.attack import AttackResult, DescentSettings, Goal, descend
+from augment.descent import AttackResult, DescentSettings, Goal, descend
 from augment.parameters import Albedo, Geometry, Lighting, Pixels, Skylight, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases

@@ -69,7 +69,7 @@ def scene_of(
 def render(scene: Scene, lights: torch.Tensor, examples: torch.Tensor | None = None) -> torch.Tensor:
     """Of scenes whose examples have one view."""
     everything = torch.arange(len(scene)) if examples is None else examples
-    return render(scene, Conditions(lights), everything)[:, 0]
+    return scene.render(Conditions(lights), everything)[:, 0]
 
 
 @pytest.fixture(params=ENCODINGS)

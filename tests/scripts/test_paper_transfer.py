@@ -18,8 +18,8 @@ import unseen_views  # noqa: E402
 from adversaries import ATTACKS, FURTHER, percent, recognised_parts, with_random_signs  # noqa: E402
 from common import Subject, scene_of  # noqa: E402
 
-from augment.attack import DescentSettings  # noqa: E402
 from augment.classifiers import Classifier  # noqa: E402
+from augment.descent import DescentSettings  # noqa: E402
 from augment.parameters import Lighting, StepSettings  # noqa: E402
 from augment.seeding import generator  # noqa: E402
 from renderer.camera import OrthographicCamera, ring  # noqa: E402

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from augment.attack_settings import AttackSettings
+from augment.attacks.settings import AttackSettings
 from renderer.errors import InputError
 from train.settings import RendererSettings
 

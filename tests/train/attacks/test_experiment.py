@@ -7,16 +7,17 @@ import torch
 from hydra import compose, initialize_config_module
 from torch import Tensor
 
-from augment.attack import DescentSettings, descend_repeatedly
+from augment.attacks import run
+from augment.attacks.checks import Checks, check
+from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
 from augment.cost import adversarial_cost
+from augment.descent import DescentSettings, descend_repeatedly
 from augment.parameters import KINDS
 from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.lights import probe
-from train.attacks import experiment
-from train.attacks.checks import Checks, check
-from train.attacks.experiment import Attacked, attack_mesh
+from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
 from train.settings import read_object, read_settings
@@ -132,7 +133,7 @@ def test_restarts_are_within_the_ball_and_follow_from_the_seed(monkeypatch):
             drawn.extend(each)
             return descend_repeatedly(*rest, drawn)
 
-        monkeypatch.setattr(experiment, "descend_repeatedly", recorded)
+        monkeypatch.setattr(run, "descend_repeatedly", recorded)
         done = attacked(f"seed={seed}", "attack.restarts=2", "attack.lighting.radius=0.02", "attack.max_steps=0")
         return torch.stack(drawn) - done.problem.start
 

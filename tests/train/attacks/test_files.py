@@ -8,15 +8,16 @@ import torch
 from hydra import compose, initialize_config_module
 from PIL import Image
 
-from augment.attack import DescentSettings
+from augment.attacks.checks import check
+from augment.attacks.files import LINES, MAP_HEIGHT, write_files
+from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
+from augment.descent import DescentSettings
 from renderer.environment import read_map, to_map
 from renderer.lights import load_light
 from renderer.mesh import load_mesh
 from renderer.mesh_damage import mesh_damage
-from train.attacks.checks import check
-from train.attacks.experiment import Attacked, attack_mesh
-from train.attacks.files import LINES, MAP_HEIGHT, write_files
+from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.settings import read_object, read_settings
 

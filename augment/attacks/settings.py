@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from augment.attack import DescentSettings
+from augment.descent import DescentSettings
 from augment.parameters import KINDS, Kind, Skylight, StepSettings
 from augment.perturbation import Perturbation
 from augment.scene import Scene

@@ -8,15 +8,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from augment.attacks.checks import Checks
+from augment.attacks.report_picture import Exhibit, answer_caption, report_picture
+from augment.attacks.run import Attacked
 from augment.scene import Conditions
 from renderer.environment import to_map, write_map
 from renderer.light_sphere import light_sphere
 from renderer.lights import save_light
 from renderer.mesh_damage import mesh_damage
 from renderer.mesh_export import export_mesh
-from train.attacks.checks import Checks
-from train.attacks.experiment import Attacked
-from train.attacks.report_picture import Exhibit, answer_caption, report_picture
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
 MAP_HEIGHT = 256
