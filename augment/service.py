@@ -13,7 +13,7 @@ from augment.attacks.settings import AttackSettings
 from augment.build import Shown, build_scene
 from augment.descent import AttackResult, Goal, Part, descend_repeatedly
 from augment.model_state import as_found
-from augment.parameters import Lighting, StepSettings
+from augment.parameters import Albedo, Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
@@ -97,6 +97,11 @@ class AugmentationSettings:
     def renders(self) -> bool:
         """Whether any example is rendered at all."""
         return self.arm != "none" and self.examples > 0
+
+    @property
+    def relights(self) -> bool:
+        """Whether nothing but the light changes, so that the scene's operators last from epoch to epoch."""
+        return not (self.vary.moves or {Geometry.name, Albedo.name} & self.attack.kinds.keys())
 
 
 @dataclass(frozen=True)

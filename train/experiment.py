@@ -202,7 +202,10 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         backend,
         cache,
     )
-    _log_skipped(built, cache, start)
+    if settings.augment.relights:
+        _log_skipped(built, cache, start)
+    else:
+        console.info("operators: none are kept, since views are rasterised in every epoch")
     return built
 
 

@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils.data import DataLoader, TensorDataset
 
 from augment.backgrounds import load_backgrounds
 from augment.objects import ObjectSettings, load_object
@@ -14,6 +15,8 @@ from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.image import PictureSettings
 from renderer.lights import probe
+from renderer.mesh import normalise
+from renderer.shapes import solid
 from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
@@ -279,3 +282,30 @@ def test_restarts_go_on_where_no_descent_has_fooled_and_repeat_with_the_epoch(fe
     first, again = (service.regenerate(never, 0) for _ in range(2))
     assert first.diagnostics["steps"] == 4 and first.diagnostics["used_all_steps"] == 1
     assert first.diagnostics == again.diagnostics and torch.equal(first.images, again.images)
+
+
+def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, monkeypatch, tmp_path):
+    """Built from meshes, label indices and a size; what it gives is what a service around the same scene gives."""
+    monkeypatch.chdir(tmp_path)
+    meshes = [("solid:plate", 0), (normalise(solid("table")), 2)]
+    attack = TrainingAttackSettings(max_steps=2)
+    settings = AugmentationSettings(lights="continue", attack=attack)
+    choices = dict(views=2, backgrounds=[0.25, 0.75], samples=2, visibility="software")
+    service = AugmentationService.from_meshes(meshes, 8, settings, **choices)
+    renders = service.regenerate(model, 0)
+    assert renders.labels.tolist() == [0] * 4 + [2] * 4 and len(service) == len(renders) == 8
+
+    objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in ("plate", "table")]
+    picture, behind = PictureSettings(size=8, samples=2), load_backgrounds([0.25, 0.75], 8)
+    scene = Scene.grid(objects, ring(2, 2.0), behind, LIGHT, picture, choose("software"))
+    same = AugmentationService(AugmentationSettings(examples=8, attack=attack), scene, renders.labels, 0, Phases())
+    assert torch.equal(same.regenerate(model, 0).images, renders.images)
+
+    data = TensorDataset(torch.zeros(5, 3, 8, 8), torch.zeros(5, dtype=torch.int64)) + renders
+    images, labels = next(iter(DataLoader(data, batch_size=13)))
+    assert torch.equal(images[5:], renders.images) and labels.tolist() == [0] * 5 + renders.labels.tolist()
+
+    resumed = AugmentationService.from_meshes(meshes, 8, settings, **choices)
+    resumed.load_state_dict(service.state_dict())
+    assert torch.equal(resumed.regenerate(model, 1).images, service.regenerate(model, 1).images)
+    assert list(tmp_path.iterdir()) == []
