@@ -5,28 +5,29 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from renderer.harmonics import live_coefficients
-from renderer.transfer import COEFFICIENTS, DEGREE, Operator, apply_transfer
+from renderer.basis import Basis
+from renderer.transfer import Operator, apply_transfer
 
 
 class OperatorStack:
     """O operators, and N images that each show one of them in a light of its own.
 
     Operators share nothing but the index of pixels that any of them covers; the other pixels are neither stored nor
-    shaded. pixels: (P,) int64. transfer: (O, 3 or 1, 32, P). albedo: (O, 3, P). coverage: (O, 1, P).
+    shaded. pixels: (P,) int64. transfer: (O, 3 or 1, K, P), K = 32 for 31 live harmonics. albedo: (O, 3, P).
+    coverage: (O, 1, P).
     """
 
     def __init__(self, operators: Sequence[Operator], shown: Tensor, device: torch.device | str = "cpu"):
-        """shown: (N,) int64, the operator of each image. The operators are of one dtype, on the CPU."""
+        """shown: (N,) int64, the operator of each image. The operators are of one dtype and basis, on the CPU."""
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         slots, self._slots = _rank_among_equals(shown)
-        parts = (pixels, *_stack(operators, pixels), shown, slots, _kept_coefficients())
+        parts = (pixels, *_stack(operators, pixels), shown, slots, _kept_coefficients(operators[0].basis))
         self.pixels, self.transfer, self.albedo, self.coverage, self.shown, self._slot, self._coefficients = (
             part.to(device) for part in parts
         )
 
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
-        """Linear radiance (A, 3, P) of images (A,), each in its light (A, 49, 3); differentiable in the lights.
+        """Linear radiance (A, 3, P) of images (A,), each in its light (A, size, 3); differentiable in the lights.
 
         Lights are laid out on a grid of the operators in use × their images, which leaves gaps where an image is not
         wanted; operators that none of them shows are left alone.
@@ -54,24 +55,28 @@ def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:
     return ranks, int(counts.max())
 
 
-def _kept_coefficients() -> Tensor:
-    """The 31 live coefficients and a dead one, whose row is zero: 32 rows make the gradient's product twice as fast."""
-    live = live_coefficients(DEGREE)
-    dead = next(index for index in range(COEFFICIENTS) if index not in live)
+def _kept_coefficients(basis: Basis) -> Tensor:
+    """The live coefficients and, where their number is odd, another, whose row is zero: for 32 rows instead of 31 the
+    gradient's product is twice as fast."""
+    live = basis.live
+    if len(live) % 2 == 0:
+        return live
+    dead = next((index for index in range(basis.size) if index not in live), 0)
     return torch.cat([live, torch.tensor([dead])])
 
 
 def _stack(operators: Sequence[Operator], pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Operators over a common set of pixels: transfer (O, 3 or 1, 32, P), albedo (O, 3, P) and coverage (O, 1, P)."""
+    """Operators over a common set of pixels: transfer (O, 3 or 1, K, P), albedo (O, 3, P) and coverage (O, 1, P)."""
     channels, like = max(len(operator.transfer) for operator in operators), operators[0].transfer
-    transfer = like.new_zeros(len(operators), channels, len(_kept_coefficients()), len(pixels))
+    live, rows = like.shape[1], len(_kept_coefficients(operators[0].basis))
+    transfer = like.new_zeros(len(operators), channels, rows, len(pixels))
     albedo = like.new_ones(len(operators), 3, len(pixels))
     coverage = like.new_zeros(len(operators), 1, len(pixels))
     for row, operator in enumerate(operators):
         columns = torch.searchsorted(pixels, operator.pixels)
         if channels == 1:
-            transfer[row][:, :-1, columns], albedo[row][:, columns] = operator.transfer, operator.albedo
+            transfer[row][:, :live, columns], albedo[row][:, columns] = operator.transfer, operator.albedo
         else:
-            transfer[row][:, :-1, columns] = operator.transfer * operator.albedo[:, None]
+            transfer[row][:, :live, columns] = operator.transfer * operator.albedo[:, None]
         coverage[row, 0, columns] = operator.coverage
     return transfer, albedo, coverage

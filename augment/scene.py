@@ -15,6 +15,7 @@ from torch.autograd.function import once_differentiable
 from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
 from renderer.albedo import face_albedo, surface_albedo
+from renderer.basis import HARMONICS, Basis
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
@@ -44,9 +45,9 @@ class Example:
 class Conditions:
     """What A examples are rendered under.
 
-    light: (A, 49, 3). vertices: (A, N, 3), None where they are the meshes'. albedo: (A, F, 3), added to each face's
-    linear albedo. pixels: (A, V, 3, size, size), added to the images' values. Where meshes differ in size, N and F
-    are the largest's, and a smaller mesh has the first of them.
+    light: (A, size, 3), of the scene's basis. vertices: (A, N, 3), None where they are the meshes'. albedo: (A, F, 3),
+    added to each face's linear albedo. pixels: (A, V, 3, size, size), added to the images' values. Where meshes differ
+    in size, N and F are the largest's, and a smaller mesh has the first of them.
     """
 
     light: Tensor
@@ -75,8 +76,8 @@ class Scene:
 
     Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
     (`OperatorStack`), equal views share one, and what a background adds to an image is kept. Where vertices move, their
-    view is rasterised anew each time. light: (49, 3), or (E, 49, 3), where attacks begin; its dtype and device are
-    those of the images.
+    view is rasterised anew each time. light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are
+    those of the images. basis: what lights are coefficients of; 49 harmonics, unless another is given.
     """
 
     def __init__(
@@ -88,11 +89,14 @@ class Scene:
         settings: PictureSettings,
         backend: Backend,
         operators: OperatorCache | None = None,
+        basis: Basis = HARMONICS,
     ):
+        if light.shape[-2:] != (basis.size, 3):
+            raise InputError(f"light of shape {tuple(light.shape)} is not of {basis}: give {basis.size} rows")
         if not (backgrounds.min() >= 0 and backgrounds.max() <= 1):
             raise InputError("scene.backgrounds: give values in [0, 1]")
         self.objects, self.examples = list(objects), list(examples)
-        self.settings, self.backend = settings, backend
+        self.settings, self.backend, self.basis = settings, backend, basis
         self.backgrounds = backgrounds.flatten(2).to(light)
         self.lights = light.expand(len(examples), *light.shape[-2:])
         self.views = len(self.examples[0].cameras)  # per example
@@ -115,12 +119,13 @@ class Scene:
         backgrounds: Tensor,
         *of_scene,
         shared: bool = False,
+        basis: Basis = HARMONICS,
     ) -> Scene:
         """Every object from every camera over every background, in that order; or, where the views share what is
         attacked, every object over every background from all cameras. of_scene: the other arguments."""
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = [Example(*row) for row in product(range(len(objects)), views, range(len(backgrounds)))]
-        return cls(objects, examples, backgrounds, *of_scene)
+        return cls(objects, examples, backgrounds, *of_scene, basis=basis)
 
     @classmethod
     def of_mesh(
@@ -144,7 +149,7 @@ class Scene:
         """The same objects in other rows, as many as before; None for the same backgrounds and operators' cache."""
         behind = self.backgrounds.unflatten(2, (self.settings.size, -1)) if backgrounds is None else backgrounds
         kept = operators or self._cache
-        return Scene(self.objects, examples, behind, self.lights, self.settings, self.backend, kept)
+        return Scene(self.objects, examples, behind, self.lights, self.settings, self.backend, kept, self.basis)
 
     def __len__(self) -> int:
         return len(self.examples)
@@ -263,7 +268,7 @@ class Scene:
         for number in dict.fromkeys(number for number, _ in views):
             item, cameras = self.objects[number], [camera for its, camera in views if its == number]
             operators += self._cache.operators(
-                item.mesh, cameras, self.settings, self.backend, item.gain, dtype=self.lights.dtype
+                item.mesh, cameras, self.settings, self.backend, item.gain, self.basis, self.lights.dtype
             )
         here = self._operator // self._per_stack == index
         stack = OperatorStack(operators, (self._operator[here] - first).cpu(), self.lights.device)

@@ -1,4 +1,4 @@
-"""Light as harmonics' coefficients, 49×3."""
+"""Light as the coefficients of its basis; 49×3 of harmonics, unless the scene has another."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from augment.scene import Conditions, Scene
 
 
 class Lighting(Kind):
-    """Every coefficient of the light; the start is the examples' own."""
+    """Every coefficient of the light, within the domain of the scene's basis; the start is the examples' own."""
 
     name = "lighting"
 
@@ -18,3 +18,6 @@ class Lighting(Kind):
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return replace(conditions, light=values.unflatten(1, (-1, 3)))
+
+    def within_domain(self, values: Tensor) -> Tensor:
+        return self.scene.basis.within_domain(values.unflatten(1, (-1, 3))).flatten(1)

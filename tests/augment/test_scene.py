@@ -1,25 +1,28 @@
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 import renderer
 from augment import scene as scene_module
 from augment.backgrounds import load_backgrounds
+from augment.descent import DescentSettings, Goal, descend
 from augment.objects import ObjectSettings, SceneObject, load_object
-from augment.parameters import Albedo, Geometry, StepSettings
+from augment.parameters import Albedo, Geometry, Lighting, StepSettings
+from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import STACKED, Conditions, Example, Scene, count_views
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from renderer.cache import OperatorCache
-from renderer.camera import ring
+from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
 from renderer.image import ENCODINGS, PictureSettings, develop
 from renderer.lights import ambient, probe
-from renderer.mesh import normalise
+from renderer.mesh import Mesh, normalise
 from renderer.shapes import solid
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
@@ -371,3 +374,46 @@ def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_its_own_values_only(mixed
     images = mixed.render(own.apply(values, mixed.conditions(everything), everything), everything)
     (gradient,) = torch.autograd.grad(images.square().sum(), values)
     assert not gradient[beyond].any() and gradient.any(1).all()
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """A basis that the package does not have: three lamps far away, along the axes, of power from 0 to 1."""
+
+    name = "lamps"
+    size = 3
+    live = torch.arange(3)
+
+    def irradiance(self, normals: torch.Tensor) -> torch.Tensor:
+        return normals.clamp(min=0)
+
+    def within_domain(self, coefficients: torch.Tensor) -> torch.Tensor:
+        return coefficients.clamp(0, 1)
+
+
+def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its_own():
+    """A white box before the camera from above: its top has the power of the lamp above, which falls to 0 at most."""
+    box = SceneObject("box", Mesh.plain(trimesh.creation.box().vertices, trimesh.creation.box().faces))
+    start = torch.tensor([[0.2] * 3, [0.3] * 3, [0.4, 0.5, 0.6]]).double()
+    above = OrthographicCamera(0.0, 0.0, 0.9)  # nothing but the top
+    scene = Scene.grid([box], [above], load_backgrounds([1.0], 8), start, SETTINGS, BACKEND, basis=Lamps())
+    chosen = torch.zeros(1, dtype=torch.int64)
+    image = scene.render(scene.conditions(chosen), chosen)
+    expected = torch.tensor([0.4, 0.5, 0.6]).double().view(3, 1, 1).expand_as(image)
+    torch.testing.assert_close(image, expected, rtol=0, atol=8 * torch.finfo(torch.float64).eps)
+
+    light = Lighting(scene, StepSettings("linf", 0.45, "sign", 0.15))
+    problem, goal = Perturbation(scene, [light]), Goal(torch.zeros(1, 1, dtype=torch.int64))
+    dark = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 2)).double()
+    torch.nn.init.constant_(dark[1].weight, 0)
+    with torch.no_grad():
+        dark[1].weight[0], dark[1].bias[:] = 1, torch.tensor([1e3, 0.0])
+    result = descend(dark, problem, goal, DescentSettings(5), Phases())
+    lamps = result.values.view(3, 3)
+    torch.testing.assert_close(lamps[:2], start[:2], rtol=0, atol=0)
+    torch.testing.assert_close(lamps[2], torch.tensor([0.0, 0.05, 0.15]).double(), rtol=0, atol=1e-12)
+
+
+def test_a_light_of_another_basis_is_refused():
+    with pytest.raises(InputError, match=r"light of shape \(9, 3\) is not of harmonics of degree 6: give 49 rows"):
+        Scene.of_mesh(solid("plate"), [ring(1, 2.0)], load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, BACKEND)
