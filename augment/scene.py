@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -109,7 +109,9 @@ class Scene:
         number = {view: index for index, view in enumerate(self._distinct)}
         self._operator = self._column(number[view] for view in seen)  # (E × V,)
         self._per_stack = max(1, STACKED // settings.size**2)
-        self._stack, self._still = cache(self._build_stack), cache(self._fragments_of_mesh)
+        # What is kept of views; `functools.cache` would tie a scene that each epoch replaces to itself.
+        self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
+        self._fragments_of_meshes: dict[tuple[int, OrthographicCamera], tuple[Fragments, Tensor]] = {}
 
     @classmethod
     def grid(
@@ -260,6 +262,11 @@ class Scene:
         smooth_faces = self._faces[number] if self.settings.normals == "smooth" else None
         return fragments, radiance(fragments, vertices, light, albedo, smooth_faces)
 
+    def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
+        if index not in self._stacks:
+            self._stacks[index] = self._build_stack(index)
+        return self._stacks[index]
+
     def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         """(some operators, (E × V,) each image's place among those that show them, what is behind these (N, C, P))."""
         first = index * self._per_stack
@@ -277,8 +284,11 @@ class Scene:
         added = behind(stack.coverage[stack.shown], backgrounds[which], self.settings.encoding)
         return stack, here.cumsum(0) - 1, added
 
-    def _fragments_of_mesh(self, number: int, camera: OrthographicCamera) -> tuple[Fragments, Tensor]:
-        return self._fragments(number, camera, self.objects[number].mesh.vertices)
+    def _still(self, number: int, camera: OrthographicCamera) -> tuple[Fragments, Tensor]:
+        view = number, camera
+        if view not in self._fragments_of_meshes:
+            self._fragments_of_meshes[view] = self._fragments(number, camera, self.objects[number].mesh.vertices)
+        return self._fragments_of_meshes[view]
 
     def _fragments(self, number: int, camera: OrthographicCamera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
         """What a camera sees of an object's moved vertices, and the albedo there (S, 3)."""
