@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 from torch import nn
-from torch.utils.data import TensorDataset
+from torch.utils.data import Dataset
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 HEADINGS = re.split(r"^#{2,3} (.*)$", README, flags=re.MULTILINE)
@@ -62,12 +62,21 @@ def test_attack_a_classifier(folder, capsys):
     assert line["fooled"] == bool(attacked.success) and (folder / "adversaries" / "example_000_light.hdr").is_file()
 
 
+class Photographs(Dataset):
+    """Labels are numbers, as torchvision's are."""
+
+    def __len__(self) -> int:
+        return 8
+
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, int]:
+        return torch.full((3, 32, 32), index / 8), index
+
+
 def test_in_your_own_training_loop():
     torch.manual_seed(0)
     network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
-    data = TensorDataset(torch.rand(8, 3, 32, 32), torch.arange(8))
     before = network[1].weight.detach().clone()
     optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
-    names = run("In your own training loop", torch=torch, network=network, data=data, optimizer=optimizer)
+    names = run("In your own training loop", torch=torch, network=network, data=Photographs(), optimizer=optimizer)
     assert len(names["renders"]) == 10 and names["renders"].labels.eq(53).all()
     assert names["renders"].images.shape == (10, 3, 32, 32) and not torch.equal(network[1].weight, before)

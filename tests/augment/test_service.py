@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, TensorDataset
+from torch.utils.data import ConcatDataset, DataLoader
 
 from augment.backgrounds import load_backgrounds
 from augment.objects import ObjectSettings, load_object
@@ -301,7 +301,7 @@ def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, mon
     same = AugmentationService(AugmentationSettings(examples=8, attack=attack), scene, renders.labels, 0, Phases())
     assert torch.equal(same.regenerate(model, 0).images, renders.images)
 
-    data = TensorDataset(torch.zeros(5, 3, 8, 8), torch.zeros(5, dtype=torch.int64)) + renders
+    data = ConcatDataset([[(torch.zeros(3, 8, 8), 0)] * 5, renders])
     images, labels = next(iter(DataLoader(data, batch_size=13)))
     assert torch.equal(images[5:], renders.images) and labels.tolist() == [0] * 5 + renders.labels.tolist()
 
