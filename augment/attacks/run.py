@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -18,6 +19,9 @@ from augment.phases import Phases
 from augment.scene import Conditions, Scene
 from augment.seeding import generator
 from renderer.errors import InputError
+
+if TYPE_CHECKING:
+    from augment.attacks.checks import Checks
 
 
 @dataclass(frozen=True)
@@ -59,13 +63,13 @@ class Attacked:
         """The lights (E, 49, 3), vertices (E, N, 3), albedos and pixels that the attack ended with; `Conditions`."""
         return self.problem.conditions(self.result.values, self.problem.everything)
 
-    def check(self):
+    def check(self) -> Checks:
         """Random search with as many tries, and success as steps grow: see `augment.attacks.checks.Checks`."""
         from augment.attacks.checks import check
 
         return check(self, self.settings.descent(), self.seed)
 
-    def save(self, folder: str | Path, checks=None) -> None:
+    def save(self, folder: str | Path, checks: Checks | None = None) -> None:
         """Write a folder: attack.jsonl and, for each example, an image of before and after, its light and its shape."""
         from augment.attacks.files import write_files
 
