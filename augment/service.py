@@ -1,4 +1,4 @@
-"""The augmentation service: each epoch, a fresh batch of labelled renders made against the current weights."""
+"""The augmentation service: fresh labelled renders, made against the current weights whenever they are asked for."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -63,17 +63,19 @@ class TrainingAttackSettings(AttackSettings):
 
 @dataclass
 class AugmentationSettings:
-    """What is regenerated each epoch.
+    """What is regenerated, and when.
 
     start: where an attack begins, the scene as it is ("light") or a random perturbation of it: of the light by
-    `random`, of all else uniform in its norm-ball. lights: "restart" begins there each epoch, "continue" begins where
-    the last epoch's attack ended. vary: what is drawn afresh in each epoch's scene.
+    `random`, of all else uniform in its norm-ball. lights: "restart" begins there each time, "continue" begins where
+    the last attack ended. vary: what of the scene is drawn afresh each time.
+    every: after how many training images the renders are made anew, counted within an epoch; None: each epoch.
     """
 
     arm: str = "adversarial"
     examples: int = 100
     start: str = "light"
     lights: str = "restart"
+    every: int | None = None
     vary: VariationSettings = field(default_factory=VariationSettings)
     random: RandomLights = field(default_factory=RandomLights)
     attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
@@ -88,6 +90,8 @@ class AugmentationSettings:
                 raise InputError(f"augment.{name}={value}: choose one of {', '.join(choices)}")
         if self.examples < 0:
             raise InputError(f"augment.examples={self.examples} must not be negative")
+        if self.every is not None and self.every < 1:
+            raise InputError(f"augment.every={self.every} must be at least 1 training image, or null for each epoch")
         if self.arm == "random" or self.start == "random":
             for name, settings in self.attack.kinds.items():
                 if name != Lighting.name and settings.radius is None:
@@ -106,7 +110,7 @@ class AugmentationSettings:
 
 @dataclass(frozen=True)
 class Renders(Dataset):
-    """An epoch's examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
+    """Labelled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
 
     As a data set, pairs of an image on the CPU and its label as a number: `data + renders` is both.
     """
@@ -123,7 +127,7 @@ class Renders(Dataset):
 
 
 class AugmentationService:
-    """Holds the scene and, where lights continue, the adversaries' values from epoch to epoch.
+    """Holds the scene and, where lights continue, the adversaries' values from one regeneration to the next.
 
     Where several processes train together, each attacks its share of the examples, and all get all renders.
     """
@@ -163,19 +167,20 @@ class AugmentationService:
         return cls(settings, scene, labels, seed, Phases(device))
 
     def __len__(self) -> int:
-        """Examples per epoch."""
+        """Examples per regeneration."""
         return len(self._labels) if self.settings.renders else 0
 
-    def regenerate(self, model: nn.Module, epoch: int) -> Renders:
-        """This epoch's examples for the model's current weights; the model is left as it was found.
+    def regenerate(self, model: nn.Module, number: int) -> Renders:
+        """Fresh examples for the model's current weights; the model is left as it was found.
 
-        The draw depends on the seed and the epoch alone, so a resumed run repeats it.
+        number: counts the regenerations of a run from 0. The draw depends on it and the seed alone, so a resumed run
+        repeats it.
         """
         if not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
         make = self._random if self.settings.arm == "random" else self._adversarial
-        scene = vary(self._scene, self.settings.vary, generator(self._seed, epoch, "rows"))
-        return make(model, self.settings.attack.problem(scene), epoch)
+        scene = vary(self._scene, self.settings.vary, generator(self._seed, number, "rows"))
+        return make(model, self.settings.attack.problem(scene), number)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The adversaries' values (E, D), where they continue; empty otherwise."""
@@ -192,8 +197,8 @@ class AugmentationService:
             )
         self._continued = state["values"].to(self._labels.device)
 
-    def _random(self, model: nn.Module, problem: Perturbation, epoch: int) -> Renders:
-        values = self._perturbed(problem, epoch)
+    def _random(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
+        values = self._perturbed(problem, number)
         with torch.no_grad():
             images = problem.render(values, problem.everything)[:, 0]
         with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
@@ -204,11 +209,11 @@ class AugmentationService:
         }
         return Renders(images, self._labels, diagnostics | _changes(problem, values))
 
-    def _adversarial(self, model: nn.Module, problem: Perturbation, epoch: int) -> Renders:
+    def _adversarial(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
         attack, goal = self.settings.attack, Goal(self._labels[:, None])
         mine = processes.share(len(problem.start)).to(problem.start.device)
-        part = Part(problem, mine, self._start(problem, epoch)[mine])
-        draws = generator(self._seed, epoch, "restart")
+        part = Part(problem, mine, self._start(problem, number)[mine])
+        draws = generator(self._seed, number, "restart")
         restarts = (problem.sample(draws)[mine] for _ in range(attack.restarts))
         result = descend_repeatedly(model, part, goal.of(mine), attack.descent(), self._phases, restarts)
         result = result.merged(mine, len(problem.start))
@@ -217,25 +222,25 @@ class AugmentationService:
         diagnostics = self._attack_diagnostics(result) | _changes(problem, result.values)
         return Renders(result.images[:, 0], self._labels, diagnostics)
 
-    def _start(self, problem: Perturbation, epoch: int) -> Tensor:
+    def _start(self, problem: Perturbation, number: int) -> Tensor:
         if self._continued is not None:
             return self._continued
-        return self._perturbed(problem, epoch) if self.settings.start == "random" else problem.start
+        return self._perturbed(problem, number) if self.settings.start == "random" else problem.start
 
-    def _perturbed(self, problem: Perturbation, epoch: int) -> Tensor:
+    def _perturbed(self, problem: Perturbation, number: int) -> Tensor:
         """Random values (E, D), within the norm-balls."""
-        values = torch.cat(list(self._perturbed_parts(problem, epoch)), dim=1)
+        values = torch.cat(list(self._perturbed_parts(problem, number)), dim=1)
         return problem.project(values, problem.everything)
 
-    def _perturbed_parts(self, problem: Perturbation, epoch: int) -> Iterator[Tensor]:
-        random, draws = self.settings.random, generator(self._seed, epoch, "lights")
+    def _perturbed_parts(self, problem: Perturbation, number: int) -> Iterator[Tensor]:
+        random, draws = self.settings.random, generator(self._seed, number, "lights")
         for kind, start in zip(problem.kinds, problem.split(problem.start), strict=True):
             if isinstance(kind, Lighting):
                 none = torch.zeros_like(problem.scene.lights[0], device="cpu")
                 offsets = perturb(none, len(start), random.amplitude, random.radius, draws)
                 yield start + offsets.flatten(1).to(start)
             else:
-                yield kind.sample(generator(self._seed, epoch, kind.name), problem.everything).to(start)
+                yield kind.sample(generator(self._seed, number, kind.name), problem.everything).to(start)
 
     def _attack_diagnostics(self, result: AttackResult) -> dict[str, float]:
         attack = self.settings.attack
