@@ -11,7 +11,7 @@ from augment import processes
 from augment.cost import adversarial_cost
 from augment.model_state import as_found
 from augment.phases import Phases
-from renderer.errors import InputError
+from renderer.errors import require_range
 
 
 @dataclass
@@ -28,10 +28,8 @@ class DescentSettings:
     batch_size: int = 128
 
     def __post_init__(self):
-        if self.max_steps < 0 or self.batch_size < 1:
-            raise InputError(
-                f"attack: max_steps={self.max_steps} must not be negative and batch_size={self.batch_size} at least 1"
-            )
+        require_range("attack: max_steps", self.max_steps, 0, 10**6)
+        require_range("attack: batch_size", self.batch_size, 1, 10**6)
 
 
 class Problem(Protocol):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 
 NORMS = ("linf", "l2")
 Domain = Callable[[Tensor], Tensor]
@@ -26,8 +26,7 @@ class NormBall:
     def __post_init__(self):
         if self.norm not in NORMS:
             raise InputError(f"attack: norm={self.norm}: choose one of {', '.join(NORMS)}")
-        if self.radius is not None and not self.radius >= 0:
-            raise InputError(f"attack: radius={self.radius} must not be below zero, or null for no limit")
+        require_range("attack: radius", self.radius, 0, FACTOR)  # no limit: null
 
     def project(self, values: Tensor, centre: Tensor, domain: Domain = lambda values: values) -> Tensor:
         """The nearest points of the ball in the Euclidean sense; values and centre (A, D).

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
@@ -22,8 +22,7 @@ class ObjectSettings:
     gain: float = 1.0
 
     def __post_init__(self):
-        if not self.gain > 0:
-            raise InputError(f"scene.meshes: gain={self.gain} of {self.mesh} must be positive")
+        require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,20 @@ from augment.build import Shown, build_scene
 from augment.descent import AttackResult, Goal, Part, descend_repeatedly
 from augment.model_state import as_found
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings
+from augment.parameters.kind import check_step
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
 from augment.seeding import generator
 from augment.variation import VariationSettings, vary
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.lights import perturb
 
 ARMS = ("none", "random", "adversarial")
 STARTS = ("light", "random")
 SCHEDULES = ("restart", "continue")
+MOST_EXAMPLES = 10**6  # at 32 × 32 pixels they take 12 GB
+MOST_EVERY = 10**9
 
 
 @dataclass
@@ -35,10 +38,8 @@ class RandomLights:
     radius: float | None = None
 
     def __post_init__(self):
-        if not self.amplitude > 0:
-            raise InputError(f"augment.random.amplitude={self.amplitude} must be positive")
-        if self.radius is not None and not self.radius > 0:
-            raise InputError(f"augment.random.radius={self.radius} must be positive, or null for ±amplitude")
+        for name in ("amplitude", "radius"):  # no radius: null
+            require_range(f"augment.random.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
 
 
 @dataclass
@@ -53,6 +54,7 @@ class TrainingAttackSettings(AttackSettings):
     batch_size: int = 128
 
     def __post_init__(self):
+        check_step(self.step, self.step_size, "augment.attack.")
         self._light = StepSettings(step=self.step, step_size=self.step_size)
         super().__post_init__()
 
@@ -88,10 +90,8 @@ class AugmentationSettings:
         ]:
             if value not in choices:
                 raise InputError(f"augment.{name}={value}: choose one of {', '.join(choices)}")
-        if self.examples < 0:
-            raise InputError(f"augment.examples={self.examples} must not be negative")
-        if self.every is not None and self.every < 1:
-            raise InputError(f"augment.every={self.every} must be at least 1 training image, or null for each epoch")
+        require_range("augment.examples", self.examples, 0, MOST_EXAMPLES)
+        require_range("augment.every", self.every, 1, MOST_EVERY)
         if self.arm == "random" or self.start == "random":
             for name, settings in self.attack.kinds.items():
                 if name != Lighting.name and settings.radius is None:

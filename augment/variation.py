@@ -10,7 +10,7 @@ from torch import Tensor
 
 from augment.scene import Example, Scene
 from renderer.cache import OperatorCache
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError
 from renderer.image_files import SUFFIXES, read_image
 
 UNCHANGED = (1.0, 1.0)
@@ -35,8 +35,8 @@ class VariationSettings:
             raise InputError(f"augment.vary.place={self.place} must be a share of the frame's width, from 0 to 1")
         for name in ("scale", "exposure"):
             limits = getattr(self, name)
-            if len(limits) != 2 or not 0 < limits[0] <= limits[1] < math.inf:
-                raise InputError(f"augment.vary.{name}={list(limits)}: give [least, most], both positive")
+            if len(limits) != 2 or not 1 / FACTOR <= limits[0] <= limits[1] <= FACTOR:
+                raise InputError(f"augment.vary.{name}={list(limits)}: give [least, most], both from {1 / FACTOR:g} to {FACTOR:g}")
 
     @property
     def moves(self) -> bool:

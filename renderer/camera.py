@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class OrthographicCamera:
 
     field_of_view: width of the square picture in world units; a normalised mesh spans at most [-1, 1] per axis.
     right, up: where the origin lies in the picture, in world units from its middle.
-    InputError where the field of view is not positive, or an angle or a place is not finite.
+    InputError where the field of view is not positive, an angle is not finite, or any is too large.
     """
 
     polar: float
@@ -24,12 +24,11 @@ class OrthographicCamera:
     up: float = 0.0
 
     def __post_init__(self):
-        if not 0 < self.field_of_view < math.inf:
-            raise InputError(f"scene.field_of_view={self.field_of_view} must be positive and finite")
+        require_range("scene.field_of_view", self.field_of_view, 1 / FACTOR, FACTOR)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
-        if not (math.isfinite(self.right) and math.isfinite(self.up)):
-            raise InputError(f"camera place right={self.right}, up={self.up}: give finite lengths")
+        if not (abs(self.right) <= FACTOR and abs(self.up) <= FACTOR):  # NaN is not
+            raise InputError(f"camera place right={self.right}, up={self.up}: give lengths of at most {FACTOR:g}")
 
     def axes(self) -> np.ndarray:
         """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""

@@ -19,6 +19,7 @@ from renderer.errors import InputError
 from renderer.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")
+LARGEST_MAP = 4096  # MB, which a damaged header may exceed
 
 
 def to_map(coefficients: Tensor, height: int) -> Tensor:
@@ -55,6 +56,12 @@ def read_map(path: Path) -> Tensor:
     return torch.from_numpy(radiance)
 
 
+def check_map_name(path: Path) -> None:
+    """InputError where the suffix is not one of `SUFFIXES`."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path} is no name for an environment map: give one that ends in {', '.join(SUFFIXES)}")
+
+
 def write_map(path: Path, radiance: Tensor) -> None:
     """Write a map's radiance (H, W, 3) as float32 to an .npy or .exr file, or as RGBE to an .hdr file.
 
@@ -62,9 +69,8 @@ def write_map(path: Path, radiance: Tensor) -> None:
     much that is), the rest is off by up to 2⁻⁸ of its texel's largest channel. The other two keep negative radiance.
     InputError where the suffix is another or the file cannot be written.
     """
+    check_map_name(path)
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"{path} is no name for an environment map: give one that ends in {', '.join(SUFFIXES)}")
     radiance = radiance.detach().cpu().float()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -79,10 +85,13 @@ def write_map(path: Path, radiance: Tensor) -> None:
 
 def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     try:
-        with path.open("rb") as file:
-            array = np.lib.format.read_array(file, allow_pickle=False).astype(np.float32)
-    except (ValueError, TypeError, OSError) as error:
-        raise InputError(f"environment map {path} is not a readable .npy file: {error}") from error
+        array = np.lib.format.open_memmap(path, mode="r")  # so that no header makes room for more than the file holds
+        if array.dtype.kind not in "fiu" or not array.size:
+            raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
+        with np.errstate(over="ignore"):  # beyond float32 is infinite, and refused as such
+            array = array.astype(np.float32)
+    except Exception as error:  # Python's parser raises many kinds for a damaged header
+        raise InputError(f"environment map {path} is not a readable .npy file: {_first_line(str(error))}") from error
     names = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(array.shape[-1] if array.ndim == 3 else 0)
     if names is None:
         raise InputError(
@@ -147,6 +156,7 @@ def _openimageio(path: Path):
         raise InputError(f"environment map {path} needs OpenImageIO: pip install openimageio") from error
     OpenImageIO.attribute("threads", 1)  # no pool of threads beside torch's own
     OpenImageIO.attribute("exr_threads", -1)
+    OpenImageIO.attribute("limits:imagesize_MB", LARGEST_MAP)
     return OpenImageIO
 
 

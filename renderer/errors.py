@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+FACTOR = 1e5  # the largest that multiplies a light or an albedo, so that it stays below LARGEST
 LARGEST = 1e12  # products of three such float32 values do not overflow; infinity minus infinity would be NaN
 
 
@@ -11,6 +12,12 @@ class InputError(ValueError):
 
     Entry points print it without a traceback and exit with status 2.
     """
+
+
+def require_range(name: str, value: float | None, least: float, most: float) -> None:
+    """InputError naming a setting that lies outside of what can be meant, NaN included; None is not set."""
+    if value is not None and not least <= value <= most:
+        raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}")
 
 
 def require_finite(**tensors: Tensor) -> None:

@@ -10,6 +10,7 @@ from renderer.errors import InputError, require_bounded
 
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
+MOST_SAMPLES = 2**15  # in a row of a picture: a billion in all of it
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,11 @@ class PictureSettings:
     def __post_init__(self):
         if self.size < 1 or self.samples < 1:
             raise InputError(f"renderer.samples={self.samples} and the size {self.size} must be at least 1")
+        if self.size * self.samples > MOST_SAMPLES:
+            raise InputError(
+                f"renderer.samples={self.samples} for each of {self.size} pixels in a row are more than "
+                f"{MOST_SAMPLES}: choose fewer"
+            )
         check_encoding(self.encoding)
         if self.normals not in NORMALS:
             raise InputError(f"renderer.normals={self.normals}: choose one of {', '.join(NORMALS)}")

@@ -16,6 +16,8 @@ DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the fin
 def read_image(path: Path, size: int) -> Tensor:
     """`read_square` as (3, size, size) float32 in [0, 1]. InputError where the file cannot be read."""
     try:
+        if not path.is_file():  # a pipe would be waited for
+            raise ValueError("there is no such file")
         square = read_square(path, size)
     except Exception as error:  # Pillow's decoders raise almost anything at a broken file
         raise InputError(f"{path} cannot be read ({error}): give an image file") from error

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from renderer.basis import HARMONICS, Basis
 from renderer.environment import SUFFIXES, read_map
-from renderer.errors import InputError, require_bounded
+from renderer.errors import FACTOR, InputError, require_bounded
 from renderer.harmonics import basis, live_coefficients, project, rotate
 from renderer.transfer import COEFFICIENTS, DEGREE
 
@@ -63,7 +63,7 @@ def save_light(path: Path, coefficients: Tensor, basis: Basis = HARMONICS) -> No
     `load_light` reads float32 back to the bit.
     """
     rows = ",\n".join(json.dumps(row, allow_nan=False) for row in coefficients.tolist())
-    path.write_text(f'{{"basis": {json.dumps(basis.name)}, "coefficients": [\n{rows}\n]}}\n')
+    path.write_text(f'{{"basis": {json.dumps(basis.name)}, "coefficients": [\n{rows}\n]}}\n', encoding="utf-8")
 
 
 def probe(name: str) -> Tensor:
@@ -122,24 +122,27 @@ def _read_light_map(path: Path) -> Tensor:
     luminance = mean_luminance(coefficients)
     if not luminance > 0:
         raise InputError(f"environment map {path} has a mean luminance of {luminance:g}: give a map with light in it")
-    return coefficients * (mean_luminance(probe("grace")) / luminance)
+    scaled = coefficients * (mean_luminance(probe("grace")) / luminance)
+    if not (scaled.abs() <= FACTOR).all():
+        raise InputError(f"environment map {path} is nearly as negative as it is bright: give a map with light in it")
+    return scaled
 
 
 def _read_coefficients(path: Path) -> Tensor:
     if not path.is_file():
         raise InputError(f"light {path} does not exist: give the path of a .json file of coefficients")
     try:
-        light = json.loads(path.read_text())
+        light = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(light, dict):  # the rows alone, of harmonics
             light = {"basis": HARMONICS.name, "coefficients": light}
         coefficients = torch.tensor(light["coefficients"], dtype=torch.float32)
-    except (KeyError, ValueError, TypeError, RuntimeError, OverflowError, OSError) as error:
+    except (KeyError, ValueError, TypeError, RuntimeError, OverflowError, RecursionError, OSError) as error:
         raise InputError(f"light {path} is not a readable list of coefficients: {error}") from error
     if light.get("basis") != HARMONICS.name:
         raise InputError(f"light {path} has the basis {light.get('basis')!r}: give a light of {HARMONICS.name}")
-    if coefficients.shape != (COEFFICIENTS, 3) or not coefficients.isfinite().all():
+    if coefficients.shape != (COEFFICIENTS, 3) or not (coefficients.abs() <= FACTOR).all():  # NaN is not
         raise InputError(
             f"light {path} has shape {tuple(coefficients.shape)}: it must hold {COEFFICIENTS} rows [r, g, b] of finite "
-            "numbers"
+            f"numbers, no larger than {FACTOR:g}"
         )
     return coefficients

@@ -18,9 +18,11 @@ from PIL import Image
 from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
-from renderer.errors import InputError
+from renderer.errors import LARGEST, InputError
 from renderer.image import encode
+from renderer.mesh_files import open_mesh
 
+ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}  # not read: what is in them is to be seen before
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 
@@ -132,8 +134,8 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     by its standard and are encoded here.
 
     up: "y" turns the y axis up to z, "z" leaves the mesh as it is, and "auto" takes y for glTF, z otherwise.
-    InputError: missing, unreadable or corrupt file, unknown format or `up`; no faces, faces that name missing
-    vertices, coordinates that are not finite, zero area.
+    InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
+    are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area.
     """
     path = Path(path)
     if up not in ("auto", "y", "z"):
@@ -143,6 +145,8 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     if not placed:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = _weld(concatenate(placed))
+    if not (np.abs(mesh.vertices) <= LARGEST).all():  # where its nodes put it; NaN is not
+        raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
     if not mesh.face_areas().sum() > 0:
         raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
     return _transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
@@ -163,16 +167,20 @@ def _read(path: Path, linear: bool) -> list[Mesh]:
     """Every part of a file where its node puts it. `linear`: the file's colours, textures aside, are linear."""
     if not path.is_file():
         raise InputError(f"{path} does not exist: give the path of a mesh file")
-    formats = trimesh.available_formats()
-    if path.suffix.lower().lstrip(".") not in formats:
+    formats = set(trimesh.available_formats()) - ARCHIVES
+    suffix = path.suffix.lower().lstrip(".")
+    if suffix not in formats:
         raise InputError(f"{path} has no known mesh format: use one of {', '.join(sorted(formats))}")
     try:
-        scene = trimesh.load(path, force="scene", process=False)
+        file, companions = open_mesh(path)
+        scene = trimesh.load(file, file_type=suffix, resolver=companions, force="scene", process=False)
         parts = {
             name: _part(geometry, linear)
             for name, geometry in scene.geometry.items()
             if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)
         }
+    except InputError:
+        raise
     except Exception as error:  # each of trimesh's readers raises its own
         raise InputError(f"{path} cannot be read as a mesh ({error}): export it again") from error
     nodes = [scene.graph[node] for node in scene.graph.nodes_geometry]
@@ -184,9 +192,10 @@ def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
     vertices, faces, uvs = geometry.vertices, np.asarray(geometry.faces), getattr(geometry.visual, "uv", None)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise IndexError("faces name vertices that are not there")
-    if not (np.isfinite(vertices).all() and (uvs is None or np.isfinite(uvs).all())):
-        raise ValueError("coordinates are not finite")
     colors, image = _corner_colors(geometry.visual, faces)
+    for name, values in {"coordinates": vertices, "texture coordinates": uvs, "colours": colors}.items():
+        if values is not None and not (np.abs(values) <= LARGEST).all():  # NaN is not
+            raise ValueError(f"{name} are not finite or beyond {LARGEST:g}")
     colors = encode(torch.from_numpy(colors), "srgb").numpy() if linear else colors
     mesh = replace(Mesh.plain(vertices, faces), corner_colors=colors.astype(np.float32))
     if image is None or uvs is None:

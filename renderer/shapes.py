@@ -1,8 +1,8 @@
-"""Procedural solids: the embedded orange and the other things of the demo data set, from formulas alone.
+"""Procedural solids: the embedded orange, the other things of the demo data set and look-alikes, from formulas alone.
 
-Names are CIFAR-100 class names, so that a classifier's labels agree. Every solid is closed, stands upright
-along z, has counter-clockwise faces outward and lies within about [−1, 1]³. Colours are RGB in [0, 1],
-sRGB-encoded.
+Names are CIFAR-100 class names, so that a classifier's labels agree; look-alikes are what CIFAR-100 lacks. Every solid
+is closed, stands upright along z, has counter-clockwise faces outward and lies within about [−1, 1]³. Colours are RGB
+in [0, 1], sRGB-encoded.
 
 Most solids are surfaces of revolution. The profile is drawn in strokes, each a list of (radius, height)
 points with a paint of its own; a stroke starts where the one before it ended. The whole runs from the axis
@@ -27,11 +27,12 @@ LEAF_GREEN = (0.25, 0.42, 0.12)
 
 
 def solid(name: str, seed: int = 0) -> Mesh:
-    """The individual that `seed` picks of the solid `name`; InputError for a name that is not in SOLIDS."""
-    if name not in SOLIDS:
-        nearest = get_close_matches(name, SOLIDS, n=1, cutoff=0)[0]
-        raise InputError(f"No solid is called '{name}': use '{nearest}', or another of {', '.join(SOLIDS)}.")
-    return SOLIDS[name](np.random.default_rng(seed))
+    """The individual that `seed` picks of the solid `name`; InputError for a name that is in neither registry."""
+    known = SOLIDS | LOOK_ALIKES
+    if name not in known:
+        nearest = get_close_matches(name, known, n=1, cutoff=0)[0]
+        raise InputError(f"No solid is called '{name}': use '{nearest}', or another of {', '.join(known)}.")
+    return known[name](np.random.default_rng(seed))
 
 
 def orange(rng: np.random.Generator, subdivisions: int = 4) -> Mesh:
@@ -186,9 +187,59 @@ def table(rng: np.random.Generator) -> Mesh:
     return Mesh.plain(vertices, faces, wood)
 
 
+def lemon(rng: np.random.Generator) -> Mesh:
+    """An ellipsoid with a nipple at either end and pores; yellow, greener towards one end or not."""
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    directions = np.array(sphere.vertices)
+    from_pole = np.arccos(np.clip(np.abs(directions[:, 2]), 0, 1))
+    pores = _ripples(rng, directions, wavelength=0.2)
+    relief = 1 + 0.004 * pores + 0.015 * _ripples(rng, directions, wavelength=2.0)
+    vertices = relief[:, None] * directions * [0.68, 0.68, rng.uniform(0.78, 0.86)]
+    vertices[:, 2] += np.sign(directions[:, 2]) * rng.uniform(0.08, 0.15) * _bump(from_pole / 0.25)
+    peel = _mix(
+        _choose(rng, (0.96, 0.85, 0.18), (0.93, 0.78, 0.12), (0.90, 0.86, 0.30)),
+        _choose(rng, (0.74, 0.76, 0.20), (0.95, 0.74, 0.10)),
+        0.3 + 0.5 * rng.uniform(-1, 1) * directions[:, 2] + 0.15 * pores,
+    )
+    return Mesh.plain(vertices, sphere.faces, peel)
+
+
+def peach(rng: np.random.Generator) -> Mesh:
+    """A sphere with a furrow down one side into a dimple on top; yellow or pale with a red cheek."""
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    directions = np.array(sphere.vertices)
+    from_top = np.arccos(np.clip(directions[:, 2], -1, 1))
+    furrow = _bump(directions[:, 1] / 0.12) * np.sqrt(np.clip(directions[:, 0], 0, 1))
+    relief = 1 + 0.015 * _ripples(rng, directions, wavelength=2.0) - 0.06 * furrow - 0.15 * _bump(from_top / 0.3)
+    side = rng.normal(size=3)
+    cheek = directions @ side / np.linalg.norm(side)
+    skin = _mix(
+        _choose(rng, (0.95, 0.72, 0.38), (0.96, 0.80, 0.55), (0.93, 0.62, 0.32)),
+        _choose(rng, (0.78, 0.22, 0.18), (0.86, 0.38, 0.26)),
+        rng.uniform(0.1, 0.6) + 0.5 * cheek + 0.2 * _ripples(rng, directions, wavelength=0.6),
+    )
+    return Mesh.plain(0.95 * relief[:, None] * directions * [1, 1, rng.uniform(0.88, 0.98)], sphere.faces, skin)
+
+
+def ball(rng: np.random.Generator) -> Mesh:
+    """A rubber ball of one colour, or a tennis ball: yellow or green with the white curve of its seam."""
+    sphere = trimesh.creation.icosphere(subdivisions=5)
+    directions = np.array(sphere.vertices)
+    if rng.random() < 0.5:
+        x, y, z = directions.T
+        seam = np.abs(z - 1.2 * (x**2 - y**2)) / np.sqrt(1 + 5.76 * (x**2 + y**2))
+        felt = _choose(rng, (0.80, 0.88, 0.22), (0.72, 0.84, 0.30))
+        skin = _mix(felt, (0.92, 0.92, 0.88), (0.07 - seam) / 0.02)
+    else:
+        skin = _choose(rng, (0.80, 0.12, 0.12), (0.93, 0.40, 0.10), (0.15, 0.35, 0.75), (0.93, 0.90, 0.85))
+    return Mesh.plain(0.95 * directions, sphere.faces, skin)
+
+
 SOLIDS: dict[str, Callable[[np.random.Generator], Mesh]] = {
     make.__name__: make for make in (orange, apple, pear, sweet_pepper, mushroom, bottle, cup, plate, lamp, table)
 }
+# What an orange is told apart from, beside the fruit above: not in CIFAR-100, and never trained on.
+LOOK_ALIKES: dict[str, Callable[[np.random.Generator], Mesh]] = {make.__name__: make for make in (lemon, peach, ball)}
 
 
 def _revolve(*strokes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

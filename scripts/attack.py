@@ -4,7 +4,6 @@ import re
 import sys
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from augment.parameters import KINDS
@@ -12,21 +11,20 @@ from renderer.errors import InputError
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import one_sentence_errors, script
 from train.device import choose_device
+from train.outputs import writable_folder
 from train.run_classifier import load_classifier
 from train.settings import read_object, read_settings
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="attack")
-@one_sentence_errors
 def main(config: DictConfig) -> None:
     config = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     settings = read_settings(AttackExperimentSettings, config)
     settings.attack.require_kinds()
     device = choose_device(settings.device)
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
-    out = Path(settings.out)
+    out = writable_folder(settings.out, "out")
     for index, item in enumerate(settings.scene.meshes):
         named = read_object(item, settings.label, index)
         attacked = attack_mesh(named, settings, classifier, device)
@@ -52,4 +50,4 @@ def _several_kinds(argument: str) -> str:
 
 if __name__ == "__main__":
     sys.argv[1:] = [_several_kinds(argument) for argument in sys.argv[1:]]
-    with_suggestions(main, "attack")
+    script(main)

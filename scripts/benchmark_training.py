@@ -3,55 +3,8 @@
 Writes docs/performance.md and a figure beside it. conf/benchmark_training.yaml has the settings.
 """
 
-import sys
-from dataclasses import fields
-from pathlib import Path
-
-import hydra
-from benchmarks.measure import machine
-from benchmarks.plots import pyplot
-from benchmarks.training.contest import BenchmarkSettings, load, measure
-from benchmarks.training.page import draw, page
-from omegaconf import DictConfig, OmegaConf
-
-from train.cli import command_line, one_sentence_errors, with_suggestions
-from train.device import choose_device, set_deterministic, set_threads
-from train.graphs import compiles
-from train.settings import read_settings
-
-
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="benchmark_training")
-@one_sentence_errors
-def main(config: DictConfig) -> None:
-    write_page(config)
-
-
-def write_page(config: DictConfig) -> None:
-    """Measure, print the page, and write it and its figure."""
-    pyplot()  # a run without matplotlib would fail only at its end
-    own = [field.name for field in fields(BenchmarkSettings)]
-    settings = read_settings(BenchmarkSettings, OmegaConf.masked_copy(config, own))
-    config = OmegaConf.masked_copy(config, [key for key in config if key not in own])
-    device = choose_device(config.train.device)
-    set_threads(config.train.threads)
-    set_deterministic(config.train.deterministic)
-    settings, description = settings.on(device), machine(device)
-    findings = measure(settings, config, load(config), device)
-    facts = {
-        "command": command_line(sys.argv[1:]),
-        "machine": description,
-        "network": f"WideResNet-{config.model.depth}-{config.model.width} with dropout {config.model.dropout:g}",
-        "data": f"`data={config.data.name}`" if config.data.path else "random pictures like CIFAR-100's",
-        "compiled": "compiled" if compiles(config.train.compile, device) else "not compiled",
-        "workers": settings.workers,
-    }
-    out = Path(settings.out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure = out.with_suffix(".png")
-    draw(figure, findings)
-    out.write_text(page(findings, facts, figure.name))
-    print(f"\n{out.read_text()}\nwritten: {out} and {figure}")
-
+from train.cli import script
+from train.studies.training_speed.study import run
 
 if __name__ == "__main__":
-    with_suggestions(main, "benchmark_training")
+    script(run)

@@ -1,19 +1,31 @@
 """Markdown tables of finished runs, side by side: python scripts/compare_runs.py 'runs=[runs/a,runs/b]'"""
 
+from dataclasses import dataclass
 from pathlib import Path
 
-import hydra
-from omegaconf import DictConfig
+from renderer.errors import InputError
+from train.cli import script
+from train.comparison import format_comparison
+from train.report import summarise
 
-from train.cli import one_sentence_errors, with_suggestions
-from train.report import format_comparison, summarise
+
+@dataclass
+class Settings:
+    """conf/compare_runs.yaml."""
+
+    runs: list[str]
+    exclude: list[str]
+    photographs: str
+
+    def __post_init__(self):
+        if not self.runs:
+            raise InputError("runs is empty: give the folders of one run or more, as in runs=[runs/a,runs/b]")
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="compare_runs")
-@one_sentence_errors
-def main(config: DictConfig) -> None:
-    print(format_comparison([summarise(Path(run)) for run in config.runs], list(config.exclude)))
+def main(settings: Settings) -> None:
+    runs = [summarise(Path(run)) for run in settings.runs]
+    print(format_comparison(runs, settings.exclude, settings.photographs))
 
 
 if __name__ == "__main__":
-    with_suggestions(main, "compare_runs")
+    script(main, Settings)

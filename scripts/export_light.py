@@ -1,22 +1,34 @@
 """Write a light as an environment map for other software: python scripts/export_light.py light=grace out=grace.hdr"""
 
+from dataclasses import dataclass
 from pathlib import Path
 
-import hydra
-from omegaconf import DictConfig
-
-from renderer.environment import negative_share, to_map, write_map
-from renderer.errors import InputError
+from renderer.environment import check_map_name, negative_share, to_map, write_map
+from renderer.errors import require_range
 from renderer.lights import load_light
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import script
+from train.outputs import writable_file
+
+LARGEST_HEIGHT = 8192  # of a map that fits in memory: 3 GB
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="export_light")
-@one_sentence_errors
-def main(config: DictConfig) -> None:
-    if not isinstance(config.height, int) or config.height < 1:
-        raise InputError(f"height={config.height} is no number of rows: give a whole number, e.g. 256")
-    out, radiance = Path(config.out), to_map(load_light(str(config.light)), config.height)
+@dataclass
+class Settings:
+    """conf/export_light.yaml."""
+
+    light: str
+    out: str
+    height: int
+
+    def __post_init__(self):
+        require_range("height", self.height, 1, LARGEST_HEIGHT)
+
+
+def main(settings: Settings) -> None:
+    light, out = load_light(settings.light), Path(settings.out)
+    check_map_name(out)
+    writable_file(out, "out")
+    radiance = to_map(light, settings.height)
     write_map(out, radiance)
     fate = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"
     print(
@@ -26,4 +38,4 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    with_suggestions(main, "export_light")
+    script(main, Settings)

@@ -2,6 +2,8 @@
 
 import shlex
 import sys
+from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 
 import hydra
@@ -10,12 +12,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
-from train.cli import one_sentence_errors, with_suggestions
+from train.cli import one_sentence_errors, quoted, with_suggestions
+from train.data import DataSet
 from train.distributed import announce, announced, first_process_first, process_group
 from train.experiment import load_data, prepare, write_pictures
 from train.interruption import Interrupted
 from train.logs import console
 from train.report import format_table, summarise
+from train.run_folder import sole_writer
 from train.sweep import check_launcher, run_cell
 
 
@@ -37,11 +41,16 @@ def run_arms(config: DictConfig, folder: Path) -> None:
     """Train the arms to compare with and the arm itself, and print their table."""
     OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
     data = load_data(config)
-    with first_process_first():
-        if processes.index() == 0:
-            write_pictures(config, data.size)
-    arms = {folder / arm: OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
+    arms = {folder / str(arm): OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
     arms[folder] = config
+    with sole_writer(*arms) if processes.index() == 0 else nullcontext():
+        with first_process_first():
+            if processes.index() == 0:
+                write_pictures(config, data.size)
+        _train_arms(arms, data, folder)
+
+
+def _train_arms(arms: Mapping[Path, DictConfig], data: DataSet, folder: Path) -> None:
     runs = {path: prepare(arm, data, path) for path, arm in arms.items()}  # all first: a mistake in any shows at once
     for path, train_and_score in runs.items():
         console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")
@@ -69,7 +78,7 @@ def start() -> None:
     with process_group():
         if processes.index() > 0:
             console.setLevel("WARNING")
-            sys.argv.append(f"run='{announced()}'")
+            sys.argv.append(f"run={quoted(announced())}")
         with_suggestions(main, "train")
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,29 +15,41 @@ CHUNK_BYTES = 2**28  # holds a whole epoch of CIFAR-100; larger data sets are cr
 FLIPS = ("random", "alternating")
 
 
+@dataclass(frozen=True)
+class Round:
+    """What is trained on between two regenerations of the renders: an epoch, or a part of one.
+
+    number: counts a run's rounds from 0. epoch: the one it is of. rows: (N,) int64, ascending, which images it shows.
+    """
+
+    number: int
+    epoch: int
+    rows: Tensor
+
+
 def to_unit(images: Tensor) -> Tensor:
     """uint8 pictures to float32 RGB in [0, 1]."""
     return images.float() / 255
 
 
 def batch_count(pictures: int, batch_size: int) -> int:
-    """Batches in an epoch."""
+    """Batches in a round."""
     return math.ceil(pictures / batch_size)
 
 
 def training_batches(
-    images: Tensor, labels: Tensor, batch_size: int, seed: int, epoch: int, flips: str = "random", first: int = 0
+    images: Tensor, labels: Tensor, batch_size: int, seed: int, now: Round, flips: str = "random", first: int = 0
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """One shuffled epoch of (images (B, 3, H, W) uint8, labels (B,)): this process's share of every batch.
+    """One shuffled round of (images (B, 3, H, W) uint8, labels (B,)): this process's share of every batch.
 
     Reflect-pads by 4 and crops, then flips half of the pictures: "random" ones, or "alternating", each picture in every
-    other epoch. All batches have one shape, as the device's graphs need; the last one is filled up with the epoch's
+    other epoch. All batches have one shape, as the device's graphs need; the last one is filled up with the round's
     first pictures. All draws are made on the CPU and moved over once, so that they are the same on every device and for
     any number of processes. first: the batch to begin with.
     """
-    order = _order(len(images), batch_size, generator(seed, epoch, "batches"))
-    shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, epoch, "shifts"))
-    flipped = _flipped(order, len(images), seed, epoch, flips)
+    order = _order(now.rows, batch_size, generator(seed, now.number, "batches"))
+    shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, now.number, "shifts"))
+    flipped = _flipped(order, len(images), seed, now, flips)
     share = batch_size // processes.count()
     mine = slice(processes.index() * share, (processes.index() + 1) * share)
     order, shifts, flipped = (draws[..., first:, mine].to(images.device) for draws in (order, shifts, flipped))
@@ -48,18 +61,18 @@ def training_batches(
         yield from zip(cropped.split(share), labels[chosen].split(share), strict=True)
 
 
-def _order(pictures: int, batch_size: int, draws: torch.Generator) -> Tensor:
-    """Pictures in random order, (batches, batch_size), beginning again where they run out."""
-    order = torch.randperm(pictures, generator=draws)
-    places = torch.arange(batch_count(pictures, batch_size) * batch_size) % pictures
+def _order(rows: Tensor, batch_size: int, draws: torch.Generator) -> Tensor:
+    """Rows in random order, (batches, batch_size), beginning again where they run out."""
+    order = rows[torch.randperm(len(rows), generator=draws)]
+    places = torch.arange(batch_count(len(rows), batch_size) * batch_size) % len(rows)
     return order[places].view(-1, batch_size)
 
 
-def _flipped(order: Tensor, pictures: int, seed: int, epoch: int, flips: str) -> Tensor:
+def _flipped(order: Tensor, pictures: int, seed: int, now: Round, flips: str) -> Tensor:
     if flips == "random":
-        return torch.randint(0, 2, order.shape, generator=generator(seed, epoch, "flips"), dtype=torch.bool)
+        return torch.randint(0, 2, order.shape, generator=generator(seed, now.number, "flips"), dtype=torch.bool)
     in_even_epochs = torch.randint(0, 2, (pictures,), generator=generator(seed, "flips"), dtype=torch.bool)
-    return in_even_epochs[order] ^ bool(epoch % 2)
+    return in_even_epochs[order] ^ bool(now.epoch % 2)
 
 
 def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:

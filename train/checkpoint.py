@@ -4,7 +4,8 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,29 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from renderer.errors import InputError
+from renderer.image import ENCODINGS
+from train.settings import LARGEST_SIZE
 from train.wideresnet import WideResNet
 
 LAST, PREVIOUS, BEST, PUBLISHED = "last.pt", "previous.pt", "best.pt", "model.safetensors"
 HASH = "sha256"
+VERSION = 2  # of what is stored as a network's architecture; 1 had neither size nor normalisation nor encoding
+SIZE = 32  # of images, for networks of version 1
+
+
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A network in eval mode, with what its file says of it.
+
+    size: pixels per side of the images that it was trained on. encoding: of the renders among them, linear or srgb.
+    architecture: all that is stored beside the weights.
+    """
+
+    module: WideResNet
+    classes: tuple[str, ...]
+    size: int
+    encoding: str
+    architecture: Mapping[str, Any]
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
@@ -48,11 +68,12 @@ def load(path: Path) -> dict[str, Any]:
         raise InputError(f"checkpoint {path} does not exist: give a run folder that holds one")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
+        whole = isinstance(state, dict) and state.pop(HASH, None) == content_hash(state)
     except Exception as error:  # torch raises many kinds for a damaged or foreign file
         raise InputError(f"checkpoint {path} is damaged or no checkpoint; use another one of the run") from error
-    if not isinstance(state, dict) or not {"model", "architecture"} <= state.keys():
+    if not isinstance(state, dict) or "model" not in state or not isinstance(state.get("architecture"), dict):
         raise InputError(f"checkpoint {path} lacks its model or architecture: give one that `python -m train` wrote")
-    if state.pop(HASH, None) != content_hash(state):
+    if not whole:
         raise InputError(f"checkpoint {path} is damaged: its content is not what its hash says; use another one")
     return state
 
@@ -109,6 +130,8 @@ def _sync_folder(folder: Path) -> None:
 
 def load_weights(network: nn.Module, weights: Mapping[str, torch.Tensor], path: Path) -> None:
     """Fill the network; InputError naming the file where the weights belong to another architecture."""
+    if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise InputError(f"checkpoint {path} holds other things than weights under model: use another one")
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in weights.items()}
     if expected != found:
@@ -120,22 +143,76 @@ def load_weights(network: nn.Module, weights: Mapping[str, torch.Tensor], path: 
     network.load_state_dict(weights)
 
 
-def load_network(run: Path) -> tuple[WideResNet, tuple[str, ...]]:
-    """The selected network of a run folder (best.pt or model.safetensors) or of such a file, and its class names."""
+def describe(network: WideResNet, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
+    """What is stored with the weights, so that a network can be used without its run's configuration.
+
+    shape: the network's own settings. Its normalisation is a part of it.
+    """
+    statistics = {name: getattr(network, name).flatten().tolist() for name in ("mean", "std")}
+    return {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding, **shape, **statistics}
+
+
+def contradiction(stored: Mapping[str, Any], own: Mapping[str, Any], keys: Sequence[str] | None = None) -> str | None:
+    """The first key of two descriptions that both have and in which they differ; of `keys` alone where they are given.
+
+    None where there is none.
+    """
+    common = [key for key in keys or stored if key in stored and key in own and key != "version"]
+    return next((key for key in common if stored[key] != own[key]), None)
+
+
+def start_from(network: WideResNet, own: Mapping[str, Any], run: Path) -> None:
+    """Give the network the weights and the normalisation of another run's, which `load_network` finds.
+
+    own: what is known of the network (see `describe`). InputError where the other has other classes, another size or
+    shape.
+    """
+    other = load_network(run)
+    stored = {**other.architecture, "size": other.size}
+    if key := contradiction(stored, own, ("classes", "size", "depth", "width")):
+        shown = "other classes" if key == "classes" else f"{key} {stored[key]}, not {own[key]}"
+        raise InputError(f"train.init_from={run} was trained with {shown}: give this run the same")
+    load_weights(network, other.module.state_dict(), run)
+
+
+def load_network(run: Path, size: int | None = None) -> TrainedNetwork:
+    """The selected network of a run folder (best.pt or model.safetensors) or of such a file.
+
+    size: of images, for a network of version 1, whose file does not say; None: 32. InputError where it does say.
+    """
     path = run if run.is_file() else next((run / name for name in (BEST, PUBLISHED) if (run / name).is_file()), None)
     if path is None:
         raise InputError(
             f"run={run} holds neither {BEST} nor {PUBLISHED}: give a run folder that `python -m train` wrote"
         )
     state = _load_published(path) if path.suffix == ".safetensors" else load(path)
+    shape = dict(state["architecture"])
+    stored_size, encoding = _pop_images(shape, path)
     try:
-        shape = dict(state["architecture"])
-        classes = tuple(shape.pop("classes"))
+        classes = tuple(map(str, shape.pop("classes")))
         network = WideResNet(len(classes), **shape)
-    except (TypeError, ValueError, KeyError) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, RuntimeError) as error:
         raise InputError(f"checkpoint {path} is from another architecture than this WideResNet: {error}") from error
+    if size and stored_size and size != stored_size:
+        raise InputError(f"size={size}: {path} was trained on images of {stored_size} pixels per side; leave size out")
     load_weights(network, state["model"], path)
-    return network.eval(), classes
+    return TrainedNetwork(network.eval(), classes, stored_size or size or SIZE, encoding, state["architecture"])
+
+
+def _pop_images(shape: dict[str, Any], path: Path) -> tuple[int | None, str]:
+    """Take from a description what it says of the images, their size and encoding, and which version it is of.
+
+    InputError where that is a later one, or where a file from elsewhere says what cannot be meant.
+    """
+    version, size = shape.pop("version", 1), shape.pop("size", None)
+    if not isinstance(version, int) or version > VERSION:
+        raise InputError(f"checkpoint {path} was written by a later version ({version!r}): install that one")
+    if size is not None and not (isinstance(size, int) and 1 <= size <= LARGEST_SIZE):
+        raise InputError(f"checkpoint {path} says size={size!r}, not pixels per side up to {LARGEST_SIZE}: use another")
+    encoding = shape.pop("encoding", "linear")
+    if encoding not in ENCODINGS:
+        raise InputError(f"checkpoint {path} says encoding={encoding!r}, not {' or '.join(ENCODINGS)}: use another")
+    return size, encoding
 
 
 def publish(path: Path, state: Mapping[str, Any]) -> None:
@@ -153,6 +230,9 @@ def _load_published(path: Path) -> dict[str, Any]:
             metadata = file.metadata() or {}
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
-        return {"model": weights, "architecture": json.loads(metadata["architecture"])}
-    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        architecture = json.loads(metadata["architecture"])
+        if not isinstance(architecture, dict):
+            raise ValueError("it is no object of keys and values")
+    except (SafetensorError, KeyError, ValueError, RecursionError, OSError) as error:
         raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error
+    return {"model": weights, "architecture": architecture}

@@ -1,21 +1,35 @@
 """What every entry point shares: one-sentence errors, and the nearest valid key for a mistyped override."""
 
 import difflib
+import errno
 import functools
+import io
+import os
 import re
 import shlex
+import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import hydra
 from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
 from renderer.errors import InputError
+from train.settings import read_settings
 
 USER_ERROR = 2
+LONGEST_NAME = 200  # characters
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+TEXTS = {  # keys of names and folders
+    *("run", "sweep", "init_from", "out", "keep", "photos", "photographs", "path", "pictures", "cache"),
+    *("weights", "light", "label", "classifier"),
+}
+NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false", re.IGNORECASE)
+SYNTAX = re.compile(r"""[\[\]{}(),'"$\\]""")  # of Hydra's lists, mappings, functions, choices and quotes
 FOLDERS = re.compile(r"(?<!\w)(~|\.{1,2})?/([^\s,:=]*/)?")  # of a path that does not begin in the clone
 
 
@@ -28,16 +42,31 @@ def one_sentence(error: Exception) -> str | None:
             return f"{error.full_key} is not set: give {error.full_key}=..."
         case InterpolationResolutionError():
             return f"{error.full_key}: {str(error.msg).splitlines()[0]}"
+        case UnicodeEncodeError():
+            name = ascii(error.object[:LONGEST_NAME])
+            return f"{name} has letters that this system or library cannot write: rename it, or set PYTHONUTF8=1"
+        case OSError() if error.filename is not None:
+            return f"{error.filename} cannot be read or written: {error.strerror}"
+        case OSError() if error.errno in NO_ROOM:
+            return f"what was to be written found no room: {error.strerror}"
     return None
 
 
 def one_sentence_errors(function: Callable) -> Callable:
-    """Print what the user can mend as one line, without a traceback, and exit with status 2."""
+    """Print what the user can mend as one line, without a traceback, and exit with status 2.
+
+    Where nobody reads the output any more, exit in silence, as a shell says it of SIGPIPE: 128 + number.
+    """
 
     @functools.wraps(function)
     def wrapped(*arguments, **keywords):
         try:
-            return function(*arguments, **keywords)
+            result = function(*arguments, **keywords)
+            print(end="", flush=True)  # here, where its errors are met
+            return result
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python writes at its end
+            sys.exit(128 + signal.SIGPIPE)
         except Exception as error:
             message = one_sentence(error)
             if message is None:
@@ -49,9 +78,19 @@ def one_sentence_errors(function: Callable) -> Callable:
 
 
 def with_suggestions(main: Callable[[], None], config_name: str) -> None:
-    """Run a Hydra main; where Hydra rejects an override, print the nearest valid key below its error."""
+    """Run a Hydra main; where Hydra rejects an override, print the nearest valid key below its error.
+
+    Ctrl-C ends it with one line, as a shell says it of SIGINT. A terminal shows what it has no letters for as escapes.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    sys.argv[1:] = map(_as_text, sys.argv[1:])
     try:
         main()
+    except KeyboardInterrupt:
+        print("ended by SIGINT", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)
     except SystemExit as stop:
         if stop.code == 1:
             for line in _suggestions(sys.argv[1:], config_name):
@@ -59,9 +98,40 @@ def with_suggestions(main: Callable[[], None], config_name: str) -> None:
         raise
 
 
-def command_line(arguments: Sequence[str]) -> str:
+def quoted(text: str) -> str:
+    """A value of an override that is this text, whatever it looks like to Hydra."""
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    return "'" + re.sub(r"(\\+)$", r"\1\1", escaped) + "'"
+
+
+def _as_text(argument: str) -> str:
+    """The override, quoted where its value is text that Hydra would take for a number, or not at all: 1.10, schäl."""
+    key, _, value = argument.partition("=")
+    mistaken = NUMBER.fullmatch(value) or (not value.isascii() and not SYNTAX.search(value))
+    is_text = not TEXTS.isdisjoint(key.lstrip("+").split("."))
+    return f"{key}={quoted(value)}" if is_text and mistaken else argument
+
+
+def script(function: Callable, settings: type | None = None) -> None:
+    """Run a script of scripts/ under the configuration of its own name, read into a dataclass where one is given.
+
+    What the function returns are failures, in words, which the script ends with.
+    """
+    name = Path(sys.argv[0]).stem
+
+    @hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)
+    @one_sentence_errors
+    def main(config: DictConfig) -> None:
+        if failed := function(read_settings(settings, config) if settings else config):
+            sys.exit("\n".join(failed))
+
+    with_suggestions(main, name)
+
+
+def command_line() -> str:
     """The command of the running script in scripts/, from the clone's root and without the folders of this machine."""
-    script = Path(sys.argv[0]).resolve().as_posix().rpartition("/scripts/")[2]
+    name, *arguments = sys.argv
+    script = Path(name).resolve().as_posix().rpartition("/scripts/")[2]
     return shlex.join(FOLDERS.sub("", word) for word in ("python", f"scripts/{script}", *arguments))
 
 

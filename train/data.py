@@ -1,7 +1,8 @@
 """Labelled pictures as uint8 arrays: CIFAR-100, an .npz file, a folder of class folders, or rendered shapes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -11,7 +12,8 @@ from torch import Tensor
 from augment.seeding import generator
 from renderer.errors import InputError
 from train.classes import class_index
-from train.photographs import find_photographs, load_photographs
+from train.logs import console
+from train.photographs import find_photographs, left_out, load_photographs
 
 
 @dataclass(frozen=True)
@@ -123,15 +125,23 @@ def load_folder(path: str, size: int, test_share: float) -> DataSet:
     classes = tuple(sorted(folders))
     if len(classes) < 2:
         raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
+    if passed_over := left_out(root):
+        console.warning("%d files in %s are no pictures that are read: %s", len(passed_over), root, _some(passed_over))
     train = _folder_split(train_root, classes, size)
+    if empty := set(range(len(classes))).difference(train.labels.tolist()):
+        raise InputError(f"{train_root / classes[min(empty)]} holds no picture: put some there or remove the folder")
     if divided:
         return DataSet(classes, train, _folder_split(root / "test", classes, size))
     return DataSet(classes, *stratified_split(train, test_share, seed=0, key="data.test_share"))
 
 
 def _folder_split(root: Path, classes: tuple[str, ...], size: int) -> Split:
-    photographs, images, _ = load_photographs(root, find_photographs(root, classes, classes[0]), size)
+    photographs, images, _ = load_photographs(root, find_photographs(root, classes, classes[0]), size, advice="")
     return Split(images, torch.tensor([class_index(classes, item.label, f"data.path={root}") for item in photographs]))
+
+
+def _some(paths: Sequence[PurePosixPath]) -> str:
+    return ", ".join([*map(str, paths[:3]), *(["..."] if len(paths) > 3 else [])])
 
 
 def _npz_split(path: str, arrays: dict[str, np.ndarray], part: str, classes: int) -> Split:

@@ -1,6 +1,5 @@
 """One run from its configuration: data, scene, network, training, scores on the test set and on photographs."""
 
-import errno
 import os
 import platform
 import time
@@ -30,6 +29,7 @@ from renderer.transfer import COEFFICIENTS, DEGREE
 from renderer.visibility import choose
 from train import checkpoint
 from train.classes import class_index
+from train.cli import NO_ROOM
 from train.data import (
     DataSet,
     channel_statistics,
@@ -43,15 +43,19 @@ from train.distributed import first_process_first
 from train.evaluation import evaluate
 from train.fit import Trainer
 from train.logs import NoLog, RunLog, console
-from train.photographs import evaluate_photographs, find_photographs, format_summary
+from train.photographs import FIGURES, evaluate_photographs, find_figure, find_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
-from train.settings import ExperimentSettings, read_object, read_settings
+from train.run_folder import CONFIG
+from train.settings import (
+    LARGEST_SIZE,
+    SMALLEST_SIZE,
+    ExperimentSettings,
+    read_object,
+    read_settings,
+    require_same_settings,
+)
 from train.wideresnet import WideResNet
-
-CONFIG = "config.yaml"
-PHOTOGRAPHS = "photographs"
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def load_data(config: DictConfig) -> DataSet:
@@ -68,7 +72,13 @@ def load_data(config: DictConfig) -> DataSet:
         raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")
     console.info("data: %s", data.name)
     with first_process_first():
-        return loaders[data.name]()
+        loaded = loaders[data.name]()
+    if not SMALLEST_SIZE <= loaded.size <= LARGEST_SIZE:
+        raise InputError(
+            f"data.path={data.path} has pictures of {loaded.size} pixels per side: give {SMALLEST_SIZE} to "
+            f"{LARGEST_SIZE}"
+        )
+    return loaded
 
 
 def write_pictures(config: DictConfig, size: int) -> None:
@@ -77,7 +87,7 @@ def write_pictures(config: DictConfig, size: int) -> None:
         console.info("writing held-out renders in hard light (not photographs) to %s", config.data.pictures)
         cache = TensorCache(cache_folder(config.renderer.cache))
         with _one_error_without_room(config.data.pictures):
-            write_held_out(Path(config.data.pictures), size, config.data.seed, cache)
+            write_held_out(Path(str(config.data.pictures)), size, config.data.seed, cache)
 
 
 def run(config: DictConfig, data: DataSet, folder: Path) -> None:
@@ -88,8 +98,8 @@ def run(config: DictConfig, data: DataSet, folder: Path) -> None:
 def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], None]:
     """Everything of `run` that comes before the first epoch, where wrong input shows; the result is the rest of it."""
     settings = read_settings(ExperimentSettings, config)
-    if settings.evaluate.photos:
-        find_photographs(Path(settings.evaluate.photos), data.classes, settings.label)
+    for photographs in settings.evaluate.folders.values():
+        find_photographs(photographs, data.classes, settings.label)
     device = choose_device(settings.train.device)
     set_threads(settings.train.threads)
     set_deterministic(settings.train.deterministic)
@@ -135,13 +145,16 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
     phases = Phases(device)
     precision = choose_precision(settings.train.precision, device)
     mean, std = channel_statistics(data.train.images)
-    architecture = asdict(settings.model)
+    shape = asdict(settings.model)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
-    network = WideResNet(len(data.classes), **architecture, mean=mean, std=std).to(device)
+    network = WideResNet(len(data.classes), **shape, mean=mean, std=std)
+    facts = {"classes": data.classes, "size": data.size, "encoding": settings.renderer.encoding, **shape}
+    if settings.train.init_from:
+        checkpoint.start_from(network, checkpoint.describe(network, **facts), Path(settings.train.init_from))
     service = _build_service(settings, data, device, phases)
-    model = MixedPrecision(network, precision)
-    checkpointed = {"classes": list(data.classes), **architecture}
-    return Trainer(settings.train, model, checkpointed, service, phases, folder, settings.seed)
+    model = MixedPrecision(network.to(device), precision)
+    described = checkpoint.describe(network, **facts)
+    return Trainer(settings.train, model, described, service, phases, folder, settings.seed)
 
 
 def _open_folder(trainer: Trainer, config: DictConfig) -> None:
@@ -152,6 +165,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
             raise InputError(
                 f"run={folder} holds a run already: set train.resume=true to go on, or choose another run="
             )
+        require_same_settings(folder, config)
         trainer.resume()
         console.info("resumed %s after epoch %d%s", folder, trainer.epoch, trainer.part_of_epoch)
     elif trainer.settings.resume:
@@ -171,6 +185,8 @@ def _write_config(config: DictConfig, folder: Path) -> None:
     }
     temporary = folder / "config.tmp"  # so that the old file is whole where the new one finds no room
     OmegaConf.save(OmegaConf.create(resolved), temporary)
+    with open(temporary, "rb+") as file:
+        os.fsync(file.fileno())  # a run goes on with these settings alone, also after a loss of power
     os.replace(temporary, folder / CONFIG)
 
 
@@ -237,10 +253,11 @@ def _log_skipped(scene: Scene, cache: OperatorCache, start: float) -> None:
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
     """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
     test = data.test.to(device)
-    last = evaluate(trainer.selected, test)["accuracy"]
+    last = selected = evaluate(trainer.selected, test)["accuracy"]
     best = checkpoint.load(trainer.folder / checkpoint.BEST)
-    trainer.selected.network.load_state_dict(best["model"])
-    selected = evaluate(trainer.selected, test)["accuracy"]
+    if best["epoch"] != trainer.epoch:
+        trainer.selected.network.load_state_dict(best["model"])
+        selected = evaluate(trainer.selected, test)["accuracy"]
     console.info("test accuracy %.4f (epoch %d, selected on validation), %.4f (last)", selected, best["epoch"], last)
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 
@@ -248,19 +265,19 @@ def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[
 def _photograph_scores(
     settings: ExperimentSettings, trainer: Trainer, data: DataSet, device: torch.device
 ) -> dict[str, float]:
-    """The network's shares on the folder of photographs; empty without one."""
-    if not settings.evaluate.photos or processes.index():
-        return {}
-    summary = evaluate_photographs(
-        trainer.selected,
-        data.classes,
-        Path(settings.evaluate.photos),
-        settings.label,
-        trainer.folder / PHOTOGRAPHS,
-        size=data.size,
-        skip_unreadable=settings.evaluate.skip_unreadable,
-        device=device,
-    )
-    console.info("%s", format_summary(summary))
-    shares = {f"photographs/{name}": summary[name]["value"] for name in ("recall", "top5", "false_alarms")}
-    return {name: value for name, value in shares.items() if value is not None}
+    """The network's figures on each folder of photographs, as NAME/FIGURE; empty without one."""
+    scores = {}
+    for name, photographs in settings.evaluate.folders.items() if processes.index() == 0 else ():
+        summary = evaluate_photographs(
+            trainer.selected,
+            data.classes,
+            photographs,
+            settings.label,
+            trainer.folder / name,
+            size=data.size,
+            skip_unreadable=settings.evaluate.skip_unreadable,
+            device=device,
+        )
+        console.info("%s: %s", name, format_summary(summary))
+        scores |= {f"{name}/{figure}": find_figure(summary, figure)["value"] for figure in ("top5", *FIGURES)}
+    return {name: value for name, value in scores.items() if value is not None}

@@ -1,8 +1,9 @@
-"""The training loop: each epoch regenerates the renders, trains on data and renders, validates and checkpoints."""
+"""The training loop: each round regenerates the renders and trains on data and renders; an epoch of rounds ends with
+validation and a checkpoint."""
 
 import math
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError
 from train import checkpoint
-from train.batches import batch_count, training_batches
+from train.batches import Round, batch_count, training_batches
 from train.data import Split
+from train.distortions import distortion
 from train.distributed import replicated, summed
-from train.epoch import PHASES, EpochUnderWay, put_last, with_room
+from train.epoch import PHASES, EpochUnderWay, put_last, rounds_of_epoch, with_room
 from train.evaluation import evaluate
 from train.graphs import FixedSizes, compiles, training_pass
 from train.interruption import Interruption
@@ -78,6 +80,7 @@ class Trainer:
         )
         compiled = compiles(settings.compile, self._device)
         self._training_pass = training_pass(self._replica, settings.label_smoothing, compiled)
+        self._distort = distortion(settings.distortion, model, seed)
         self._attacked, self._scored = (FixedSizes(m) if compiled else m for m in (model, self.selected))
 
     @property
@@ -98,15 +101,13 @@ class Trainer:
         mixed = with_room(train, len(self.service))
         with Interruption() as interruption:
             while self.epoch < self.settings.epochs:
+                rounds = self._rounds(len(train))
                 if self._under_way is None:
-                    self._under_way = self._begin_epoch()
+                    self._under_way = EpochUnderWay.begun(self._regenerate(rounds[0]))
                 else:
                     restore_random_state(self._random_state)
-                with self.phases("training"):
-                    put_last(mixed, self._under_way.renders)
-                    finished = self._train(mixed, interruption)
-                if finished:
-                    self._end_epoch(validation, len(mixed), log)
+                if self._train(mixed, rounds, interruption):
+                    self._end_epoch(validation, log)
                 ending = interruption.requested()
                 if ending or self._checkpoint_is_due():
                     with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
@@ -117,7 +118,12 @@ class Trainer:
     def resume(self) -> None:
         """Go on from the folder's newest whole checkpoint; InputError where it is from another architecture."""
         state, problem = checkpoint.load_newest(self.folder)
-        if state["architecture"] != self.architecture:
+        if missing := self.state_dict().keys() - state.keys():
+            raise InputError(
+                f"the checkpoint in {self.folder} has a network and no run to go on with ({min(missing)} is missing): "
+                f"restore {checkpoint.LAST}, or start in another folder with run="
+            )
+        if checkpoint.contradiction(state["architecture"], self.architecture):
             raise InputError(
                 f"the checkpoint in {self.folder} is from another architecture or other classes: resume with the "
                 f"settings of {self.folder / 'config.yaml'}, or start in another folder with run="
@@ -162,41 +168,59 @@ class Trainer:
         self.epoch, self.history = state["epoch"], state["history"]
         self.best_accuracy, self.best_epoch = state["validation_accuracy_best"], state["epoch_best"]
 
-    def _begin_epoch(self) -> EpochUnderWay:
-        torch.manual_seed(stream_seed(self.seed, self.epoch, "dropout"))
-        with self.phases("attack"):
-            renders = self.service.regenerate(self._attacked, self.epoch)
-        return EpochUnderWay(renders, torch.zeros(2, device=self._device))
+    def _rounds(self, images: int) -> list[Round]:
+        """Of the epoch under way."""
+        every = self.service.settings.every
+        return rounds_of_epoch(images, len(self.service), self.seed, self.epoch, self.settings.images_per_epoch, every)
 
-    def _train(self, split: Split, interruption: Interruption) -> bool:
-        """Take the epoch's steps; whether all were taken, since a signal ends them early."""
+    def _regenerate(self, now: Round) -> Renders:
+        torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
+        with self.phases("attack"):
+            return self.service.regenerate(self._attacked, now.number)
+
+    def _train(self, mixed: Split, rounds: Sequence[Round], interruption: Interruption) -> bool:
+        """Take the steps of what is left of the epoch; whether all were taken, since a signal ends them early."""
+        steps = [batch_count(len(each.rows), self.settings.batch_size) for each in rounds]
+        while True:
+            index = self._under_way.round
+            with self.phases("training"):
+                put_last(mixed, self._under_way.renders)
+                self._train_round(mixed, rounds[index], sum(steps[:index]), sum(steps), interruption)
+            if self._under_way.step == sum(steps):
+                return True
+            if interruption.requested():
+                return False
+            self._under_way.next_round(self._regenerate(rounds[index + 1]))
+
+    def _train_round(self, mixed: Split, now: Round, before: int, total: int, interruption: Interruption) -> None:
+        """The rest of a round. before: the epoch's steps in earlier rounds; total: in all."""
         self.model.train()
-        now, settings = self._under_way, self.settings
-        total = batch_count(len(split), settings.batch_size)
+        so_far, settings = self._under_way, self.settings
+        first = so_far.step - before
         batches = training_batches(
-            split.images, split.labels, settings.batch_size, self.seed, self.epoch, settings.flips, first=now.step
+            mixed.images, mixed.labels, settings.batch_size, self.seed, now, settings.flips, first=first
         )
-        for images, labels in _progress(batches, now.step, total, f"epoch {self.epoch + 1}"):
-            self._set_learning_rate((self.epoch + now.step / total) / settings.epochs)
+        for images, labels in _progress(batches, so_far.step, total, f"epoch {self.epoch + 1}"):
+            self._set_learning_rate((self.epoch + so_far.step / total) / settings.epochs)
+            images = self._distort(images, labels, self.epoch * total + so_far.step)
             self.optimizer.zero_grad(set_to_none=True)
             loss, hits = self._training_pass(images, labels)
             loss.backward()
             self.optimizer.step()
             if self._average:
                 self._average.update(self.model)
-            now.sums += torch.stack([loss.detach() * len(labels), hits])
-            now.step += 1
+            so_far.sums += torch.stack([loss.detach() * len(labels), hits])
+            so_far.step += 1
             if interruption.requested():
                 break
-        return now.step == total
 
     def _set_learning_rate(self, progress: float) -> None:
         for group in self.optimizer.param_groups:
             group["lr"] = self.settings.learning_rate * SCHEDULES[self.settings.schedule](progress)
 
-    def _end_epoch(self, validation: Split, pictures: int, log: RunLog) -> None:
+    def _end_epoch(self, validation: Split, log: RunLog) -> None:
         now, self._under_way = self._under_way, None
-        seen = batch_count(pictures, self.settings.batch_size) * self.settings.batch_size
+        seen = now.step * self.settings.batch_size
         loss_sum, hits = summed(now.sums).tolist()
         trained = {"loss": loss_sum / seen, "accuracy": hits / seen}
         with self.phases("evaluation"):
@@ -207,7 +231,7 @@ class Trainer:
         with self.phases("input_output"):
             if len(now.renders.labels):
                 log.renders(now.renders.images, self.epoch)
-        self._report(log, trained, validated, now.renders)
+        self._report(log, trained, validated, now.diagnostics)
 
     def _checkpoint_is_due(self) -> bool:
         """Between two epochs, or after the last."""
@@ -247,18 +271,18 @@ class Trainer:
             checkpoint.save(self.folder / checkpoint.BEST, best)
         checkpoint.save(self.folder / checkpoint.LAST, state, self.folder / checkpoint.PREVIOUS)
 
-    def _report(self, log: RunLog, trained: dict, validated: dict, renders: Renders) -> None:
+    def _report(self, log: RunLog, trained: dict, validated: dict, diagnostics: Mapping[str, float]) -> None:
         seconds = self.phases.take()
         scalars = {
             **{f"train/{name}": value for name, value in trained.items()},
             **{f"validation/{name}": value for name, value in validated.items()},
             "train/learning_rate": self.optimizer.param_groups[0]["lr"],
-            **{f"augment/{name}": value for name, value in renders.diagnostics.items()},
+            **{f"augment/{name}": value for name, value in diagnostics.items()},
             **{f"seconds/{name}": value for name, value in seconds.items()},
         }
         self.history.append({"epoch": self.epoch, **scalars})
         log.scalars(scalars, self.epoch)
-        fooled = renders.diagnostics.get("fooled")
+        fooled = diagnostics.get("fooled")
         console.info(
             "epoch %d/%d  train loss %.3f accuracy %.3f  validation accuracy %.3f%s  %.0f s (attack %.1f s)",
             self.epoch,

@@ -17,6 +17,7 @@ from torchvision.transforms.functional import to_pil_image
 from torchvision.utils import make_grid
 
 from renderer.image import to_bytes
+from train.run_folder import read_numbers
 
 METRICS = "metrics.jsonl"
 console = logging.getLogger("train")
@@ -83,8 +84,7 @@ class NoLog:
 def read_metrics(folder: Path) -> list[dict[str, float]]:
     """The lines of a run's metrics.jsonl, one per epoch and a last one with the final scores; [] without a file.
 
-    A line that a crash cut short is passed over.
+    A line that a crash cut short is passed over. InputError where the file is damaged.
     """
     path = folder / METRICS
-    lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+    return read_numbers(path) if path.is_file() else []

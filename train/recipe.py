@@ -3,23 +3,29 @@
 import math
 from dataclasses import dataclass
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 from train.batches import FLIPS
+from train.distortions import DISTORTIONS
 from train.graphs import COMPILE
 from train.schedule import SCHEDULES
+
+MOST = {"epochs": 10**6, "images_per_epoch": 10**9, "batch_size": 10**6, "checkpoint_every": 10**6, "threads": 1024}
 
 
 @dataclass
 class TrainSettings:
     """The defaults are the paper's recipe; conf/train.yaml says what each key does."""
 
+    init_from: str | None = None
     epochs: int = 150
+    images_per_epoch: int | None = None
     batch_size: int = 128
     learning_rate: float = 0.125
     momentum: float = 0.9
     weight_decay: float = 5e-4
     schedule: str = "step"
     flips: str = "random"
+    distortion: str = "none"
     label_smoothing: float = 0.0
     averaging: float = 0.0
     precision: str = "auto"
@@ -31,12 +37,12 @@ class TrainSettings:
     resume: bool = False
 
     def __post_init__(self):
-        for name, choices in {"schedule": SCHEDULES, "flips": FLIPS, "compile": COMPILE}.items():
+        choices_of = {"schedule": SCHEDULES, "flips": FLIPS, "distortion": DISTORTIONS, "compile": COMPILE}
+        for name, choices in choices_of.items():
             if getattr(self, name) not in choices:
                 raise InputError(f"train.{name}={getattr(self, name)}: choose one of {', '.join(choices)}")
-        for name in ("epochs", "batch_size", "checkpoint_every", "threads"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise InputError(f"train.{name}={value} must be at least 1")
+        for name, most in MOST.items():
+            require_range(f"train.{name}", getattr(self, name), 1, most)
         for name in ("momentum", "label_smoothing", "averaging"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")

@@ -1,13 +1,14 @@
 """A small labelled data set that the project renders itself, so that the experiment runs with nothing downloaded.
 
 Training and test pictures stand in soft, even light, as stock photographs do. The held-out pictures, written to a
-folder and scored like photographs, show other individuals in hard light from one side. They are renders.
+folder and scored like photographs, show other individuals in hard light from one side: every class under the same
+lights before the same cameras, so that nothing but the thing itself tells one from another. They are renders.
 """
 
 import csv
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -24,7 +25,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.image import PictureSettings, to_bytes
 from renderer.lights import ambient, directional
-from renderer.mesh import normalise
+from renderer.mesh import Mesh, normalise
 from renderer.shapes import SOLIDS, solid
 from renderer.visibility import Backend, choose
 from train.data import DataSet, Split
@@ -40,6 +41,15 @@ CODE = RENDERER + source_key(Path(augment.__file__).parent, Path(__file__).paren
 Lights = Callable[[Tensor, torch.Generator], Tensor]
 
 
+@dataclass(frozen=True)
+class Part:
+    """A part of the data: its name, its light, and whether all classes have the same draws of light and camera."""
+
+    name: str
+    light: Lights
+    same_for_all: bool = False
+
+
 def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
     """That many training and test pictures of every class, in even light; whole individuals (20 pictures) each.
 
@@ -51,25 +61,26 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
         )
     settings = replace(SETTINGS, size=size)
     splits = [
-        _render_split(per_class, seed, part, even_light, settings, cache or TensorCache())
-        for per_class, part in [(train, "train"), (test, "test")]
+        _render_split(per_class, seed, Part(name, even_light), settings, cache or TensorCache())
+        for per_class, name in [(train, "train"), (test, "test")]
     ]
     return DataSet(CLASSES, *splits)
 
 
 def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None = None) -> None:
-    """Class folders of PNG pictures in hard light, with a photos.csv that calls them rendered."""
+    """Class folders of PNG pictures in hard light; photos.csv calls them rendered and numbers the lights."""
     settings = replace(SETTINGS, size=size)
-    split = _render_split(HELD_OUT_PER_CLASS, seed, "held out", hard_light, settings, cache or TensorCache())
+    part = Part("held out", hard_light, same_for_all=True)
+    split = _render_split(HELD_OUT_PER_CLASS, seed, part, settings, cache or TensorCache())
     folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "photos.csv", "w", newline="") as file:
+    with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
-        rows.writerow(["path", "source_tag"])
+        rows.writerow(["path", "source_tag", "light"])
         for number, (image, label) in enumerate(zip(split.images, split.labels, strict=True)):
             path = Path(CLASSES[label]) / f"rendered_{number:04d}.png"
             (folder / path).parent.mkdir(exist_ok=True)
             Image.fromarray(image.permute(1, 2, 0).numpy()).save(folder / path)
-            rows.writerow([path.as_posix(), SOURCE])
+            rows.writerow([path.as_posix(), SOURCE, number % HELD_OUT_PER_CLASS])
 
 
 def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
@@ -88,35 +99,38 @@ def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
     return ambient(0.06 * tint) + directional(direction, strength * tint)
 
 
-def _render_split(
-    per_class: int, seed: int, part: str, light: Lights, settings: PictureSettings, cache: TensorCache
-) -> Split:
-    key = content_key(CODE, CLASSES, per_class, seed, part, light.__name__, settings)
+def _render_split(per_class: int, seed: int, part: Part, settings: PictureSettings, cache: TensorCache) -> Split:
+    key = content_key(CODE, CLASSES, per_class, seed, part.name, settings)
     kept = cache.read(key)
     if kept is None:
-        kept = {"images": _render(per_class, generator(seed, part), light, settings)}
+        kept = {"images": _render(per_class, seed, part, settings)}
         cache.write(key, kept)
         source = f"rendered; not kept: {cache.problem}" if cache.problem else "rendered"
     else:
         source = "from the cache"
-    console.info("%s pictures: %d %s", part, len(kept["images"]), source)
+    console.info("%s pictures: %d %s", part.name, len(kept["images"]), source)
     return Split(kept["images"], torch.arange(len(CLASSES)).repeat_interleave(per_class))
 
 
-def _render(per_class: int, draws: torch.Generator, light: Lights, settings: PictureSettings) -> Tensor:
+def _render(per_class: int, seed: int, part: Part, settings: PictureSettings) -> Tensor:
     """Pictures of every class, in order: uint8 (classes × per_class, 3, size, size)."""
     backend = choose("software")
     individuals = math.ceil(per_class / (VIEWS * BACKGROUNDS))
+    draws = seeds = generator(seed, part.name)
     images = []
     for name in CLASSES:
-        pictures = [_portraits(name, light, settings, backend, draws) for _ in range(individuals)]
+        if part.same_for_all:
+            draws, seeds = generator(seed, part.name), generator(seed, part.name, name)
+        meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(individuals))
+        pictures = [_portraits(name, mesh, part.light, settings, backend, draws) for mesh in meshes]
         images.append(torch.cat(pictures)[:per_class])
     return torch.cat(images)
 
 
-def _portraits(name: str, light: Lights, settings: PictureSettings, backend: Backend, draws: torch.Generator) -> Tensor:
+def _portraits(
+    name: str, mesh: Mesh, light: Lights, settings: PictureSettings, backend: Backend, draws: torch.Generator
+) -> Tensor:
     """20 pictures of one individual: uint8 (20, 3, size, size)."""
-    mesh = normalise(solid(name, int(torch.randint(2**31, (1,), generator=draws))))
     polar, azimuth, field = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
     cameras = [
         OrthographicCamera(math.radians(40 + 45 * p), 2 * math.pi * a, 2 + f)
@@ -126,7 +140,7 @@ def _portraits(name: str, light: Lights, settings: PictureSettings, backend: Bac
     towards = [torch.tensor(camera.axes()[2], dtype=torch.float32) for camera in cameras for _ in backgrounds]
     lights = torch.stack([light(back, draws) for back in towards])
     behind = load_backgrounds(backgrounds, settings.size)
-    scene = Scene.grid([SceneObject(name, mesh)], cameras, behind, lights, settings, backend)
+    scene = Scene.grid([SceneObject(name, normalise(mesh))], cameras, behind, lights, settings, backend)
     return to_bytes(scene.render(Conditions(lights), torch.arange(len(scene))).flatten(0, 1))
 
 

@@ -2,15 +2,10 @@
 
 from pathlib import Path
 
-from omegaconf import OmegaConf
-
 from augment import classifiers
 from augment.classifiers import Classifier
 from renderer.errors import InputError
 from train.checkpoint import load_network
-
-CONFIG = "config.yaml"  # not train.experiment's: an attack has no use for the trainer that comes with it
-SIZE = 32  # of the data sets whose configuration has no size, CIFAR-100 above all
 
 
 def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
@@ -21,21 +16,14 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
 def load_run(run: str, weights: Path | None = None) -> Classifier:
     """The selected network of a run's folder, of a folder under pretrained/, or of a file of either.
 
-    The classes are the checkpoint's; the size is the run's data.size, or 32 where no configuration names one.
     InputError for a folder without a network, and for weights=, since the run holds its own.
     """
     if weights is not None:
         raise InputError(
             f"weights={weights} is not for classifier=run:{run}, which has weights of its own: leave it out"
         )
-    network, classes = load_network(Path(run))
-    return Classifier(network, _size(Path(run)), classes, f"run:{run}")
-
-
-def _size(run: Path) -> int:
-    config = (run.parent if run.is_file() else run) / CONFIG
-    configured = OmegaConf.load(config) if config.is_file() else OmegaConf.create()
-    return OmegaConf.select(configured, "data.size", default=SIZE)
+    network = load_network(Path(run))
+    return Classifier(network.module, network.size, network.classes, f"run:{run}")
 
 
 SOURCES = {**classifiers.SOURCES, "run:": load_run}

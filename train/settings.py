@@ -1,9 +1,10 @@
 """conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
 
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -11,15 +12,20 @@ from omegaconf.errors import OmegaConfBaseException
 from augment.objects import ObjectSettings
 from augment.scene import count_views
 from augment.service import AugmentationSettings
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import PictureSettings
 from train.recipe import TrainSettings
+from train.run_folder import CONFIG, read_config
 
 # Where, how and with what a run was made: these do not decide its result, nor name a sweep's cell.
 CIRCUMSTANCES = (
     *("run", "sweep", "launcher", "compare", "versions", "renderer.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
+PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
+RESERVED = ("renders", "rendered_pictures", "test")  # other sub-folders and scores of a run
+SMALLEST_SIZE, LARGEST_SIZE = 5, 4096  # pixels per side: 4 are padded by reflection
+MOST_PICTURES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
 
 
 @dataclass
@@ -37,8 +43,10 @@ class DataSettings:
     pictures: str | None = None
 
     def __post_init__(self):
-        if self.size < 1 or self.seed < 0:
-            raise InputError(f"data.size={self.size} must be at least 1 and data.seed={self.seed} not negative")
+        require_range("data.size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
+        require_range("data.seed", self.seed, 0, LARGEST_SEED)
+        for name in ("train_per_class", "test_per_class"):
+            require_range(f"data.{name}", getattr(self, name), 1, MOST_PICTURES)
 
 
 @dataclass
@@ -53,8 +61,8 @@ class SceneSettings:
     exposure: float = 1.0
 
     def __post_init__(self):
-        if not 0 < self.exposure < math.inf:
-            raise InputError(f"scene.exposure={self.exposure} must be positive")
+        require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
+        require_range("scene.views", self.views, 1, MOST_VIEWS)
 
 
 @dataclass
@@ -86,10 +94,30 @@ class ModelSettings:
 
 @dataclass
 class EvaluationSettings:
-    """photos: a folder of photographs to score the network on. skip_unreadable: pass over those that are broken."""
+    """photos: a folder of photographs to score the network on, or several by name. skip_unreadable: pass over those
+    that are broken.
+    """
 
-    photos: str | None = None
+    photos: Any = None  # str | dict[str, str] | None, a union that OmegaConf has no type for
     skip_unreadable: bool = False
+
+    def __post_init__(self):
+        given = self.photos
+        named = isinstance(given, dict) and all(isinstance(folder, str) for folder in given.values())
+        if not (given is None or isinstance(given, str) or named):
+            raise InputError(f"evaluate.photos={given} must be a folder, or a mapping of names to folders")
+        for name in self.folders:
+            if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
+                raise InputError(
+                    f"evaluate.photos.{name}: name a sub-folder of the run, of letters, digits, _ and -, and none of "
+                    f"{', '.join(RESERVED)}"
+                )
+
+    @property
+    def folders(self) -> dict[str, Path]:
+        """The folders of photographs by the name of the run's sub-folder that gets their scores."""
+        named = self.photos if isinstance(self.photos, dict) else {PHOTOGRAPHS: self.photos} if self.photos else {}
+        return {str(name): Path(folder) for name, folder in named.items()}
 
 
 @dataclass
@@ -110,8 +138,7 @@ class ExperimentSettings:
     evaluate: EvaluationSettings = field(default_factory=EvaluationSettings)
 
     def __post_init__(self):
-        if self.seed < 0:
-            raise InputError(f"seed={self.seed} must not be negative")
+        require_range("seed", self.seed, 0, LARGEST_SEED)
         if self.augment.renders:
             _ = self.views  # fails on an inconsistent product before any data is read
 
@@ -136,12 +163,38 @@ def read_settings(kind: type, config: DictConfig, parent: str = ""):
 def decisive_settings(config: DictConfig) -> dict[str, object]:
     """What decides a run's result, by dotted key: all but the circumstances, with `${run}` for its own folder."""
     settings = OmegaConf.to_container(config, resolve=True)
-    own = re.compile(f"^{re.escape(settings['run'])}(?=/|$)")
+    own = re.compile(f"^{re.escape(str(settings.get('run')))}(?=/|$)")
     return {
         key: own.sub("${run}", value) if isinstance(value, str) else value
         for key, value in _dotted(settings)
         if key not in CIRCUMSTANCES
     }
+
+
+def differing_settings(folder: Path, config: DictConfig) -> Iterator[tuple[str, object, object]]:
+    """The decisive keys in which the run in a folder and a configuration differ, with both values.
+
+    A key that the run is older than has its default.
+    """
+    defaults = decisive_settings(OmegaConf.structured(ExperimentSettings))
+    found, asked = ({**defaults, **decisive_settings(each)} for each in (read_config(folder / CONFIG), config))
+    for key in sorted(found.keys() | asked.keys()):
+        if found.get(key) != asked.get(key):
+            yield key, found.get(key), asked.get(key)
+
+
+def require_same_settings(folder: Path, config: DictConfig) -> None:
+    """InputError where the run in a folder cannot go on under a configuration; with more epochs it can.
+
+    Nor does what comes after training have to be the same.
+    """
+    for key, found, asked in differing_settings(folder, config):
+        longer = key == "train.epochs" and isinstance(found, int) and asked > found
+        if not longer and not key.startswith("evaluate."):
+            raise InputError(
+                f"run={folder} was trained with {key}={found}, and train.resume=true asks for {asked}: resume with the "
+                f"settings of {folder / CONFIG}, or start in another folder with run="
+            )
 
 
 def _dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
@@ -152,7 +205,7 @@ def _dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
             yield prefix + key, value
 
 
-def read_object(item: str | dict, label: str, index: int) -> ObjectSettings:
-    """An entry of scene.meshes: a file or solid of the class `label`, or a mapping that may name its own."""
+def read_object(item: str | dict, label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
+    """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own."""
     keys = item if isinstance(item, dict) else {"mesh": item}
-    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"scene.meshes[{index}]")
+    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")

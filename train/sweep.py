@@ -4,6 +4,7 @@ Hydra's launchers run the cells, in this process or in others; what became of ea
 """
 
 import atexit
+import functools
 import hashlib
 import importlib.metadata
 import os
@@ -12,12 +13,11 @@ import shutil
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
-from filelock import FileLock, Timeout
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -28,12 +28,13 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from train import checkpoint
 from train.cli import one_sentence, one_sentence_errors
-from train.experiment import CONFIG, load_data, run, write_pictures
+from train.experiment import load_data, run, write_pictures
 from train.logs import console
 from train.report import format_spread, format_table, is_finished, summarise
-from train.settings import CIRCUMSTANCES, decisive_settings
+from train.run_folder import locked
+from train.settings import CIRCUMSTANCES, differing_settings
 
-FAILURE, LOCK = "failed.txt", ".lock"
+FAILURE = "failed.txt"
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 NEEDS = {  # launcher: its extra and the package in it
     "joblib": ("joblib", "hydra-joblib-launcher"),
@@ -95,7 +96,7 @@ def run_cell(config: DictConfig, folder: Path) -> None:
 
     What stops the process (SystemExit, KeyboardInterrupt) stops the sweep.
     """
-    with _lock(folder) as ours:
+    with locked(folder) as ours:
         if is_finished(folder) or not ours:
             print(f"{'finished before' if ours else 'in training elsewhere'}: {folder}", flush=True)
             return
@@ -103,7 +104,9 @@ def run_cell(config: DictConfig, folder: Path) -> None:
         try:
             _train(config, folder)
         except Exception as error:
-            (folder / FAILURE).write_text(_reason(error) + "\n")
+            with suppress(OSError):  # where there is no room for it, the console alone says it
+                reason = _reason(error) + "\n"
+                (folder / FAILURE).write_text(reason, encoding="utf-8", errors="backslashreplace")
 
 
 def _train(config: DictConfig, folder: Path) -> None:
@@ -122,19 +125,18 @@ def _reason(error: Exception) -> str:
     return reason
 
 
-@contextmanager
-def _lock(folder: Path) -> Iterator[bool]:
-    """Whether nobody else holds the folder, on any machine that shares it; nobody else gets it then."""
-    lock = FileLock(folder / LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        yield False
-        return
-    try:
-        yield True
-    finally:
-        lock.release()
+def _one_outcome(callback: Callable) -> Callable:
+    """Of a callback, whose exceptions Hydra turns into warnings, exit status 0 with them: end the process instead."""
+
+    @functools.wraps(callback)
+    def wrapped(*arguments, **keywords):
+        try:
+            return one_sentence_errors(callback)(*arguments, **keywords)
+        except Exception:
+            traceback.print_exc()
+            sys.exit(1)
+
+    return wrapped
 
 
 class SweepReport(Callback):
@@ -143,7 +145,7 @@ class SweepReport(Callback):
     def __init__(self):
         self.folders: list[Path] = []
 
-    @one_sentence_errors
+    @_one_outcome
     def on_multirun_start(self, config: DictConfig, **_) -> None:
         """One sentence and exit status 2 rather than two cells in a folder, or a cell where one has other settings."""
         try:
@@ -158,6 +160,7 @@ class SweepReport(Callback):
         atexit.register(self._print)  # where the launcher raises, or a signal stops the sweep:
         signal.signal(signal.SIGTERM, _stop)
 
+    @_one_outcome
     def on_multirun_end(self, **_) -> None:
         atexit.unregister(self._print)
         self._print()
@@ -188,14 +191,11 @@ def _check_same_settings(folder: Path, cell: DictConfig) -> None:
     """InputError where the folder has a run, finished or begun, with other settings than the cell's."""
     if not (is_finished(folder) or checkpoint.exists(folder)):
         return
-    found = decisive_settings(OmegaConf.load(folder / CONFIG))
-    asked = decisive_settings(OmegaConf.masked_copy(cell, [key for key in cell if key != "hydra"]))
-    for key in sorted(found.keys() | asked.keys()):
-        if found.get(key) != asked.get(key):
-            raise InputError(
-                f"{folder} has {key}={found.get(key)}, and {asked.get(key)} is asked for: give another folder with "
-                "sweep=, or remove this one"
-            )
+    own = OmegaConf.masked_copy(cell, [key for key in cell if key != "hydra"])
+    for key, found, asked in differing_settings(folder, own):
+        raise InputError(
+            f"{folder} has {key}={found}, and {asked} is asked for: give another folder with sweep=, or remove this one"
+        )
 
 
 def format_sweep(folders: Sequence[Path]) -> str:
@@ -212,8 +212,12 @@ def _state(folder: Path) -> str:
     """Of a cell that is not finished."""
     if not folder.exists():
         return "not begun"
-    with _lock(folder) as ours:
+    with locked(folder) as ours:
         if not ours:
             return "in training"
     failure = folder / FAILURE
-    return f"failed: {failure.read_text().strip()}" if failure.exists() else "interrupted"
+    return (
+        f"failed: {failure.read_text(encoding='utf-8', errors='replace').strip()}"
+        if failure.exists()
+        else "interrupted"
+    )

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from renderer.errors import InputError
 from train.dropout import Dropout
 
+DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything
+
 
 class WideResNet(nn.Module):
     """WRN-depth-width for small pictures of any size.
@@ -27,9 +29,15 @@ class WideResNet(nn.Module):
         std: Sequence[float] = (0.25, 0.25, 0.25),
     ):
         super().__init__()
-        if depth < 10 or (depth - 4) % 6 or width < 1:
+        if not (isinstance(depth, int) and isinstance(width, int)) or depth < 10 or (depth - 4) % 6 or width < 1:
             raise InputError(
                 f"model.depth={depth}, model.width={width}: depth is 10, 16, 22, 28, ... and width at least 1"
+            )
+        parameters = 9 * (depth - 4) // 3 * width**2 * 16**2 * (1 + 4 + 16)
+        if depth > DEEPEST or parameters > MOST_PARAMETERS:
+            raise InputError(
+                f"model.depth={depth}, model.width={width} make {parameters:.1g} parameters: the largest depth is "
+                f"{DEEPEST}, and {MOST_PARAMETERS:g} parameters"
             )
         if not 0 <= dropout < 1:
             raise InputError(f"model.dropout={dropout} must be at least 0 and below 1")

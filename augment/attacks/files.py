@@ -29,7 +29,7 @@ def write_files(attacked: Attacked, checks: Checks | None, folder: Path) -> None
     everything = attacked.problem.everything
     before = attacked.problem.conditions(attacked.problem.start, everything)
     after = attacked.problem.conditions(attacked.result.values, everything)
-    with open(folder / LINES, "w") as file:
+    with open(folder / LINES, "w", encoding="utf-8") as file:
         for example in range(len(everything)):
             stem = folder / f"example_{example:03d}"
             _write_picture(attacked, before, after, example, stem.with_suffix(".png"))

@@ -7,7 +7,7 @@ from augment.descent import DescentSettings
 from augment.parameters import KINDS, Kind, Skylight, StepSettings
 from augment.perturbation import Perturbation
 from augment.scene import Scene
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 
 
 @dataclass
@@ -39,8 +39,7 @@ class AttackSettings:
     def __post_init__(self):
         if self.lighting and self.skylight:
             raise InputError("attack: lighting and skylight both set the light: choose one of them")
-        if self.restarts < 0:
-            raise InputError(f"attack.restarts={self.restarts} must not be negative")
+        require_range("attack.restarts", self.restarts, 0, 10**6)
         if self.restarts and any(settings.radius is None for settings in self.kinds.values()):
             raise InputError("attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0")
         self.descent()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from augment.norm_ball import NormBall
 from augment.scene import Conditions, Scene
-from renderer.errors import InputError
+from renderer.errors import FACTOR, LARGEST, InputError, require_range
 
 STEPS = ("unit", "raw", "sign")
 
@@ -29,10 +29,14 @@ class StepSettings:
 
     def __post_init__(self):
         NormBall(self.norm, self.radius)
-        if self.step not in STEPS:
-            raise InputError(f"attack: step={self.step}: choose one of {', '.join(STEPS)}")
-        if not self.step_size > 0:
-            raise InputError(f"attack: step_size={self.step_size} must be positive")
+        check_step(self.step, self.step_size, "attack: ")
+
+
+def check_step(step: str, step_size: float, prefix: str) -> None:
+    """InputError unless the rule is known and the size positive. prefix: of the settings' names."""
+    if step not in STEPS:
+        raise InputError(f"{prefix}step={step}: choose one of {', '.join(STEPS)}")
+    require_range(f"{prefix}step_size", step_size, 1 / LARGEST, FACTOR)
 
 
 def direction(gradient: Tensor, step: str) -> Tensor:

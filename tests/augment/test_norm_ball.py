@@ -128,7 +128,7 @@ def test_draws_repeat_with_the_generator_and_leave_the_global_one(name):
     ("make", "message"),
     [
         (lambda: NormBall("l1", 1.0), "norm=l1: choose one of linf, l2"),
-        (lambda: NormBall("l2", -0.1), "radius=-0.1 must not be below zero"),
+        (lambda: NormBall("l2", -0.1), "radius=-0.1 must be at least 0"),
         (lambda: NormBall("linf", math.nan), "radius=nan"),
         (lambda: NormBall().sample(torch.zeros(1, 2), torch.Generator()), "radius=null has no uniform draw"),
     ],

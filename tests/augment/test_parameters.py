@@ -280,7 +280,7 @@ def test_every_example_steps_by_its_own_gradient_and_a_zero_one_stays(step):
     ("change", "message"),
     [
         ({"step": "newton"}, "step=newton: choose one of unit, raw, sign"),
-        ({"step_size": 0.0}, "step_size=0.0 must be positive"),
+        ({"step_size": 0.0}, "step_size=0.0 must be at least"),
         ({"step_size": -0.05}, "step_size=-0.05"),
         ({"step_size": math.nan}, "step_size=nan"),
         ({"norm": "l1"}, "norm=l1"),

@@ -222,10 +222,10 @@ def test_continued_lights_of_another_number_of_examples_are_refused(serve):
         (lambda: AugmentationSettings(start="dark"), r"augment\.start=dark: choose one of light, random"),
         (lambda: AugmentationSettings(lights="stay"), r"augment\.lights=stay: choose one of restart, continue"),
         (lambda: AugmentationSettings(examples=-1), r"augment\.examples=-1"),
-        (lambda: TrainingAttackSettings(step="newton"), r"attack: step=newton: choose one of unit, raw, sign"),
-        (lambda: TrainingAttackSettings(step_size=0.0), r"attack: step_size=0\.0 must be positive"),
+        (lambda: TrainingAttackSettings(step="newton"), r"augment\.attack\.step=newton: choose one of unit, raw, sign"),
+        (lambda: TrainingAttackSettings(step_size=0.0), r"augment\.attack\.step_size=0\.0 must be at least"),
         (lambda: TrainingAttackSettings(max_steps=-1), r"attack: max_steps=-1"),
-        (lambda: TrainingAttackSettings(batch_size=0), r"batch_size=0 at least 1"),
+        (lambda: TrainingAttackSettings(batch_size=0), r"attack: batch_size=0 must be at least 1"),
         (lambda: TrainingAttackSettings(restarts=1), r"attack\.restarts draws from the norm-balls: set the radius"),
         (
             lambda: AugmentationSettings(arm="random", attack=TrainingAttackSettings(geometry=StepSettings())),

@@ -1,7 +1,7 @@
-import importlib.util
 import io
 import math
 import re
+import runpy
 import struct
 import sys
 from pathlib import Path
@@ -16,7 +16,7 @@ from PIL import Image
 from renderer.environment import SUFFIXES, negative_share, read_map, to_map, write_map
 from renderer.errors import InputError
 from renderer.harmonics import basis, equirectangular, project
-from renderer.lights import load_light, probe, project_environment, save_light
+from renderer.lights import load_light, mean_luminance, probe, project_environment, save_light
 
 ROOT = Path(__file__).parents[2]
 HDRI = ROOT.parent / "shared" / "data" / "hdri"
@@ -303,6 +303,13 @@ def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, suffix, damage, cap
     assert capfd.readouterr() == ("", "")
 
 
+def announcing(shape: str) -> bytes:
+    """An array of 96 numbers under a header of the same length that tells of another shape."""
+    content = array(np.ones((4, 8, 3)))
+    header = content[10:128].decode().replace("(4, 8, 3)", shape).rstrip()
+    return content[:10] + header.ljust(117).encode() + b"\n" + content[128:]
+
+
 NOT_READABLE = "is not a readable .npy file: "
 
 
@@ -312,6 +319,13 @@ NOT_READABLE = "is not a readable .npy file: "
         pytest.param(archive(), NOT_READABLE, id="npz"),
         pytest.param(array(np.array([None, "pickled"], dtype=object)), NOT_READABLE, id="pickled"),
         pytest.param(array(np.array([["text"] * 3] * 4)), NOT_READABLE, id="text"),
+        pytest.param(array(np.ones((4, 8, 3), dtype=complex)), NOT_READABLE, id="complex"),
+        pytest.param(array(np.ones((0, 8, 3))), NOT_READABLE, id="empty"),
+        pytest.param(announcing("(4e9, 8, 3)"), NOT_READABLE, id="no whole number"),
+        pytest.param(announcing("(-4, 8, 3)"), NOT_READABLE, id="negative"),
+        pytest.param(announcing("(4000000, 800000, 3)"), NOT_READABLE, id="77 TB"),
+        pytest.param(announcing("(" * 60), NOT_READABLE, id="brackets"),
+        pytest.param(array(np.full((4, 8, 3), 1e300)), "holds NaN or infinity", id="beyond float32"),
         pytest.param(array(np.ones((4, 8))), "has shape (4, 8): it must be (height, width, channels)", id="2 axes"),
         pytest.param(array(np.ones((49, 3))), "has shape (49, 3): it must be", id="coefficients"),
         pytest.param(array(np.ones((4, 8, 2))), "has shape (4, 8, 2): it must be", id="2 channels"),
@@ -385,21 +399,26 @@ def test_without_openimageio_arrays_still_work_and_pictures_name_it(tmp_path, mo
             read_map(path)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (2, 2)])
+def test_a_map_of_few_texels_is_the_light_of_its_mean(tmp_path, size):
+    """The same radiance from everywhere: one coefficient, at the grace probe's luminance."""
+    np.save(tmp_path / "map.npy", np.ones((*size, 3)))
+    light = load_light(str(tmp_path / "map.npy"))
+    assert light.isfinite().all() and float(light[0].min()) == pytest.approx(mean_luminance(probe("grace")), rel=1e-6)
+
+
 # ---------------------------------------------------------------------------------------- the script
 
 
 @pytest.fixture
 def export(monkeypatch, capsys):
     """`python scripts/export_light.py ...` in this process: its exit status, output and errors."""
-    path = ROOT / "scripts" / "export_light.py"
-    spec = importlib.util.spec_from_file_location("export_light", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    path = str(ROOT / "scripts" / "export_light.py")
 
     def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", [str(path), *arguments])
+        monkeypatch.setattr(sys, "argv", [path, *arguments])
         try:
-            module.main()
+            runpy.run_path(path, run_name="__main__")
         except SystemExit as stop:
             return stop.code, *capsys.readouterr()
         return 0, *capsys.readouterr()
@@ -431,8 +450,11 @@ def test_the_script_takes_coefficients_as_they_are(tmp_path, export):
     [
         (["light=graze", "out=x.hdr"], "light 'graze' is not known: choose grace"),
         (["light=grace", "out=x.png"], "x.png is no name for an environment map"),
-        (["light=grace", "out=x.hdr", "height=0"], "height=0 is no number of rows"),
-        (["light=grace", "out=x.hdr", "height=2.5"], "height=2.5 is no number of rows"),
+        (["light=grace", "out=x.hdr", "height=0"], "height=0 must be at least 1 and at most 8192"),
+        (
+            ["light=grace", "out=x.hdr", "height=2.5"],
+            "height: Value '2.5' of type 'float' could not be converted to Integer",
+        ),
         (["light=grace"], "out is not set"),
     ],
 )

@@ -7,13 +7,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from renderer.errors import InputError
-from renderer.shapes import SOLIDS, orange, solid
+from renderer.shapes import LOOK_ALIKES, SOLIDS, orange, solid
 
-SHELLS = dict.fromkeys(SOLIDS, 1) | {"cup": 2}  # a cup's handle is a shell of its own
+EVERY = SOLIDS | LOOK_ALIKES
+SHELLS = dict.fromkeys(EVERY, 1) | {"cup": 2}  # a cup's handle is a shell of its own
 SEEDS = range(4)
 
 
-@pytest.fixture(params=[(name, seed) for name in SOLIDS for seed in SEEDS], ids=lambda p: f"{p[0]}-{p[1]}")
+@pytest.fixture(params=[(name, seed) for name in EVERY for seed in SEEDS], ids=lambda p: f"{p[0]}-{p[1]}")
 def named(request):
     name, seed = request.param
     return name, solid(name, seed)
@@ -66,19 +67,43 @@ def test_colours_are_display_values_per_corner(named):
     assert mesh.corner_colors.min() >= 0 and mesh.corner_colors.max() <= 1
 
 
-@pytest.mark.parametrize("name", SOLIDS)
+@pytest.mark.parametrize("name", EVERY)
 def test_a_seed_picks_one_individual(name):
     one, again, other = solid(name, 1), solid(name, 1), solid(name, 2)
     for field in ("vertices", "faces", "corner_colors"):
         np.testing.assert_array_equal(getattr(one, field), getattr(again, field))
-    assert not np.array_equal(one.vertices, other.vertices)
+    assert name == "ball" or not np.array_equal(one.vertices, other.vertices)
     assert not np.array_equal(one.corner_colors, other.corner_colors)
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_and_all_known():
     with pytest.raises(InputError, match="'ornage': use 'orange'") as error:
         solid("ornage")
-    assert all(name in str(error.value) for name in SOLIDS)
+    assert all(name in str(error.value) for name in EVERY)
+
+
+def mean_hue(mesh):
+    """Degrees, of the mean colour."""
+    mean = np.average(mesh.corner_colors.mean(axis=1), axis=0, weights=mesh.face_areas())
+    return 360 * colorsys.rgb_to_hsv(*mean.tolist())[0]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_lemons_are_yellow_and_longer_than_wide_and_peaches_between_red_and_yellow(seed):
+    lemon, peach = solid("lemon", seed), solid("peach", seed)
+    assert 42 < mean_hue(lemon) < 65 and 0 < mean_hue(peach) < 40
+    width, depth, length = np.ptp(lemon.vertices, axis=0)
+    assert 1.15 * max(width, depth) < length < 1.6 * min(width, depth)
+
+
+def test_a_ball_is_a_sphere_of_one_colour_or_has_a_pale_seam_on_green():
+    balls = [solid("ball", seed) for seed in range(20)]
+    plain = [ball for ball in balls if ball.one_color]
+    assert 4 < len(plain) < 16
+    for ball in balls:
+        np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=1), 0.95)
+        seam = (ball.corner_colors[..., 2] > 0.7).mean()
+        assert ball in plain or (0.02 < seam < 0.2 and 50 < mean_hue(ball) < 90)
 
 
 def spheroid(mesh):

@@ -91,7 +91,7 @@ REFUSED = [
     (["attack=null"], "attack=null is not known: choose from lighting"),
     (["attack=[]"], "attack: name what to change"),
     (["attack=lighting+skylight"], "attack: lighting and skylight both set the light: choose one of them"),
-    (["attack.lighting.radius=-1"], "attack: radius=-1.0 must not be below zero"),
+    (["attack.lighting.radius=-1"], "attack: radius=-1.0 must be at least 0"),
     (["attack.restarts=1"], "attack.restarts draws from the norm-balls"),
     (["scene.views=0"], "scene.views=0 must be at least 1"),
     (["scene.backgrounds=[absent.png]"], "scene.backgrounds: absent.png cannot be read"),

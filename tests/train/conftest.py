@@ -1,5 +1,6 @@
 """A small data set, a configuration to match, and one finished run that several tests look at."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from train.experiment import load_data, run
@@ -107,3 +108,49 @@ def finished(tiny, photos, tmp_path_factory) -> Path:
     config = tiny(f"evaluate.photos={photos}")
     run(config, load_data(config), folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def made_up_run(tiny) -> Callable[..., Path]:
+    """Makes a folder with what a finished run of two epochs writes, but for its checkpoints.
+
+    photographs: the summaries of evaluations by the name of their sub-folder.
+    """
+
+    def make(folder: Path, arm: str = "none", photographs: dict | None = None, *overrides: str) -> Path:
+        folder.mkdir()
+        config = OmegaConf.to_container(tiny(f"augment={arm}", "seed=0", *overrides), resolve=True)
+        OmegaConf.save(OmegaConf.create({**config, "versions": {"python": "3.11"}}), folder / "config.yaml")
+        seconds = {"attack": 0.5, "attack_classifier": 0.25, "training": 3.0, "evaluation": 1.0, "input_output": 0.5}
+        lines = [
+            {"epoch": epoch, **{f"seconds/{phase}": epoch * value for phase, value in seconds.items()}}
+            for epoch in (1, 2)
+        ]
+        lines[0]["seconds/operators"] = 7.0
+        lines.append({"test/accuracy": 0.76543, "test/accuracy_last": 0.75, "test/epoch": 2})
+        (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        for name, summary in (photographs or {}).items():
+            (folder / name).mkdir()
+            (folder / name / "summary.json").write_text(json.dumps(summary))
+        return folder
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def read_markdown() -> Callable[[str], dict[str, list[list[str]]]]:
+    """Reads the tables of a text, rows of cells, the header first, by the heading or line before each, or ""."""
+
+    def read(text: str) -> dict[str, list[list[str]]]:
+        tables, title = {}, ""
+        for paragraph in text.split("\n\n"):
+            lines = [line for line in paragraph.splitlines() if line.startswith("|")]
+            if heading := [line for line in paragraph.splitlines() if not line.startswith("|")]:
+                title = heading[-1].removeprefix("### ").removesuffix(":")
+            if lines:
+                assert len({len(line) for line in lines}) == 1 and set(lines[1]) == {"|", "-", " "}
+                rows = [lines[0], *lines[2:]]
+                tables[title] = [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
+        return tables
+
+    return read

@@ -4,18 +4,22 @@ import torch.nn.functional as F
 
 from renderer.image import to_bytes
 from train import batches
-from train.batches import PADDING, crop_and_flip, to_unit, training_batches
+from train.batches import PADDING, Round, crop_and_flip, to_unit, training_batches
 
 
 def noise(*shape: int) -> torch.Tensor:
     return torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
 
 
+def whole_epoch(images: torch.Tensor, epoch: int) -> Round:
+    return Round(epoch, epoch, torch.arange(len(images)))
+
+
 def epoch_of(count: int, seed: int = 0, epoch: int = 0, batch_size: int = 7) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Batches of plain pictures, each of its own value, which is its label too."""
     rows = torch.arange(count)
     images = rows.view(-1, 1, 1, 1).expand(-1, 3, 8, 8).to(torch.uint8)
-    return list(training_batches(images, rows, batch_size, seed, epoch))
+    return list(training_batches(images, rows, batch_size, seed, whole_epoch(images, epoch)))
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (5, 5), (6, 11)])
@@ -53,10 +57,10 @@ def test_fewer_pictures_than_a_batch_fill_it_several_times():
 @pytest.mark.parametrize("pictures_at_once", [1, 20, 10**6])
 def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, pictures_at_once):
     images, labels = noise(50, 3, 8, 8), torch.arange(50)
-    whole = list(training_batches(images, labels, 8, 0, 1, flips))
+    whole = list(training_batches(images, labels, 8, 0, whole_epoch(images, 1), flips))
     monkeypatch.setattr(batches, "CHUNK_BYTES", pictures_at_once * 3 * 8 * 8)
     for first in range(len(whole) + 1):
-        rest = list(training_batches(images, labels, 8, 0, 1, flips, first))
+        rest = list(training_batches(images, labels, 8, 0, whole_epoch(images, 1), flips, first))
         assert len(rest) == len(whole) - first
         for found, expected in zip(rest, whole[first:], strict=True):
             assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
@@ -67,7 +71,7 @@ def test_alternating_flips_show_each_picture_mirrored_in_every_other_epoch():
 
     def mirrored(epoch: int) -> torch.Tensor:
         """By picture."""
-        ((images, labels),) = training_batches(ramp, torch.arange(40), 40, 0, epoch, "alternating")
+        ((images, labels),) = training_batches(ramp, torch.arange(40), 40, 0, whole_epoch(ramp, epoch), "alternating")
         flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
         return flipped[labels.argsort()]
 
@@ -79,18 +83,21 @@ def test_alternating_flips_show_each_picture_mirrored_in_every_other_epoch():
 def test_batches_are_a_function_of_seed_and_epoch_alone():
     images, labels = noise(50, 3, 8, 8), torch.arange(50)
     drawn = {}
-    for key in [(0, 0), (0, 1), (1, 0)]:
+    for seed, epoch in [(0, 0), (0, 1), (1, 0)]:
         torch.manual_seed(len(drawn))
-        first, again = (torch.cat([x for x, _ in training_batches(images, labels, 16, *key)]) for _ in range(2))
+        first, again = (
+            torch.cat([x for x, _ in training_batches(images, labels, 16, seed, whole_epoch(images, epoch))])
+            for _ in range(2)
+        )
         assert torch.equal(first, again)
-        drawn[key] = first
+        drawn[seed, epoch] = first
     assert not torch.equal(drawn[0, 0], drawn[0, 1]) and not torch.equal(drawn[0, 0], drawn[1, 0])
 
 
 def test_shifts_and_flips_are_all_drawn_about_equally_often():
     count, size, middle = 6000, 11, 5
     place = torch.arange(size * size).view(1, 1, size, size).expand(count, 3, -1, -1).to(torch.uint8)
-    (images, _), *_ = training_batches(place, torch.zeros(count), count, seed=0, epoch=0)
+    (images, _), *_ = training_batches(place, torch.zeros(count), count, 0, whole_epoch(place, 0))
     seen = images[:, 0, middle].long()
     flipped = seen[:, middle - 1] > seen[:, middle + 1]
     assert abs(flipped.double().mean() - 0.5) < 4 * 0.5 / count**0.5  # four standard deviations

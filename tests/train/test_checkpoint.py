@@ -2,6 +2,7 @@ import errno
 import os
 import pickle
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,12 +17,14 @@ from train.checkpoint import (
     PREVIOUS,
     PUBLISHED,
     content_hash,
+    describe,
     load,
     load_network,
     load_newest,
     load_weights,
     publish,
     save,
+    start_from,
 )
 from train.wideresnet import WideResNet
 
@@ -31,6 +34,11 @@ CLASSES = ["fig", "lime"]
 def state_of(network: WideResNet, classes: list[str] = CLASSES, **architecture) -> dict:
     shape = {"depth": 10, "width": 1, "dropout": 0.0} | architecture
     return {"model": network.state_dict(), "architecture": {"classes": classes, **shape}}
+
+
+def description_of(network: WideResNet, **changes) -> dict:
+    shape = {"size": 32, "encoding": "linear", "depth": 10, "width": 1, "dropout": 0.0} | changes
+    return describe(network, CLASSES, **shape)
 
 
 @pytest.fixture
@@ -183,9 +191,87 @@ def test_a_network_loads_from_its_file_or_its_run_folder(network, tmp_path):
     save(tmp_path / BEST, state_of(network))
     images = torch.rand(3, 3, 16, 16)
     for path in (tmp_path, tmp_path / BEST):
-        loaded, classes = load_network(path)
-        assert classes == ("fig", "lime") and not loaded.training
-        assert torch.equal(loaded(images), network(images))
+        loaded = load_network(path)
+        assert loaded.classes == ("fig", "lime") and not loaded.module.training
+        assert torch.equal(loaded.module(images), network(images))
+
+
+def test_a_network_is_stored_with_all_that_it_takes_to_use_it(network, tmp_path):
+    described = describe(network, CLASSES, size=64, encoding="srgb", depth=10, width=1, dropout=0.0)
+    state = {"model": network.state_dict(), "architecture": described}
+    save(tmp_path / BEST, state)
+    publish(tmp_path / PUBLISHED, state)
+    for name in (BEST, PUBLISHED):
+        loaded = load_network(tmp_path / name)
+        assert (loaded.size, loaded.encoding, loaded.classes) == (64, "srgb", ("fig", "lime"))
+        assert loaded.architecture["mean"] == pytest.approx([0.1, 0.2, 0.3])
+        assert loaded.architecture["std"] == pytest.approx([0.3, 0.2, 0.1])
+        with pytest.raises(InputError, match=r"size=32: .* was trained on images of 64 pixels per side"):
+            load_network(tmp_path / name, 32)
+
+
+def test_an_old_network_that_does_not_say_its_size_has_32_or_the_one_asked_for(network, tmp_path):
+    save(tmp_path / BEST, state_of(network))
+    assert load_network(tmp_path).size == 32
+    assert load_network(tmp_path, 64).size == 64
+
+
+@pytest.mark.parametrize(
+    "key, value", [("version", "2"), ("version", None), ("size", "32"), ("size", 0), ("size", 1e3), ("size", 10**9),
+                   ("encoding", 3), ("encoding", ["srgb"]), ("classes", 3), ("depth", "10"), ("mean", "a")]
+)  # fmt: skip
+def test_a_network_that_says_what_cannot_be_meant_is_refused_in_one_sentence(network, tmp_path, key, value):
+    state = state_of(network)
+    state["architecture"] = state["architecture"] | {key: value}
+    save(tmp_path / BEST, state)
+    publish(tmp_path / PUBLISHED, state)
+    for name in (BEST, PUBLISHED):
+        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} [^\n]+$"):
+            load_network(tmp_path / name)
+
+
+@pytest.mark.parametrize("architecture", [None, [], "orange", 3])
+def test_a_network_without_a_description_is_refused_by_name(network, tmp_path, architecture):
+    state = state_of(network) | {"architecture": architecture}
+    save(tmp_path / BEST, state)
+    publish(tmp_path / PUBLISHED, state)
+    for name in (BEST, PUBLISHED):
+        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} .*lacks its .*architecture"):
+            load_network(tmp_path / name)
+
+
+def test_a_network_of_a_later_version_is_refused(network, tmp_path):
+    save(tmp_path / BEST, state_of(network, version=99))
+    with pytest.raises(InputError, match=r"best.pt was written by a later version"):
+        load_network(tmp_path)
+
+
+# ---------------------------------------------------------------------------------------- starting from another run's
+
+
+def test_a_network_starts_with_the_weights_and_the_normalisation_of_another(network, tmp_path):
+    save(tmp_path / BEST, {"model": network.state_dict(), "architecture": description_of(network)})
+    own = WideResNet(2, 10, 1, 0.3, mean=(0.5, 0.5, 0.5))
+    start_from(own, description_of(own, dropout=0.3), tmp_path)
+    images = torch.rand(3, 3, 32, 32)
+    assert torch.equal(own.eval()(images), network(images))
+
+
+@pytest.mark.parametrize(
+    "change, fault",
+    [
+        ({"classes": ["lime", "fig"]}, "other classes"),
+        ({"size": 64}, "size 32, not 64"),
+        ({"depth": 16}, "depth 10, not 16"),
+        ({"width": 2}, "width 1, not 2"),
+    ],
+)
+def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, change, fault):
+    save(tmp_path / BEST, {"model": network.state_dict(), "architecture": description_of(network)})
+    with pytest.raises(
+        InputError, match=f"train.init_from={tmp_path} was trained with {fault}: give this run the same"
+    ):
+        start_from(network, {**description_of(network), **change}, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -195,15 +281,40 @@ def test_a_network_loads_from_its_file_or_its_run_folder(network, tmp_path):
         {"classes": ["fig", "lime"], "depth": 10, "heads": 3},
         {"depth": 10},
         {"classes": None},
-        ["fig", "lime"],
         {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1},
         {"classes": ["fig", "lime"], "depth": 10, "width": 2},
+        {"classes": ["fig", "lime"], "depth": 6 * 10**9 + 4, "width": 1},
+        {"classes": ["fig", "lime"], "depth": 10, "width": 10**9},
+        {"classes": ["fig", "lime"], "depth": 10.0, "width": 1},
+        {"classes": ["fig", "lime"], "depth": 10, "width": 1, "mean": [0.5]},
+        {"classes": 2, "depth": 10, "width": 1},
     ],
 )
 def test_a_checkpoint_of_another_network_is_one_error(network, tmp_path, architecture):
     save(tmp_path / BEST, state_of(network) | {"architecture": architecture})
     with pytest.raises(InputError, match=r"best.pt is from another architecture"):
         load_network(tmp_path)
+
+
+@pytest.mark.parametrize("model", [None, 3, ["stem"], {"stem.weight": 1}, {}])
+def test_a_checkpoint_of_other_things_than_weights_is_one_error(network, tmp_path, model):
+    save(tmp_path / BEST, state_of(network) | {"model": model})
+    with pytest.raises(InputError, match=r"checkpoint .*best\.pt (holds other things|is from another architecture)"):
+        load_network(tmp_path)
+
+
+def test_a_checkpoint_nested_beyond_reason_is_one_error(network, tmp_path):
+    nested = []
+    for _ in range(3000):
+        nested = [nested]
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(20_000)  # whoever forges one has as much
+    try:
+        torch.save(state_of(network) | {"more": nested}, tmp_path / BEST)
+    finally:
+        sys.setrecursionlimit(limit)
+    with pytest.raises(InputError, match=r"best\.pt is damaged"):
+        load(tmp_path / BEST)
 
 
 def test_a_folder_without_a_network_is_one_error(tmp_path):
@@ -217,9 +328,10 @@ def test_a_folder_without_a_network_is_one_error(tmp_path):
 def test_a_published_network_is_the_same_to_half_precision(network, tmp_path):
     publish(tmp_path / PUBLISHED, state_of(network))
     for path in (tmp_path, tmp_path / PUBLISHED):
-        loaded, classes = load_network(path)
-        assert classes == ("fig", "lime")
-        for (name, value), found in zip(network.state_dict().items(), loaded.state_dict().values(), strict=True):
+        loaded = load_network(path)
+        assert loaded.classes == ("fig", "lime")
+        found_state = loaded.module.state_dict()
+        for (name, value), found in zip(network.state_dict().items(), found_state.values(), strict=True):
             assert found.dtype == value.dtype
             # rounding to 11 bits; below 2^-14 half precision is spaced evenly
             bound = value.double().abs() * 2**-11 + 2**-25

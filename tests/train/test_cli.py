@@ -4,11 +4,17 @@ import sys
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.checkpoint import LAST
-from train.cli import USER_ERROR, command_line, one_sentence_errors, with_suggestions
+from train.cli import USER_ERROR, command_line, one_sentence_errors, quoted, with_suggestions
 from train.experiment import load_data, prepare
+from train.outputs import Folders
+from train.run_folder import locked
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -59,11 +65,41 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
     )
     assert (done.returncode, done.stderr) == (0, "")
     rows = [line.split("|")[1].strip() for line in done.stdout.splitlines() if line.startswith("|")]
-    assert [rows[0], *rows[2:]] == ["augment", "none", "adversarial"]
+    assert [row for row in rows if set(row) != {"-"}] == ["augment", "none", "adversarial"] * 2
     for folder in (tmp_path / "here", tmp_path / "here" / "none"):
         assert (folder / LAST).is_file() and (folder / "photographs" / "contact_sheet.png").is_file()
     assert (tmp_path / "here" / "train.log").read_text() == done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
+
+
+def test_a_run_folder_that_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").touch()
+    done = train(tmp_path, "run=file/run")
+    assert (done.returncode, done.stdout) == (USER_ERROR, "")
+    assert done.stderr == "error: run=file/run cannot be written to (Not a directory): choose another folder\n"
+
+
+@pytest.mark.parametrize("start", [Folders().on_run_start, Folders().on_multirun_start])
+@pytest.mark.parametrize("folder", ["/proc/none", ["a", "b"], {"a": "b"}])
+def test_a_folder_for_runs_that_cannot_be_meant_or_written_is_one_line(capsys, start, folder):
+    config = OmegaConf.create({"hydra": {"run": {"dir": folder}, "sweep": {"dir": folder}}})
+    with pytest.raises(SystemExit) as stop:
+        start(config)
+    printed = capsys.readouterr()
+    assert stop.value.code == USER_ERROR and printed.err.startswith(("error: run=", "error: sweep="))
+    assert printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("held", ["here", "here/none"])
+def test_two_commands_do_not_train_in_one_folder(tmp_path, tiny_npz, held):
+    (tmp_path / held).mkdir(parents=True)
+    with locked(tmp_path / held):
+        done = train(
+            tmp_path, "run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", *SMALL, "train.resume=true"
+        )
+    assert done.returncode == USER_ERROR
+    assert done.stderr.startswith(f"error: run={tmp_path / held} is in training elsewhere: let it end")
+    assert not list(tmp_path.rglob("config.yaml")) and not list(tmp_path.rglob("metrics.jsonl"))
 
 
 # ---------------------------------------------------------------------------------------- parts
@@ -93,6 +129,60 @@ def test_unset_and_unresolved_keys_are_one_line_too(tiny, capsys):
         with pytest.raises(SystemExit):
             one_sentence_errors(lambda config: config.data.path)(tiny(override))
         assert capsys.readouterr().err == f"error: {message}\n"
+
+
+@pytest.mark.parametrize(
+    "error, message",
+    [
+        (PermissionError(13, "Permission denied", "/a/b"), "/a/b cannot be read or written: Permission denied"),
+        (OSError(28, "No space left on device"), "what was to be written found no room: No space left on device"),
+        (UnicodeEncodeError("utf-8", "a\udcffb", 1, 2, "no"), "'a\\udcffb' has letters that this system or library"),
+    ],
+)
+def test_what_the_system_refuses_is_one_line_that_names_it(capsys, error, message):
+    def refused():
+        raise error
+
+    with pytest.raises(SystemExit) as stop:
+        one_sentence_errors(refused)()
+    assert stop.value.code == USER_ERROR
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"error: {message}") and printed.count("\n") == 1
+
+
+def test_ctrl_c_outside_the_epochs_is_one_line_and_as_a_shell_says_it(monkeypatch, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["train"])
+    with pytest.raises(SystemExit) as stop:
+        with_suggestions(one_sentence_errors(interrupted), "train")
+    assert stop.value.code == 130 and capsys.readouterr() == ("", "ended by SIGINT\n")
+
+
+@given(st.text())
+def test_quoted_text_is_read_as_it_is(text):
+    """But for what means an interpolation."""
+    (override,) = OverridesParser.create().parse_overrides([f"run={quoted(text)}"])
+    assert str(override.value()) == text
+
+
+@pytest.mark.parametrize(
+    "argument, passed",
+    [
+        ("photos=2024", "photos='2024'"),
+        ("evaluate.photos=1.10", "evaluate.photos='1.10'"),
+        ("+data.path=1e3", "+data.path='1e3'"),
+        ("out=true", "out='true'"),
+        ("run=schäl", "run='schäl'"),
+        ("run=a\udcff", "run='a\udcff'"),
+        *((same, same) for same in ["train.epochs=3", "photos=null", "photos=2024,2025", "run=a", "2024", "run='ä'"]),
+    ],
+)
+def test_a_folder_that_looks_like_a_number_stays_text(monkeypatch, argument, passed):
+    monkeypatch.setattr(sys, "argv", ["train", argument])
+    with_suggestions(lambda: None, "train")
+    assert sys.argv[1:] == [passed]
 
 
 def test_what_is_no_users_fault_keeps_its_traceback():

@@ -182,6 +182,7 @@ def test_a_class_of_the_test_folder_alone_is_an_error(tmp_path):
     [
         (None, 0.1, "is not a folder"),
         (["fig/a.png"], 0.1, "holds 1 class folders: it needs two or more"),
+        (["fig/a.png", "lime/.a.png"], 0.1, "data/lime holds no picture: put some there or remove the folder"),
         (["fig/a.png", "lime/a.png"], 0.1, "data.test_share=0.1 of the 1 pictures of class 0"),
         (["fig/a.png", "lime/a.png"], 60, "data.test_share=60 must lie between 0 and 1"),
     ],
@@ -191,6 +192,27 @@ def test_a_fault_in_a_folder_is_named(tmp_path, pictures, test, fault):
         save_picture(tmp_path / "data" / name, 0)
     with pytest.raises(InputError, match=fault):
         load_folder(str(tmp_path / "data"), 8, test)
+
+
+def test_a_broken_picture_of_a_class_folder_is_named_without_advice_that_would_not_help(tmp_path):
+    for name in ("fig", "lime"):
+        save_picture(tmp_path / name / "a.png", 0)
+    (tmp_path / "fig" / "b.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"1 of 3 photographs cannot be read, .*fig/b\.png .*: replace them$"):
+        load_folder(str(tmp_path), 8, 0.1)
+
+
+def test_files_of_other_kinds_are_counted_and_named_before_training(tmp_path, caplog):
+    for name in ("fig", "lime"):
+        for number in range(4):
+            save_picture(tmp_path / name / f"{number}.png", 0)
+        for number in range(3):
+            (tmp_path / name / f"{number}.heic").touch()
+    with caplog.at_level("WARNING", "train"):
+        load_folder(str(tmp_path), 8, 0.25)
+    assert (
+        f"6 files in {tmp_path} are no pictures that are read: fig/0.heic, fig/1.heic, fig/2.heic, ..." in caplog.text
+    )
 
 
 # ---------------------------------------------------------------------------------------- CIFAR-100

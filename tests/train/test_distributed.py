@@ -136,7 +136,7 @@ def interrupted_at(epoch: int, step: int, process: int) -> Iterator[None]:
 
     def signalled(images, labels, batch_size, seed, now, *rest, **more):
         for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
-            if (now, count, processes.index()) == (epoch, step, process):
+            if (now.epoch, count, processes.index()) == (epoch, step, process):
                 signal.raise_signal(signal.SIGTERM)
             yield batch
 

@@ -22,7 +22,7 @@ from train.data import DataSet
 from train.experiment import load_data, prepare, run
 from train.interruption import Interrupted
 from train.logs import read_metrics
-from train.settings import ExperimentSettings, read_settings
+from train.settings import ExperimentSettings, read_settings, require_same_settings
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -43,9 +43,9 @@ def interrupt_in_the_second_epoch(monkeypatch) -> None:
     """After its first batch."""
     training_batches = fit.training_batches
 
-    def interrupted(images, labels, batch_size, seed, epoch, *rest, **more):
-        for number, batch in enumerate(training_batches(images, labels, batch_size, seed, epoch, *rest, **more)):
-            if (epoch, number) == (1, 1):
+    def interrupted(images, labels, batch_size, seed, now, *rest, **more):
+        for number, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more)):
+            if (now.epoch, number) == (1, 1):
                 raise KeyboardInterrupt
             yield batch
 
@@ -90,13 +90,13 @@ def test_an_interrupted_and_resumed_run_ends_as_an_uninterrupted_one(
         assert (tmp_path / "renders" / name).read_bytes() == (finished / "renders" / name).read_bytes()
 
 
-def run_with_signal(config, folder: Path, monkeypatch, epoch: int, step: int, number: signal.Signals) -> None:
+def run_with_signal(config, folder: Path, monkeypatch, round_number: int, step: int, number: signal.Signals) -> None:
     """The signal comes while the step is taken."""
     training_batches = fit.training_batches
 
     def signalled(images, labels, batch_size, seed, now, *rest, **more):
         for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
-            if (now, count) == (epoch, step):
+            if (now.number, count) == (round_number, step):
                 signal.raise_signal(number)
             yield batch
 
@@ -259,9 +259,9 @@ from train import experiment, fit
 
 training_batches = fit.training_batches
 
-def kill_in_the_second_epoch(images, labels, batch_size, seed, epoch, *rest, **more):
-    for number, batch in enumerate(training_batches(images, labels, batch_size, seed, epoch, *rest, **more)):
-        if (epoch, number) == (1, 1):
+def kill_in_the_second_epoch(images, labels, batch_size, seed, now, *rest, **more):
+    for number, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more)):
+        if (now.epoch, number) == (1, 1):
             os.kill(os.getpid(), signal.SIGKILL)
         yield batch
 
@@ -302,11 +302,76 @@ def test_a_folder_that_holds_a_run_is_not_written_over(tiny, finished):
     assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("change", ["model.width=2", "model.depth=16", "model.dropout=0.1"])
-def test_resuming_with_another_architecture_is_refused(tiny, finished, change):
+@pytest.mark.parametrize("change", ["seed=8", "augment=none", "model.width=2", "train.epochs=2", "label=pear"])
+def test_resuming_with_other_settings_is_refused_by_name_and_changes_nothing(tiny, finished, change):
+    before = {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()}
     config = tiny("train.resume=true", change)
-    with pytest.raises(InputError, match=r"checkpoint in .* is from another architecture.*config.yaml"):
+    key = {"augment=none": "augment.arm"}.get(change, change.partition("=")[0])
+    asked = change.partition("=")[2]
+    with pytest.raises(
+        InputError, match=rf"was trained with {key}=\S+, and train.resume=true asks for {asked}: resume"
+    ):
         prepare(config, load_data(config), finished)
+    assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
+
+
+def test_resuming_with_another_data_path_is_refused(tiny, finished, tiny_npz, tmp_path):
+    shutil.copy(tiny_npz, tmp_path / "other.npz")
+    config = tiny("train.resume=true", f"data.path={tmp_path / 'other.npz'}")
+    with pytest.raises(InputError, match=r"was trained with data.path="):
+        prepare(config, load_data(config), finished)
+
+
+def test_a_network_alone_is_no_run_to_go_on_with(tiny, finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    shutil.copy(folder / checkpoint.BEST, folder / checkpoint.LAST)
+    (folder / checkpoint.PREVIOUS).unlink()
+    config = tiny("train.resume=true")
+    with pytest.raises(InputError, match=r"has a network and no run to go on with \(\S+ is missing\)"):
+        prepare(config, load_data(config), folder)
+
+
+def test_resuming_for_more_epochs_and_under_other_circumstances_is_no_change(tiny, finished):
+    for changes in (["train.epochs=4"], ["train.threads=1", "renderer.cache=null", "train.checkpoint_every=2"]):
+        require_same_settings(finished, tiny("train.resume=true", *changes))
+
+
+# ---------------------------------------------------------------------------------------- rounds and starts
+
+
+def test_a_signal_between_two_rounds_or_within_one_leads_to_the_same_end(tiny, tmp_path, monkeypatch):
+    """Bit for bit: 40 of 54 images an epoch, in rounds of 16, 16 and 8, each with 4 renders (2, 2 and 1 steps)."""
+    overrides = ("augment.every=16", "train.images_per_epoch=40", "train.resume=true")
+    run(tiny(*overrides), load_data(tiny()), tmp_path / "whole")
+    folder = tmp_path / "stopped"
+    for number, at in [(1, 2), (4, 1), (6, 2)]:
+        with pytest.raises(Interrupted):
+            run_with_signal(tiny(*overrides), folder, monkeypatch, number, at, signal.SIGTERM)
+        assert checkpoint.load(folder / checkpoint.LAST)["under_way"]["step"] == {1: 4, 4: 3, 6: 2}[number]
+    run(tiny(*overrides), load_data(tiny()), folder)
+    assert_same_weights(folder / checkpoint.LAST, tmp_path / "whole" / checkpoint.LAST)
+    assert metrics_without_times(folder) == metrics_without_times(tmp_path / "whole")
+
+
+def test_every_round_is_trained_on_renders_made_for_its_own_weights(tiny, tmp_path, monkeypatch):
+    trained = []
+    put_last = fit.put_last
+    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
+    config = tiny("train.epochs=1", "augment=random", "augment.every=20")
+    run(config, load_data(config), tmp_path)
+    assert len(trained) == 3  # 54 images
+    assert len(torch.cat([renders.images for renders in trained]).unique(dim=0)) == 3 * 4
+    (line,) = [line for line in read_metrics(tmp_path) if "epoch" in line]
+    assert line["augment/loss"] == pytest.approx(sum(renders.diagnostics["loss"] for renders in trained) / 3)
+
+
+def test_a_run_starts_from_the_selected_network_of_another(tiny, finished, tmp_path):
+    config = tiny(f"train.init_from={finished}", "augment=none", "train.epochs=1", "train.learning_rate=1e-30")
+    run(config, load_data(config), tmp_path)
+    first, found = checkpoint.load(finished / checkpoint.BEST), checkpoint.load(tmp_path / checkpoint.LAST)
+    for name, value in first["model"].items():
+        assert "running" in name or "batches" in name or torch.equal(found["model"][name], value), name
+    assert found["epoch"] == 1
 
 
 # ---------------------------------------------------------------------------------------- arms
@@ -361,7 +426,7 @@ def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(fi
     assert last["model"].keys() == best["model"].keys() and "optimizer" not in best
     assert sorted(path.name for path in (finished / "renders").iterdir()) == [f"epoch_00{n}.png" for n in (1, 2, 3)]
     assert {path.name for path in (finished / "photographs").iterdir()} == {
-        "photographs.csv", "summary.json", "contact_sheet.png"
+        "photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png"
     }  # fmt: skip
     assert not list(finished.glob("*.tmp")) and list(finished.glob("events.out.tfevents.*"))
 
@@ -380,10 +445,25 @@ def test_metrics_have_each_epochs_losses_attack_and_seconds_and_the_final_scores
     summary = json.loads((finished / "photographs" / "summary.json").read_text())
     assert scores.keys() == {
         "test/accuracy", "test/accuracy_last", "test/epoch",
-        "photographs/recall", "photographs/top5", "photographs/false_alarms",
+        *(f"photographs/{name}" for name in ("recall", "top5", "false_alarms", "auc")),
+        *(f"photographs/recall_at/{rate}" for rate in ("0.05", "0.10", "0.20")),
     }  # fmt: skip
-    for name in ("recall", "top5", "false_alarms"):
+    for name in ("recall", "top5", "false_alarms", "auc"):
         assert scores[f"photographs/{name}"] == summary[name]["value"]
+    for rate, figure in summary["recall_at"].items():
+        assert scores[f"photographs/recall_at/{rate}"] == figure["value"]
+
+
+def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names(tiny, photos, tmp_path):
+    named = f"evaluate.photos={{lab: {photos}, wild-1: {photos / 'orange'}}}"
+    config = tiny("augment=none", "train.epochs=1", named)
+    run(config, load_data(config), tmp_path / "run")
+    scores = read_metrics(tmp_path / "run")[-1]
+    for name in ("lab", "wild-1"):
+        summary = json.loads((tmp_path / "run" / name / "summary.json").read_text())
+        assert scores[f"{name}/recall"] == summary["recall"]["value"]
+    assert "lab/auc" in scores and "wild-1/auc" not in scores  # a folder of oranges alone
+    assert not (tmp_path / "run" / "photographs").exists()
 
 
 def test_the_selected_network_is_the_best_on_validation_and_the_one_that_is_scored(finished, tiny):
@@ -391,11 +471,11 @@ def test_the_selected_network_is_the_best_on_validation_and_the_one_that_is_scor
     accuracies = [line["validation/accuracy"] for line in epochs]
     best = checkpoint.load(finished / checkpoint.BEST)
     assert best["epoch"] == scores["test/epoch"] == accuracies.index(max(accuracies)) + 1
-    network, classes = checkpoint.load_network(finished)
+    network = checkpoint.load_network(finished)
     test = load_data(tiny()).test
-    logits = network(test.images / 255)
+    logits = network.module(test.images / 255)
     assert scores["test/accuracy"] == pytest.approx((logits.argmax(1) == test.labels).double().mean().item())
-    assert classes == ("apple", "orange", "pear")
+    assert network.classes == ("apple", "orange", "pear") and network.size == 16
 
 
 class GuardedData:
@@ -493,7 +573,7 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
 @pytest.mark.parametrize(
     "overrides, fault",
     [
-        (["seed=-1"], "seed=-1 must not be negative"),
+        (["seed=-1"], "seed=-1 must be at least 0"),
         (["seed=abc"], "seed: Value 'abc' of type 'str' could not be converted to Integer"),
         (["train.epochs=abc"], "train.epochs: Value 'abc'"),
         (["train.epochs=0"], "train.epochs=0"),
@@ -511,7 +591,17 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], r"scene.meshes\[0\].lable: Key 'lable'"),
         (["scene.meshes=[{label: orange}]", "augment.examples=2"], r"mesh"),
         (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
-        (["scene.exposure=0"], "scene.exposure=0.0 must be positive"),
+        (["scene.exposure=0"], "scene.exposure=0.0 must be at least"),
+        (["scene.exposure=1e30"], r"scene.exposure=1e\+30 must be at least 1e-05 and at most 100000"),
+        (["scene.views=1000000000000"], "scene.views=1000000000000 must be at least 1 and at most 100000"),
+        (["train.threads=100000"], "train.threads=100000 must be at least 1 and at most 1024"),
+        (["augment.examples=1000000000000"], "augment.examples=1000000000000 must be at least 0"),
+        (["augment.random.amplitude=1e30"], r"augment.random.amplitude=1e\+30 must be"),
+        (["augment.attack.step_size=nan"], "augment.attack.step_size=nan must be"),
+        (["renderer.samples=100000"], "renderer.samples=100000 for each of 16 pixels in a row are more than 32768"),
+        (["model.width=100000"], "model.depth=10, model.width=100000 make"),
+        (["model.depth=1000000"], "model.depth=1000000, model.width=1 make"),
+        (["+data.size=1"], "data.size=1 must be at least 5"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=ornage"], r"label of scene.meshes\[0\]: 'ornage' is not a class of the model: did you mean 'orange'"),
         (["renderer.samples=0"], "renderer.samples=0"),
@@ -519,6 +609,11 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["model.dropout=2"], "model.dropout=2"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["evaluate.photos=/no/such/folder"], "/no/such/folder does not exist"),
+        (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab does not exist"),
+        (["evaluate.photos={a/b: /x}"], r"evaluate\.photos\.a/b: name a sub-folder of the run, of letters"),
+        (["evaluate.photos={renders: /x}"], r"evaluate\.photos\.renders: name a sub-folder of the run"),
+        (["evaluate.photos=[/x]"], r"evaluate\.photos=\['/x'\] must be a folder, or a mapping of names to folders"),
+        (["evaluate.photos={lab: null}"], r"evaluate\.photos=\{'lab': None\} must be a folder, or a mapping"),
         (["evaluate.skip_unreadable=perhaps"], "evaluate.skip_unreadable: Value 'perhaps'"),
     ],
 )

@@ -11,7 +11,7 @@ from augment.service import Renders
 from renderer.errors import InputError
 from train import checkpoint, evaluation, fit
 from train.data import Split
-from train.epoch import put_last, with_room
+from train.epoch import put_last, rounds_of_epoch, with_room
 from train.evaluation import evaluate
 from train.fit import Trainer
 from train.logs import RunLog, read_metrics
@@ -28,11 +28,12 @@ class NoRenders:
 
     class settings:
         arm = "none"
+        every = None
 
     def __len__(self):
         return 0
 
-    def regenerate(self, model, epoch):
+    def regenerate(self, model, number):
         return Renders(torch.zeros(0, 3, 1, 1), torch.zeros(0, dtype=torch.int64), {})
 
     def state_dict(self):
@@ -121,6 +122,28 @@ def test_without_renders_the_data_stay_as_they_are():
     assert torch.equal(mixed.labels, data.labels)
 
 
+def test_without_rounds_an_epoch_is_one_of_all_images_and_renders():
+    (only,) = rounds_of_epoch(5, 2, seed=0, epoch=3, images_per_epoch=None, every=None)
+    assert (only.number, only.epoch, only.rows.tolist()) == (3, 3, list(range(7)))
+
+
+def test_rounds_share_out_the_epochs_images_and_each_has_all_renders():
+    first, second, third = rounds_of_epoch(100, 7, seed=0, epoch=4, images_per_epoch=50, every=20)
+    assert [(each.number, each.epoch) for each in (first, second, third)] == [(12, 4), (13, 4), (14, 4)]
+    assert [len(each.rows) for each in (first, second, third)] == [27, 27, 17]
+    rows = [each.rows.tolist() for each in (first, second, third)]
+    assert all(part == sorted(part) and part[-7:] == list(range(100, 107)) for part in rows)
+    shown = [row for part in rows for row in part[:-7]]
+    assert len(set(shown)) == 50 and max(shown) < 100
+
+
+def test_an_epochs_images_are_drawn_anew_and_are_never_more_than_there_are():
+    (first,), (second,) = (rounds_of_epoch(100, 0, 0, epoch, 50, None) for epoch in (0, 1))
+    assert first.rows.tolist() != second.rows.tolist()
+    (everything,) = rounds_of_epoch(100, 0, 0, 0, 5000, None)
+    assert everything.rows.tolist() == list(range(100))
+
+
 @pytest.mark.parametrize("training", [True, False])
 def test_evaluation_is_the_mean_over_all_pictures_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
     monkeypatch.setattr(evaluation, "BATCH", 7)
@@ -149,7 +172,9 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
     torch.manual_seed(0)
     network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
     weight, bias = (parameter.detach().clone().requires_grad_() for parameter in network[1].parameters())
-    settings = TrainSettings(1, 4, 0.5, momentum=0.9, weight_decay=0.1, schedule="cosine")
+    settings = TrainSettings(
+        epochs=1, batch_size=4, learning_rate=0.5, momentum=0.9, weight_decay=0.1, schedule="cosine"
+    )
     trainer = Trainer(settings, MixedPrecision(network, "float32"), {}, NoRenders(), Phases(), tmp_path, seed=0)
     trainer.fit(Split(pictures.flatten(0, 1), labels.flatten()), noise(1), RunLog(tmp_path))
 

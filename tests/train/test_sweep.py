@@ -20,6 +20,7 @@ from train.__main__ import main
 from train.checkpoint import LAST
 from train.cli import USER_ERROR
 from train.logs import read_metrics
+from train.run_folder import LOCK, locked
 from train.settings import decisive_settings
 from train.sweep import FAILURE, cell_name, check_launcher, format_sweep, run_cell
 
@@ -139,7 +140,7 @@ def test_a_second_call_skips_finished_cells_and_shows_them_again(run_sweep, cell
             path: (path.read_bytes(), path.stat().st_mtime_ns)
             for folder in cells
             for path in folder.rglob("*")
-            if path.is_file() and path.name != sweep.LOCK
+            if path.is_file() and path.name != LOCK
         }
 
     before = files()
@@ -222,12 +223,12 @@ def test_a_failed_cell_is_told_with_its_reason_and_tried_again_and_stops_no_othe
 
 
 def test_a_cell_that_another_process_trains_is_left_alone(tiny, tmp_path, capsys):
-    with sweep._lock(tmp_path) as ours:
+    with locked(tmp_path) as ours:
         assert ours
         run_cell(tiny(), tmp_path)
         assert format_sweep([tmp_path]).endswith(f"{tmp_path}: in training")
     assert capsys.readouterr().out == f"in training elsewhere: {tmp_path}\n"
-    assert [path.name for path in tmp_path.iterdir()] == [sweep.LOCK]
+    assert [path.name for path in tmp_path.iterdir()] == [LOCK]
 
 
 # ---------------------------------------------------------------------------------------- what is refused
@@ -269,6 +270,29 @@ def test_circumstances_may_change(run_sweep, cell, swept, tmp_path, key, value):
     config = (folder / "config.yaml").read_bytes()
     assert run_sweep(tmp_path / "edited", "seed=0,1") == 0
     assert (folder / "config.yaml").read_bytes() == config
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.jsonl"])
+def test_a_finished_cell_whose_files_are_damaged_ends_the_sweep_with_one_sentence(
+    run_sweep, cell, swept, tmp_path, capsys, name
+):
+    shutil.copytree(swept, tmp_path / "damaged")
+    file = cell(tmp_path / "damaged", "seed=0") / name
+    file.write_bytes(b"\xff{" + file.read_bytes())
+    assert run_sweep(tmp_path / "damaged", "seed=0,1") == USER_ERROR
+    printed = capsys.readouterr()
+    assert printed.out == "" and len(printed.err.splitlines()) == 1
+    assert printed.err.startswith(f"error: {file} is damaged or no file that `python -m train` wrote")
+
+
+@pytest.mark.parametrize("callback", ["_compose_cells", "format_sweep"])
+def test_whatever_fails_in_a_sweeps_checks_or_table_is_no_success(run_sweep, swept, monkeypatch, capsys, callback):
+    def broken(*arguments):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(sweep, callback, broken)
+    assert run_sweep(swept, "seed=0,1") == 1
+    assert "ZeroDivisionError" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

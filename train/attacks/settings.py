@@ -1,12 +1,13 @@
 """conf/attack.yaml as dataclasses: the types, ranges and keys that an attack accepts."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
 from augment.attacks.settings import AttackSettings
-from renderer.errors import InputError
-from train.settings import RendererSettings
+from renderer.errors import FACTOR, InputError, require_range
+from train.settings import LARGEST_SEED, MOST_VIEWS, RendererSettings
+
+MOST_VERTICES = 10**7  # some 5 GB
 
 
 @dataclass
@@ -34,10 +35,9 @@ class AttackSceneSettings:
     def __post_init__(self):
         if not self.meshes or not self.backgrounds:
             raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
-        if self.views < 1:
-            raise InputError(f"scene.views={self.views} must be at least 1")
-        if not 0 < self.exposure < math.inf:
-            raise InputError(f"scene.exposure={self.exposure} must be positive")
+        require_range("scene.views", self.views, 1, MOST_VIEWS)
+        require_range("scene.vertices", self.vertices, 0, MOST_VERTICES)
+        require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
 
 
 @dataclass
@@ -56,5 +56,4 @@ class AttackExperimentSettings:
     renderer: RendererSettings = field(default_factory=RendererSettings)
 
     def __post_init__(self):
-        if self.seed < 0:
-            raise InputError(f"seed={self.seed} must not be negative")
+        require_range("seed", self.seed, 0, LARGEST_SEED)

@@ -1,15 +1,22 @@
 """Real photographs: find them in a folder, reduce them to the classifier's size, and score its answers."""
 
-from train.photographs.folder import Photograph, find_photographs, load_photographs
-from train.photographs.scoring import evaluate_photographs
+from train.photographs.figures import FIGURES, figure_title, find_figure
+from train.photographs.folder import Photograph, find_photographs, left_out, load_photographs
+from train.photographs.scoring import SUMMARY, evaluate_photographs
 from train.photographs.shares import share
-from train.photographs.text import format_summary
+from train.photographs.text import format_interval, format_summary
 
 __all__ = [
+    "FIGURES",
+    "SUMMARY",
     "Photograph",
     "evaluate_photographs",
+    "figure_title",
+    "find_figure",
     "find_photographs",
+    "format_interval",
     "format_summary",
+    "left_out",
     "load_photographs",
     "share",
 ]

@@ -17,7 +17,8 @@ class Answer:
     """What the model says of one photograph.
 
     Ranks count from 1, the model's prediction. The figures of the true class are None for a class that
-    the model lacks. `asked` is the class that the evaluation is about.
+    the model lacks. `asked` is the class that the evaluation is about; its log-odds against all others are the score
+    by which photographs are ranked.
     """
 
     photograph: Photograph
@@ -27,6 +28,7 @@ class Answer:
     true_rank: int | None
     asked_probability: float
     asked_rank: int
+    asked_log_odds: float | None
 
 
 def ask(
@@ -64,6 +66,7 @@ def rank_classes(
     ranks = (order.argsort(dim=1) + 1).numpy()
     index = {name: column for column, name in enumerate(classes)}
     asked = index[label]
+    log_odds = _log_odds(logits.double(), asked)
     answers = []
     for row, photograph in enumerate(photographs):
         true, best = index.get(photograph.label), int(order[row, 0])
@@ -76,6 +79,13 @@ def rank_classes(
                 true_rank=None if true is None else int(ranks[row, true]),
                 asked_probability=float(probabilities[row, asked]),
                 asked_rank=int(ranks[row, asked]),
+                asked_log_odds=float(log_odds[row]),
             )
         )
     return answers
+
+
+def _log_odds(logits: torch.Tensor, asked: int) -> torch.Tensor:
+    """log p / (1 - p) of a class, (N,), from logits (N, C): finite also where p rounds to 0 or 1."""
+    others = torch.cat([logits[:, :asked], logits[:, asked + 1 :]], dim=1)
+    return logits[:, asked] - others.logsumexp(dim=1)

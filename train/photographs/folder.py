@@ -1,10 +1,12 @@
 """Find the pictures of a folder, tell their classes, and reduce them to the classifier's size."""
 
 import csv
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -13,18 +15,24 @@ from renderer.errors import InputError
 from renderer.image_files import read_square
 from train.classes import class_index, nearest_class
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
+SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 FOREIGN = "other_"  # starts the name of a folder whose class the model lacks
 TABLE = "photos.csv"
+SEPARATOR = ";"  # between the sources in a cell of its look_alikes
+SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training) to skip them"
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture: its path relative to the folder, its class (or `other_*`) and, where known, its source."""
+    """A picture: its path relative to the folder, its class (or `other_*`) and, where known, its source.
+
+    look_alikes: the sources of the other things that it is ranked against, besides its own.
+    """
 
     path: PurePosixPath
     label: str
     source: str | None
+    look_alikes: tuple[str, ...] = ()
 
 
 def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[Photograph]:
@@ -32,32 +40,65 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
 
     The folder either holds one sub-folder per class, named exactly as in `classes` (or `other_NAME` for a
     class the model lacks), or holds pictures only, which are then all of class `label`. Sub-folders are
-    searched to any depth; hidden files are passed over. `photos.csv` in the folder, if there, gives sources
-    by its columns `path` and `source_tag`.
+    searched to any depth, also where they are symbolic links; hidden files are passed over, and so are other kinds of
+    file, which `left_out` tells. `photos.csv` in the folder, if there, gives sources by its columns `path` and
+    `source_tag`, and by `look_alikes`, if it has that, the other sources, separated by `;`, whose pictures of other
+    things a picture is ranked against.
 
-    Raises InputError for a folder that is missing, empty or mixes both layouts, for a sub-folder or `label`
-    that is no class, and for a `photos.csv` without those columns.
+    Raises InputError for a folder that is missing, unreadable, empty or mixes both layouts, for a sub-folder or `label`
+    that is no class, for a `photos.csv` without those columns or that names none of the pictures, and for look-alikes
+    of a source that is nowhere.
     """
     class_index(classes, label, "label")
     paths = _picture_paths(folder)
     has_class_folders = _check_layout(folder, paths, classes)
-    sources = _read_sources(folder / TABLE)
-    return [Photograph(path, path.parts[0] if has_class_folders else label, sources.get(path)) for path in paths]
+    rows = _read_table(folder / TABLE)
+    if rows and rows.keys().isdisjoint(paths):
+        raise InputError(f"{folder / TABLE} names none of the photographs: give paths such as {paths[0]}")
+    photographs = [
+        Photograph(path, path.parts[0] if has_class_folders else label, *rows.get(path, (None, ()))) for path in paths
+    ]
+    _check_look_alikes(folder / TABLE, photographs)
+    return photographs
+
+
+def left_out(folder: Path) -> list[PurePosixPath]:
+    """The files of a folder, as `find_photographs` searches it, that are of no kind that is read; sorted."""
+    return sorted(path for path in _files(folder) if not _is_picture(folder, path) and str(path) != TABLE)
 
 
 def _picture_paths(folder: Path) -> list[PurePosixPath]:
     if not folder.is_dir():
         fault = "is not a folder" if folder.exists() else "does not exist"
         raise InputError(f"{folder} {fault}: name a folder of photographs")
-    below = ((file, PurePosixPath(file.relative_to(folder).as_posix())) for file in folder.rglob("*"))
-    paths = [path for file, path in below if _is_picture(path) and file.is_file()]
+    files = list(_files(folder))
+    paths = sorted(path for path in files if _is_picture(folder, path))
     if not paths:
-        raise InputError(f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})")
-    return sorted(paths)
+        others = f" among its {len(files)} files" if files else ""
+        raise InputError(f"{folder} holds no photographs{others}: put some there ({', '.join(SUFFIXES)})")
+    return paths
 
 
-def _is_picture(path: PurePosixPath) -> bool:
-    return path.suffix.lower() in SUFFIXES and not any(map(_is_hidden, path.parts))
+def _files(folder: Path) -> Iterator[PurePosixPath]:
+    """What is not hidden, by its path in the folder; links are followed, but for those to a folder they lie in."""
+
+    def refuse(error: OSError) -> NoReturn:
+        raise InputError(f"{error.filename} cannot be read: {error.strerror}") from error
+
+    for root, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
+        inside = os.path.realpath(root)
+        folders[:] = [
+            name
+            for name in folders
+            if not _is_hidden(name) and not Path(inside).is_relative_to(os.path.realpath(os.path.join(root, name)))
+        ]
+        at = PurePosixPath(Path(root).relative_to(folder).as_posix())
+        yield from (at / name for name in files if not _is_hidden(name))
+
+
+def _is_picture(folder: Path, path: PurePosixPath) -> bool:
+    """Also of a link to nothing, which is a picture that cannot be read; but not of a pipe, whose end never comes."""
+    return path.suffix.lower() in SUFFIXES and ((folder / path).is_file() or not (folder / path).exists())
 
 
 def _is_hidden(name: str) -> bool:
@@ -79,20 +120,47 @@ def _check_layout(folder: Path, paths: Sequence[PurePosixPath], classes: Sequenc
     return bool(names)
 
 
-def _read_sources(table: Path) -> dict[PurePosixPath, str]:
+def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str, ...]]]:
+    """Source and look-alikes by path; nothing without a table."""
     if not table.is_file():
         return {}
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
-            header, *rows = csv.reader(file)
+            header, *lines = csv.reader(file)
         path, tag = header.index("path"), header.index("source_tag")
-    except (ValueError, csv.Error) as error:  # no header, a column missing, not UTF-8, or not a table
+    except (ValueError, csv.Error, OSError) as error:  # no header, a column missing, not UTF-8, or not a table
         raise InputError(f"{table} cannot be used: make it UTF-8 with the columns path and source_tag") from error
-    return {PurePosixPath(row[path]): row[tag] for row in rows if len(row) > max(path, tag) and row[tag]}
+    rows = [dict(zip(header, line, strict=False)) for line in lines if len(line) > max(path, tag)]
+    return {
+        PurePosixPath(row["path"].replace("\\", "/")): (
+            row["source_tag"] or None,
+            split_sources(row.get("look_alikes", "")),
+        )
+        for row in rows
+    }
+
+
+def split_sources(text: str) -> tuple[str, ...]:
+    """The sources that a cell of `look_alikes` names."""
+    return tuple(name.strip() for name in text.split(SEPARATOR) if name.strip())
+
+
+def _check_look_alikes(table: Path, photographs: Sequence[Photograph]) -> None:
+    sources = {photograph.source for photograph in photographs} - {None}
+    for photograph in photographs:
+        if unknown := set(photograph.look_alikes) - sources:
+            raise InputError(
+                f"{table} pairs {photograph.path} with look_alikes of source {min(unknown)!r}, of which there is no "
+                f"picture: name one of {', '.join(sorted(sources))}"
+            )
 
 
 def load_photographs(
-    folder: Path, photographs: Sequence[Photograph], size: int = 32, skip_unreadable: bool = False
+    folder: Path,
+    photographs: Sequence[Photograph],
+    size: int = 32,
+    skip_unreadable: bool = False,
+    advice: str = SKIP,
 ) -> tuple[list[Photograph], torch.Tensor, list[str]]:
     """Read photographs as the classifier sees them.
 
@@ -103,6 +171,7 @@ def load_photographs(
     of what fits the most is kept, which counts at 32 pixels.
 
     Raises InputError at broken or oversized pictures unless `skip_unreadable`, and if no picture can be read.
+    advice: how they could be skipped, in the words of whoever calls.
     """
     with ThreadPoolExecutor() as pool:  # Pillow releases the interpreter while it decodes and resizes
         read = pool.map(lambda photograph: _try_read(folder / photograph.path, size), photographs)
@@ -111,12 +180,9 @@ def load_photographs(
     kept = [photograph for photograph in photographs if photograph not in errors]
     if errors and not (kept and skip_unreadable):
         first, reason = next(iter(errors.items()))
-        advice = (
-            ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training) to skip them" if kept else ""
-        )
         raise InputError(
             f"{len(errors)} of {len(photographs)} photographs cannot be read, the first being "
-            f"{folder / first.path} ({reason}): replace them{advice}"
+            f"{folder / first.path} ({reason}): replace them{advice if kept else ''}"
         )
     pixels = torch.from_numpy(np.stack([results[photograph] for photograph in kept]))
     return kept, pixels.permute(0, 3, 1, 2).contiguous(), [str(photograph.path) for photograph in errors]

@@ -1,20 +1,21 @@
 """Score a model on a folder of photographs: recall and false alarms of one class, and the files that tell of them."""
 
-import csv
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 
 from renderer.errors import InputError
 from train.photographs.answers import Answer, ask, rank_classes
+from train.photographs.answers_table import ANSWERS, write_answers
 from train.photographs.contact_sheet import choose_sections, draw_contact_sheet
-from train.photographs.folder import find_photographs, load_photographs
-from train.photographs.shares import share
+from train.photographs.figures import OVERALL, Pool, figures, pool_answers, share_true
+from train.photographs.folder import find_photographs, left_out, load_photographs
+from train.photographs.roc import draw_roc, rank_pools, write_roc_csv
 
+SUMMARY = "summary.json"
 WRONG_ANSWERS = 5  # how many of the most common wrong answers are named
 
 
@@ -36,14 +37,17 @@ def evaluate_photographs(
     `find_photographs`.
 
     Written into `out`: photographs.csv, a row per photograph (probability and rank of the true class are
-    empty for `other_*`); contact_sheet.png, hits, misses and false alarms; and summary.json, which is also
-    returned:
+    empty for `other_*`); contact_sheet.png, hits, misses and false alarms; roc.csv and roc.png, the ROC curves
+    overall and of each source that has both kinds; and summary.json, which is also returned:
 
-    - n: photographs, label, others, unreadable; label; unreadable: their paths;
+    - n: photographs, label, others, unreadable, left_out; label; size; unreadable, left_out: their paths (see
+      `left_out`);
     - recall, top5: of the photographs of class `label`, with their most_common_wrong answers;
     - false_alarms: the share of all others that are called `label`;
+    - auc, recall_at: how well the log-odds of `label` tell its photographs from all others, as `rank` returns them;
     - by_class: n, recall, top5, called_label (the share called `label`) and most_common_wrong;
-    - by_source: n, recall, top5 and false_alarms, over the photographs whose source is known.
+    - by_source: n, recall, top5, false_alarms, auc and recall_at, over the photographs whose source is known; they are
+      ranked among the others of their source and of the sources that they name as look-alikes.
 
     Shares come with their 95 % Wilson intervals, as `share` returns them.
 
@@ -56,48 +60,53 @@ def evaluate_photographs(
     photographs, images, unreadable = load_photographs(folder, found, size, skip_unreadable)
     logits = ask(model, images, len(classes), batch_size, device)
     answers = rank_classes(photographs, logits, classes, label)
-    summary = _summarise(answers, label, unreadable)
+    pools = pool_answers(answers, label)
+    others = [str(path) for path in left_out(folder)]
+    summary = _summarise(answers, pools, label, size, unreadable, others)
 
     out.mkdir(parents=True, exist_ok=True)
-    _write_csv(out / "photographs.csv", answers, label)
+    write_answers(out / ANSWERS, answers, label)
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    (out / SUMMARY).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     draw_contact_sheet(choose_sections(answers, images, label)).save(out / "contact_sheet.png")
+    rankings = rank_pools(pools)
+    write_roc_csv(out / "roc.csv", rankings)
+    draw_roc(rankings, label).savefig(out / "roc.png")
     return summary
 
 
-def _summarise(answers: Sequence[Answer], label: str, unreadable: Sequence[str]) -> dict:
-    by_class, by_source = defaultdict(list), defaultdict(list)
+def _summarise(
+    answers: Sequence[Answer],
+    pools: Mapping[str, Pool],
+    label: str,
+    size: int,
+    unreadable: Sequence[str],
+    others: Sequence[str],
+) -> dict:
+    by_class = defaultdict(list)
     for answer in answers:
         by_class[answer.photograph.label].append(answer)
-        if answer.photograph.source is not None:
-            by_source[answer.photograph.source].append(answer)
-    mine = by_class.get(label, [])
+    whole = pools[OVERALL]
     return {
         "label": label,
+        "size": size,
         "n": {
             "photographs": len(answers),
-            "label": len(mine),
-            "others": len(answers) - len(mine),
+            "label": len(whole.mine),
+            "others": len(whole.others),
             "unreadable": len(unreadable),
+            "left_out": len(others),
         },
-        **_figures(answers, label),
-        "most_common_wrong": _most_common_wrong(mine),
+        **figures(whole, label),
+        "most_common_wrong": _most_common_wrong(whole.mine),
         "by_source": {
-            source: {"n": len(group), **_figures(group, label)} for source, group in sorted(by_source.items())
+            source: {"n": len(pool.mine) + len(pool.others), **figures(pool, label)}
+            for source, pool in pools.items()
+            if source != OVERALL
         },
         "by_class": {name: _class_figures(group, label) for name, group in sorted(by_class.items())},
         "unreadable": list(unreadable),
-    }
-
-
-def _figures(answers: Sequence[Answer], label: str) -> dict:
-    mine = [answer for answer in answers if answer.photograph.label == label]
-    others = [answer for answer in answers if answer.photograph.label != label]
-    return {
-        "recall": _share_true(answer.true_rank == 1 for answer in mine),
-        "top5": _share_true(answer.true_rank <= 5 for answer in mine),
-        "false_alarms": _share_true(answer.prediction == label for answer in others),
+        "left_out": list(others),
     }
 
 
@@ -105,9 +114,9 @@ def _class_figures(answers: Sequence[Answer], label: str) -> dict:
     ranks = [answer.true_rank for answer in answers if answer.true_rank is not None]
     return {
         "n": len(answers),
-        "recall": _share_true(rank == 1 for rank in ranks),
-        "top5": _share_true(rank <= 5 for rank in ranks),
-        "called_label": _share_true(answer.prediction == label for answer in answers),
+        "recall": share_true(rank == 1 for rank in ranks),
+        "top5": share_true(rank <= 5 for rank in ranks),
+        "called_label": share_true(answer.prediction == label for answer in answers),
         "most_common_wrong": _most_common_wrong(answers),
     }
 
@@ -116,18 +125,3 @@ def _most_common_wrong(answers: Sequence[Answer]) -> dict[str, int]:
     counts = Counter(answer.prediction for answer in answers if answer.true_rank != 1)
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     return dict(ordered[:WRONG_ANSWERS])
-
-
-def _share_true(outcomes: Iterable[bool]) -> dict:
-    outcomes = list(outcomes)
-    return share(sum(outcomes), len(outcomes))
-
-
-def _write_csv(path: Path, answers: Sequence[Answer], label: str) -> None:
-    header = ["path", "label", "source", "prediction", "probability", "true_probability", "true_rank"]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*header, f"{label}_probability", f"{label}_rank"])
-        for answer in answers:
-            photograph, *figures = astuple(answer)
-            writer.writerow([*photograph, *figures])

@@ -2,16 +2,26 @@
 
 from collections.abc import Sequence
 
+from train.photographs.figures import RANKED, figure_title, find_figure
+
+COUNTED = ("recall", "top5", "false_alarms")
+NAMED = 10  # how many of the files that were left out
+
 
 def format_summary(summary: dict) -> str:
     """The summary of `evaluate_photographs` as aligned plain text, without a newline at the end."""
     label, n = summary["label"], summary["n"]
-    overall_rows = [
+    pools = {"overall": summary, **summary["by_source"]}
+    share_rows = [
         ("", "recall", "top-5", "false alarms"),
         *(
-            (name, *(_interval(figures[key]) for key in ("recall", "top5", "false_alarms")))
-            for name, figures in [("overall", summary), *summary["by_source"].items()]
+            (name, *(_counted(figures[key]) for key in ("recall", "top5", "false_alarms")))
+            for name, figures in pools.items()
         ),
+    ]
+    ranked_rows = [
+        ("", *(figure_title(name, label) for name in RANKED)),
+        *((name, *(format_interval(find_figure(figures, key)) for key in RANKED)) for name, figures in pools.items()),
     ]
     class_rows = [
         ("class", "n", "recall", "top-5", f"called {label}", "most common wrong answers"),
@@ -27,22 +37,32 @@ def format_summary(summary: dict) -> str:
     ]
     paragraphs = [
         f"{n['label']} pictures of {label}, {n['others']} of other things",
-        _table(overall_rows, "<>>>"),
+        _table(share_rows, "<>>>"),
+        _table(ranked_rows, "<>>>>"),
         _table(class_rows, "<>>>><"),
     ]
     if summary["unreadable"]:
         paragraphs.append(f"{n['unreadable']} unreadable: {', '.join(summary['unreadable'])}")
+    if summary["left_out"]:
+        shown = summary["left_out"][:NAMED]
+        rest = ", ..." if len(summary["left_out"]) > NAMED else ""
+        paragraphs.append(f"{n['left_out']} left out, of kinds that are not read: {', '.join(shown)}{rest}")
     return "\n\n".join(paragraphs)
+
+
+def format_interval(figure: dict) -> str:
+    """A figure's value and interval; "-" where it is unknown or absent."""
+    if figure.get("value") is None:
+        return "-"
+    return f"{figure['value']:.3f} [{figure['low']:.3f}, {figure['high']:.3f}]"
 
 
 def _value(share: dict) -> str:
     return "-" if share["n"] == 0 else f"{share['value']:.3f}"
 
 
-def _interval(share: dict) -> str:
-    if share["n"] == 0:
-        return "-"
-    return f"{share['hits']}/{share['n']} = {share['value']:.3f} [{share['low']:.3f}, {share['high']:.3f}]"
+def _counted(share: dict) -> str:
+    return "-" if share["n"] == 0 else f"{share['hits']}/{share['n']} = {format_interval(share)}"
 
 
 def _table(rows: Sequence[Sequence[str]], alignment: str) -> str:

@@ -1,3 +1,5 @@
+import errno
+import os
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -6,7 +8,7 @@ import torch
 from PIL import Image
 
 from renderer.errors import InputError
-from train.photographs import Photograph, find_photographs, load_photographs
+from train.photographs import Photograph, find_photographs, left_out, load_photographs
 
 CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
 DATA = Path(__file__).parents[4] / "shared" / "data"
@@ -66,6 +68,61 @@ def test_hidden_files_and_other_kinds_of_file_are_passed_over(tmp_path):
     assert [str(photograph.path) for photograph in find_photographs(tmp_path, CLASSES, "orange")] == ["orange/a.jpg"]
 
 
+def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):
+    touch(tmp_path, "elsewhere/deep/a.jpg", "elsewhere/b.jpg", "photos/pear/c.jpg")
+    photos = tmp_path / "photos"
+    (photos / "orange").symlink_to(tmp_path / "elsewhere")
+    (photos / "pear" / "d.jpg").symlink_to(tmp_path / "elsewhere" / "b.jpg")
+    for circle, target in [("pear/all", photos), ("pear/self", photos / "pear"), ("pear/root", tmp_path)]:
+        (photos / circle).symlink_to(target)
+    found = find_photographs(photos, CLASSES, "orange")
+    assert [str(photograph.path) for photograph in found] == [
+        "orange/b.jpg",
+        "orange/deep/a.jpg",
+        "pear/c.jpg",
+        "pear/d.jpg",
+    ]
+
+
+def test_a_folder_that_cannot_be_read_is_refused_by_name(tmp_path, monkeypatch):
+    touch(tmp_path, "orange/a.jpg", "pear/b.jpg")
+    scandir = os.scandir
+
+    def denied(path):
+        if Path(path).name == "pear":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", denied)
+    with pytest.raises(InputError, match=rf"{tmp_path / 'pear'} cannot be read: Permission denied"):
+        find_photographs(tmp_path, CLASSES, "orange")
+
+
+def test_what_is_of_no_kind_that_is_read_is_told(tmp_path):
+    touch(tmp_path, "orange/a.JFIF", "orange/b.HEIC", "orange/c.avif", "orange/.d.heic", "photos.csv", "notes.txt")
+    os.mkfifo(tmp_path / "orange" / "pipe.jpg")  # opened, it would be waited for
+    (tmp_path / "photos.csv").write_text("path,source_tag\n")
+    assert [str(photograph.path) for photograph in find_photographs(tmp_path, CLASSES, "orange")] == ["orange/a.JFIF"]
+    assert [*map(str, left_out(tmp_path))] == ["notes.txt", "orange/b.HEIC", "orange/c.avif", "orange/pipe.jpg"]
+
+
+def test_a_link_to_nothing_is_a_picture_that_cannot_be_read(tmp_path):
+    save(tmp_path / "good.png", plain())
+    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
+    _, _, unreadable = load_photographs(tmp_path, find_photographs(tmp_path, CLASSES, "orange"), skip_unreadable=True)
+    assert unreadable == ["gone.jpg"]
+
+
+@pytest.mark.parametrize("rows", ["photos/orange/a.jpg,web", "a.jpg,web"])
+def test_a_photos_csv_that_names_none_of_the_photographs_is_refused(tmp_path, rows):
+    touch(tmp_path, "orange/a.jpg")
+    (tmp_path / "photos.csv").write_text(f"path,source_tag\n{rows}\n")
+    with pytest.raises(
+        InputError, match=r"photos\.csv names none of the photographs: give paths such as orange/a\.jpg"
+    ):
+        find_photographs(tmp_path, CLASSES, "orange")
+
+
 def test_an_empty_class_folder_is_passed_over(tmp_path):
     touch(tmp_path, "orange/a.jpg")
     (tmp_path / "pear").mkdir()
@@ -74,10 +131,35 @@ def test_an_empty_class_folder_is_passed_over(tmp_path):
 
 def test_sources_come_from_photos_csv_whatever_its_other_columns_and_rows(tmp_path):
     touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "pear/c.jpg")
-    rows = "path,class,source_tag\norange/a.jpg,orange,web\norange/b.jpg,orange,\nfig/gone.jpg,fig,web\n\n"
+    rows = "orange/a.jpg,orange,web\norange/b.jpg,orange,\npear\\c.jpg,pear,shop\nfig/gone.jpg,fig,web\n\n"
+    rows = "path,class,source_tag\n" + rows
     (tmp_path / "photos.csv").write_text("\ufeff" + rows, encoding="utf-8")
     found = find_photographs(tmp_path, CLASSES, "orange")
-    assert [photograph.source for photograph in found] == ["web", None, None]
+    assert [photograph.source for photograph in found] == ["web", None, "shop"]
+
+
+def test_look_alikes_are_the_sources_named_in_photos_csv(tmp_path):
+    touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "other_lemon/c.jpg", "other_lemon/d.jpg", "other_lemon/e.jpg")
+    rows = ["look_alikes,path,source_tag", "lab; web,orange/a.jpg,sun", ",orange/b.jpg,web", ",other_lemon/c.jpg,lab"]
+    (tmp_path / "photos.csv").write_text("\n".join([*rows, ",other_lemon/d.jpg,web", ";,other_lemon/e.jpg,sun"]))
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    assert [photograph.source for photograph in found] == ["sun", "web", "lab", "web", "sun"]
+    assert [photograph.look_alikes for photograph in found] == [("lab", "web"), (), (), (), ()]
+
+
+def test_look_alikes_of_a_source_without_pictures_are_refused_by_name(tmp_path):
+    touch(tmp_path, "orange/a.jpg", "other_lemon/b.jpg")
+    rows = [
+        "path,source_tag,look_alikes",
+        "orange/a.jpg,web,lib",
+        "other_lemon/b.jpg,lab,",
+        "other_lemon/gone.jpg,lib,",
+    ]
+    (tmp_path / "photos.csv").write_text("\n".join(rows))
+    with pytest.raises(
+        InputError, match=r"photos\.csv pairs orange/a\.jpg with .* source 'lib', .* name one of lab, web$"
+    ):
+        find_photographs(tmp_path, CLASSES, "orange")
 
 
 @pytest.mark.parametrize("table", [b"", b"path,source\na.jpg,web\n", b"path,source_tag\n\xff.jpg,web\n"])

@@ -1,16 +1,18 @@
 import csv
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy.special import softmax
+from scipy.special import logsumexp, softmax
 from scipy.stats import binomtest
 
 from renderer.errors import InputError
 from train.photographs import evaluate_photographs, format_summary
+from train.photographs.answers_table import read_answers
 
 
 def share(hits: int, n: int) -> dict:
@@ -20,17 +22,43 @@ def share(hits: int, n: int) -> dict:
 
 NOTHING = {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
 
+
+def ranked(auc: float | None, label: int, others: int) -> dict:
+    """The ranking of the story's photographs, without intervals.
+
+    Their log-odds depend on the rank of orange alone; 1 is the highest. The only thresholds are those of rank 1, which
+    no orange exceeds.
+    """
+    recall = {"value": None, "threshold": None}
+    if auc is not None:
+        recall = {"value": 0, "threshold": -logsumexp([-1, -2, -3, -4, -5])}
+    return {
+        "auc": {"value": auc, "label": label, "others": others},
+        "recall_at": dict.fromkeys(("0.05", "0.10", "0.20"), recall),
+    }
+
+
+# Orange has the ranks 1, 2, 6, 5, 2 on its own photographs a to e and 1, 5, 2, 1, 2 on the others f to j, so that those
+# five beat 3, 1, 0, 0, 1 of the others and tie with 2, 2, 0, 1, 2: an AUC of (5 + 7/2) / 25.
 STORY_SUMMARY = {
     "label": "orange",
-    "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0},
+    "size": 32,
+    "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0, "left_out": 0},
     "recall": share(1, 5),
     "top5": share(4, 5),
     "false_alarms": share(2, 5),
+    **ranked(0.34, 5, 5),
     "most_common_wrong": {"pear": 2, "apple": 1, "plum": 1},
     "by_source": {
-        "lab": {"n": 2, "recall": share(1, 2), "top5": share(2, 2), "false_alarms": NOTHING},
-        "shop": {"n": 2, "recall": NOTHING, "top5": NOTHING, "false_alarms": share(1, 2)},
-        "street": {"n": 4, "recall": share(0, 2), "top5": share(1, 2), "false_alarms": share(1, 2)},
+        "lab": {"n": 2, "recall": share(1, 2), "top5": share(2, 2), "false_alarms": NOTHING, **ranked(None, 2, 0)},
+        "shop": {"n": 2, "recall": NOTHING, "top5": NOTHING, "false_alarms": share(1, 2), **ranked(None, 0, 2)},
+        "street": {
+            "n": 4,
+            "recall": share(0, 2),
+            "top5": share(1, 2),
+            "false_alarms": share(1, 2),
+            **ranked(0.25, 2, 2),
+        },
     },
     "by_class": {
         "orange": {
@@ -56,6 +84,7 @@ STORY_SUMMARY = {
         },
     },
     "unreadable": [],
+    "left_out": [],
 }
 
 
@@ -66,9 +95,18 @@ def rounded(tree):
     return round(tree, 12) if isinstance(tree, float) else tree
 
 
+def take_intervals(figures: dict) -> list[dict]:
+    """Remove the intervals of a ranking; what is removed, with the values."""
+    ranked = [figures["auc"], *figures["recall_at"].values()]
+    return [{"value": figure["value"], "low": figure.pop("low"), "high": figure.pop("high")} for figure in ranked]
+
+
 @pytest.mark.parametrize("batch_size", [1, 3, 256])
 def test_every_figure_of_a_known_model_is_right(story, tmp_path, batch_size):
     summary = evaluate_photographs(*story, "orange", tmp_path / "out", batch_size=batch_size)
+    for figures in (summary, *summary["by_source"].values()):
+        for figure in take_intervals(figures):
+            assert set(figure.values()) == {None} or figure["low"] <= figure["value"] <= figure["high"]
     assert rounded(summary) == rounded(STORY_SUMMARY)
     ordered = summary["by_class"]["orange"]["most_common_wrong"]
     assert list(ordered.items()) == [("pear", 2), ("apple", 1), ("plum", 1)]
@@ -82,6 +120,39 @@ def test_the_summary_written_is_the_summary_returned_in_strict_json(story, tmp_p
         raise AssertionError(f"{constant} is not JSON")
 
     assert json.loads(text, parse_constant=refuse) == summary
+
+
+def test_a_source_is_ranked_against_the_look_alikes_that_it_names(story, tmp_path):
+    """The oranges of the lab, of rank 1 and 2, against the pears of the shop, of rank 2 and 1: one win and two ties."""
+    _, _, folder = story
+    header, *rows = (folder / "photos.csv").read_text().splitlines()
+    paired = [f"{row},{'shop' if row.startswith('orange/a') else ''}" for row in rows]
+    (folder / "photos.csv").write_text("\n".join([f"{header},look_alikes", *paired]))
+    summary = evaluate_photographs(*story, "orange", tmp_path / "out")
+    lab = summary["by_source"]["lab"]
+    assert {key: lab["auc"][key] for key in ("value", "label", "others")} == {"value": 0.5, "label": 2, "others": 2}
+    assert lab["false_alarms"] == NOTHING  # its own
+    assert summary["auc"]["value"] == 0.34 and summary["by_source"]["street"]["auc"]["value"] == 0.25
+    table = {row["path"]: row["look_alikes"] for row in read_csv(tmp_path / "out" / "photographs.csv")}
+    assert {path: names for path, names in table.items() if names} == {"orange/a.png": "shop"}
+
+
+def test_look_alikes_that_cannot_be_read_are_left_out(story, tmp_path):
+    _, _, folder = story
+    (folder / "pear" / "broken.png").touch()
+    rows = ["path,source_tag,look_alikes", "orange/a.png,lab,wreck", "pear/broken.png,wreck,"]
+    (folder / "photos.csv").write_text("\n".join(rows))
+    summary = evaluate_photographs(*story, "orange", tmp_path / "out", skip_unreadable=True)
+    assert summary["by_source"]["lab"]["auc"]["others"] == 0
+
+
+def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(known_model, tmp_path):
+    logits = [[0, 100, 3], [0, -900, 3], [1, 2, 3]]
+    names = [f"{index}.png" for index in range(3)]
+    evaluate_photographs(*known_model(names, logits, ["a", "b", "c"]), "b", tmp_path)
+    told = [float(row["b_log_odds"]) for row in read_csv(tmp_path / "photographs.csv")]
+    expected = [100 - logsumexp([0, 3]), -900 - logsumexp([0, 3]), 2 - logsumexp([1, 3])]
+    assert told == pytest.approx(expected, rel=1e-15)
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -159,7 +230,7 @@ def test_skipped_photographs_are_counted_and_named_but_not_scored(story, tmp_pat
         evaluate_photographs(*story, "orange", tmp_path)
     summary = evaluate_photographs(*story, "orange", tmp_path, skip_unreadable=True)
     assert summary["unreadable"] == ["orange/broken.jpg"]
-    assert summary["n"] == {"photographs": 10, "label": 5, "others": 5, "unreadable": 1}
+    assert summary["n"] == {"photographs": 10, "label": 5, "others": 5, "unreadable": 1, "left_out": 0}
     assert format_summary(summary).endswith("1 unreadable: orange/broken.jpg")
 
 
@@ -218,3 +289,19 @@ def test_scores_are_never_written_among_the_photographs(story, tmp_path, out):
 def test_scores_may_be_written_beside_or_above_the_photographs(story, tmp_path, out):
     evaluate_photographs(*story, "orange", tmp_path / out)
     assert (tmp_path / out / "summary.json").is_file()
+
+
+def test_names_that_a_spreadsheet_would_run_are_text_and_numbers_stay_numbers(known_model, tmp_path):
+    names = ["other_x/=1+1.png", "=HYPERLINK/a.png", "@b/-2.png"]
+    classes = ["=HYPERLINK", "@b", "orange"]
+    logits = [[-9.0, 0.0, 1.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
+    evaluate_photographs(*known_model(names, logits, classes), "orange", tmp_path / "out")
+    with open(tmp_path / "out" / "photographs.csv", newline="", encoding="utf-8") as file:
+        _, *rows = csv.reader(file)
+    assert {row[0] for row in rows} == {"other_x/=1+1.png", "'=HYPERLINK/a.png", "'@b/-2.png"}
+    assert {row[4] for row in rows} == {"orange", "'=HYPERLINK", "'@b"}
+    names, numbers = ([cell for row in rows for cell in row[part]] for part in (slice(5), slice(5, None)))
+    assert all(cell[:1] not in ("=", "+", "-", "@") for cell in names)
+    assert all(math.isfinite(float(cell)) for cell in numbers if cell)
+    answers = read_answers(tmp_path / "out" / "photographs.csv", "orange")
+    assert [answer.photograph.label for answer in answers] == ["=HYPERLINK", "@b", "other_x"]

@@ -13,8 +13,26 @@ lab      1/2 = 0.500 [0.095, 0.905]  2/2 = 1.000 [0.342, 1.000]                 
 shop                              -                           -  1/2 = 0.500 [0.095, 0.905]
 street   0/2 = 0.000 [0.000, 0.658]  1/2 = 0.500 [0.095, 0.905]  1/2 = 0.500 [0.095, 0.905]
 
+                          AUC  recall at 5% false alarms  recall at 10% false alarms  recall at 20% false alarms
+overall  0.340 [0.060, 0.680]       0.000 [0.000, 0.200]        0.000 [0.000, 0.200]        0.000 [0.000, 0.400]
+lab                         -                          -                           -                           -
+shop                        -                          -                           -                           -
+street   0.250 [0.000, 1.000]       0.000 [0.000, 1.000]        0.000 [0.000, 1.000]        0.000 [0.000, 1.000]
+
 class        n  recall  top-5  called orange  most common wrong answers
 orange       5   0.200  0.800          0.200  pear 2, apple 1, plum 1
 other_lemon  2       -      -          0.500  lime 1, orange 1
 pear         3   0.333  0.667          0.333  apple 1, orange 1"""
+    )
+
+
+def test_files_that_were_left_out_are_counted_and_named(story, tmp_path):
+    _, _, folder = story
+    for number in range(12):
+        (folder / "orange" / f"{number:02d}.HEIC").touch()
+    summary = evaluate_photographs(*story, "orange", tmp_path / "out")
+    assert summary["n"]["left_out"] == 12 and summary["left_out"][:2] == ["orange/00.HEIC", "orange/01.HEIC"]
+    last = format_summary(summary).splitlines()[-1]
+    assert last.startswith("12 left out, of kinds that are not read: orange/00.HEIC, ") and last.endswith(
+        "09.HEIC, ..."
     )

@@ -1,0 +1,14 @@
+"""Path-trace photographs of oranges and look-alikes under a projector: python scripts/lab.py out=lab"""
+
+from train.cli import script
+from train.laboratory.folder import write_laboratory
+from train.laboratory.settings import LabSettings
+
+
+def main(settings: LabSettings) -> None:
+    count = write_laboratory(settings)
+    print(f"{settings.out}: {count} photographs under {settings.lights} lights")
+
+
+if __name__ == "__main__":
+    script(main, LabSettings)

@@ -1,1 +1,0 @@
-"""The renderer's largest errors, condition by condition: what scripts/stress_renderer.py measures."""

@@ -1,0 +1,155 @@
+"""What every command shares: typed settings, outputs tried before the work, and terminals of any kind."""
+
+import os
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from train.checkpoint import BEST, save
+from train.cli import USER_ERROR
+from train.wideresnet import WideResNet
+
+ROOT = Path(__file__).parents[2]
+CLASSES = ["fig", "lime", "orange"]
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path) -> Callable[..., int]:
+    """`python scripts/NAME.py` within this process, from another folder: the exit status."""
+
+    def command(name: str, *arguments: str) -> int:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
+        monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+        try:
+            runpy.run_path(str(ROOT / "scripts" / f"{name}.py"), run_name="__main__")
+        except SystemExit as stop:
+            return stop.code
+        return 0
+
+    return command
+
+
+@pytest.fixture
+def here(tmp_path) -> Path:
+    """A folder with a network in 1.10 and photographs in 2024; what else is in it is in the way."""
+    torch.manual_seed(0)
+    architecture = {"classes": CLASSES, "depth": 10, "width": 1, "dropout": 0.0}
+    network = WideResNet(len(CLASSES), 10, 1, 0.0)
+    (tmp_path / "1.10").mkdir()
+    save(tmp_path / "1.10" / BEST, {"model": network.state_dict(), "architecture": architecture})
+    for name in ("2024/orange", "2024/other_\udcff"):
+        (tmp_path / name).mkdir(parents=True)
+        Image.new("RGB", (8, 8), "orange").save(tmp_path / name / "a.png")
+    (tmp_path / "file").touch()
+    return tmp_path
+
+
+EVALUATE = ["evaluate_photos", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
+EXPORT = ["export_light", "light=grace", "height=4"]
+
+
+def test_folders_whose_names_look_like_numbers_or_have_no_utf_8_are_scored(call, here, capsys):
+    assert call(*EVALUATE, "out=1e3") == 0
+    assert "1 pictures of orange, 1 of other things" in capsys.readouterr().out
+    assert {path.name for path in (here / "1e3").iterdir()} == {
+        *("photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png")
+    }
+    assert r"other_\udcff/a.png" in (here / "1e3" / "photographs.csv").read_text(encoding="utf-8")
+
+
+WRONG = [
+    ([*EVALUATE, "size=abc"], "size: Value 'abc' of type 'str' could not be converted to Integer"),
+    ([*EVALUATE, "size=0"], "size=0 must be at least 1 and at most 4096"),
+    ([*EVALUATE, "size=1000000"], "size=1000000 must be at least 1 and at most 4096"),
+    ([*EVALUATE, "skip_unreadable=maybe"], "skip_unreadable: Value 'maybe' is not a valid bool"),
+    ([*EVALUATE, "photos=[a,b]"], "photos: "),
+    ([*EVALUATE, "run={a:b}"], "run: "),
+    (["compare_runs", "runs=[]"], "runs is empty"),
+    (["compare_runs", "runs=runs/a"], "runs: "),
+    (["compare_runs", "runs=null"], "runs: "),
+    (["compare_runs", "runs=[a]", "exclude=web"], "exclude: "),
+    (["compare_runs", "runs=[2024]"], "2024 holds no finished run"),
+    ([*EXPORT, "height=abc", "out=a.hdr"], "height: "),
+    ([*EXPORT, "height=1000000000", "out=a.hdr"], "height=1000000000 must be at least 1 and at most 8192"),
+    (["publish", "run=[a]", "out=out"], "run: "),
+    (["fit_skylight", "zenith_degree=many", "out=a.safetensors"], "zenith_degree: "),
+    (["check_accuracy", "degree=-1", "out=a.md"], "degree=-1 must be at least"),
+    (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
+    (["check_interruptions", "jobs=0", "out=a.md"], "jobs=0 must be at least 1"),
+    (["lab", "size=0", "out=a"], "size=0 must be at least 1"),
+    (["benchmark_training", "steps=-1", "out=a.md"], "steps=-1 must be at least 0"),
+]
+
+
+@pytest.mark.parametrize(("command", "message"), WRONG, ids=[" ".join([c[0], *c[-2:]]) for c, _ in WRONG])
+def test_a_setting_of_another_type_or_beyond_its_range_is_one_line(call, here, capsys, command, message):
+    before = sorted(here.rglob("*"))
+    assert call(*command) == USER_ERROR
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.startswith(f"error: {message}") and printed.err.count("\n") == 1
+    assert sorted(here.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "out"),
+    [(EXPORT, "/proc/none/out"), (EXPORT, "file/out"), (EXPORT, "x" * 300), (EVALUATE, "/dev/full/out"),
+     (["publish", "run=1.10"], "file/out"), (["fit_skylight"], "file/out"), (["check_accuracy"], "file/out"),
+     (["check_interruptions"], "file/out"), (["benchmark_training"], "file/out"), (["benchmark_renderer"], "file/out"),
+     (["reproduce_paper", "section=run_time", "scene.meshes=[a.glb]"], "file/out"), (["lab"], "file/out")],
+)  # fmt: skip
+def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, capsys, command, out, monkeypatch):
+    def work(*arguments, **more):
+        raise AssertionError("the work was begun")
+
+    for name in ("train.photographs.evaluate_photographs", "train.report.publish_run", "renderer.environment.to_map",
+                 "renderer.skylight.fit_polynomials"):  # fmt: skip
+        monkeypatch.setattr(name, work)
+    suffix = ".hdr" if command is EXPORT else ""
+    assert call(*command, f"out={out}{suffix}") == USER_ERROR
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"error: out={out}{suffix} cannot be written") and printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("out", ["/dev/full", "2024"])
+def test_a_file_that_is_none_is_not_written_to(call, here, capsys, out):
+    assert call("fit_skylight", f"out={out}") == USER_ERROR
+    assert (
+        capsys.readouterr().err == f"error: out={out} cannot be written (it is no regular file): choose another file\n"
+    )
+
+
+def test_a_folder_that_is_a_file_is_refused(call, here, capsys):
+    assert call(*EVALUATE, "out=file") == USER_ERROR
+    assert capsys.readouterr().err == "error: out=file cannot be written to (Not a directory): choose another folder\n"
+
+
+# ---------------------------------------------------------------------------------------- processes of their own
+
+
+def process(folder: Path, *command: str, **environment: str) -> list[str]:
+    """A command as the shell runs it, from a folder."""
+    program = [sys.executable, str(ROOT / "scripts" / f"{command[0]}.py"), *command[1:]]
+    settings = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **environment}
+    return ["env", "-C", str(folder), *(f"{name}={value}" for name, value in settings.items()), *program]
+
+
+def test_a_reader_that_has_gone_ends_a_command_in_silence(here):
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(process(here, *EXPORT, "out=a.hdr"), stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "") and (here / "a.hdr").is_file()
+
+
+def test_a_terminal_of_ascii_shows_other_letters_as_escapes(here):
+    ascii_only = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
+    done = subprocess.run(process(here, *EXPORT, "out=a.hdr", **ascii_only), capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert rb"\xd7" in done.stdout and (here / "a.hdr").is_file()  # the × in "8 × 4 texels"

@@ -1,0 +1,92 @@
+"""scripts/reproduce.sh, with a stub in place of Python."""
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from train.settings import ExperimentSettings, read_settings
+
+ROOT = Path(__file__).parents[2]
+
+
+def settings(name: str, *overrides: str) -> OmegaConf:
+    with initialize_config_module("conf", version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+STUB = """#!{python}
+import json, os, pathlib, sys
+with open(os.environ["CALLS"], "a") as file:
+    print(json.dumps(sys.argv[1:]), file=file)
+for argument in sys.argv:
+    if argument.startswith("sweep="):
+        for cell in ("augment-none+seed-0", "augment-none+seed-1"):
+            (pathlib.Path(argument[6:]) / cell).mkdir(parents=True)
+"""
+
+
+def reproduce(tmp_path: Path, *arguments: str, **environment: str) -> tuple[int, list[list[str]], str]:
+    """(exit status, arguments of each call of Python, what was said) of a run that calls a stub."""
+    stub, calls = tmp_path / "python", tmp_path / "calls"
+    stub.write_text(STUB.format(python=sys.executable))
+    stub.chmod(0o755)
+    variables = {
+        "PYTHON": str(stub),
+        "CALLS": str(calls),
+        "DOCS": str(tmp_path),
+        "RUNS": "runs",
+        "PATH": os.environ["PATH"],
+    }
+    done = subprocess.run(
+        [ROOT / "scripts" / "reproduce.sh", *arguments], cwd=tmp_path, env=variables | environment, capture_output=True
+    )
+    lines = calls.read_text().splitlines() if calls.exists() else []
+    return done.returncode, [json.loads(line) for line in lines], done.stderr.decode()
+
+
+GIVEN = {"DATA": "cifar100.npz", "MESHES": "[a.glb,{mesh:b.glb,gain:3.0}]", "PHOTOS": "photos"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment"),
+    [(["gpu"], {}), ([], GIVEN), (["tpu"], GIVEN), (["cpu"], GIVEN | {"PHOTOS": ""})],
+)
+def test_what_is_missing_is_said_before_anything_runs(tmp_path, arguments, environment):
+    status, calls, said = reproduce(tmp_path, *arguments, **environment)
+    assert (status, calls) == (2, []) and said.startswith("usage: ")
+
+
+@pytest.mark.parametrize(("machine", "experiments"), [("cpu", ["cpu"]), ("gpu", ["paper", "fast"])])
+def test_reproducing_measures_then_trains_and_compares_each_experiment(tmp_path, machine, experiments):
+    status, (benchmark, *calls), said = reproduce(tmp_path, machine, "train.checkpoint_every=5", **GIVEN)
+    assert (status, said) == (0, "")
+    assert benchmark[0] == "scripts/benchmark_training.py"
+    config = settings("benchmark_training", *benchmark[1:])
+    assert (config.out, config.data.path) == (f"{tmp_path}/performance.md", "cifar100.npz")
+
+    for experiment, train, compare in zip(experiments, calls[::2], calls[1::2], strict=True):
+        assert train[:4] == ["-m", "train", "--multirun", f"experiment={experiment}"]
+        assert train[4:6] == ["augment=none,random,adversarial", "seed=0,1,2,3,4"]
+        assert train[-2:] == [f"sweep=runs/{experiment}", "train.checkpoint_every=5"]
+        assert compare[0] == "scripts/compare_runs.py"
+        compared = settings("compare_runs", *compare[1:])
+        assert compared.runs == [f"runs/{experiment}/augment-none+seed-{seed}" for seed in (0, 1)]
+        assert compared.exclude == []
+        assert (tmp_path / f"runs_{experiment}.md").read_text().startswith(f"# experiment={experiment}\n")
+
+
+@pytest.mark.parametrize("machine", ["cpu", "gpu"])
+def test_every_arm_that_is_reproduced_is_a_valid_run(tmp_path, machine):
+    _, (_, *calls), _ = reproduce(tmp_path, machine, **GIVEN)
+    for train, arm in itertools.product(calls[::2], ("none", "random", "adversarial")):
+        config = settings("train", train[3], f"augment={arm}", "seed=4", *train[6:])
+        run = read_settings(ExperimentSettings, config)
+        assert (run.augment.arm, run.seed, run.data.path) == (arm, 4, "cifar100.npz")
+        assert run.scene.meshes == ["a.glb", {"mesh": "b.glb", "gain": 3.0}] and run.evaluate.photos == "photos"

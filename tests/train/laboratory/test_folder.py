@@ -1,0 +1,127 @@
+import csv
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from renderer.errors import InputError
+from renderer.shapes import LOOK_ALIKES, SOLIDS
+from train.laboratory.folder import read_subject, write_laboratory
+from train.laboratory.settings import LabSettings
+from train.photographs import find_photographs, load_photographs
+
+pytest.importorskip("mitsuba")
+
+MESHES = ["solid:orange:7", {"mesh": "solid:orange:8", "gain": 0.5}, "solid:lemon:7", "solid:pear:7"]
+
+
+def settings(out: Path, **changes) -> LabSettings:
+    small = {"lights": 4, "patterns": ["stripes", "half"], "size": 8, "samples": 4, "bounces": 2}
+    return LabSettings(**{"out": str(out), "meshes": MESHES, **small, **changes})
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with open(folder / "photos.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("laboratory") / "lab"
+    assert write_laboratory(settings(folder)) == 8
+    return folder
+
+
+def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_its_source(laboratory):
+    found = find_photographs(laboratory, sorted(SOLIDS), "orange")
+    assert Counter((item.label, item.source) for item in found) == {
+        ("orange", "stripes"): 2, ("orange", "half"): 2, ("other_lemon", "stripes"): 1, ("other_lemon", "half"): 1,
+        ("pear", "stripes"): 1, ("pear", "half"): 1,
+    }  # fmt: skip
+    _, images, _ = load_photographs(laboratory, found, 8)
+    assert len(images.unique(dim=0)) == 8
+
+
+def test_each_light_shows_one_object_of_the_label_and_one_other_which_take_turns(laboratory):
+    by_light = {}
+    for row in rows(laboratory):
+        by_light.setdefault(int(row["light"]), []).append((row["mesh"], row["source_tag"], row["brightness"]))
+    pairs = [("solid:orange:7", "solid:lemon:7"), ("solid:orange:8", "solid:pear:7")] * 2
+    for light, (pair, source) in enumerate(zip(pairs, ["stripes"] * 2 + ["half"] * 2, strict=True)):
+        meshes, sources, brightness = zip(*sorted(by_light[light]), strict=True)
+        assert set(meshes) == set(pair) and set(sources) == {source} and len(set(brightness)) == 1
+        assert 0.2 <= float(brightness[0]) <= 2.5
+    assert len(by_light) == 4
+
+
+def test_the_same_settings_write_the_same_bytes_and_another_seed_writes_others(laboratory, tmp_path):
+    for seed, same in [(0, True), (1, False)]:
+        write_laboratory(settings(tmp_path / str(seed), seed=seed))
+        for row in rows(laboratory):
+            first, again = ((folder / row["path"]).read_bytes() for folder in (laboratory, tmp_path / str(seed)))
+            assert (first == again) is same
+    assert (tmp_path / "0" / "photos.csv").read_bytes() == (laboratory / "photos.csv").read_bytes()
+
+
+def test_nothing_but_the_object_tells_the_label_from_a_look_alike(tmp_path):
+    """One and the same mesh under both labels: the photographs under a light are the same, byte for byte."""
+    meshes = ["solid:orange:7", {"mesh": "solid:orange:7", "label": "other_orange"}]
+    write_laboratory(settings(tmp_path, meshes=meshes))
+    for path in (tmp_path / "orange").iterdir():
+        assert path.read_bytes() == (tmp_path / "other_orange" / path.name).read_bytes()
+
+
+def test_the_settings_and_versions_lie_beside_the_photographs(laboratory):
+    described = json.loads((laboratory / "lab.json").read_text())
+    assert described["meshes"] == MESHES and described["lights"] == 4 and described["seed"] == 0
+    assert {"python", "mitsuba", "numpy", "torch"} == described["versions"].keys()
+
+
+def test_exposure_brightens(laboratory, tmp_path):
+    write_laboratory(settings(tmp_path, exposure=4.0))
+    for row in rows(laboratory):
+        plain, exposed = (sum(Image.open(folder / row["path"]).tobytes()) for folder in (laboratory, tmp_path))
+        assert exposed > plain
+
+
+@pytest.mark.parametrize("name", [*SOLIDS, *LOOK_ALIKES])
+def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_else(name):
+    expected = name if name in SOLIDS else f"other_{name}"
+    assert read_subject(f"solid:{name}:1", 0).label == expected
+    assert read_subject({"mesh": f"solid:{name}", "label": "pear"}, 0).label == "pear"
+
+
+REFUSED = [
+    ({"meshes": []}, "meshes: name at least one of label=orange and one of something else"),
+    ({"meshes": ["solid:orange"]}, "meshes: name at least one of label=orange and one of something else"),
+    ({"meshes": ["solid:lemon"]}, "meshes: name at least one of label=orange and one of something else"),
+    ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\]: fruit.glb has no label: give {mesh: fruit.glb, label: "),
+    ({"meshes": [{"mesh": "solid:orange", "gian": 2}]}, r"meshes\[0\].gian: Key 'gian' not in 'ObjectSettings'"),
+    ({"meshes": ["solid:lime"]}, "No solid is called 'lime': use"),
+    ({"meshes": [{"mesh": "fruit.glb", "label": "apple"}]}, "fruit.glb does not exist: give the path of a mesh file"),
+    ({"lights": 5}, "lights=5 must be a positive multiple of the 2 patterns"),
+    ({"lights": 0}, "lights=0 must be a positive multiple"),
+    ({"patterns": []}, "must be a positive multiple of the 0 patterns"),
+    ({"patterns": ["stripe"]}, "patterns: 'stripe' is not known: choose from solid, gradient, stripes"),
+    ({"brightness": [2.0, 1.0]}, r"brightness=\[2.0, 1.0\] must be two positive numbers, the dimmer one first"),
+    ({"brightness": [1.0]}, r"brightness=\[1.0\] must be two positive numbers"),
+    ({"exposure": 0.0}, "exposure=0.0 must be at least 1e-05"),
+    ({"size": 0}, "size=0 must be at least 1"),
+    ({"seed": -1}, "seed=-1 must be at least 0"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), REFUSED, ids=lambda value: str(value)[:40])
+def test_what_cannot_be_photographed_is_refused_in_a_sentence_before_anything_is_written(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message):
+        write_laboratory(settings(tmp_path / "lab", **changes))
+    assert not (tmp_path / "lab").exists()
+
+
+def test_a_folder_that_holds_something_is_left_alone(laboratory):
+    before = {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}
+    with pytest.raises(InputError, match=r"out=.*lab is not an empty folder: name another, or delete it"):
+        write_laboratory(settings(laboratory))
+    assert before == {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}

@@ -1,0 +1,58 @@
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from train.laboratory.patterns import FAMILIES
+from train.laboratory.shots import FIELD_OF_VIEW, draw_shots
+
+FAMILY_NAMES = list(FAMILIES)
+
+
+@pytest.fixture(scope="module")
+def shots():
+    return list(draw_shots(120, FAMILY_NAMES, (0.2, 2.5), seed=3))
+
+
+def test_every_family_has_as_many_lights_evenly_from_dim_to_bright(shots):
+    assert [shot.family for shot in shots] == [name for name in FAMILY_NAMES for _ in range(20)]
+    for start in range(0, 120, 20):
+        brightness = np.array([shot.brightness for shot in shots[start : start + 20]])
+        edges = np.geomspace(0.2, 2.5, 21)
+        assert (edges[:-1] <= brightness).all() and (brightness <= edges[1:]).all()
+
+
+def test_shots_follow_from_the_seed_and_differ_from_each_other(shots):
+    again, other = (list(draw_shots(120, FAMILY_NAMES, (0.2, 2.5), seed)) for seed in (3, 4))
+    for shot, same in zip(shots, again, strict=True):
+        for name, value in asdict(shot).items():
+            np.testing.assert_array_equal(value, asdict(same)[name], name)
+    assert len({tuple(shot.camera) for shot in shots + other}) == 240
+
+
+def test_the_camera_looks_down_at_an_object_that_fits_its_view(shots):
+    for shot in shots:
+        back = shot.camera - shot.aim
+        assert 18 <= np.degrees(np.arcsin(back[2] / np.linalg.norm(back))) <= 60
+        assert 1.2 <= np.linalg.norm(back) * np.tan(np.radians(FIELD_OF_VIEW / 2)) <= 1.9
+        assert np.abs(shot.aim - shot.centre).max() <= 0.25
+
+
+def test_the_projector_stands_above_on_the_cameras_side(shots):
+    for shot in shots:
+        towards, back = shot.projector - shot.centre, shot.camera - shot.aim
+        assert towards[2] > 0
+        across = towards[:2] @ back[:2] / np.linalg.norm(towards[:2]) / np.linalg.norm(back[:2])
+        assert across >= np.cos(np.radians(70)) - 1e-9
+
+
+def test_an_object_is_turned_without_mirroring_and_tilted_by_at_most_60_degrees(shots):
+    for shot in shots:
+        np.testing.assert_allclose(shot.turn @ shot.turn.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(shot.turn) == pytest.approx(1)
+        assert shot.turn[2, 2] >= 0.5 - 1e-9
+
+
+def test_light_from_around_and_the_table_are_dark_and_tinted(shots):
+    assert max(shot.ambient.max() for shot in shots) <= 0.06 and max(shot.table.max() for shot in shots) <= 0.16
+    assert len({tuple(np.round(shot.ambient / shot.ambient.max(), 3)) for shot in shots}) == 120

@@ -1,0 +1,123 @@
+"""Photographs against closed forms, with the light that comes from the table and the surroundings without bounces."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from renderer.errors import InputError
+from renderer.mesh import Mesh
+from renderer.shapes import solid
+from train.laboratory.props import corner_normals, split_parts
+from train.laboratory.shots import FIELD_OF_VIEW, Shot, draw_shots
+from train.laboratory.studio import ROUGHNESS, photograph
+
+pytest.importorskip("mitsuba")
+
+
+def frontal(**changes) -> Shot:
+    """A camera and a projector in front of an upright object, in white light on a black table."""
+    [shot] = draw_shots(1, ["solid"], (1, 1), seed=0)
+    centre, front = np.array([0, 0, 1.0]), np.array([0, -6.0, 1.0])
+    plain = {
+        "pattern": np.ones((4, 4, 3), np.float32), "ambient": np.zeros(3), "table": np.zeros(3), "projector": front,
+        "camera": front, "centre": centre, "aim": centre, "turn": np.eye(3), "scale": 1.0,
+    }  # fmt: skip
+    return replace(shot, **plain | changes)
+
+
+def card(texture: np.ndarray) -> Mesh:
+    """A square that faces -y, with the texture upright on it."""
+    square = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], dtype=float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    uvs = (square[:, [0, 2]] + 1) / 2
+    return replace(
+        Mesh.plain(square, faces),
+        corner_uvs=uvs[faces].astype(np.float32),
+        texture_ids=np.zeros(2, dtype=np.int32),
+        textures=(texture,),
+    )
+
+
+def directions(shot: Shot, size: int) -> np.ndarray:
+    """(size, size, 3) from the camera through the pixels' middles."""
+    ahead = (shot.aim - shot.camera) / np.linalg.norm(shot.aim - shot.camera)
+    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
+    reach = np.tan(np.radians(FIELD_OF_VIEW / 2)) * ((np.arange(size) + 0.5) / size * 2 - 1)
+    return ahead + reach[None, :, None] * right - reach[:, None, None] * np.cross(right, ahead)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
+    """Beyond an object too small to see. A projector lights the planes that face it evenly: by 1 / z² at depth z."""
+    [shot] = draw_shots(1, ["solid"], (1.5, 1.5), seed)
+    shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
+    picture = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 8, 4096, bounces=1, seed=0)
+
+    rays = directions(shot, 8)
+    places = shot.camera - rays * (shot.camera[2] / rays[..., 2:])
+    axis, ray = shot.centre - shot.projector, places - shot.projector
+    depth = ray @ axis / np.linalg.norm(axis)
+    evenly = axis @ axis / depth**2 * (-ray[..., 2] / depth)
+    lit = evenly[..., None] * shot.brightness * shot.pattern[0, 0] + shot.ambient
+    inside = np.linalg.norm(places, axis=-1) < 1.5  # of what the projector reaches
+    assert inside.mean() > 0.3
+    np.testing.assert_allclose(picture[inside], (shot.table * lit)[inside], rtol=0.03)
+
+
+def test_a_texture_lies_upright_on_its_faces():
+    red, green, blue, white = [220, 0, 0], [0, 220, 0], [0, 0, 220], [220, 220, 220]
+    texture = np.array([[red, green], [blue, white]], dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
+    picture = photograph(split_parts(card(texture), 1.0, "card"), frontal(), 16, 16, bounces=1, seed=0)
+    strong = picture > picture.max() / 2
+    for row, column, expected in [(5, 5, red), (5, 10, green), (10, 5, blue), (10, 10, white)]:
+        np.testing.assert_array_equal(strong[row, column], np.array(expected) > 0)
+
+
+def test_a_card_reflects_its_linear_albedo_times_the_gain_and_the_brightness():
+    """Facing projector and camera, with its gloss: 4 % of the light times the GGX peak, 1 / (4 α²)."""
+    grey = np.full((4, 4, 3), 128, dtype=np.uint8)  # linear 0.216
+    gloss = 0.04 / (4 * ROUGHNESS**4)  # α is the roughness's square
+    for gain, brightness in [(1, 1), (2, 1), (1, 0.5)]:
+        shot = frontal(brightness=brightness)
+        picture = photograph(split_parts(card(grey), gain, "card"), shot, 8, 16, bounces=1, seed=0)
+        assert picture[3:5, 3:5].mean() == pytest.approx((0.216 * gain + gloss) * brightness, rel=0.05)
+
+
+def test_an_object_stands_on_the_table():
+    """A cube's front, lit by its surroundings, reaches from the table up to its height."""
+    cube = trimesh.creation.box((2, 2, 2))
+    shot = frontal(ambient=np.ones(3), brightness=1e-9)
+    picture = photograph(split_parts(Mesh.plain(cube.vertices, cube.faces), 1, "cube"), shot, 32, 64, bounces=1, seed=0)
+    ray = directions(shot, 32)[:, 15]
+    height = shot.camera[2] + ray[:, 2] * (5 / ray[:, 1])  # where it meets the plane of the front, y = -1
+    clear = (height < 2) & (np.abs(height) > 0.04)  # not the row that the lower edge runs through
+    np.testing.assert_array_equal((picture[:, 15] > 0.1).all(axis=1)[clear], (height > 0)[clear])
+
+
+@pytest.mark.parametrize("divisions", [0, 1, 3])
+def test_right_angles_stay_sharp_and_round_surfaces_are_smooth(divisions):
+    cube, ball = trimesh.creation.box((2, 2, 2)), trimesh.creation.icosphere(subdivisions=3)
+    vertices, faces = cube.vertices, cube.faces
+    for _ in range(divisions):
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+    mesh = Mesh.plain(vertices, faces)
+    np.testing.assert_array_equal(corner_normals(mesh), mesh.face_normals()[:, None].repeat(3, axis=1))
+    mesh = Mesh.plain(ball.vertices, ball.faces)
+    np.testing.assert_allclose(corner_normals(mesh), mesh.vertices[mesh.faces], atol=0.02)
+
+
+def test_parts_are_the_faces_of_each_texture_and_of_none():
+    red, blue = (np.full((1, 1, 3), color, dtype=np.uint8) for color in ([255, 0, 0], [0, 0, 255]))
+    mesh = replace(card(red), texture_ids=np.array([-1, 1], dtype=np.int32), textures=(red, blue))
+    bare, textured = split_parts(mesh, 1.0, "card")
+    assert not bare.textured and len(bare.positions) == 1 and (bare.albedo == 1).all()
+    assert textured.textured and textured.albedo.tolist() == [[[0, 0, 1]]]
+
+
+def test_a_texture_and_colours_of_vertices_at_once_are_refused():
+    mesh = card(np.zeros((1, 1, 3), dtype=np.uint8))
+    mesh = replace(mesh, corner_colors=np.linspace(0, 1, 18, dtype=np.float32).reshape(2, 3, 3))
+    with pytest.raises(InputError, match=r"card.glb has a texture and colours of its vertices, too: paint them into"):
+        split_parts(mesh, 1.0, "card.glb")

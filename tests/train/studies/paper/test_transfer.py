@@ -1,0 +1,222 @@
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+import trimesh
+
+from augment.classifiers import Classifier
+from augment.descent import DescentSettings
+from augment.parameters import Lighting, StepSettings
+from augment.seeding import generator
+from renderer.camera import OrthographicCamera, ring
+from renderer.errors import InputError
+from renderer.mesh import Mesh
+from renderer.mesh_export import export_mesh
+from train.studies.paper import adversaries, subjects, transfer, unseen_views
+from train.studies.paper.adversaries import ATTACKS, FURTHER, recognised_parts, with_random_signs
+from train.studies.paper.shares import percent
+from train.studies.paper.subjects import Subject, scene_of
+
+SIZE = 12
+BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+SUBJECT = Subject("ball", Mesh.plain(BALL.vertices, BALL.faces, (0.5, 0.4, 0.3)), "orange")
+
+
+def by_brightness(grey: float = 0.2, name: str = "source") -> Classifier:
+    """Calls what is brighter than a grey in the middle an orange."""
+    middle = slice(SIZE // 3, SIZE - SIZE // 3)
+
+    def logits(images):
+        bright = 20 * (images[:, :, middle, middle].mean((1, 2, 3)) - grey)
+        return torch.stack([bright, -bright], dim=1)
+
+    return Classifier(logits, SIZE, ("orange", "coal"), name)
+
+
+def always(answer: str) -> Classifier:
+    """Blind to images."""
+    sign = 1 if answer == "orange" else -1
+    return Classifier(
+        lambda images: images.mean((1, 2, 3))[:, None] * 0 + sign * torch.tensor([1.0, -1.0]),
+        SIZE,
+        ("orange", "coal"),
+        f"always {answer}",
+    )
+
+
+def a_scene(count: int, classifier: Classifier):
+    return scene_of(SUBJECT, classifier, "grace", [[camera] for camera in ring(count, 2.0)], torch.full((count,), 0.5))
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Shapes, which are rasterised at each step, are attacked for a step, and everything for one more."""
+    geometry = replace(ATTACKS["geometry"], descent=DescentSettings(1, shorten=True))
+    monkeypatch.setitem(ATTACKS, "geometry", geometry)
+    monkeypatch.setattr(adversaries, "FURTHER", 1)
+
+
+class Line:
+    """Images of a value's grey."""
+
+    start = torch.tensor([[0.42], [0.92]])
+
+    def render(self, values, examples):
+        return values.view(-1, 1, 1, 1, 1).expand(-1, 1, 3, SIZE, SIZE)
+
+    def step(self, gradient):
+        return 0.05 * gradient.sign()
+
+    def project(self, values, examples):
+        return values
+
+
+# ---------------------------------------------------------------------------------------- attacks
+
+
+def test_the_descent_stops_where_it_fools_and_then_goes_on_for_as_many_steps_as_were_asked():
+    """From 0.42 in steps of 0.05 it is 5 steps to below 0.2, and from 0.92 it is 15."""
+    attack = adversaries.Attack(Lighting, StepSettings(), DescentSettings(30))
+    first, further = attack.adversaries(Line(), by_brightness(), "orange", views=1)
+    # Sums of at most 25 float32 steps of size 0.05, each rounded to 2⁻²⁵.
+    torch.testing.assert_close(first, torch.tensor([[0.17], [0.17]]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(further, first - 0.05 * FURTHER, rtol=0, atol=1e-6)
+
+
+def test_random_signs_go_as_far_in_every_entry_and_to_either_side():
+    draws = generator(0, "test")
+    start = torch.randn(4, 500, generator=draws, dtype=torch.float64)
+    values = start + torch.randn(4, 500, generator=draws, dtype=torch.float64)
+    values[:, :100] = start[:, :100]
+    drawn = with_random_signs(values, start, draws)
+    torch.testing.assert_close((drawn - start).abs(), (values - start).abs(), rtol=0, atol=1e-14)  # two roundings
+    assert torch.equal(drawn[:, :100], start[:, :100])
+    agreeing = ((drawn - start) * (values - start) > 0).double().mean()
+    assert 0.35 < agreeing < 0.45  # half of 400 of 500 entries, ten standard deviations of 1600 draws
+
+
+def test_examples_are_drawn_until_as_many_are_recognised_as_were_asked(monkeypatch):
+    monkeypatch.setattr(adversaries, "PART", 2)
+    parts = list(recognised_parts(SUBJECT, by_brightness(), "grace", 5, generator(0, "test")))
+    assert sum(len(kept) for _, kept in parts) == 5
+    monkeypatch.setattr(adversaries, "LEAST_SHARE", 0.5)
+    with pytest.raises(InputError, match="always coal recognises only 0"):
+        list(recognised_parts(SUBJECT, always("coal"), "grace", 1, generator(0, "test")))
+
+
+# ---------------------------------------------------------------------------------------- transfer
+
+
+def test_all_transfers_to_an_equal_network_and_nothing_to_a_blind_one(short):
+    source, twin, blind = by_brightness(), by_brightness(name="twin"), always("orange")
+    parts = transfer.transfer(SUBJECT, (source, twin, blind), 3, "grace", generator(0, "test"))
+    records = [record for some, _ in parts for record in some]
+    lighting = [record for record in records if record["kind"] == "lighting"]
+    assert len(lighting) == 3 and len(records) == 6
+    for state in ("first", "further"):
+        assert transfer.outcomes(lighting, "twin", state, "source", "orange") == [True] * 3
+        assert transfer.outcomes(lighting, blind.name, state, "source", "orange") == [False] * 3
+
+
+def test_only_what_fools_the_source_and_was_recognised_counts():
+    def record(source: str, before: str, first: str, random: str) -> dict:
+        return {
+            "answers": {
+                "source": {"before": "orange", "first": source},
+                "target": {"before": before, "first": first, "first_random": random},
+            }
+        }
+
+    records = [
+        record("coal", "orange", "coal", "orange"),
+        record("coal", "orange", "orange", "coal"),
+        record("coal", "coal", "coal", "coal"),
+        record("orange", "orange", "coal", "coal"),
+    ]
+    assert transfer.outcomes(records, "target", "first", "source", "orange") == [True, False]
+    assert transfer.outcomes(records, "target", "first_random", "source", "orange") == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("found", "text"),
+    [([], "none of 0"), ([True] * 81 + [False] * 182, "31 % [26, 37] of 263")],
+    ids=["none", "Newcombe"],
+)
+def test_a_cell_has_the_share_with_its_wilson_interval(found, text):
+    """81 of 263: 0.2553 to 0.3662 (Newcombe 1998, table I)."""
+    assert percent(found) == text
+
+
+# ---------------------------------------------------------------------------------------- unseen views
+
+
+@pytest.mark.parametrize("kind", ATTACKS)
+def test_views_together_have_the_sum_of_their_gradients(kind):
+    scene = a_scene(3, by_brightness())
+    problem, every = ATTACKS[kind].problem(scene), torch.arange(3)
+    together = unseen_views.Together(problem)
+    shared = together.start.clone().requires_grad_(True)
+    apart = problem.start.clone().requires_grad_(True)
+    views, images = together.render(shared, torch.tensor([0])), problem.render(apart, every)
+    assert torch.equal(views[0], images[:, 0])
+    views.square().sum().backward()
+    images.square().sum().backward()
+    assert apart.grad.abs().amax() > 0
+    # Float32 sums of three views in another order.
+    torch.testing.assert_close(shared.grad[0], apart.grad.sum(0), rtol=1e-5, atol=1e-5 * float(apart.grad.abs().amax()))
+
+
+def test_the_angle_to_the_nearest_attacked_view_goes_either_way_round():
+    def scene(*degrees: float):
+        cameras = [[OrthographicCamera(1.0, math.radians(each), 2.0)] for each in degrees]
+        return scene_of(SUBJECT, by_brightness(), "grace", cameras, torch.zeros(len(degrees)))
+
+    seen = scene(350, 180, 31)
+    assert [unseen_views._angle(seen, index, scene(10, 100)) for index in range(3)] == [20, 80, 21]
+
+
+def test_darkness_fools_every_view_and_the_start_none():
+    scene, classifier = a_scene(3, by_brightness(0.1)), by_brightness(0.1)
+    start = ATTACKS["lighting"].problem(scene).start[:1]
+    dark = unseen_views.summary(scene, "lighting", 0 * start, classifier, "orange")
+    assert dark == {"distance": round(float(start.norm()), 4), "fooled": True}
+    assert unseen_views.summary(scene, "lighting", start, classifier, "orange") == {"distance": 0, "fooled": False}
+
+
+def test_each_unseen_view_has_an_answer_for_each_attack(short):
+    records = list(unseen_views.unseen(SUBJECT, by_brightness(), 0, 4, "grace", 0))
+    assert len(records) == 4
+    assert all(0 < angle <= 180 for record in records for angle in record["angle"].values())
+    assert {attack: set(said) for attack, said in records[0]["answers"].items()} == {
+        f"{kind}, {views} attacked": set(unseen_views.STATES) for kind in ATTACKS for views in unseen_views.ATTACKED
+    }
+
+
+# ---------------------------------------------------------------------------------------- pages
+
+
+@pytest.mark.parametrize(
+    ("section", "settings", "lines"),
+    [
+        ("transfer", ["section.examples=1", "section.targets=[run:pretrained/random]"], 2),
+        ("unseen_views", ["section.sets=1", "section.views=2"], 2),
+    ],
+)
+def test_a_section_has_data_an_image_and_text_without_folders(
+    section, settings, lines, short, tmp_path, monkeypatch, reproduce
+):
+    monkeypatch.setattr(subjects, "VERTICES", 0)
+    monkeypatch.setattr(adversaries, "PART", 2)
+    monkeypatch.setattr(transfer, "load_classifier", lambda name: by_brightness(name=name))
+    export_mesh(SUBJECT.mesh, tmp_path / "ball.glb")
+    meshes, out = f"scene.meshes=[{{mesh:{tmp_path}/ball.glb,gain:1.5}}]", f"out={tmp_path}"
+    reproduce(by_brightness(), f"section={section}", meshes, *settings, out)
+    page = (tmp_path / "paper.md").read_text()
+    data = (tmp_path / "paper" / f"{section}.jsonl").read_text()
+    command = f"python scripts/reproduce_paper.py section={section} 'scene.meshes=[{{mesh:ball.glb,gain:1.5}}]'"
+    assert command in page and str(tmp_path) not in page + data
+    assert len([json.loads(line) for line in data.splitlines()]) == lines
+    assert (tmp_path / "paper" / f"{section}.png").stat().st_size > 1000
+    assert "{" not in page.replace(command, "") and "nan" not in page.split("```")[0].lower().split()

@@ -1,0 +1,108 @@
+"""A laboratory on disk: class folders of PNG files, photos.csv and lab.json, as `train.photographs` reads them."""
+
+import csv
+import json
+import platform
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from augment.objects import load_object
+from augment.seeding import stream_seed
+from renderer.errors import InputError
+from renderer.image import encode
+from renderer.shapes import LOOK_ALIKES
+from train.laboratory.props import Part, split_parts
+from train.laboratory.settings import LabSettings
+from train.laboratory.shots import Shot, draw_shots
+from train.laboratory.studio import photograph
+from train.outputs import writable_folder
+from train.photographs.folder import FOREIGN, TABLE
+from train.settings import read_object
+
+DESCRIPTION = "lab.json"
+PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may decide a pixel
+COLUMNS = ("path", "source_tag", "light", "mesh", "brightness")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An object: the name of its class, that of its mesh, and its parts."""
+
+    label: str
+    mesh: str
+    parts: list[Part]
+
+
+def write_laboratory(settings: LabSettings) -> int:
+    """Write the folder `settings.out` and return its number of photographs; their bytes follow from the settings.
+
+    InputError: a folder that is not empty; meshes that cannot be read or have no label; none of the label under study
+    or none beside it; Mitsuba is not installed.
+    """
+    out = Path(settings.out)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"out={out} is not an empty folder: name another, or delete it")
+    writable_folder(out, "out")
+    subjects = [read_subject(item, index) for index, item in enumerate(settings.meshes)]
+    sittings, hidden, rows = _sittings(subjects, settings), not sys.stderr.isatty(), []
+    for light, shot, subject in tqdm(sittings, "photographs", 2 * settings.lights, leave=False, disable=hidden):
+        path = Path(subject.label) / f"{light:04d}_{shot.family}.png"
+        (out / path).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(_picture(subject, shot, light, settings)).save(out / path)
+        rows.append((path.as_posix(), shot.family, light, subject.mesh, f"{shot.brightness:.4f}"))
+    with open(out / TABLE, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([COLUMNS, *sorted(rows)])
+    versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+    (out / DESCRIPTION).write_text(json.dumps({**asdict(settings), "versions": versions}, indent=2) + "\n", "utf-8")
+    return len(rows)
+
+
+def read_subject(item: str | dict, index: int) -> Subject:
+    """An entry of `meshes`. Without a label, a solid has its own name, with `other_` before that of a look-alike.
+
+    InputError: as `load_object`; a file without a label.
+    """
+    named = read_object(item, "", index, "meshes")
+    label = named.label or _label_of_solid(named.mesh)
+    if not label:
+        raise InputError(
+            f"meshes[{index}]: {named.mesh} has no label: give {{mesh: {named.mesh}, label: CLASS}}, with "
+            f"{FOREIGN}NAME for what the network has no class for"
+        )
+    return Subject(label, named.mesh, split_parts(load_object(named).mesh, named.gain, named.mesh))
+
+
+def _label_of_solid(mesh: str) -> str:
+    """The label of `solid:NAME:SEED`; nothing for a file."""
+    kind, _, name = mesh.partition(":")
+    name = name.partition(":")[0]
+    if kind != "solid":
+        return ""
+    return FOREIGN + name if name in LOOK_ALIKES else name
+
+
+def _sittings(subjects: list[Subject], settings: LabSettings) -> Iterator[tuple[int, Shot, Subject]]:
+    """Each light with its number, once with an object of the label and once with another; either side takes turns."""
+    sides = [[item for item in subjects if (item.label == settings.label) is wanted] for wanted in (True, False)]
+    if not all(sides):
+        raise InputError(f"meshes: name at least one of label={settings.label} and one of something else")
+    shots = draw_shots(settings.lights, settings.patterns, settings.brightness, settings.seed)
+    for light, shot in enumerate(shots):
+        for side in sides:
+            yield light, shot, side[light % len(side)]
+
+
+def _picture(subject: Subject, shot: Shot, light: int, settings: LabSettings) -> np.ndarray:
+    """(size, size, 3) uint8 sRGB. The seed of the samples is the light's, too."""
+    seed = stream_seed(settings.seed, "samples", light) % 2**32
+    radiance = photograph(subject.parts, shot, settings.size, settings.samples, settings.bounces, seed)
+    exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
+    return (encode(exposed, "srgb") * 255).round().byte().numpy()

@@ -1,0 +1,43 @@
+"""conf/lab.yaml as a dataclass: the types and ranges that a laboratory accepts."""
+
+import math
+from dataclasses import dataclass, field
+
+from renderer.errors import FACTOR, InputError, require_range
+from train.laboratory.patterns import FAMILIES
+from train.settings import LARGEST_SEED, LARGEST_SIZE
+
+MOST_LIGHTS = 10**6
+
+
+@dataclass
+class LabSettings:
+    """What is photographed, and how. meshes: each a file, a `solid:NAME`, or a mapping with ObjectSettings' keys.
+
+    lights: draws of light, camera and pose, each shown with one object of `label` and one other. brightness: of the
+    projector, from dim to bright; see `Shot`.
+    """
+
+    out: str
+    meshes: list
+    label: str = "orange"
+    lights: int = 180
+    patterns: list[str] = field(default_factory=lambda: list(FAMILIES))
+    brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])
+    exposure: float = 1.0
+    size: int = 64
+    samples: int = 32
+    bounces: int = 4
+    seed: int = 0
+
+    def __post_init__(self):
+        if unknown := [name for name in self.patterns if name not in FAMILIES]:
+            raise InputError(f"patterns: {unknown[0]!r} is not known: choose from {', '.join(FAMILIES)}")
+        if not self.patterns or self.lights < 1 or self.lights % len(self.patterns):
+            raise InputError(f"lights={self.lights} must be a positive multiple of the {len(self.patterns)} patterns")
+        if len(self.brightness) != 2 or not 0 < self.brightness[0] <= self.brightness[1] < math.inf:
+            raise InputError(f"brightness={self.brightness} must be two positive numbers, the dimmer one first")
+        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
+        require_range("seed", self.seed, 0, LARGEST_SEED)
+        for name, most in {"lights": MOST_LIGHTS, "size": LARGEST_SIZE, "samples": 10**5, "bounces": 1000}.items():
+            require_range(name, getattr(self, name), 1, most)

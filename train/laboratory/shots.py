@@ -1,0 +1,86 @@
+"""What is drawn for a photograph, apart from its object: light, camera, pose and table.
+
+World units: a normalised mesh spans [-1, 1]; it stands on the table z = 0 about the origin. Light and albedo are linear
+RGB; a radiance of 1 is white at an exposure of 1.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from augment.seeding import stream_seed
+from train.laboratory.patterns import draw_colour, draw_pattern
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One light, camera and pose, for whatever object.
+
+    brightness: radiance of a white surface that faces the projector where its image is white. pattern: the image
+    (H, W, 3). ambient: radiance from everywhere (3,). table: albedo (3,). projector, camera: places (3,). centre,
+    aim: the points (3,) that they look at. turn: the object's rotation (3, 3). scale: the object's largest coordinate.
+    """
+
+    family: str
+    brightness: float
+    pattern: np.ndarray
+    ambient: np.ndarray
+    table: np.ndarray
+    projector: np.ndarray
+    camera: np.ndarray
+    centre: np.ndarray
+    aim: np.ndarray
+    turn: np.ndarray
+    scale: float
+
+
+FIELD_OF_VIEW = 25.0  # degrees, of the camera
+
+
+def draw_shots(lights: int, families: Sequence[str], brightness: Sequence[float], seed: int) -> Iterator[Shot]:
+    """`lights` shots, equally many of each family, in its order and evenly (by ratios) from dim to bright."""
+    dimmest, brightest = brightness
+    of_each = lights // len(families)
+    for family in families:
+        for rank in range(of_each):
+            rng = np.random.default_rng(stream_seed(seed, "shot", family, rank))
+            yield draw_shot(family, dimmest * (brightest / dimmest) ** ((rank + rng.uniform()) / of_each), rng)
+
+
+def draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:
+    """A shot under a pattern of the family. The projector stands on the camera's side, up to 70° off."""
+    azimuth, half_width, scale = rng.uniform(0, 360), rng.uniform(1.2, 1.9), rng.uniform(0.75, 1)
+    distance = half_width / math.tan(math.radians(FIELD_OF_VIEW / 2))
+    centre = np.array([0, 0, 0.8 * scale])
+    aim = centre + rng.uniform(-0.25, 0.25, 3)
+    return Shot(
+        family=family,
+        brightness=brightness,
+        pattern=draw_pattern(family, rng),
+        ambient=rng.uniform(0.01, 0.06) * draw_colour(rng),
+        table=rng.uniform(0.04, 0.16) * draw_colour(rng),
+        projector=centre + _place(azimuth + rng.uniform(-70, 70), rng.uniform(25, 70), rng.uniform(5, 8)),
+        camera=aim + _place(azimuth, rng.uniform(18, 60), distance),
+        centre=centre,
+        aim=aim,
+        turn=_turn(2, rng.uniform(0, 360)) @ _turn(0, rng.uniform(0, 60)) @ _turn(2, rng.uniform(0, 360)),
+        scale=scale,
+    )
+
+
+def _place(azimuth: float, elevation: float, distance: float) -> np.ndarray:
+    """(3,) from angles in degrees."""
+    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
+    across = math.cos(elevation)
+    return distance * np.array([across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation)])
+
+
+def _turn(axis: int, angle: float) -> np.ndarray:
+    """(3, 3) rotation about a coordinate axis, by degrees."""
+    sine, cosine = math.sin(math.radians(angle)), math.cos(math.radians(angle))
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[[first, first, second, second], [first, second, first, second]] = cosine, -sine, sine, cosine
+    return matrix

@@ -1,0 +1,109 @@
+"""A shot's scene, path-traced by Mitsuba 3: an object on a table, a projector, weak light from everywhere."""
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from renderer.errors import InputError
+from train.laboratory.props import Part
+from train.laboratory.shots import FIELD_OF_VIEW, Shot
+
+VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
+ROUGHNESS = 0.5  # of the objects' surface: a soft gloss, as peel has
+THROW = 2.6  # half of the width that the projector lights where it aims, in world units
+FLOOR = 100.0  # half of the table's width
+
+
+def photograph(parts: Sequence[Part], shot: Shot, size: int, samples: int, bounces: int, seed: int) -> np.ndarray:
+    """(size, size, 3) float32 linear radiance; the seed is that of Mitsuba's samples, `samples` per pixel and light.
+
+    The projector and the surroundings are rendered one by one and added: with both in one scene each path would draw
+    which of them to look at, which is most of the noise. InputError: Mitsuba is not installed.
+    """
+    with _mitsuba() as mi:
+        surroundings = {"type": "constant", "radiance": _rgb(shot.ambient)}
+        still = {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": bounces + 1},
+            "sensor": _sensor(mi, shot, size),
+            "table": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale(FLOOR),
+                "bsdf": {"type": "diffuse", "reflectance": _rgb(shot.table)},
+            },
+            **{f"part_{index}": shape for index, shape in enumerate(_object(mi, parts, shot))},
+        }
+        scenes = [mi.load_dict({**still, "light": light}) for light in (_projector(mi, shot), surroundings)]
+        return sum(np.array(mi.render(scene, spp=samples, seed=seed)) for scene in scenes)
+
+
+@contextmanager
+def _mitsuba():
+    """The module under our variant; that of before, if any, comes back."""
+    try:
+        import mitsuba
+    except ImportError as error:
+        raise InputError("the laboratory needs Mitsuba, which is not installed: pip install '.[lab]'") from error
+    before = mitsuba.variant()
+    mitsuba.set_variant(VARIANT)
+    try:
+        yield mitsuba
+    finally:
+        if before:
+            mitsuba.set_variant(before)
+
+
+def _sensor(mi, shot: Shot, size: int) -> dict:
+    look = mi.ScalarTransform4f().look_at(origin=list(shot.camera), target=list(shot.aim), up=[0, 0, 1])
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    return {"type": "perspective", "fov": FIELD_OF_VIEW, "to_world": look, "film": film}
+
+
+def _projector(mi, shot: Shot) -> dict:
+    """Mitsuba's gives a white surface that faces it at distance 1 the radiance of its image."""
+    distance = float(np.linalg.norm(shot.projector - shot.centre))
+    return {
+        "type": "projector",
+        "to_world": mi.ScalarTransform4f().look_at(origin=list(shot.projector), target=list(shot.centre), up=[0, 0, 1]),
+        "fov": 2 * float(np.degrees(np.arctan(THROW / distance))),
+        "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(shot.pattern), "raw": True},
+        "scale": shot.brightness * distance**2,
+    }
+
+
+def _object(mi, parts: Sequence[Part], shot: Shot) -> list:
+    """The object turned, scaled and set down on the table."""
+    turned = [shot.scale * part.positions @ shot.turn.T for part in parts]
+    lowest = min(positions[..., 2].min() for positions in turned)
+    return [
+        _shape(mi, part, positions - [0, 0, lowest], part.normals @ shot.turn.T)
+        for part, positions in zip(parts, turned, strict=True)
+    ]
+
+
+def _shape(mi, part: Part, positions: np.ndarray, normals: np.ndarray):
+    """Every face gets corners of its own, as colours are kept."""
+    albedo = {"type": "mesh_attribute", "name": "vertex_color"}
+    if part.textured:
+        albedo = {"type": "bitmap", "bitmap": mi.Bitmap(part.albedo), "raw": True}
+    surface = {"type": "principled", "base_color": albedo, "roughness": ROUGHNESS}
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "surface": surface})
+    corners = 3 * len(positions)
+    shape = mi.Mesh(
+        "part", corners, len(positions), props=properties, has_vertex_normals=True, has_vertex_texcoords=True
+    )
+    if not part.textured:
+        shape.add_attribute("vertex_color", 3, part.albedo.ravel())
+    buffers = mi.traverse(shape)
+    buffers["faces"] = np.arange(corners, dtype=np.uint32)
+    buffers["vertex_positions"] = positions.astype(np.float32).ravel()
+    buffers["vertex_normals"] = normals.astype(np.float32).ravel()
+    buffers["vertex_texcoords"] = part.uvs.astype(np.float32).ravel()
+    buffers.update()
+    return shape
+
+
+def _rgb(color: np.ndarray) -> dict:
+    return {"type": "rgb", "value": [float(channel) for channel in color]}

@@ -1,0 +1,120 @@
+"""A run's folder: who may write in it, and what its files hold, read as data that anyone may have written."""
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from filelock import FileLock, Timeout
+from omegaconf import DictConfig, OmegaConf
+from omegaconf._utils import get_yaml_loader
+
+from renderer.errors import InputError
+
+CONFIG, LOCK = "config.yaml", ".lock"
+LARGEST_CONFIG, LARGEST_FILE = 2**20, 2**28  # bytes; a run has written 300 for each of its epochs
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[bool]:
+    """Whether nobody else holds the folder, on any machine that shares it; nobody else gets it then."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
+
+
+@contextmanager
+def sole_writer(*folders: Path) -> Iterator[None]:
+    """InputError where another process trains in one of the folders; none may begin to until they are left."""
+    with ExitStack() as stack:
+        for folder in folders:
+            if not stack.enter_context(locked(folder)):
+                raise InputError(
+                    f"run={folder} is in training elsewhere: let it end, or choose another folder with run="
+                )
+        yield
+
+
+def read_config(path: Path) -> DictConfig:
+    """A run's config.yaml, in which nothing is resolved: `${...}` is text. InputError naming a file that is none."""
+    try:
+        plain = yaml.load(_read(path, LARGEST_CONFIG), _PlainLoader)
+        if not isinstance(plain, dict):
+            raise ValueError("it holds no keys")
+        config = OmegaConf.create(_escaped(plain))
+        if unset := OmegaConf.missing_keys(config):
+            raise ValueError(f"{min(unset)} is not set")
+        return config
+    except Exception as error:  # YAML and OmegaConf raise many kinds for what is no configuration
+        raise _damaged(path, error) from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file that holds an object; InputError naming one that does not."""
+    try:
+        return _object(_read(path))
+    except (ValueError, RecursionError, OSError) as error:
+        raise _damaged(path, error) from error
+
+
+def read_numbers(path: Path) -> list[dict[str, float]]:
+    """A file of JSON lines, an object of numbers each; a last line that a crash cut short is passed over.
+
+    InputError naming a file that is none.
+    """
+    try:
+        lines = [_object(line) for line in _read(path).split("\n")[:-1]]
+        if any(not isinstance(value, int | float) for line in lines for value in line.values()):
+            raise ValueError("a value is no number")
+    except (ValueError, RecursionError, OSError) as error:
+        raise _damaged(path, error) from error
+    return lines
+
+
+class _PlainLoader(get_yaml_loader()):
+    """Without aliases, which no run writes, and by which a short file stands for one beyond memory."""
+
+    def compose_node(self, parent, index):
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("it holds an alias")
+        return super().compose_node(parent, index)
+
+
+def _read(path: Path, largest: int = LARGEST_FILE) -> str:
+    if not path.is_file():
+        raise ValueError("there is no such file")
+    if path.stat().st_size > largest:
+        raise ValueError(f"it is larger than {largest} bytes")
+    return path.read_text(encoding="utf-8")
+
+
+def _object(text: str) -> dict[str, Any]:
+    found = json.loads(text)
+    if not isinstance(found, dict) or not found:
+        raise ValueError("it holds no object of keys and values")
+    return found
+
+
+def _escaped(value: Any) -> Any:
+    """With `${` as OmegaConf writes it where it means no interpolation."""
+    if isinstance(value, dict):
+        return {key: _escaped(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_escaped(item) for item in value]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return InputError(f"{path} is damaged or no file that `python -m train` wrote ({reason}): use another run")

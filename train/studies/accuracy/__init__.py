@@ -1,0 +1,1 @@
+"""The largest errors of the renderer, condition by condition."""

@@ -1,0 +1,206 @@
+"""The renderer's largest errors against the wide reference, quantity by quantity."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer.albedo import surface_albedo
+from renderer.basis import Harmonics
+from renderer.camera import OrthographicCamera
+from renderer.fragments import Fragments, build_fragments
+from renderer.harmonics import basis, basis_gradient
+from renderer.image import PictureSettings, develop
+from renderer.mesh import Mesh
+from renderer.shading import radiance
+from renderer.transfer import build_operators
+from renderer.visibility import Backend, choose
+from train.studies.accuracy import reference
+from train.studies.accuracy.reference import exact, extended
+
+BACKEND = choose("software")
+CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, field_of_view=2.2)
+SETTINGS = PictureSettings(size=16, samples=2)
+IMAGE, LIGHT_GRADIENT = "image", "light gradient"  # of an operator
+GEOMETRY, VERTEX_GRADIENT = "image by geometry", "vertex gradient"  # of `renderer.shading`
+
+
+@dataclass(frozen=True)
+class Error:
+    """The largest error of a quantity over its largest magnitude (over 1 if all of it is zero); infinite where a result
+    is not finite. eps: of the result's number type."""
+
+    relative: float
+    eps: float
+
+    @property
+    def units(self) -> float:
+        return self.relative / self.eps
+
+
+Errors = dict[str, Error]
+
+
+def error(ours: Tensor, wide: np.ndarray) -> Error:
+    """ours: of the wide reference's shape."""
+    eps = torch.finfo(ours.dtype).eps
+    ours = ours.detach().double().numpy()
+    if ours.shape != wide.shape or not np.isfinite(ours).all():
+        return Error(inf, eps)
+    if not ours.size:
+        return Error(0.0, eps)
+    ours = exact(ours) if wide.dtype == object else extended(ours)
+    return Error(float(abs(ours - wide).max() / (abs(wide).max() or 1)), eps)
+
+
+def light(degree: int = 6) -> Tensor:
+    """Coefficients of order one, dead bands and all."""
+    return torch.randn((degree + 1) ** 2, 3, generator=torch.Generator().manual_seed(degree), dtype=torch.float64)
+
+
+def worst(conditions: Iterable[Errors]) -> Errors:
+    """The largest error of each quantity over several conditions."""
+    conditions = list(conditions)
+    return {name: max((errors[name] for errors in conditions), key=lambda e: e.units) for name in conditions[0]}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is rendered. vertices: those that are shaded, where not the mesh's own. They and the light are given to the
+    renderer in its dtype, and to the reference with that rounding."""
+
+    mesh: Mesh
+    light: Tensor
+    vertices: np.ndarray | None = None
+    camera: OrthographicCamera = CAMERA
+    settings: PictureSettings = SETTINGS
+    backend: Backend = BACKEND
+    dtype: torch.dtype = torch.float64
+    lift: Callable = extended
+
+    @property
+    def degree(self) -> int:
+        return round(len(self.light) ** 0.5) - 1
+
+    def shaded(self) -> Tensor:
+        """(V, 3) in the dtype."""
+        return torch.from_numpy(self.mesh.vertices if self.vertices is None else self.vertices).to(self.dtype)
+
+    def view(self) -> reference.View:
+        mesh, samples, lift = self.mesh, self.settings.samples, self.lift
+        points = self.camera.project(mesh.vertices)
+        closed = mesh.closed and bool((points[:, 2] >= -1).all())
+        [ids] = self.backend.rasterise(points[None], mesh.faces, self.settings.size * samples, closed=closed)
+        albedo, vertices = mesh.corner_colors[:, 0].astype(np.float64), self.shaded().double().numpy()
+        return reference.view(ids, samples, mesh.vertices, vertices, mesh.faces, albedo, self.camera.axes()[2], lift)
+
+    def fragments(self) -> Fragments:
+        mesh = self.mesh
+        return build_fragments(mesh.vertices, mesh.faces, [self.camera], self.settings, self.backend, mesh.closed)[0]
+
+
+def by_operator(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
+    """Of the image and its gradient by the light, through an operator kept in `dtype`."""
+    [operator] = build_operators(
+        setup.mesh, [setup.camera], setup.settings, setup.backend, basis=Harmonics(setup.degree), dtype=dtype
+    )
+    view, light = setup.view(), setup.light.to(dtype)
+    upstream = _upstream(len(view.pixels))
+    wide = reference.image(view, setup.lift(light.double().numpy()))
+    gradient = reference.light_gradient(view, setup.lift(upstream.double().numpy()), setup.degree)
+    return {
+        IMAGE: error(operator.radiance(light).T, wide),
+        LIGHT_GRADIENT: error(operator.light_gradient(upstream.to(dtype).T), gradient),
+    }
+
+
+def by_geometry(setup: Setup) -> Errors:
+    """Of the image and its gradient by the vertices."""
+    view, vertices, light = setup.view(), setup.shaded().requires_grad_(), setup.light.to(setup.dtype)
+    fragments, upstream = setup.fragments(), _upstream(len(view.pixels))
+    image = radiance(fragments, vertices, light, _albedo(setup, fragments))
+    (gradient,) = torch.autograd.grad(image, vertices, upstream.T.to(image))
+    light, above = (setup.lift(part.double().numpy()) for part in (light, upstream))
+    return {
+        GEOMETRY: error(image.T, reference.image(view, light)),
+        VERTEX_GRADIENT: error(gradient, reference.vertex_gradient(view, above, light, len(vertices))),
+    }
+
+
+def by_both(setup: Setup) -> Errors:
+    return by_operator(setup) | by_geometry(setup)
+
+
+def with_vertex_normals(setup: Setup) -> Errors:
+    """`by_geometry` with interpolated normals; the gradient as its product with one random move of the vertices."""
+    view, vertices, light = setup.view(), setup.shaded().requires_grad_(), setup.light.to(setup.dtype)
+    fragments, upstream = setup.fragments(), _upstream(len(view.pixels))
+    faces = torch.from_numpy(setup.mesh.faces)
+    image = radiance(fragments, vertices, light, _albedo(setup, fragments), smooth_faces=faces)
+    (gradient,) = torch.autograd.grad(image, vertices, upstream.T.to(image))
+    move = _upstream(len(vertices), seed=1)
+    parts = vertices.detach().double(), fragments.barycentric(), light.double(), upstream, move
+    placed, barycentric, light, above, along = (extended(part.numpy()) for part in parts)
+
+    def shade(vertices):
+        return reference.smooth_image(view, vertices, setup.mesh.faces, barycentric, light)
+
+    slope = (above * reference.derivative(shade(reference.stepped(placed, along)))).sum()
+    product = (gradient.double() * move).sum().to(image)
+    return {GEOMETRY: error(image.T, shade(placed)), VERTEX_GRADIENT: error(product, np.asarray(slope))}
+
+
+def of_harmonics(directions: Tensor, degrees: Iterable[int]) -> Errors:
+    """Of basis, gradient and the gradient of a sum that autograd makes: the worst of directions (N, 3) and degrees.
+
+    Gradients count relative to each direction's own, since they fall with its length.
+    """
+    degrees = list(degrees)
+    wide = exact(directions.double().numpy()).T
+    basis_to, gradient_to = reference.basis(wide, max(degrees)), reference.basis_gradient(wide, max(degrees))
+    largest = torch.finfo(directions.dtype).max
+
+    def by_direction(ours: Tensor, theirs: np.ndarray) -> Error:
+        pairs = zip(ours, theirs.clip(-largest, largest), strict=True)
+        return max((error(*pair) for pair in pairs), key=lambda e: e.units)
+
+    def at(degree: int) -> Errors:
+        rows = directions.clone().requires_grad_()
+        upstream = _upstream((degree + 1) ** 2)[:, 0].to(directions)
+        values, slopes = basis(rows, degree), basis_gradient(directions, degree)
+        (summed,) = torch.autograd.grad(values @ upstream, rows, torch.ones_like(rows[:, 0]))
+        kept = gradient_to[:, : values.shape[1]]
+        sums = (kept * exact(upstream.double().numpy())[:, None]).sum(axis=1)
+        return {
+            "basis": error(values, basis_to[:, : values.shape[1]]),
+            "gradient": by_direction(slopes, kept),
+            "gradient by autograd": by_direction(summed, sums),
+        }
+
+    return worst(at(degree) for degree in degrees)
+
+
+def of_development(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str) -> Errors:
+    """Of the image's values and of their gradient by the radiance.
+
+    At 0 and 1 themselves the clamp has no one gradient: torch's versions differ. There it only has to be finite.
+    """
+    radiance = radiance.clone().requires_grad_()
+    values = develop(radiance, coverage, background, encoding)
+    (gradient,) = torch.autograd.grad(values.sum(), radiance)
+    parts = radiance.detach(), coverage, background
+    wide, slope, bounds = reference.develop(*(extended(part.double().numpy()) for part in parts), encoding)
+    gradient = gradient.where(torch.from_numpy(~bounds), 0 * gradient)
+    return {"image value": error(values, wide), "gradient by radiance": error(gradient, slope * ~bounds)}
+
+
+def _upstream(rows: int, seed: int = 0) -> Tensor:
+    """(rows, 3) multiples of 1/64 in [-1, 1], which every number type holds exactly."""
+    return torch.randint(-64, 65, (rows, 3), generator=torch.Generator().manual_seed(seed)) / 64.0
+
+
+def _albedo(setup: Setup, fragments: Fragments) -> Tensor:
+    return surface_albedo(setup.mesh, fragments, setup.settings.encoding)

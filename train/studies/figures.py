@@ -1,0 +1,34 @@
+"""Figures on disk. Needs matplotlib."""
+
+from pathlib import Path
+
+from renderer.errors import InputError
+
+
+def pyplot():
+    """matplotlib.pyplot without a display; InputError where it is not installed."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise InputError("matplotlib is not installed: pip install '.[benchmark]'") from error
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
+
+
+def panels_beside(count: int, size: tuple[float, float], layout: str = "tight"):
+    """(figure, panels) side by side on one vertical scale. size: of each, in inches."""
+    width, height = size
+    figure, panels = pyplot().subplots(
+        1, count, figsize=(count * width, height), sharey=True, squeeze=False, layout=layout
+    )
+    for panel in panels[0]:
+        panel.spines[["top", "right"]].set_visible(False)
+    return figure, panels[0]
+
+
+def save(figure, path: Path, dpi: int = 110) -> None:
+    """Write the figure and let go of it."""
+    figure.savefig(path, dpi=dpi)
+    pyplot().close(figure)

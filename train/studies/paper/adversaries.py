@@ -1,0 +1,97 @@
+"""What Tables 3 and 4 share: attacks by light and by shape, random changes as large, and what a classifier answers."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from augment.attacks.run import logits_of
+from augment.classifiers import Classifier
+from augment.descent import DescentSettings, Goal, Part, Problem, descend
+from augment.parameters import Geometry, Kind, Lighting, StepSettings
+from augment.perturbation import Perturbation
+from augment.phases import Phases
+from augment.scene import Scene
+from renderer.errors import InputError
+from train.studies.paper.subjects import Subject, random_scene, recognised
+
+STEPS = 30  # the paper's appendix C
+FURTHER = 10  # steps that an adversary goes on for
+PART = 10  # random examples held at once
+LEAST_SHARE = 0.02  # recognised; below it the search for examples is given up
+
+
+class Unreachable(Goal):
+    """An error is wanted, and is never enough: the descent takes all of its steps."""
+
+    def of(self, examples: Tensor) -> "Unreachable":
+        return Unreachable(self.decrease[examples])
+
+    def reached(self, predicted: Tensor) -> Tensor:
+        return torch.zeros(len(predicted), dtype=torch.bool)
+
+
+@dataclass(frozen=True)
+class Attack:
+    """What changes, by which steps, and for how long."""
+
+    kind: type[Kind]
+    step: StepSettings
+    descent: DescentSettings
+
+    def problem(self, scene: Scene) -> Perturbation:
+        return Perturbation(scene, [self.kind(scene, self.step)])
+
+    def adversaries(self, problem: Problem, classifier: Classifier, label: str, views: int) -> tuple[Tensor, Tensor]:
+        """(E, D) values where the descent first fools or ends, and (E, D) those `FURTHER` steps later.
+
+        views: of each example.
+        """
+        goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))
+        first = descend(classifier, problem, goal, self.descent, Phases())
+        onwards = Part(problem, torch.arange(len(first.values)), first.values)
+        longer = replace(self.descent, max_steps=FURTHER)
+        last = descend(classifier, onwards, Unreachable(goal.decrease), longer, Phases())
+        return first.values, last.values
+
+
+LIGHT = StepSettings("linf", None, "unit", 0.05)
+SHAPE = StepSettings("linf", 0.002, "sign", 0.0005)
+ATTACKS = {
+    "lighting": Attack(Lighting, LIGHT, DescentSettings(STEPS)),
+    "geometry": Attack(Geometry, SHAPE, DescentSettings(STEPS, shorten=True)),
+}
+
+
+def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> Tensor:
+    """The start (E, D) with each entry changed by as much as in values (E, D), but up or down at random.
+
+    It is as far in any norm, and changes nothing that could not reach a pixel.
+    """
+    signs = 2 * torch.randint(2, values.shape, generator=draws) - 1
+    return start + (values - start) * signs.to(values)
+
+
+@torch.no_grad()
+def answers(problem: Problem, values: Tensor, examples: Tensor, classifier: Classifier) -> list[str]:
+    """What a classifier calls the only view of each of the examples (A,) under values (A, D)."""
+    found = []
+    for part, rows in zip(values.split(PART), examples.split(PART), strict=True):
+        found += logits_of(classifier, problem.render(part, rows), PART)[:, 0].argmax(1).tolist()
+    return [classifier.classes[index] for index in found]
+
+
+def recognised_parts(
+    subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator
+) -> Iterator[tuple[Scene, Tensor]]:
+    """Random scenes, each with those of its examples (A,) that the classifier recognises: `count` in all."""
+    found = drawn = 0
+    while found < count:
+        scene = random_scene(subject, classifier, light, PART, draws)
+        kept = recognised(scene, classifier, subject.label).nonzero().squeeze(1)[: count - found]
+        if len(kept):
+            yield scene, kept
+        found, drawn = found + len(kept), drawn + len(scene)
+        if found < LEAST_SHARE * drawn - PART:
+            raise InputError(f"{classifier.name} recognises only {found} of {drawn} images of {subject.name}")

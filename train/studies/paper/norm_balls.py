@@ -1,0 +1,336 @@
+"""Adversarial against random perturbations in norm-balls of light, shape and pixels (Section 4.1 and appendix A)."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from augment.attacks.run import logits_of
+from augment.classifiers import Classifier
+from augment.descent import DescentSettings, Goal, descend
+from augment.parameters import KINDS, StepSettings
+from augment.perturbation import Perturbation
+from augment.phases import Phases
+from augment.scene import Scene
+from augment.seeding import generator
+from train.photographs.shares import share
+from train.studies.figures import panels_beside, pyplot, save
+from train.studies.paper.section import Section, SectionSettings, Study
+from train.studies.paper.shares import draw_shares, interval
+from train.studies.paper.subjects import Subject, finer, recognised_scene, scene_of
+from train.tables import markdown
+
+PART = 10  # examples attacked at once
+
+
+@dataclass
+class NormBallSettings(SectionSettings):
+    """examples: of each mesh. steps: of a descent at most, and draws of a search."""
+
+    examples: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class Space:
+    """What is perturbed: L∞ radii, the paper's among them; the length of a step along the gradient's sign, in radii.
+
+    A whole radius is the fast gradient sign method, so that images of pixel attacks reach their radius.
+    """
+
+    title: str
+    axis: str
+    radii: tuple[float, ...]
+    paper: tuple[float, ...]
+    step: float
+
+
+LEVELS = {"small": 0.12, "medium": 0.53, "large": 0.82}  # the paper's L∞ on the image
+SPACES = {
+    "lighting": Space("light", "per coefficient", (0.02, 0.05, 0.1, 0.3, 1.0), (0.1,), 0.25),
+    "geometry": Space("shape", "per vertex and axis", (0.0001, 0.0005, 0.002, 0.01, 0.03), (0.002,), 0.25),
+    "pixels": Space("pixels", "per value", (0.01, *LEVELS.values()), tuple(LEVELS.values()), 1.0),
+}
+METHODS = {
+    "adversarial": "adversarial",
+    "random": "random, one draw",
+    "search": "random, any of {steps} draws",
+}
+STYLES = {
+    "adversarial": {"color": "#c2410c", "marker": "o", "linestyle": "-"},
+    "random": {"color": "#888888", "marker": "s", "linestyle": ":"},
+    "search": {"color": "#222222", "marker": "^", "linestyle": "--"},
+}
+
+TEXT = """
+The share of {count} images that {classifier} recognises as `{label}` to begin with and no longer does, after a
+descent in an L∞ ball and after uniform draws from the same ball, with 95 % Wilson intervals; {examples} random views
+each of {meshes} in the light `{probe}`, the same ones in every row. Descents take up to {steps} steps along the
+gradient's sign, a quarter of the radius each (pixels: the whole radius, the fast gradient sign method, repeated), and
+end as soon as the classifier is fooled. *L∞ on the image* is the largest change of any value in it, averaged over
+the images: where the descent ended, with the share of pixels that change by more than half of it, and of one draw.
+
+{table}
+
+![Success against radius](paper/norm_balls.png)
+
+Adversaries of one image at about the same L∞ on it (the paper's 0.12, 0.53 and 0.82), with the class that they are
+taken for, each beside its change (grey: none):
+
+![Light, shape and pixels at about the same L∞](paper/norm_balls.spaces.png)
+
+| at the paper's radius | paper | here: adversarial | here: random, one draw |
+| --- | --- | --- | --- |
+| light, 0.1 | adversarial above random, of 10,000 each | {light_adversarial} | {light_random} |
+| shape, 0.002 | adversarial above random, of 10,000 each | {shape_adversarial} | {shape_random} |
+
+The paper shows its shares in a figure and prints none, so that only their order can be compared. What differs:
+
+- {count} images instead of 10,000, since a step of a shape takes a CPU about a tenth of a second. All show one
+  class: the intervals are about views of these meshes, not about shapes at large.
+- {classifier} instead of ResNet-101; up to {steps} steps, where the paper's appendix has 30. The paper does not say
+  how its attacks step within the ball, nor how often a random one may try; one draw and as many as there are steps
+  bracket that.
+- Images need only be recognised: the median confidence in the label is {confidence:.2f} before the attacks. What
+  small random changes fool are views on the verge of another class, whatever is perturbed.
+- The same radius is not the same perturbation from mesh to mesh. An offset of a vertex tilts the faces around it by
+  about the offset over the length of an edge, so that finer meshes give way to smaller radii. The paper's shapes have
+  over 10,000 vertices, here {fineness}.
+- L∞ on the image does not compare the spaces well: a few pixels at the outline or at an edge of the texture that
+  change sides give a shape a large one where all else is nearly still, as the share of pixels beyond half of it tells.
+  Under light a large part of the object changes as much; in pixels almost the whole image does.
+
+Made in {minutes:.0f} minutes of processor time by
+"""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a ball holds for E examples.
+
+    adversarial, random, search: (E,) bool, fooled by the descent, by one uniform draw, by any of as many draws as the
+    descent may take steps. reach, random_reach: (E,) L∞ between the starting image and those of the first two.
+    before, images: (E, 3, H, W) at the start and where the descent ended; predicted: (E,) its class.
+    """
+
+    adversarial: Tensor
+    random: Tensor
+    search: Tensor
+    reach: Tensor
+    random_reach: Tensor
+    before: Tensor
+    images: Tensor
+    predicted: Tensor
+
+
+@torch.no_grad()
+def attack_ball(
+    scene: Scene, classifier: Classifier, label: str, name: str, radius: float, steps: int, draws: torch.Generator
+) -> Outcome:
+    """Descend and draw in one ball of a space."""
+    space = SPACES[name]
+    problem = Perturbation(scene, [KINDS[name](scene, StepSettings("linf", radius, "sign", radius * space.step))])
+    goal = Goal(torch.full((len(scene), 1), classifier.label(label)))
+    everything = torch.arange(len(scene))
+
+    def fooled(images: Tensor, examples: Tensor) -> Tensor:
+        return goal.of(examples).reached(logits_of(classifier, images, PART).argmax(2))
+
+    before = problem.render(problem.start, everything)
+    # The gradient of geometry holds visibility fixed, so that whole steps may raise the cost.
+    descent = DescentSettings(steps, shorten=name == "geometry", batch_size=PART)
+    result = descend(classifier, problem, goal, descent, Phases(problem.start.device))
+    drawn = problem.render(problem.sample(draws), everything)
+    random = fooled(drawn, everything)
+    search = random.clone()
+    for _ in range(steps - 1):
+        left = torch.nonzero(~search).squeeze(1)
+        if len(left):
+            search[left] = fooled(problem.render(problem.sample(draws)[left], left), left)
+    return Outcome(
+        result.fooled,
+        random,
+        search,
+        distance(result.images, before),
+        distance(drawn, before),
+        before[:, 0],
+        result.images[:, 0],
+        result.predicted[:, 0],
+    )
+
+
+def distance(images: Tensor, before: Tensor) -> Tensor:
+    """(E,) L∞ between images (E, 1, 3, H, W)."""
+    return (images - before).abs().flatten(1).amax(1)
+
+
+def parts(subject: Subject, scene: Scene, classifier: Classifier, light: str) -> Iterator[Scene]:
+    """A scene's examples a few at a time: the gradient of a shape keeps all its images' samples."""
+    for examples in torch.arange(len(scene)).split(PART):
+        cameras = [scene.cameras[index] for index in examples]
+        yield scene_of(subject, classifier, light, cameras, scene.backgrounds[examples, 0, 0])
+
+
+def outcomes(subject: Subject, study: Study, settings: NormBallSettings) -> dict[tuple[str, float], Outcome]:
+    """All balls' outcomes over the same recognised examples of a subject."""
+    classifier = study.classifier
+    scene = recognised_scene(subject, classifier, study.light, settings.examples, study.seed)
+    draws = {name: generator(study.seed, subject.name, name) for name in SPACES}
+    found = {(name, radius): [] for name, space in SPACES.items() for radius in space.radii}
+    for part in parts(subject, scene, classifier, study.light):
+        for (name, radius), outcome in found.items():
+            outcome.append(attack_ball(part, classifier, study.label, name, radius, settings.steps, draws[name]))
+    return {ball: joined(outcome) for ball, outcome in found.items()}
+
+
+def joined(found: Sequence[Outcome]) -> Outcome:
+    """One outcome of several, example after example."""
+    return Outcome(*(torch.cat([getattr(each, field.name) for each in found]) for field in fields(Outcome)))
+
+
+def record(mesh: str, name: str, radius: float, outcome: Outcome) -> dict:
+    """A ball's shares with their intervals, and averages: how far its images went, and the share of pixels that
+    changed by more than half of the most that any did."""
+    shares = {method: share(int(hits.sum()), len(hits)) for method in METHODS for hits in [getattr(outcome, method)]}
+    change = (outcome.images - outcome.before).abs().amax(1)
+    means = {
+        "reach": outcome.reach,
+        "changed_pixels": (change > outcome.reach.view(-1, 1, 1) / 2).double(),
+        "random_reach": outcome.random_reach,
+    }
+    return {
+        "mesh": mesh,
+        "space": name,
+        "radius": radius,
+        **shares,
+        **{key: float(each.mean()) for key, each in means.items()},
+    }
+
+
+def header(steps: int) -> list[str]:
+    methods = [method.format(steps=steps) for method in METHODS.values()]
+    return ["space", "radius", *methods, "L∞ on the image", "pixels beyond half of it", "L∞, one draw"]
+
+
+def row(found: dict) -> list[str]:
+    space = SPACES[found["space"]]
+    radius = f"{found['radius']:g}" + (" (paper)" if found["radius"] in space.paper else "")
+    shares = [interval(found[method]) for method in METHODS]
+    change = f"{found['reach']:.2f}", f"{found['changed_pixels']:.2%}", f"{found['random_reach']:.2f}"
+    return [space.title, radius, *shares, *change]
+
+
+def at_paper_radius(pooled: Sequence[dict]) -> dict[str, str]:
+    """The cells of the comparison with the paper's figure: light_adversarial, shape_random and so on."""
+    return {
+        f"{SPACES[each['space']].title}_{method}": interval(each[method])
+        for each in pooled
+        for method in ("adversarial", "random")
+        if each["radius"] in SPACES[each["space"]].paper
+    }
+
+
+def median_confidence(images: Tensor, classifier: Classifier, label: str) -> float:
+    """In the label, over images (E, 3, H, W)."""
+    shares = logits_of(classifier, images[:, None], PART).softmax(2)
+    return float(shares[:, 0, classifier.label(label)].median())
+
+
+def fineness(subject: Subject) -> str:
+    mesh = subject.mesh
+    edges = np.diff(mesh.vertices[mesh.faces[:, [0, 1, 2, 0]]], axis=1)
+    return f"{len(mesh.vertices):,} with edges of {np.linalg.norm(edges, axis=2).mean():.3f} on average"
+
+
+def draw_success(pooled: Sequence[dict], steps: int, path: Path) -> None:
+    """Success against radius, a panel per space; the paper's radii are dashed."""
+    figure, panels = panels_beside(len(SPACES), (3.7, 4), layout="constrained")
+    for panel, (name, space) in zip(panels, SPACES.items(), strict=True):
+        here = [each for each in pooled if each["space"] == name]
+        for index, (method, style) in enumerate(STYLES.items()):
+            radii = [radius * 1.06 ** (index - 1) for radius in space.radii]  # beside each other
+            shares, name = [each[method] for each in here], METHODS[method].format(steps=steps)
+            draw_shares(panel, radii, shares, label=name, capsize=3, **style)
+        for radius in space.paper:
+            panel.axvline(radius, color="#bbbbbb", linestyle=(0, (4, 4)), linewidth=1, zorder=0)
+        panel.set(xscale="log", title=space.title, xlabel=f"L∞ radius {space.axis}", ylim=(-0.03, 1.03))
+        panel.set_xticks(space.radii, [f"{radius:g}" for radius in space.radii], fontsize=8)
+        panel.set_xticks([], minor=True)
+    panels[0].set_ylabel("share fooled")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(METHODS))
+    save(figure, path)
+
+
+def most_comparable(found: dict[tuple[str, float], Outcome]) -> tuple[int, dict[tuple[str, str], float]]:
+    """The example whose adversaries come nearest to the paper's levels on the image, and for each space and level the
+    radius of its nearest one."""
+    off = {}  # by space and level, (radii, E)
+    for name, space in SPACES.items():
+        balls = [found[name, radius] for radius in space.radii]
+        reach = torch.stack([torch.where(ball.adversarial, ball.reach, torch.inf) for ball in balls])
+        off |= {(name, level): (reach - wanted).abs() for level, wanted in LEVELS.items()}
+    example = int(torch.stack([each.amin(0) for each in off.values()]).amax(0).argmin())
+    return example, {key: SPACES[key[0]].radii[int(each[:, example].argmin())] for key, each in off.items()}
+
+
+def draw_examples(found: dict[tuple[str, float], Outcome], classifier: Classifier, label: str, path: Path) -> None:
+    """Adversaries of one example at about the same L∞ on the image, a row per level, each beside its difference."""
+    example, chosen = most_comparable(found)
+    before = next(iter(found.values())).before[example]
+    figure, cells = pyplot().subplots(len(LEVELS), 1 + 2 * len(SPACES), figsize=(13, 6.9), layout="tight")
+    for cell in cells.flat:
+        cell.set(xticks=[], yticks=[])
+    for line, (level, wanted) in zip(cells, LEVELS.items(), strict=True):
+        line[0].imshow(array(before))
+        line[0].set_title(label, fontsize=9)
+        line[0].set_ylabel(f"{level}: L∞ {wanted}", fontsize=10)
+        for index, (name, space) in enumerate(SPACES.items()):
+            radius = chosen[name, level]
+            outcome = found[name, radius]
+            image, change = line[1 + 2 * index], line[2 + 2 * index]
+            image.imshow(array(outcome.images[example]))
+            image.set_title(classifier.classes[int(outcome.predicted[example])], fontsize=9)
+            image.set_xlabel(f"{space.title}, radius {radius:g}", fontsize=8)
+            change.imshow(array((outcome.images[example] - before) / 2 + 0.5))
+            change.set_xlabel(f"change, L∞ {float(outcome.reach[example]):.2f}", fontsize=8)
+    save(figure, path, dpi=75)
+
+
+def array(image: Tensor) -> np.ndarray:
+    """(H, W, 3) of an image (3, H, W)."""
+    return image.permute(1, 2, 0).numpy()
+
+
+def measure(study: Study, settings: NormBallSettings) -> Section:
+    """All balls of all meshes."""
+    begin = time.process_time()
+    chosen = [finer(subject) for subject in study.subjects]
+    found = {subject.name: outcomes(subject, study, settings) for subject in chosen}
+    pooled = {ball: joined([each[ball] for each in found.values()]) for ball in next(iter(found.values()))}
+    records = [record(mesh, *ball, outcome) for mesh, balls in found.items() for ball, outcome in balls.items()]
+    together = [record("all", *ball, outcome) for ball, outcome in pooled.items()]
+    before = next(iter(pooled.values())).before
+    text = TEXT.format(
+        classifier=study.classifier.name,
+        label=study.label,
+        meshes=study.meshes,
+        count=settings.examples * len(found),
+        examples=settings.examples,
+        probe=study.light,
+        steps=settings.steps,
+        table=markdown(header(settings.steps), map(row, together)),
+        **at_paper_radius(together),
+        confidence=median_confidence(before, study.classifier, study.label),
+        fineness=" and ".join(map(fineness, chosen)),
+        minutes=(time.process_time() - begin) / 60,
+    )
+    figures = {
+        "norm_balls.png": partial(draw_success, together, settings.steps),
+        "norm_balls.spaces.png": partial(draw_examples, pooled, study.classifier, study.label),
+    }
+    return Section(text, records + together, figures)

@@ -1,0 +1,79 @@
+"""A section of docs/paper.md, measured, and put in its place there."""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+
+from renderer.errors import InputError
+from train.cli import command_line
+from train.outputs import writable_folder
+from train.run_classifier import load_classifier
+from train.settings import SceneSettings, read_object, read_settings
+from train.studies.figures import pyplot
+from train.studies.page import joined, versions, wrapped, write
+from train.studies.paper import gallery, norm_balls, rendering_quality, run_time, transfer, unseen_views
+from train.studies.paper.section import Section, Study
+
+SECTIONS = {  # by their titles, in the order of the page
+    "norm_balls": ("Adversarial against random perturbations", norm_balls.NormBallSettings, norm_balls.measure),
+    "transfer": ("Transfer to unseen networks", transfer.TransferSettings, transfer.measure),
+    "unseen_views": ("Unseen views", unseen_views.UnseenViewSettings, unseen_views.measure),
+    "rendering_quality": ("Rendering quality", rendering_quality.QualitySettings, rendering_quality.measure),
+    "gallery": ("A gallery of attacks", gallery.GallerySettings, gallery.measure),
+    "run_time": ("Run time", run_time.RunTimeSettings, run_time.measure),
+}
+HEAD = """# The paper's tables and figures
+
+Each section is written by the command that it names; do not edit.
+Renders of orange_sketchfab show "An Orange" by thisisepic, Sketchfab, CC BY-SA 4.0."""
+
+
+@dataclass
+class PaperSettings:
+    """conf/reproduce_paper.yaml. section: a choice of conf/section. out: the folder of paper.md."""
+
+    section: dict[str, Any]
+    out: str
+    label: str
+    classifier: str
+    weights: str | None
+    seed: int
+    scene: SceneSettings
+
+
+def run(settings: PaperSettings) -> None:
+    """Measure a section, write its data and its figures to out/paper, and put its text into out/paper.md."""
+    out = writable_folder(settings.out, "out")
+    pyplot()  # a run without matplotlib would fail only at its end
+    name = settings.section.get("name")
+    if name not in SECTIONS:
+        raise InputError(f"section.name={name}: choose section={', '.join(SECTIONS)}")
+    title, kind, measure = SECTIONS[name]
+    section_settings = read_settings(kind, OmegaConf.create(settings.section), "section")
+    items = [read_object(item, settings.label, index) for index, item in enumerate(settings.scene.meshes)]
+    torch.set_num_threads(section_settings.threads)
+    classifier = load_classifier(settings.classifier, settings.weights)
+    study = Study(classifier, items, settings.scene.light, settings.label, settings.seed)
+    _write(out / "paper", name, title, measure(study, section_settings))
+
+
+def _write(folder: Path, name: str, title: str, section: Section) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.jsonl").write_text("".join(json.dumps(record) + "\n" for record in section.records), "utf-8")
+    for figure, draw in section.figures.items():
+        draw(folder / figure)
+    command = f"```bash\n{command_line()}\n```"
+    page = folder.with_suffix(".md")
+    text = joined([title, wrapped(section.text.strip()), command, versions()])
+    write(page, with_section(page.read_text("utf-8") if page.is_file() else "", title, text))
+
+
+def with_section(page: str, title: str, text: str) -> str:
+    """The page with a section's text, which begins with its title, in place of the one before."""
+    there = {block.partition("\n")[0]: block for block in re.split("^## ", page, flags=re.M)[1:]} | {title: text}
+    return joined([HEAD, *(f"## {there[each]}" for each, *_ in SECTIONS.values() if each in there)])

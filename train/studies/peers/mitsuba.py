@@ -1,0 +1,109 @@
+"""Mitsuba 3 as its users would set it up for this task: an environment map of the light and plain AD."""
+
+import math
+
+import numpy as np
+import torch
+
+from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
+from renderer.harmonics import basis
+from train.studies.peers import PeerScene
+
+MAP_ROWS, MAP_COLUMNS = 32, 64  # bilinear texels this wide dim band l by l(l + 1) (π / 31)² / 12: band 2 by 0.5 %
+TO_Z_UP = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]  # its maps have y up and +z in the middle
+
+
+class MitsubaPeer:
+    """Mitsuba's `direct` integrator in llvm_ad_rgb on one thread, `samples` camera rays per pixel.
+
+    Each camera ray draws one direction by the cosine and looks the map up there: Mitsuba's cheapest way, and the least
+    noisy for a smooth light. Each call turns coefficients into texels by a matrix product, and the gradient back by its
+    transpose, or moves the vertices and rebuilds the ray tracer's tree. Outlines count as fixed.
+    """
+
+    def __init__(self, scene: PeerScene):
+        self._mi, self._dr = _mitsuba_on_one_thread()
+        self._positions = scene.vertices.astype(np.float32).ravel()
+        self._light = scene.light.astype(np.float32)
+        self._samples = scene.samples
+        numbered = self._mi.Bitmap(np.tile(np.arange(MAP_COLUMNS, dtype=np.float32)[:, None], (MAP_ROWS, 1, 3)))
+        description = {
+            "type": "scene",
+            "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1, "hide_emitters": True},
+            "light": {"type": "envmap", "bitmap": numbered, "to_world": self._mi.ScalarTransform4f(TO_Z_UP)},
+            "mesh": self._mesh(scene.faces, scene.albedo),
+            "sensor": self._sensor(scene.camera, scene.size),
+        }
+        self._scene = self._mi.load_dict(description)
+        self._parameters = self._mi.traverse(self._scene)
+        with_seam = np.array(self._parameters["light.data"])[0, :, 0].astype(int)  # its map repeats columns there
+        self._basis = _texel_basis()[:, with_seam]
+        self._parameters["light.data"] = self._mi.TensorXf(self._basis @ self._light)
+        self._parameters.update()
+
+    def image(self) -> np.ndarray:
+        return math.pi * np.array(self._render()).transpose(2, 0, 1)
+
+    def light_gradient(self, image_gradient: np.ndarray) -> np.ndarray:
+        texels = self._mi.TensorXf(self._basis @ self._light)
+        by_texel = self._gradient("light.data", texels, image_gradient)
+        return np.tensordot(self._basis, by_texel, ([0, 1], [0, 1]))
+
+    def vertex_gradient(self, image_gradient: np.ndarray) -> np.ndarray:
+        positions = self._mi.Float(self._positions)
+        return self._gradient("mesh.vertex_positions", positions, image_gradient).reshape(-1, 3)
+
+    def _gradient(self, key: str, value, image_gradient: np.ndarray) -> np.ndarray:
+        self._dr.enable_grad(value)
+        self._parameters[key] = value
+        self._parameters.update()
+        by_radiance = self._mi.TensorXf(np.ascontiguousarray(math.pi * image_gradient.transpose(1, 2, 0), np.float32))
+        self._dr.backward(self._dr.sum(self._render() * by_radiance))
+        gradient = np.array(self._dr.grad(value))  # waits for the result
+        self._dr.disable_grad(self._parameters[key])
+        return gradient
+
+    def _render(self):
+        return self._mi.render(self._scene, self._parameters, spp=self._samples)
+
+    def _mesh(self, faces: np.ndarray, albedo: np.ndarray):
+        properties = self._mi.Properties()
+        properties["face_normals"] = True
+        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo.tolist()}}
+        properties["bsdf"] = self._mi.load_dict(diffuse)
+        mesh = self._mi.Mesh("mesh", len(self._positions) // 3, len(faces), props=properties)
+        buffers = self._mi.traverse(mesh)
+        buffers["vertex_positions"] = self._positions
+        buffers["faces"] = faces.astype(np.uint32).ravel()
+        buffers.update()
+        return mesh
+
+    def _sensor(self, camera: OrthographicCamera, size: int) -> dict:
+        _, up, back = camera.axes()
+        half = camera.field_of_view / 2  # its image spans [-1, 1]
+        look = self._mi.ScalarTransform4f().look_at(origin=list(4 * back), target=[0, 0, 0], up=list(up))
+        film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+        return {"type": "orthographic", "to_world": look.scale([half, half, 1]), "film": film}
+
+
+def _mitsuba_on_one_thread():
+    """The modules (mitsuba, drjit). InputError: not installed, or no LLVM library."""
+    try:
+        import drjit
+        import mitsuba
+
+        mitsuba.set_variant("llvm_ad_rgb")
+    except ImportError as error:
+        advice = "pip install mitsuba, apt install libllvm19, set DRJIT_LIBLLVM_PATH to its libLLVM.so.19.1"
+        raise InputError(f"Mitsuba's variant llvm_ad_rgb does not start: {advice}") from error
+    drjit.set_thread_count(1)
+    return mitsuba, drjit
+
+
+def _texel_basis() -> np.ndarray:
+    """(rows, columns, 49) harmonics at the texels; there is a row at either pole."""
+    azimuth = math.pi - 2 * math.pi * (np.arange(MAP_COLUMNS) + 0.5) / MAP_COLUMNS
+    polar, azimuth = np.meshgrid(np.linspace(0, math.pi, MAP_ROWS), azimuth, indexing="ij")
+    directions = [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+    return basis(torch.from_numpy(np.stack(directions, axis=-1)), 6).numpy().astype(np.float32)

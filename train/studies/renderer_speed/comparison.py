@@ -1,0 +1,123 @@
+"""Side by side on one scene: this renderer, plain autograd through its shading, and other differentiable renderers."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import product
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer import reference, shading
+from renderer.errors import InputError
+from renderer.transfer import DEGREE, Operator
+from train.studies.peers import PeerScene
+from train.studies.renderer_speed.errors import Exact
+from train.studies.renderer_speed.panels import SAMPLES, Bench, Entries, row_of
+from train.studies.renderer_speed.results import Row
+from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View, coefficients
+from train.studies.renderer_speed.steps import shade_by_face, vertex_step
+
+DIRECT, AUTOGRAD, WHOLE = "operator, direct", "operator, autograd", "operator, direct, whole images in and out"
+ANALYTIC, BY_FACE, BY_SAMPLE = "analytic", "plain autograd, face by face", "plain autograd, sample by sample"
+KEPT, REFRESHED = "visibility kept", "re-rasterised"
+MITSUBA, PYTORCH3D = "Mitsuba 3", "PyTorch3D"
+SAMPLES_OF = {MITSUBA: 16, PYTORCH3D: 1}  # per pixel
+
+COARSER, FINER = 2, 4  # samples per side: as attacks have by default, and as many in all as Mitsuba has
+SHADINGS = {ANALYTIC: shading.radiance, BY_FACE: shade_by_face, BY_SAMPLE: reference.radiance}
+
+Peers = Mapping[str, Callable]  # makers by name
+
+
+def installed_peers() -> tuple[dict[str, Callable], list[str]]:
+    """(the peers that start here, by name, and a sentence about each that does not)."""
+    from train.studies.peers.mitsuba import MitsubaPeer
+    from train.studies.peers.pytorch3d import PyTorch3DPeer
+
+    peers, absent = {}, []
+    for name, make in {MITSUBA: MitsubaPeer, PYTORCH3D: PyTorch3DPeer}.items():
+        triangle = np.eye(3), np.array([[0, 1, 2]])
+        try:
+            make(PeerScene(*triangle, np.array(ALBEDO), np.zeros((49, 3)), CAMERA, 4, SAMPLES_OF[name]))
+        except InputError as error:
+            absent.append(f"{name} was not timed: {error}.")
+        else:
+            peers[name] = make
+    return peers, absent
+
+
+def by_light(bench: Bench, size: int, peers: Peers) -> list[Row]:
+    """Radiance of a light of degree 6, and the gradient of a scalar loss on it by the light."""
+
+    def entries() -> Entries:
+        view, light = bench.view(bench.plan.mesh, size), bench.light()
+        operator, exact = view.operator(SAMPLES), Exact(view, _irradiance)
+        row = row_of(view, f"gradient by the light, {size}²", "", SAMPLES, **exact.light_errors(operator, light))
+        for name, call in _light_gradients(view, operator, light).items():
+            yield replace(row, setting=name), call
+        for name, peer in _set_up(view, peers):
+            call = partial(peer.light_gradient, view.image_gradient.cpu().float().numpy())
+            errors = exact.errors(
+                torch.from_numpy(peer.image()), torch.from_numpy(call()), exact.by_light[: len(light)]
+            )
+            yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
+
+    return bench.timed(entries())
+
+
+def _light_gradients(view: View, operator: Operator, light: Tensor) -> dict[str, Callable[[], Tensor]]:
+    upstream, image_gradient = view.upstream(operator.pixels), view.image_gradient.flatten(1).float()
+
+    def direct() -> Tensor:
+        operator.radiance(light)
+        return operator.light_gradient(upstream)
+
+    def autograd() -> Tensor:
+        variable = light.clone().requires_grad_()
+        return torch.autograd.grad((operator.radiance(variable) * upstream).sum(), variable)[0]
+
+    def whole() -> Tensor:
+        view.canvas(operator.radiance(light), operator.pixels)
+        return operator.light_gradient(image_gradient.index_select(1, operator.pixels))
+
+    return {DIRECT: direct, AUTOGRAD: autograd, WHOLE: whole}
+
+
+def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
+    """An image, and the gradient of a scalar loss on it by the vertices."""
+
+    def entries() -> Entries:
+        view, light = bench.view(bench.plan.mesh, size), bench.light()
+        exact = Exact(view, _irradiance)
+        row = row_of(view, f"gradient by the vertices, {size}²", "", 1)
+        for samples, name in (*product((1, COARSER), SHADINGS), (FINER, ANALYTIC)):
+            shade = SHADINGS[name]
+            found = replace(row, samples=samples**2, **exact.vertex_errors(view, samples, light, shade))
+            if samples == 1:
+                yield replace(found, setting=f"{name}, {KEPT}"), vertex_step(view, 1, light, kept=True, shade=shade)
+            yield replace(found, setting=rasterised(name, samples)), vertex_step(view, samples, light, shade=shade)
+        for name, peer in _set_up(view, peers):
+            call = partial(peer.vertex_gradient, view.image_gradient.cpu().float().numpy())
+            errors = exact.errors(torch.from_numpy(peer.image()), torch.from_numpy(call()), exact.by_vertices)
+            yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
+
+    return bench.timed(entries())
+
+
+def rasterised(name: str, samples: int) -> str:
+    """The row of a shading whose every step rasterises anew, with so many samples per side of a pixel."""
+    return f"{name}, {REFRESHED}, {samples}² samples"
+
+
+def _irradiance(normals: Tensor) -> Tensor:
+    """Of the light as the peers are given it, cut off after degree 6."""
+    return reference.irradiance(normals, coefficients(DEGREE))
+
+
+def _set_up(view: View, peers: Peers) -> Iterator[tuple[str, object]]:
+    light = coefficients(DEGREE).float().numpy()
+    for name, make in peers.items():
+        mesh, samples = view.mesh, SAMPLES_OF[name]
+        yield name, make(PeerScene(mesh.vertices, mesh.faces, np.array(ALBEDO), light, CAMERA, view.size, samples))

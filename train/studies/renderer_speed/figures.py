@@ -1,0 +1,92 @@
+"""The figures: fronts of time and error, and how time and memory grow. Needs matplotlib."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from train.studies.figures import pyplot, save
+from train.studies.renderer_speed.results import Row, pareto_front
+from train.studies.renderer_speed.scaling import Point
+
+RED = "#c62f2f"
+FEW = 12  # settings that can all be named in the figure
+
+
+def draw_fronts(path: Path, panels: Sequence[Sequence[Row]]) -> None:
+    """One set of axes per panel: all settings, by name or coloured by degree, their front and the default."""
+    plt = pyplot()
+    lines = -(-len(panels) // 3)
+    figure, axes = plt.subplots(lines, 3, figsize=(16, 5 * lines), squeeze=False, layout="tight")
+    for ax, rows in zip(axes.flat, panels, strict=False):
+        _draw_front(ax, rows)
+        if len(rows) > FEW:
+            _draw_by_degree(ax, rows, plt.get_cmap("viridis"))
+        else:
+            for row in rows:
+                ax.plot(row.time_ms, row.error, "o", ms=6, label=row.setting)
+        ax.set(title=rows[0].panel, xlabel="milliseconds", ylabel="relative error")
+        _logarithmic(ax, "x", *("y" if min(row.error for row in rows) > 0 else ""))
+        ax.legend(fontsize=8)
+    for ax in axes.flat[len(panels) :]:
+        ax.axis("off")
+    save(figure, path, dpi=100)
+
+
+def _draw_front(ax, rows: Sequence[Row]) -> None:
+    front = pareto_front(rows)
+    ax.plot([row.time_ms for row in front], [row.error for row in front], "k-", lw=1, zorder=1, label="front")
+    for row in rows:
+        if row.default:
+            ax.plot(row.time_ms, row.error, "*", ms=15, color=RED, label="default")
+
+
+def _draw_by_degree(ax, rows: Sequence[Row], colors) -> None:
+    degrees = sorted({row.degree for row in rows})
+    for place, degree in enumerate(degrees):
+        same = [(row.time_ms, row.error) for row in rows if row.degree == degree]
+        ax.scatter(*zip(*same, strict=True), s=22, color=colors(place / len(degrees)), label=f"degree {degree}")
+
+
+def draw_scaling(path: Path, points: Sequence[Point], workloads: Sequence[Sequence[Row]]) -> None:
+    """Time and memory of a gradient by its variables, and time of each kind of work by size, vertices and lights."""
+    figure, axes = pyplot().subplots(2, 3, figsize=(16, 10), layout="tight")
+    methods = list(dict.fromkeys(point.method for point in points))
+    lines = {method: [point for point in points if point.method == method] for method in methods}
+    for ax, quantity, unit in ((axes[0, 0], "time_ms", "milliseconds"), (axes[0, 1], "memory_mb", "peak MB allocated")):
+        _draw_lines(ax, lines, "variables", quantity)
+        ax.set(title=f"gradient by the vertices, {points[0].size}², visibility kept", xlabel="variables", ylabel=unit)
+    by_size, by_vertices, by_lights = workloads
+    _draw_lines(axes[0, 2], {by_lights[0].panel: by_lights}, "batch", "time_ms")
+    axes[0, 2].set(title=by_lights[0].panel, xlabel="lights", ylabel="milliseconds per light")
+    for ax, rows, axis in ((axes[1, 0], by_size, "size"), (axes[1, 1], by_vertices, "vertices")):
+        _draw_lines(ax, _by_work(rows), axis, "time_ms")
+        ax.set(title=rows[0].panel, xlabel=axis, ylabel="milliseconds")
+    stepping = [row for row in by_size if row.setting in ("light step", "vertex step, refreshed")]
+    _draw_lines(axes[1, 2], _by_work(stepping), "size", "error")
+    axes[1, 2].set(title=by_size[0].panel, xlabel="size", ylabel="relative error")
+    save(figure, path, dpi=100)
+
+
+def _by_work(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    return {work: [row for row in rows if row.setting == work] for work in dict.fromkeys(row.setting for row in rows)}
+
+
+def _draw_lines(ax, lines: dict[str, Sequence], x: str, y: str) -> None:
+    for name, line in lines.items():
+        ax.plot([getattr(point, x) for point in line], [getattr(point, y) for point in line], "o-", ms=4, label=name)
+    _logarithmic(ax, "x", "y")
+    ax.legend(fontsize=8)
+
+
+def _logarithmic(ax, *names: str) -> None:
+    """With as many plain numbers beside an axis as there is room for, also where it spans less than a decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    ax.set(**{f"{name}scale": "log" for name in names})
+    for name in names:
+        axis = getattr(ax, f"{name}axis")
+        low, high = axis.get_view_interval()
+        steps = range(1, 10) if high < 5 * low else (1, 2, 5) if high < 1000 * low else (1,)
+        axis.set_major_locator(LogLocator(subs=steps, numticks=12))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.12g}"))
+        axis.set_minor_formatter(NullFormatter())
+    ax.grid(alpha=0.3, which="both")

@@ -1,0 +1,167 @@
+"""The page that a run leaves in docs/: what was measured, on what, and whether it is enough."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from train.studies.page import joined
+from train.studies.renderer_speed.results import Row, pareto_front, verdict
+from train.studies.renderer_speed.scaling import Point
+from train.studies.renderer_speed.skipping import Saving
+from train.studies.targets import Target, table_of
+from train.tables import markdown, shown
+
+HEADER = """# Time against error
+
+`{command}` measures everything on this page in one run and writes it; do not edit.
+
+{machine}.
+
+- The scene is an ellipsoid of one colour, flat-shaded, under the Grace Cathedral probe and a sun: parallel light, whose
+  bands never end, so that cutting the light off after a degree is an error too.
+- **Time** is the median over rounds in which all candidates take turns. On a CPU it is the process's own time, on one
+  thread. **Error** is the root mean square of the difference to a converged reference, over the reference's root mean
+  square: of the radiance before clamping, and of the gradient of Σ radiance × normal random numbers.
+- **The reference** is float64, differentiated by plain autograd, with the sun uncut and 64² samples per pixel at 32²
+  ({reference_samples}² at {reference_size}², where its own image is still off by {uncertainty}). Visibility is fixed
+  in every gradient, and a cut light's gradient is compared on the coefficients that the light has.
+- A **light step** is image, clamp and gradient of a scalar loss by the light; a **vertex step** is the same by the
+  vertices, with visibility kept or the mesh projected and rasterised anew. There is no classifier in either.
+"""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a run measured.
+
+    choices: panels with a default. comparisons: with plain autograd and, where asked for, with other renderers.
+    workloads: by size, vertices and lights. notes: what could not be measured. reference: (its samples per side, the
+    image's size, its own relative error) of the large image.
+    """
+
+    targets: Sequence[Target]
+    choices: Sequence[Sequence[Row]]
+    descent: Sequence[Row]
+    comparisons: Sequence[Sequence[Row]]
+    workloads: Sequence[Sequence[Row]]
+    savings: Sequence[Saving]
+    scaling: Sequence[Point]
+    notes: Sequence[str]
+    reference: tuple[int, int, float]
+
+    @property
+    def panels(self) -> list[Sequence[Row]]:
+        """Those that have a front."""
+        return [*self.choices, self.descent, *self.comparisons]
+
+
+WHY_NOT = """\
+At 32² one light's image and gradient are some twenty operations on a few thousand numbers, whose cost is Python's and
+torch's for each operation and not the arithmetic; a light among 100 costs a fraction of it
+([Light step by lights](#light-step-by-lights-32)). Plain autograd sample by sample is `renderer.reference`; face by
+face it shades each face once, as the analytic derivative does. Rasterising anew takes more than half of a vertex step
+and is the same work for all; [Gradient by the vertices](#gradient-by-the-vertices-224) has the ratios without it, too.
+"""
+
+
+def page(findings: Findings, command: str, machine: str) -> str:
+    """The whole page, in Markdown."""
+    samples, size, uncertainty = findings.reference
+    header = HEADER.format(
+        command=command,
+        machine=machine,
+        reference_samples=samples,
+        reference_size=size,
+        uncertainty=shown(uncertainty),
+    )
+    sections = [
+        header,
+        *findings.notes,
+        "## Targets",
+        table_of(findings.targets),
+        WHY_NOT,
+        "## Choices",
+        "The error that counts is the larger of the two. All settings, not only the fronts, are in "
+        "[renderer_pareto.csv](renderer_pareto.csv).",
+        "![Fronts of time and error](renderer_pareto.png)",
+        *_choices(findings.choices),
+        *_descent(findings.descent),
+        "## Side by side",
+        *_comparisons(findings.comparisons),
+        "## What a scene does not need",
+        _savings(findings.savings),
+        "## How it grows",
+        *_growth(findings),
+    ]
+    return joined(sections)
+
+
+def _choices(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
+    for rows in panels:
+        front = pareto_front(rows)
+        shown_rows = sorted({*front, *(row for row in rows if row.default)}, key=lambda row: row.time_ms)
+        yield f"### {_title(rows)}"
+        yield verdict(rows)
+        lines = [(row.setting, *_numbers(row), row in front, "default" if row.default else "") for row in shown_rows]
+        yield markdown(["setting", "ms", "image's error", "gradient's error", "front", ""], lines)
+
+
+def _descent(rows: Sequence[Row]) -> Iterator[str]:
+    yield f"### {_title(rows)}"
+    yield (
+        "The vertices move until the image looks lit from the other side, in unit steps of 0.05. The error is the "
+        "final image's, against the descent whose visibility is refreshed in every step."
+    )
+    lines = [(row.setting, row.time_ms, row.image_error, row.cost) for row in rows]
+    yield markdown(["visibility", "ms per step", "final image's error", "share of the cost that is left"], lines)
+
+
+def _comparisons(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
+    yield "The light is cut after degree 6 in the reference too, since that is what all are given."
+    for rows in panels:
+        fastest = min(row.time_ms for row in rows)
+        lines = [(row.setting, row.samples, *_numbers(row), f"{shown(row.time_ms / fastest)}×") for row in rows]
+        yield f"### {_title(rows)}"
+        header = ["who", "samples per pixel", "ms", "image's error", "gradient's error", "of the fastest"]
+        yield markdown(header, lines)
+
+
+def _savings(savings: Sequence[Saving]) -> str:
+    lines = [
+        (s.what, s.all_ms, s.needed_ms, f"{shown(s.all_ms / s.needed_ms)}×", _mb(s.all_bytes), _mb(s.needed_bytes))
+        for s in savings
+    ]
+    return markdown(["what", "ms with all", "ms without", "saved", "MB with all", "MB without"], lines)
+
+
+def _growth(findings: Findings) -> Iterator[str]:
+    yield (
+        "The paper's scaling figure, and every kind of work by size, by vertices and by lights; the numbers are in "
+        "[renderer_scaling.csv](renderer_scaling.csv) and [renderer_pareto.csv](renderer_pareto.csv)."
+    )
+    yield "![How time and memory grow](renderer_scaling.png)"
+    methods = list(dict.fromkeys(point.method for point in findings.scaling))
+    header = ["variables", *(f"{method}: {unit}" for method in methods for unit in ("ms", "MB"))]
+    by_count = {point.variables: {} for point in findings.scaling}
+    for point in findings.scaling:
+        by_count[point.variables][point.method] = point.time_ms, point.memory_mb
+    lines = [(count, *(value for method in methods for value in found[method])) for count, found in by_count.items()]
+    yield markdown(header, lines)
+    for rows in findings.workloads:
+        yield f"### {_title(rows)}"
+        lines = [(row.setting, row.size, row.vertices, row.samples, *_numbers(row)) for row in rows]
+        yield markdown(
+            ["work", "size", "vertices", "samples per pixel", "ms", "image's error", "gradient's error"], lines
+        )
+
+
+def _title(rows: Sequence[Row]) -> str:
+    panel = rows[0].panel
+    return panel[0].upper() + panel[1:]
+
+
+def _numbers(row: Row) -> tuple[float | None, ...]:
+    return row.time_ms, row.image_error, row.gradient_error
+
+
+def _mb(count: int | None) -> float | None:
+    return None if count is None else count / 1e6

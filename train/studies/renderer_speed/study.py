@@ -1,0 +1,111 @@
+"""The renderer's time against its error, in one run."""
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from augment.objects import load_object
+from renderer.errors import InputError
+from renderer.mesh import Mesh
+from renderer.shapes import solid
+from renderer.visibility import Backend, choose
+from train.cli import command_line
+from train.device import choose_device
+from train.outputs import writable_folder
+from train.settings import SceneSettings, read_object
+from train.studies.figures import pyplot
+from train.studies.page import machine, write
+from train.studies.renderer_speed import comparison, figures, panels, results, scaling, skipping, targets
+from train.studies.renderer_speed.measure import Clock
+from train.studies.renderer_speed.page import Findings, page
+from train.studies.renderer_speed.panels import QUICK, Bench, Plan
+from train.studies.renderer_speed.reference import Converged
+from train.studies.renderer_speed.scenes import irradiance
+
+
+@dataclass
+class RendererSpeedSettings:
+    """conf/benchmark_renderer.yaml. out: a folder. peers: whether others are timed, too. quick: tiny settings, once.
+
+    scene.meshes: those whose operators are built; none: two solid oranges as they are, not normalised.
+    """
+
+    out: str
+    device: str
+    peers: bool
+    quick: bool
+    scene: SceneSettings
+
+
+def run(settings: RendererSpeedSettings) -> None:
+    """Measure, and write the page, its figures and its numbers."""
+    out = writable_folder(settings.out, "out")
+    pyplot()  # a run without matplotlib would fail only at its end
+    torch.set_num_threads(1)
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software OpenGL, too, on the one thread
+    device, plan = choose_device(settings.device), QUICK if settings.quick else Plan()
+    description = machine(device)
+    bench = Bench(plan, Clock(device, plan.rounds), _backends(), device)
+    named = [read_object(item, "", index) for index, item in enumerate(settings.scene.meshes)]
+    meshes = [load_object(item).mesh for item in named] or [solid("orange", seed) for seed in (0, 1)]
+    findings = _measure(bench, meshes, settings.peers)
+    _write(out, findings, description)
+
+
+def _backends() -> tuple[Backend, ...]:
+    """The rasterisers that work here, the one that "auto" chooses first."""
+    backends = [choose()]
+    for name in ("software", "opengl"):
+        if name != backends[0].name:
+            try:
+                backends.append(choose(name))
+            except InputError:
+                print(f"{name} does not rasterise here and is left out")
+    return tuple(backends)
+
+
+def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
+    plan = bench.plan
+    peers, notes = (
+        comparison.installed_peers() if with_peers else ({}, ["Run with peers=true to time other renderers."])
+    )
+    print(f"rasterisers: {', '.join(backend.description for backend in bench.backends)}", flush=True)
+    choices = [
+        panels.light_steps(bench, plan.small),
+        panels.light_steps(bench, plan.large),
+        panels.builds(bench),
+        panels.vertex_steps(bench),
+    ]
+    print("measured: choices", flush=True)
+    compared = [
+        comparison.by_light(bench, plan.small, peers),
+        comparison.by_light(bench, plan.large, peers),
+        comparison.by_vertices(bench, plan.large, peers),
+    ]
+    print("measured: comparisons", flush=True)
+    workloads = [*(panels.workloads(bench, axis) for axis in ("size", "vertices")), panels.batches(bench)]
+    print("measured: workloads", flush=True)
+    reference = Converged(bench.view(plan.mesh, plan.large))
+    return Findings(
+        targets=[*targets.compared(compared), *targets.measured(bench, meshes)],
+        choices=choices,
+        descent=panels.refreshes(bench),
+        comparisons=compared,
+        workloads=workloads,
+        savings=skipping.measure(bench, meshes),
+        scaling=scaling.measure(bench),
+        notes=notes,
+        reference=(reference.samples, plan.large, reference.uncertainty(irradiance)),
+    )
+
+
+def _write(folder: Path, findings: Findings, description: str) -> None:
+    text = page(findings, command_line(), description)
+    write(folder / "performance_renderer.md", text)
+    rows = [*results.records(findings.panels), *(asdict(row) for rows in findings.workloads for row in rows)]
+    results.write_csv(folder / "renderer_pareto.csv", rows)
+    results.write_csv(folder / "renderer_scaling.csv", [asdict(point) for point in findings.scaling])
+    figures.draw_fronts(folder / "renderer_pareto.png", findings.panels)
+    figures.draw_scaling(folder / "renderer_scaling.png", findings.scaling, findings.workloads)

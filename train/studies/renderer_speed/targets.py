@@ -1,0 +1,102 @@
+"""The targets, each with what this run measured."""
+
+from collections.abc import Sequence
+
+from renderer.cache import OperatorCache
+from renderer.mesh import Mesh
+from train.studies.renderer_speed import comparison
+from train.studies.renderer_speed.panels import SAMPLES, Bench
+from train.studies.renderer_speed.results import Row
+from train.studies.renderer_speed.skipping import build_operators
+from train.studies.renderer_speed.steps import light_step, vertex_step
+from train.studies.targets import Target
+from train.tables import shown
+
+QUOTED = {32: 1.3, 224: 13.0}  # ms, PyTorch3D with its fragments kept, measured once on another machine
+
+
+def compared(panels: Sequence[Sequence[Row]]) -> list[Target]:
+    """Of the panels of `comparison`: light at the small size, light at the large one, vertices at the large one."""
+    small, large, vertices = ({row.setting: row for row in rows} for rows in panels)
+    return [
+        *(_faster(rows, comparison.DIRECT, comparison.PYTORCH3D, least) for rows, least in ((large, 10), (small, 30))),
+        *(_faster(rows, comparison.DIRECT, comparison.MITSUBA, least) for rows, least in ((large, 300), (small, 400))),
+        _faster(vertices, comparison.rasterised(comparison.ANALYTIC, 1), comparison.MITSUBA, 30),
+        *(
+            _faster(
+                vertices, comparison.rasterised(comparison.ANALYTIC, samples), comparison.rasterised(peer, samples), 3
+            )
+            for peer in (comparison.BY_SAMPLE, comparison.BY_FACE)
+            for samples in (comparison.COARSER, 1)
+        ),
+    ]
+
+
+def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Target:
+    """Beside the ratio, for other renderers: no larger an error of the image and of the gradient."""
+    own, other = rows[ours], rows.get(theirs)
+    what, asked = f"{own.panel}: {ours}, against {theirs}", f"at least {least}× faster"
+    if other is None:
+        return _unmeasured(own, what, asked, theirs)
+    ratio, found = other.time_ms / own.time_ms, f"{shown(other.time_ms / own.time_ms)}×"
+    if theirs not in (comparison.MITSUBA, comparison.PYTORCH3D):
+        return Target(what, asked, found, ratio >= least)
+    accurate = own.image_error <= other.image_error and own.gradient_error <= other.gradient_error
+    errors = f"errors of image and gradient {_errors(own)} against {_errors(other)}"
+    return Target(what, f"{asked}, error no larger", f"{found}, {errors}", ratio >= least and accurate)
+
+
+def _unmeasured(own: Row, what: str, asked: str, theirs: str) -> Target:
+    if theirs != comparison.PYTORCH3D or own.size not in QUOTED:
+        return Target(what, asked, "not measured", None)
+    quoted = QUOTED[own.size]
+    found = f"not measured here; {shown(quoted / own.time_ms)}× against {quoted} ms on another machine"
+    return Target(what, asked, found, None)
+
+
+def _errors(row: Row) -> str:
+    return f"{shown(row.image_error)} and {shown(row.gradient_error)}"
+
+
+def measured(bench: Bench, meshes: Sequence[Mesh]) -> list[Target]:
+    """Those that need timings of their own. meshes: of the scene whose operators are built."""
+    return [_any_mesh(bench), *_geometry(bench), _building(bench, meshes)]
+
+
+def _any_mesh(bench: Bench) -> Target:
+    counts = bench.plan.mesh, bench.plan.vertices[-1]
+    views = {count: bench.view(count, bench.plan.large) for count in counts}
+    steps = {
+        count: light_step(view, view.operator(bench.plan.workload_samples), bench.light())
+        for count, view in views.items()
+    }
+    times = bench.clock.medians(steps, 3 * bench.clock.rounds)
+    ratio = times[counts[1]] / times[counts[0]]
+    what = f"light step, {bench.plan.large}²: {counts[1]:,} vertices against {counts[0]:,}"
+    return Target(what, "within 10 %", f"{100 * (ratio - 1):+.1f} %", abs(ratio - 1) <= 0.1)
+
+
+def _geometry(bench: Bench) -> list[Target]:
+    view, light = bench.view(bench.plan.mesh, bench.plan.large), bench.light()
+    steps = {
+        "light": light_step(view, view.operator(1), light),
+        comparison.KEPT: vertex_step(view, 1, light, kept=True),
+        comparison.REFRESHED: vertex_step(view, 1, light),
+    }
+    times = bench.clock.medians(steps, 3 * bench.clock.rounds)
+    targets = []
+    for visibility, most in ((comparison.KEPT, 8), (comparison.REFRESHED, 14)):
+        ratio = times[visibility] / times["light"]
+        found = f"{shown(ratio)}×, {shown(times[visibility])} ms against {shown(times['light'])} ms"
+        what = f"vertex step against light step, {view.size}², {visibility}"
+        targets.append(Target(what, f"at most {most}×", found, ratio <= most))
+    return targets
+
+
+def _building(bench: Bench, meshes: Sequence[Mesh]) -> Target:
+    rounds = max(1, bench.clock.rounds // 3)
+    times = bench.clock.medians({"build": lambda: build_operators(bench, meshes, OperatorCache())}, rounds)
+    faces, seconds = " and ".join(f"{len(mesh.faces):,}" for mesh in meshes), times["build"] / 1e3
+    views, size = len(meshes) * bench.plan.views, bench.plan.small
+    what = f"operators of {views} views, {size}², {SAMPLES}² samples, meshes of {faces} faces"
+    return Target(what, "under 1.5 s", f"{shown(seconds)} s", seconds < 1.5)
