@@ -19,7 +19,16 @@ from train.run_folder import CONFIG, read_config, read_json
 from train.settings import decisive_settings
 from train.tables import aligned
 
-RECIPE = ("epochs", "batch_size", "learning_rate", "momentum", "weight_decay", "schedule", "precision")
+RECIPE = (
+    "epochs",
+    "images_per_epoch",
+    "batch_size",
+    "learning_rate",
+    "momentum",
+    "weight_decay",
+    "schedule",
+    "precision",
+)
 
 
 @dataclass(frozen=True)
@@ -178,12 +187,15 @@ def _card(run: RunSummary, name: str) -> str:
     architecture = f"WideResNet-{config.model.depth}-{config.model.width}, dropout {config.model.dropout}"
     data = Path(config.data.path).name if config.data.name in ("npz", "folder") else config.data.name
     meshes = [Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in config.scene.meshes]
+    often = f"every {config.augment.every} training images" if config.augment.get("every") else "each epoch"
     renders = f"{config.augment.examples} renders of {', '.join(meshes)}" if run.arm != "none" else "none"
+    start = config.train.get("init_from")
     rows = [
         ("network", architecture),
         ("data", f"{data}, {config.data.validation:.0%} of training for validation"),
-        ("augmentation", f"{run.arm}; renders each epoch: {renders}"),
-        ("recipe", ", ".join(f"{name} {config.train[name]}" for name in RECIPE)),
+        *([("begun from", Path(start).name)] if start else []),
+        ("augmentation", f"{run.arm}; renders {often}: {renders}"),
+        ("recipe", ", ".join(f"{name} {config.train[name]}" for name in RECIPE if config.train.get(name))),
         ("seed", str(config.seed)),
         ("epoch", f"{scores['test/epoch']}, selected on validation"),
         ("test accuracy", f"{scores['test/accuracy']:.4f}"),
