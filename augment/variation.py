@@ -36,7 +36,9 @@ class VariationSettings:
         for name in ("scale", "exposure"):
             limits = getattr(self, name)
             if len(limits) != 2 or not 1 / FACTOR <= limits[0] <= limits[1] <= FACTOR:
-                raise InputError(f"augment.vary.{name}={list(limits)}: give [least, most], both from {1 / FACTOR:g} to {FACTOR:g}")
+                raise InputError(
+                    f"augment.vary.{name}={list(limits)}: give [least, most], both from {1 / FACTOR:g} to {FACTOR:g}"
+                )
 
     @property
     def moves(self) -> bool:
