@@ -183,7 +183,7 @@ REFUSED = [
     (["attack.lighting.step=long"], r"step=long: choose one of unit, raw, sign"),
     (["attack.lighting.step_size=0"], r"step_size=0.0 must be at least"),
     (["attack.restarts=2"], r"attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0"),
-    (["attack.restarts=-1"], r"attack.restarts=-1 must not be negative"),
+    (["attack.restarts=-1"], r"attack.restarts=-1 must be at least 0"),
     (["attack.max_steps=-1"], r"attack: max_steps=-1 must be at least 0"),
     (["attack.batch_size=0"], r"attack: batch_size=0 must be at least 1"),
     (["scene.views=0"], r"scene.views=0 must be at least 1"),
