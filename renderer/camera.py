@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import LARGEST, InputError, require_range
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class OrthographicCamera:
     up: float = 0.0
 
     def __post_init__(self):
-        require_range("scene.field_of_view", self.field_of_view, 1 / FACTOR, FACTOR)
+        require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
         if not (abs(self.right) <= FACTOR and abs(self.up) <= FACTOR):  # NaN is not

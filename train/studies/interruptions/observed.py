@@ -15,7 +15,7 @@ from train.fit import Trainer
 from train.logs import RunLog
 
 PHASES = {  # entered with a function, and left with it
-    "attack": [(Trainer, "_begin_epoch")],
+    "attack": [(Trainer, "_regenerate")],
     "training": [(Trainer, "fit"), (Trainer, "_train")],
     "evaluation": [(Trainer, "_end_epoch")],
     "log": [(RunLog, "scalars"), (RunLog, "renders")],
