@@ -27,8 +27,8 @@ class OrthographicCamera:
         require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
-        if not (abs(self.right) <= FACTOR and abs(self.up) <= FACTOR):  # NaN is not
-            raise InputError(f"camera place right={self.right}, up={self.up}: give lengths of at most {FACTOR:g}")
+        if not (abs(self.right) <= LARGEST and abs(self.up) <= LARGEST):  # NaN is not
+            raise InputError(f"camera place right={self.right}, up={self.up}: give lengths of at most {LARGEST:g}")
 
     def axes(self) -> np.ndarray:
         """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""
