@@ -269,7 +269,7 @@ def test_a_lighting_attack_rasterises_nothing(rasterised):
     torch.nn.init.constant_(network[1].bias[0], 1000)
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=30))
     service = AugmentationService(settings, scene, torch.zeros(24, dtype=torch.int64), 0, Phases())
-    assert service.regenerate(network, 0).diagnostics["steps"] == 30 and rasterised == [4, 4]
+    assert service.regenerate(network, number=0).diagnostics["steps"] == 30 and rasterised == [4, 4]
 
 
 def test_a_scene_stores_no_background_pixel_and_no_backgrounds_or_dead_bands_of_a_view():
