@@ -1,1 +1,18 @@
 """Classifier and scenes to labelled images. Knows no OpenGL, no optimiser and no data set."""
+
+from renderer.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "attacks.criteria": ["LeastLikely", "Misclassification", "Targeted"],
+        "attacks.run": ["Attacked", "attack"],
+        "attacks.settings": ["AttackSettings", "SkylightSettings"],
+        "build": ["build_scene"],
+        "classifiers": ["Classifier", "load_classifier"],
+        "parameters": ["StepSettings"],
+        "scene": ["Conditions", "Example", "Scene"],
+        "service": ["AugmentationService", "AugmentationSettings"],
+        "variation": ["VariationSettings"],
+    },
+)

@@ -39,16 +39,24 @@ class NormBall:
             return domain(values).clamp(centre - self.radius, centre + self.radius)
         return _project_on_sphere(values, centre, self.radius, domain)
 
-    def sample(self, centre: Tensor, generator: torch.Generator) -> Tensor:
-        """A uniform draw around each centre (A, D), on the generator's device. InputError where there is no radius."""
+    def sample(self, centre: Tensor, generator: torch.Generator, used: Tensor | None = None) -> Tensor:
+        """A uniform draw around each centre (A, D), on the generator's device. InputError where there is no radius.
+
+        used: (A, D) bool, the axes along which each is drawn; None for all.
+        """
         if self.radius is None:
             raise InputError("attack: radius=null has no uniform draw: set a radius to compare with random ones")
         if self.norm == "linf":
             offset = 2 * torch.rand(centre.shape, generator=generator) - 1
         else:
             direction = torch.randn(centre.shape, generator=generator)
-            share = torch.rand(len(centre), 1, generator=generator) ** (1 / centre.shape[1])
+            axes = centre.shape[1]
+            if used is not None:
+                direction, axes = direction * used.cpu(), used.cpu().sum(1, keepdim=True)
+            share = torch.rand(len(centre), 1, generator=generator) ** (1 / axes)
             offset = direction / direction.norm(dim=1, keepdim=True) * share
+        if used is not None:
+            offset = offset * used.cpu()
         return centre + self.radius * offset.to(centre)
 
 

@@ -5,23 +5,24 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from augment.mesh_scene import Conditions, MeshScene
 from augment.parameters.kind import Kind
+from augment.scene import Conditions, Scene
 
 
 class Perturbation:
-    """Kinds side by side: values (E, D) are theirs, one after the other. See `augment.attack.Problem`."""
+    """Kinds side by side: values (E, D) are theirs, one after the other. See `augment.descent.Problem`."""
 
-    def __init__(self, scene: MeshScene, kinds: Sequence[Kind]):
+    def __init__(self, scene: Scene, kinds: Sequence[Kind]):
         self.scene, self.kinds = scene, kinds
-        self.start = torch.cat([kind.start.to(scene.light) for kind in kinds], dim=1)
+        self.start = torch.cat([kind.start.to(scene.lights) for kind in kinds], dim=1)
+        self.everything = torch.arange(len(scene), device=self.start.device)
         self._sizes = [kind.start.shape[1] for kind in kinds]
 
     def conditions(self, values: Tensor, examples: Tensor) -> Conditions:
         """What values (A, D) make of the scene of examples (A,)."""
         conditions = self.scene.conditions(examples)
         for kind, part in zip(self.kinds, self.split(values), strict=True):
-            conditions = kind.apply(part, conditions)
+            conditions = kind.apply(part, conditions, examples)
         return conditions
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
@@ -37,23 +38,15 @@ class Perturbation:
 
     def sample(self, generator: torch.Generator) -> Tensor:
         """Uniform draws (E, D) from every kind's ball around its start, within its domain."""
-        examples = torch.arange(len(self.scene))
-        drawn = [kind.sample(generator, examples).to(self.start) for kind in self.kinds]
+        drawn = [kind.sample(generator, self.everything).to(self.start) for kind in self.kinds]
         return torch.cat(drawn, dim=1)
 
     def sample_as_far(self, values: Tensor, generator: torch.Generator) -> Tensor:
         """Draws (E, D) as far as values went: uniform in a kind's ball where it has a radius, else in a random
         direction at the values' own L2 distance from the start."""
-        examples, drawn = torch.arange(len(self.scene)), []
-        for kind, part in zip(self.kinds, self.split(values), strict=True):
-            if kind.ball.radius is None:
-                start = kind.start.to(part)
-                offset = torch.randn(part.shape, generator=generator).to(part)
-                reach = (part - start).norm(dim=1, keepdim=True)
-                drawn.append(kind.within_domain(start + offset * reach / offset.norm(dim=1, keepdim=True)))
-            else:
-                drawn.append(kind.sample(generator, examples))
-        return torch.cat([part.to(self.start) for part in drawn], dim=1)
+        parts = zip(self.kinds, self.split(values), strict=True)
+        drawn = [kind.sample_as_far(part, generator, self.everything).to(self.start) for kind, part in parts]
+        return torch.cat(drawn, dim=1)
 
     def split(self, values: Tensor) -> tuple[Tensor, ...]:
         """Each kind's part (A, D_k) of values (A, D)."""

@@ -1,45 +1,339 @@
-"""The examples an augmentation renders: every mesh from every view over every background, as stacked operators."""
+"""The one scene: rows of what is shown, rendered under conditions that an attack may change."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from augment.objects import SceneObject
+from augment.operator_stack import OperatorStack
+from renderer.albedo import face_albedo, surface_albedo
+from renderer.basis import HARMONICS, Basis
 from renderer.cache import OperatorCache
-from renderer.camera import ring
-from renderer.errors import FACTOR, InputError, require_bounded, require_range
-from renderer.harmonics import live_coefficients
-from renderer.image import PictureSettings, behind, clamped, develop_composite
-from renderer.mesh import Mesh, load_mesh, normalise
-from renderer.shapes import solid
-from renderer.transfer import COEFFICIENTS, DEGREE, Operator, apply_transfer
+from renderer.camera import OrthographicCamera
+from renderer.errors import InputError, require_bounded
+from renderer.fragments import Fragments, build_fragments
+from renderer.image import PictureSettings, behind, clamp, clamped, develop_composite
+from renderer.mesh import Mesh
+from renderer.shading import radiance
 from renderer.visibility import Backend
 
-
-@dataclass
-class ObjectSettings:
-    """One mesh of a scene.
-
-    mesh: a file that trimesh reads, or `solid:NAME` or `solid:NAME:SEED`, a built-in procedural solid. label: the
-    name of its class. up: the axis that points up in the file, auto|y|z. gain: multiplies the albedo.
-    """
-
-    mesh: str
-    label: str
-    up: str = "auto"
-    gain: float = 1.0
-
-    def __post_init__(self):
-        require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
+STACKED = 2**16  # pixels of the images whose operators are multiplied at once; more would only be copied about
 
 
 @dataclass(frozen=True)
-class SceneObject:
-    """The operators (one per view) of one mesh, and the name of its class."""
+class Example:
+    """A row of a scene: which object, from V cameras, before which background.
 
-    label: str
-    operators: Sequence[Operator]
+    object, background: indices into the scene's. exposure: multiplies the light.
+    """
+
+    object: int
+    cameras: tuple[OrthographicCamera, ...]
+    background: int
+    exposure: float = 1.0
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What A examples are rendered under.
+
+    light: (A, size, 3), of the scene's basis. vertices: (A, N, 3), None where they are the meshes'. albedo: (A, F, 3),
+    added to each face's linear albedo. pixels: (A, V, 3, size, size), added to the images' values. Where meshes differ
+    in size, N and F are the largest's, and a smaller mesh has the first of them.
+    """
+
+    light: Tensor
+    vertices: Tensor | None = None
+    albedo: Tensor | None = None
+    pixels: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """Pixels (P,) that a mesh covers in B images, `rows` of all, None for all of them in order.
+
+    composite: (B, 3, P) linear radiance and what is behind it. coverage: (O, 1, P) of the O views, of which each image
+    has the one that `shown` (B,) says.
+    """
+
+    rows: list[int] | None
+    pixels: Tensor
+    composite: Tensor
+    coverage: Tensor
+    shown: Tensor | list[int]
+
+
+class Scene:
+    """E examples of V views each, over backgrounds (B, 3 or 1, size, size) of values in [0, 1].
+
+    Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
+    (`OperatorStack`), equal views share one, and what a background adds to an image is kept. Where vertices move, their
+    view is rasterised anew each time. light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are
+    those of the images. basis: what lights are coefficients of; 49 harmonics, unless another is given.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[SceneObject],
+        examples: Sequence[Example],
+        backgrounds: Tensor,
+        light: Tensor,
+        settings: PictureSettings,
+        backend: Backend,
+        operators: OperatorCache | None = None,
+        basis: Basis = HARMONICS,
+    ):
+        if light.shape[-2:] != (basis.size, 3):
+            raise InputError(f"light of shape {tuple(light.shape)} is not of {basis}: give {basis.size} rows")
+        if not (backgrounds.min() >= 0 and backgrounds.max() <= 1):
+            raise InputError("scene.backgrounds: give values in [0, 1]")
+        self.objects, self.examples = list(objects), list(examples)
+        self.settings, self.backend, self.basis = settings, backend, basis
+        self.backgrounds = backgrounds.flatten(2).to(light)
+        self.lights = light.expand(len(examples), *light.shape[-2:])
+        self.views = len(self.examples[0].cameras)  # per example
+        self._cache = operators or OperatorCache()
+        self.object_of = self._column(example.object for example in examples)  # (E,)
+        self._background = self._column(example.background for example in examples)
+        self._exposure = torch.tensor([example.exposure for example in examples]).to(light)[:, None, None]
+        seen = [(example.object, camera) for example in examples for camera in example.cameras]
+        self._distinct = sorted(dict.fromkeys(seen), key=lambda view: view[0])  # (object, camera) of each operator
+        number = {view: index for index, view in enumerate(self._distinct)}
+        self._operator = self._column(number[view] for view in seen)  # (E × V,)
+        self._per_stack = max(1, STACKED // settings.size**2)
+        # What is kept of views; `functools.cache` would tie a scene that each epoch replaces to itself.
+        self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
+        self._fragments_of_meshes: dict[tuple[int, OrthographicCamera], tuple[Fragments, Tensor]] = {}
+
+    @classmethod
+    def grid(
+        cls,
+        objects: Sequence[SceneObject],
+        cameras: Sequence[OrthographicCamera],
+        backgrounds: Tensor,
+        *of_scene,
+        shared: bool = False,
+        basis: Basis = HARMONICS,
+    ) -> Scene:
+        """Every object from every camera over every background, in that order; or, where the views share what is
+        attacked, every object over every background from all cameras. of_scene: the other arguments."""
+        views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
+        examples = [Example(*row) for row in product(range(len(objects)), views, range(len(backgrounds)))]
+        return cls(objects, examples, backgrounds, *of_scene, basis=basis)
+
+    @classmethod
+    def of_mesh(
+        cls,
+        mesh: Mesh,
+        cameras: Sequence[Sequence[OrthographicCamera]],
+        backgrounds: Tensor,
+        light: Tensor,
+        settings: PictureSettings,
+        backend: Backend,
+        gain: float = 1.0,
+        operators: OperatorCache | None = None,
+    ) -> Scene:
+        """One mesh from cameras (E × V), each example before a background of its own (E, 3, size, size)."""
+        examples = [Example(0, tuple(views), index) for index, views in enumerate(cameras)]
+        return cls([SceneObject("", mesh, gain)], examples, backgrounds, light, settings, backend, operators)
+
+    def with_rows(
+        self, examples: Sequence[Example], backgrounds: Tensor | None = None, operators: OperatorCache | None = None
+    ) -> Scene:
+        """The same objects in other rows, as many as before; None for the same backgrounds and operators' cache."""
+        behind = self.backgrounds.unflatten(2, (self.settings.size, -1)) if backgrounds is None else backgrounds
+        kept = operators or self._cache
+        return Scene(self.objects, examples, behind, self.lights, self.settings, self.backend, kept, self.basis)
+
+    def __len__(self) -> int:
+        return len(self.examples)
+
+    @cached_property
+    def cameras(self) -> list[tuple[OrthographicCamera, ...]]:
+        """The V of each example."""
+        return [example.cameras for example in self.examples]
+
+    @cached_property
+    def labels(self) -> list[str]:
+        """Of each example."""
+        return [self.objects[example.object].label for example in self.examples]
+
+    @cached_property
+    def vertices(self) -> Tensor:
+        """(M, N, 3) of each object; those of smaller meshes end in zeros."""
+        return self._padded([torch.from_numpy(item.mesh.vertices) for item in self.objects])
+
+    @property
+    def stacks(self) -> list[OperatorStack]:
+        """All operators, of which those that are missing are built now."""
+        return [self._stack(index)[0] for index in range(-(-len(self._distinct) // self._per_stack))]
+
+    def mesh(self, example: int) -> Mesh:
+        """What an example shows."""
+        return self.objects[self.examples[example].object].mesh
+
+    def conditions(self, examples: Tensor) -> Conditions:
+        """The scene's own, for examples (A,)."""
+        return Conditions(self.lights[examples])
+
+    def render(self, conditions: Conditions, examples: Tensor) -> Tensor:
+        """Images (A, V, 3, size, size) in [0, 1] of examples (A,), differentiable in the conditions.
+
+        InputError: NaN.
+        """
+        layers = list(self._layers(conditions, examples))
+        canvas = self.backgrounds.index_select(0, self._background[examples].repeat_interleave(self.views))
+        canvas = canvas.expand(-1, 3, -1).contiguous()
+        covered = [develop_composite(layer.composite, self.settings.encoding) for layer in layers]
+        images = _Placed.apply(canvas, [(layer.rows, layer.pixels) for layer in layers], *covered)
+        images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
+        return images if conditions.pixels is None else clamp(images + conditions.pixels)
+
+    @torch.no_grad()
+    def clamped_share(self, conditions: Conditions, examples: Tensor) -> Tensor:
+        """Per example (A,), the share of its covered pixels' values that the clamp changes."""
+        shares = self.lights.new_zeros(2, len(examples) * self.views)
+        for layer in self._layers(conditions, examples):
+            covered = (layer.coverage[layer.shown] > 0).expand_as(layer.composite)
+            counts = torch.stack([clamped(layer.composite) & covered, covered]).sum((2, 3)).to(shares)
+            shares[:, slice(None) if layer.rows is None else layer.rows] += counts
+        changed, covered = shares.unflatten(1, (-1, self.views)).sum(2)
+        return changed / covered.clamp(min=1)
+
+    def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[_Layer]:
+        require_bounded(light=conditions.light)
+        light = conditions.light * self._exposure[examples]
+        only_light = conditions.vertices is None and conditions.albedo is None
+        return self._relit(light, examples) if only_light else self._reshaded(light, conditions, examples)
+
+    def _relit(self, light: Tensor, examples: Tensor) -> Iterator[_Layer]:
+        """By one product per stack of operators."""
+        views = torch.arange(self.views, device=examples.device)
+        images = (examples[:, None] * self.views + views).flatten()
+        if self.views > 1:
+            light = light.repeat_interleave(self.views, dim=0)
+        if len(self._distinct) <= self._per_stack:
+            yield self._relit_layer(0, None, light, images)
+            return
+        stack = self._operator[images] // self._per_stack
+        for index in stack.unique().tolist():
+            rows = torch.nonzero(stack == index).squeeze(1)
+            yield self._relit_layer(index, rows.tolist(), light[rows], images[rows])
+
+    def _relit_layer(self, index: int, rows: list[int] | None, light: Tensor, images: Tensor) -> _Layer:
+        stack, place, added = self._stack(index)
+        images = place[images]
+        seen = stack.radiance(light, images)
+        return _Layer(rows, stack.pixels, seen + added[images], stack.coverage, stack.shown[images])
+
+    def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[_Layer]:
+        """View by view."""
+        views = [(row, index, view) for row, index in enumerate(examples.tolist()) for view in range(self.views)]
+        for image, (row, index, view) in enumerate(views):
+            example = self.examples[index]
+            fragments, seen = self._reshaded_view(example.object, example.cameras[view], light[row], conditions, row)
+            coverage = fragments.coverage.to(seen)[None]
+            there = self.backgrounds[example.background].index_select(1, fragments.pixels)
+            composite = seen + behind(coverage, there, self.settings.encoding)
+            yield _Layer([image], fragments.pixels, composite[None], coverage[None], [0])
+
+    def _reshaded_view(
+        self, number: int, camera: OrthographicCamera, light: Tensor, conditions: Conditions, row: int
+    ) -> tuple[Fragments, Tensor]:
+        """What a camera sees of an object under the conditions of one row, with its radiance (3, P)."""
+        mesh = self.objects[number].mesh
+        if conditions.vertices is None:
+            vertices = self.vertices[number, : len(mesh.vertices)]
+            fragments, albedo = self._still(number, camera)
+        else:
+            vertices = conditions.vertices[row, : len(mesh.vertices)]
+            fragments, albedo = self._fragments(number, camera, vertices.detach().cpu().double().numpy())
+        if conditions.albedo is not None:
+            offset = face_albedo(conditions.albedo[row, : len(mesh.faces)], fragments)
+            albedo = clamp(albedo + offset, albedo.clamp(min=1))
+        smooth_faces = self._faces[number] if self.settings.normals == "smooth" else None
+        return fragments, radiance(fragments, vertices, light, albedo, smooth_faces)
+
+    def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
+        if index not in self._stacks:
+            self._stacks[index] = self._build_stack(index)
+        return self._stacks[index]
+
+    def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
+        """(some operators, (E × V,) each image's place among those that show them, what is behind these (N, C, P))."""
+        first = index * self._per_stack
+        views = self._distinct[first : first + self._per_stack]
+        operators = []
+        for number in dict.fromkeys(number for number, _ in views):
+            item, cameras = self.objects[number], [camera for its, camera in views if its == number]
+            operators += self._cache.operators(
+                item.mesh, cameras, self.settings, self.backend, item.gain, self.basis, self.lights.dtype
+            )
+        here = self._operator // self._per_stack == index
+        stack = OperatorStack(operators, (self._operator[here] - first).cpu(), self.lights.device)
+        backgrounds = self.backgrounds.index_select(2, stack.pixels)
+        which = self._background.repeat_interleave(self.views)[here]
+        added = behind(stack.coverage[stack.shown], backgrounds[which], self.settings.encoding)
+        return stack, here.cumsum(0) - 1, added
+
+    def _still(self, number: int, camera: OrthographicCamera) -> tuple[Fragments, Tensor]:
+        view = number, camera
+        if view not in self._fragments_of_meshes:
+            self._fragments_of_meshes[view] = self._fragments(number, camera, self.objects[number].mesh.vertices)
+        return self._fragments_of_meshes[view]
+
+    def _fragments(self, number: int, camera: OrthographicCamera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
+        """What a camera sees of an object's moved vertices, and the albedo there (S, 3)."""
+        item = self.objects[number]
+        (fragments,) = build_fragments(
+            vertices, item.mesh.faces, [camera], self.settings, self.backend, closed=item.mesh.closed
+        )
+        fragments = fragments.to(self.lights.device)
+        return fragments, (surface_albedo(item.mesh, fragments, self.settings.encoding) * item.gain).to(self.lights)
+
+    @cached_property
+    def _faces(self) -> list[Tensor]:
+        return [torch.from_numpy(item.mesh.faces).to(self.lights.device) for item in self.objects]
+
+    def _column(self, values) -> Tensor:
+        return torch.tensor(list(values), device=self.lights.device)
+
+    def _padded(self, parts: Sequence[Tensor]) -> Tensor:
+        return torch.nn.utils.rnn.pad_sequence(list(parts), batch_first=True).to(self.lights)
+
+
+class _Placed(torch.autograd.Function):
+    """Covered pixels (B, 3, P) in their places on canvases (N, 3, size²), which are overwritten."""
+
+    @staticmethod
+    def forward(ctx, canvas: Tensor, places: Sequence[tuple[list[int] | None, Tensor]], *covered: Tensor) -> Tensor:
+        ctx.places = places
+        for (rows, pixels), values in zip(places, covered, strict=True):
+            if rows is None:
+                canvas.index_copy_(2, pixels, values)
+            else:
+                for row, value in zip(rows, values, strict=True):
+                    canvas[row].index_copy_(1, pixels, value)
+        return canvas
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return None, None, *(_taken(upstream, *place) for place in ctx.places)
+
+
+def _taken(images: Tensor, rows: list[int] | None, pixels: Tensor) -> Tensor:
+    if rows is None:  # of two axes, torch selects ten times as fast as of three
+        return images.flatten(0, 1).index_select(1, pixels).unflatten(0, (-1, 3))
+    return torch.stack([images[row].index_select(1, pixels) for row in rows])
 
 
 def count_views(examples: int, objects: int, backgrounds: int, views: int | None) -> int:
@@ -61,122 +355,3 @@ def count_views(examples: int, objects: int, backgrounds: int, views: int | None
             f"{objects * views * backgrounds}: change one of them, or set scene.views=null to derive the views"
         )
     return derived
-
-
-def build_objects(
-    objects: Sequence[ObjectSettings],
-    views: int,
-    field_of_view: float,
-    settings: PictureSettings,
-    backend: Backend,
-    cache: OperatorCache | None = None,
-) -> list[SceneObject]:
-    """Load and normalise every mesh, and rasterise it from a ring of views where the cache does not have them."""
-    cache, cameras = cache or OperatorCache(), ring(views, field_of_view)
-    return [
-        SceneObject(item.label, cache.operators(load_object(item), cameras, settings, backend, item.gain))
-        for item in objects
-    ]
-
-
-def load_object(item: ObjectSettings) -> Mesh:
-    """The mesh, normalised. InputError: as `load_mesh` and `solid`."""
-    kind, _, name = item.mesh.partition(":")
-    if kind != "solid":
-        return normalise(load_mesh(item.mesh, up=item.up))
-    name, _, seed = name.partition(":")
-    if seed and not seed.isdecimal():
-        raise InputError(f"scene.meshes: the seed in {item.mesh!r} must be a whole number, as in solid:orange:3")
-    return normalise(solid(name, int(seed or 0)))
-
-
-class Scene:
-    """E = views of all meshes × backgrounds examples, in that order, each lit by a light of its own.
-
-    Views share nothing but the index of pixels that any of them covers; the other pixels are neither stored nor
-    shaded. Backgrounds share their view's operator.
-    """
-
-    def __init__(
-        self,
-        objects: Sequence[SceneObject],
-        backgrounds: Sequence[float],
-        settings: PictureSettings,
-        device: torch.device | str = "cpu",
-    ):
-        if not all(0 <= grey <= 1 for grey in backgrounds):
-            raise InputError(f"scene.backgrounds={list(backgrounds)}: give grey values in [0, 1]")
-        operators = [operator for item in objects for operator in item.operators]
-        self.settings = settings
-        self.labels = [item.label for item in objects for _ in item.operators for _ in backgrounds]
-        self.pixels = torch.cat([operator.pixels for operator in operators]).unique()
-        self.transfer, self.albedo, self.coverage = _stack(operators, self.pixels)
-        self.backgrounds = torch.tensor(backgrounds, dtype=torch.float32)
-        self._coefficients = _kept_coefficients()
-        for name in ("pixels", "transfer", "albedo", "coverage", "backgrounds", "_coefficients"):
-            setattr(self, name, getattr(self, name).to(device))
-        greys = self.backgrounds.view(-1, 1, 1)
-        self._behind = behind(self.coverage[:, None], greys, settings.encoding).flatten(0, 1)  # (E, 1, P)
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
-    def render(self, lights: Tensor, examples: Tensor | None = None) -> Tensor:
-        """Pictures (A, 3, size, size) in [0, 1] of lights (A, 49, 3); differentiable in the lights.
-
-        examples: (A,) ascending indices, when not all are wanted; operators that they do not need are left alone.
-        """
-        if examples is None:
-            examples = torch.arange(len(self), device=lights.device)
-        covered = develop_composite(self._composite(lights, examples), self.settings.encoding)
-        greys = self.backgrounds[examples % len(self.backgrounds)].view(-1, 1, 1)
-        pictures = greys.repeat(1, 3, self.settings.size**2).index_copy(2, self.pixels, covered)
-        return pictures.unflatten(2, (self.settings.size, self.settings.size))
-
-    def clamped_share(self, lights: Tensor) -> Tensor:
-        """Per example, the share of its covered pixels' values that the clamp changes. (E,)"""
-        examples = torch.arange(len(self), device=lights.device)
-        over = clamped(self._composite(lights, examples))
-        covered = (self.coverage[examples // len(self.backgrounds)] > 0).expand_as(over)
-        return (over & covered).sum((1, 2)) / covered.sum((1, 2)).clamp(min=1)
-
-    def _composite(self, lights: Tensor, examples: Tensor) -> Tensor:
-        """Radiance and what is behind it of A examples, linear (A, 3, P).
-
-        One product per operator, for all of its backgrounds at once: lights are laid out on a grid of the operators
-        in use × backgrounds, which leaves gaps where an example is not wanted.
-        """
-        per_operator = len(self.backgrounds)
-        used, row = torch.unique(examples // per_operator, return_inverse=True)
-        cell = row * per_operator + examples % per_operator
-        kept = lights.index_select(1, self._coefficients)
-        grid = kept.new_zeros(len(used) * per_operator, *kept.shape[1:]).index_copy(0, cell, kept)
-        everything = len(used) == len(self.transfer)
-        transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
-        radiance = apply_transfer(grid.unflatten(0, (len(used), per_operator)), transfer, albedo)
-        radiance = radiance.flatten(0, 1).index_select(0, cell)
-        require_bounded(radiance=radiance)
-        return radiance + self._behind[examples]
-
-
-def _kept_coefficients() -> Tensor:
-    """The 31 live coefficients and a dead one, whose row is zero: 32 rows make the gradient's product twice as fast."""
-    live = live_coefficients(DEGREE)
-    dead = next(index for index in range(COEFFICIENTS) if index not in live)
-    return torch.cat([live, torch.tensor([dead])])
-
-
-def _stack(operators: Sequence[Operator], pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Operators over a common set of pixels: transfer (O, 3 or 1, 32, P), albedo (O, 3, P) and coverage (O, 1, P)."""
-    channels = max((len(operator.transfer) for operator in operators), default=1)
-    transfer = torch.zeros(len(operators), channels, len(_kept_coefficients()), len(pixels))
-    albedo = torch.ones(len(operators), 3, len(pixels))
-    coverage = torch.zeros(len(operators), 1, len(pixels))
-    for row, operator in enumerate(operators):
-        columns = torch.searchsorted(pixels, operator.pixels)
-        if channels == 1:
-            transfer[row][:, :-1, columns], albedo[row][:, columns] = operator.transfer, operator.albedo
-        else:
-            transfer[row][:, :-1, columns] = operator.transfer * operator.albedo[:, None]
-        coverage[row, 0, columns] = operator.coverage
-    return transfer, albedo, coverage

@@ -1,18 +1,25 @@
 """The augmentation service: fresh labelled renders, made against the current weights whenever they are asked for."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
+from torch.utils.data import Dataset
 
 from augment import processes
-from augment.attack import AttackResult, DescentSettings, Goal, Part, descend
+from augment.attacks.settings import AttackSettings
+from augment.build import Shown, build_scene
+from augment.descent import AttackResult, Goal, Part, descend_repeatedly
 from augment.model_state import as_found
-from augment.parameters.kind import check_step, direction
+from augment.parameters import Albedo, Geometry, Lighting, StepSettings
+from augment.parameters.kind import check_step
+from augment.perturbation import Perturbation
 from augment.phases import Phases
-from augment.scene import Scene
+from augment.scene import Conditions, Scene
 from augment.seeding import generator
+from augment.variation import VariationSettings, vary
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.lights import perturb
 
@@ -36,43 +43,44 @@ class RandomLights:
 
 
 @dataclass
-class LightAttackSettings:
-    """The paper's appendix C: 0.05 along the gradient's direction, at most 30 steps.
+class TrainingAttackSettings(AttackSettings):
+    """Unless kinds are named, the paper's appendix C: 0.05 along the gradient's direction of the light, 30 steps.
 
-    step: what "along the direction" means: the gradient at unit L2 norm per example, as it is, or its sign.
-    batch_size: examples per pass through the classifier.
+    step, step_size: those of that light; see `StepSettings` for what "along the direction" means.
     """
 
     step: str = "unit"
     step_size: float = 0.05
-    max_steps: int = 30
     batch_size: int = 128
 
     def __post_init__(self):
         check_step(self.step, self.step_size, "augment.attack.")
-        self.descent()
+        self._light = StepSettings(step=self.step, step_size=self.step_size)
+        super().__post_init__()
 
-    def descent(self) -> DescentSettings:
-        """How long it lasts."""
-        return DescentSettings(self.max_steps, batch_size=self.batch_size)
+    @property
+    def kinds(self) -> dict[str, StepSettings]:
+        return super().kinds or {Lighting.name: self._light}
 
 
 @dataclass
 class AugmentationSettings:
     """What is regenerated, and when.
 
+    start: where an attack begins, the scene as it is ("light") or a random perturbation of it: of the light by
+    `random`, of all else uniform in its norm-ball. lights: "restart" begins there each time, "continue" begins where
+    the last attack ended. vary: what of the scene is drawn afresh each time.
     every: after how many training images the renders are made anew, counted within an epoch; None: each epoch.
-    start: where an attack begins, the scene's light or a random perturbation of it. lights: "restart" begins there
-    each time, "continue" begins where the last attack ended.
     """
 
     arm: str = "adversarial"
     examples: int = 100
-    every: int | None = None
     start: str = "light"
     lights: str = "restart"
+    every: int | None = None
+    vary: VariationSettings = field(default_factory=VariationSettings)
     random: RandomLights = field(default_factory=RandomLights)
-    attack: LightAttackSettings = field(default_factory=LightAttackSettings)
+    attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
 
     def __post_init__(self):
         for name, value, choices in [
@@ -84,45 +92,79 @@ class AugmentationSettings:
                 raise InputError(f"augment.{name}={value}: choose one of {', '.join(choices)}")
         require_range("augment.examples", self.examples, 0, MOST_EXAMPLES)
         require_range("augment.every", self.every, 1, MOST_EVERY)
+        if self.arm == "random" or self.start == "random":
+            for name, settings in self.attack.kinds.items():
+                if name != Lighting.name and settings.radius is None:
+                    raise InputError(f"augment.attack.{name}.radius=null has no random draw: set a radius")
 
     @property
     def renders(self) -> bool:
         """Whether any example is rendered at all."""
         return self.arm != "none" and self.examples > 0
 
+    @property
+    def relights(self) -> bool:
+        """Whether nothing but the light changes, so that the scene's operators last from epoch to epoch."""
+        return not (self.vary.moves or {Geometry.name, Albedo.name} & self.attack.kinds.keys())
+
 
 @dataclass(frozen=True)
-class Renders:
-    """Labelled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers."""
+class Renders(Dataset):
+    """Labelled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
+
+    As a data set, pairs of an image on the CPU and its label as a number: `data + renders` is both.
+    """
 
     images: Tensor
     labels: Tensor
     diagnostics: Mapping[str, float]
 
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, int]:
+        return self.images[index].cpu(), int(self.labels[index])
+
 
 class AugmentationService:
-    """Holds the scene and, where lights continue, the adversaries' lights from one regeneration to the next.
+    """Holds the scene and, where lights continue, the adversaries' values from one regeneration to the next.
 
     Where several processes train together, each attacks its share of the examples, and all get all renders.
     """
 
-    def __init__(
-        self,
-        settings: AugmentationSettings,
-        scene: Scene | None,
-        labels: Tensor,
-        light: Tensor,
-        seed: int,
-        phases: Phases,
-    ):
-        """scene: None where nothing is rendered. labels: (E,) int64 classes. light: (49, 3), where lights begin."""
+    def __init__(self, settings: AugmentationSettings, scene: Scene | None, labels: Tensor, seed: int, phases: Phases):
+        """scene: None where nothing is rendered; one view per example. labels: (E,) int64 classes."""
         self.settings = settings
         self._scene = scene
         self._labels = labels
-        self._light = light
         self._seed = seed
         self._phases = phases
         self._continued: Tensor | None = None
+
+    @classmethod
+    def from_meshes(
+        cls,
+        meshes: Sequence[tuple[Shown, int]],
+        size: int,
+        settings: AugmentationSettings | None = None,
+        *,
+        views: int = 10,
+        backgrounds: Sequence[float | str | Path] = (0.0, 0.25, 0.5, 0.75, 1.0),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        **of_scene,
+    ) -> "AugmentationService":
+        """For any training loop: meshes × views × backgrounds renders, as the paper has them unless told otherwise.
+
+        meshes: (file, solid:NAME or `Mesh`; the index of its class) each. size: pixels per side. of_scene: further
+        arguments of `build_scene`; as in the paper, 8 × 8 samples per pixel and flat shading are the default.
+        """
+        named = [(mesh, str(label)) for mesh, label in meshes]
+        choices = {"samples": 8, "normals": "flat", "backgrounds": backgrounds, "device": device, **of_scene}
+        scene = build_scene(named, size, views, **choices)
+        labels = torch.tensor([int(label) for label in scene.labels], device=device)
+        settings = replace(settings or AugmentationSettings(), examples=len(scene))
+        return cls(settings, scene, labels, seed, Phases(device))
 
     def __len__(self) -> int:
         """Examples per regeneration."""
@@ -137,92 +179,91 @@ class AugmentationService:
         if not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
         make = self._random if self.settings.arm == "random" else self._adversarial
-        return make(model, number)
+        scene = vary(self._scene, self.settings.vary, generator(self._seed, number, "rows"))
+        return make(model, self.settings.attack.problem(scene), number)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The adversaries' lights, where they continue; empty otherwise."""
-        return {} if self._continued is None else {"lights": self._continued.cpu()}
+        """The adversaries' values (E, D), where they continue; empty otherwise."""
+        return {} if self._continued is None else {"values": self._continued.cpu()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore what `state_dict` gave; InputError where it is from another number of examples."""
-        if "lights" not in state:
+        if "values" not in state:
             return
-        if len(state["lights"]) != len(self._labels):
+        if len(state["values"]) != len(self._labels):
             raise InputError(
-                f"augment.examples: the checkpoint continues {len(state['lights'])} lights and the scene has "
+                f"augment.examples: the checkpoint continues {len(state['values'])} examples and the scene has "
                 f"{len(self._labels)}; resume with the settings of the run"
             )
-        self._continued = state["lights"].to(self._labels.device)
+        self._continued = state["values"].to(self._labels.device)
 
-    def _random(self, model: nn.Module, number: int) -> Renders:
-        lights = self._perturbed(number)
-        images = self._scene.render(lights)
+    def _random(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
+        values = self._perturbed(problem, number)
+        with torch.no_grad():
+            images = problem.render(values, problem.everything)[:, 0]
         with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
             logits = torch.cat([model(batch) for batch in images.split(self.settings.attack.batch_size)])
         diagnostics = {
             "fooled": _mean(logits.argmax(1) != self._labels),
             "loss": _mean(nn.functional.cross_entropy(logits, self._labels)),
         }
-        return Renders(images, self._labels, diagnostics | self._light_diagnostics(lights))
+        return Renders(images, self._labels, diagnostics | _changes(problem, values))
 
-    def _adversarial(self, model: nn.Module, number: int) -> Renders:
+    def _adversarial(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
         attack, goal = self.settings.attack, Goal(self._labels[:, None])
-        problem = _SceneLights(self._scene, self._starting_lights(number), attack)
-        mine = processes.share(len(self._scene)).to(self._light.device)
-        part = Part(problem, mine, problem.start[mine])
-        result = descend(model, part, goal.of(mine), attack.descent(), self._phases)
-        result = result.merged(mine, len(self._scene))
-        lights = result.values.unflatten(1, (-1, 3))
+        mine = processes.share(len(problem.start)).to(problem.start.device)
+        part = Part(problem, mine, self._start(problem, number)[mine])
+        draws = generator(self._seed, number, "restart")
+        restarts = (problem.sample(draws)[mine] for _ in range(attack.restarts))
+        result = descend_repeatedly(model, part, goal.of(mine), attack.descent(), self._phases, restarts)
+        result = result.merged(mine, len(problem.start))
         if self.settings.lights == "continue":
-            self._continued = lights
-        diagnostics = self._attack_diagnostics(result) | self._light_diagnostics(lights)
-        return Renders(result.images.flatten(0, 1), self._labels, diagnostics)
+            self._continued = result.values
+        diagnostics = self._attack_diagnostics(result) | _changes(problem, result.values)
+        return Renders(result.images[:, 0], self._labels, diagnostics)
 
-    def _starting_lights(self, number: int) -> Tensor:
+    def _start(self, problem: Perturbation, number: int) -> Tensor:
         if self._continued is not None:
             return self._continued
-        if self.settings.start == "random":
-            return self._perturbed(number)
-        return self._light.expand(len(self._scene), -1, -1)
+        return self._perturbed(problem, number) if self.settings.start == "random" else problem.start
 
-    def _perturbed(self, number: int) -> Tensor:
+    def _perturbed(self, problem: Perturbation, number: int) -> Tensor:
+        """Random values (E, D), within the norm-balls."""
+        values = torch.cat(list(self._perturbed_parts(problem, number)), dim=1)
+        return problem.project(values, problem.everything)
+
+    def _perturbed_parts(self, problem: Perturbation, number: int) -> Iterator[Tensor]:
         random, draws = self.settings.random, generator(self._seed, number, "lights")
-        lights = perturb(self._light.cpu(), len(self._scene), random.amplitude, random.radius, draws)
-        return lights.to(self._light.device)
+        for kind, start in zip(problem.kinds, problem.split(problem.start), strict=True):
+            if isinstance(kind, Lighting):
+                none = torch.zeros_like(problem.scene.lights[0], device="cpu")
+                offsets = perturb(none, len(start), random.amplitude, random.radius, draws)
+                yield start + offsets.flatten(1).to(start)
+            else:
+                yield kind.sample(generator(self._seed, number, kind.name), problem.everything).to(start)
 
     def _attack_diagnostics(self, result: AttackResult) -> dict[str, float]:
+        attack = self.settings.attack
         return {
             "fooled_before": _mean(result.fooled_before),
             "fooled": _mean(result.fooled),
             "steps": _mean(result.steps),
-            "used_all_steps": _mean(result.steps == self.settings.attack.max_steps),
+            "used_all_steps": _mean(result.steps == attack.max_steps * (1 + attack.restarts)),
             "loss_before": -_mean(result.cost_before),
             "loss": -_mean(result.cost),
             "zero_gradient": _mean(result.zero_gradient),
         }
 
-    def _light_diagnostics(self, lights: Tensor) -> dict[str, float]:
-        return {
-            "light_change": _mean((lights - self._light).flatten(1).norm(dim=1)),
-            "clamped": _mean(self._scene.clamped_share(lights)),
-        }
 
-
-class _SceneLights:
-    """A light of its own for each example of a scene. See `augment.attack.Problem`."""
-
-    def __init__(self, scene: Scene, start: Tensor, settings: LightAttackSettings):
-        """start: (E, 49, 3)."""
-        self.start, self._scene, self._settings = start.flatten(1), scene, settings
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self._scene.render(values.unflatten(1, (-1, 3)), examples)[:, None]
-
-    def step(self, gradient: Tensor) -> Tensor:
-        return self._settings.step_size * direction(gradient, self._settings.step)
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return values
+def _changes(problem: Perturbation, values: Tensor) -> dict[str, float]:
+    """The mean L2 norm of what changed of each condition, and the share of values that are clamped."""
+    before, after = (problem.conditions(each, problem.everything) for each in (problem.start, values))
+    changes = {
+        f"{part.name}_change": _mean((value - getattr(before, part.name)).flatten(1).norm(dim=1))
+        for part in fields(Conditions)
+        if (value := getattr(after, part.name)) is not None
+    }
+    return changes | {"clamped": _mean(problem.scene.clamped_share(after, problem.everything))}
 
 
 def _mean(values: Tensor) -> float:

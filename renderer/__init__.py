@@ -1,1 +1,19 @@
 """Scene to pixels, and pixel gradients to scene parameters. Knows no classifier and no data set."""
+
+from renderer.lazy import attach
+
+__getattr__, __dir__, __all__ = attach(
+    __name__,
+    {
+        "camera": ["OrthographicCamera", "ring"],
+        "errors": ["InputError"],
+        "image": ["PictureSettings"],
+        "lights": ["load_light", "save_light"],
+        "mesh": ["Mesh", "load_mesh", "normalise"],
+        "mesh_export": ["export_mesh"],
+        "rendering": ["operators", "render"],
+        "shapes": ["solid"],
+        "subdivision": ["subdivide"],
+        "transfer": ["Operator"],
+    },
+)

@@ -16,14 +16,13 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from renderer.basis import HARMONICS, Basis
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import PictureSettings
 from renderer.mesh import Mesh
-from renderer.transfer import DEGREE, Operator, build_operator
+from renderer.transfer import TENSORS, Operator, build_operator
 from renderer.visibility import Backend
-
-TENSORS = ("transfer", "albedo", "coverage", "pixels")  # of an operator
 
 
 def cache_folder(choice: str | None) -> Path | None:
@@ -156,21 +155,21 @@ class OperatorCache(TensorCache):
         settings: PictureSettings,
         backend: Backend,
         gain: float = 1.0,
-        degree: int = DEGREE,
+        basis: Basis = HARMONICS,
         dtype: torch.dtype = torch.float32,
     ) -> list[Operator]:
         """`transfer.build_operators`, to the bit, but only the views that are not on disk are built."""
-        scene = content_key(RENDERER, mesh, settings, backend.name, float(gain), degree, dtype)
+        scene = content_key(RENDERER, mesh, settings, backend.name, float(gain), basis, dtype)
         keys = {camera: content_key(scene, camera) for camera in cameras}
         views = {camera: view for camera, key in keys.items() if (view := self.read(key)) is not None}
         missing = [camera for camera in keys if camera not in views]
         if missing:
             fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, backend, closed=mesh.closed)
             for camera, seen in zip(missing, fragments, strict=True):
-                views[camera] = _pack(mesh, seen, build_operator(mesh, seen, settings, gain, degree, dtype))
+                views[camera] = _pack(mesh, seen, build_operator(mesh, seen, settings, gain, basis, dtype))
                 self.write(keys[camera], views[camera])
         self.tally.add(built=len(missing), views=views.values())
-        return [_unpack(views[camera], degree) for camera in cameras]
+        return [_unpack(views[camera], settings, basis) for camera in cameras]
 
 
 def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
@@ -178,5 +177,5 @@ def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
     return {name: getattr(operator, name) for name in TENSORS} | {"counts": counts}
 
 
-def _unpack(view: Mapping[str, Tensor], degree: int) -> Operator:
-    return Operator(**{name: view[name] for name in TENSORS}, degree=degree)
+def _unpack(view: Mapping[str, Tensor], settings: PictureSettings, basis: Basis) -> Operator:
+    return Operator(**{name: view[name] for name in TENSORS}, settings=settings, basis=basis)

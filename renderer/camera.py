@@ -13,17 +13,22 @@ class OrthographicCamera:
     """A parallel projection from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
 
     field_of_view: width of the square picture in world units; a normalised mesh spans at most [-1, 1] per axis.
-    InputError where it is not positive, or an angle is not finite.
+    right, up: where the origin lies in the picture, in world units from its middle.
+    InputError where the field of view is not positive, an angle is not finite, or any is too large.
     """
 
     polar: float
     azimuth: float
     field_of_view: float
+    right: float = 0.0
+    up: float = 0.0
 
     def __post_init__(self):
         require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
+        if not (abs(self.right) <= LARGEST and abs(self.up) <= LARGEST):  # NaN is not
+            raise InputError(f"camera place right={self.right}, up={self.up}: give lengths of at most {LARGEST:g}")
 
     def axes(self) -> np.ndarray:
         """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""
@@ -40,7 +45,7 @@ class OrthographicCamera:
         origin, which every normalised mesh (radius at most √3) is.
         """
         scale = np.array([2 / self.field_of_view, 2 / self.field_of_view, -1 / 2])
-        return points @ (self.axes() * scale[:, None]).T
+        return points @ (self.axes() * scale[:, None]).T + np.array([self.right, self.up, 0.0]) * scale
 
 
 def ring(views: int, field_of_view: float, polar: float = math.pi / 3) -> list[OrthographicCamera]:

@@ -48,6 +48,33 @@ def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: st
     return develop_composite(radiance + behind(coverage, background, encoding), encoding)
 
 
+def compose(radiance: Tensor, coverage: Tensor, pixels: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
+    """Whole images (..., 3, size, size): `develop` at the covered pixels, the background elsewhere.
+
+    radiance: (..., 3, P). coverage: (P,). pixels: (P,), row-major. background: (..., 3, size, size), or without the
+    leading axes.
+    """
+    behind_all = background.expand(*radiance.shape[:-2], *background.shape[-3:]).flatten(-2)
+    covered = develop(radiance, coverage[None], behind_all.index_select(-1, pixels), encoding)
+    return behind_all.index_copy(-1, pixels, covered).unflatten(-1, background.shape[-2:])
+
+
+def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor:
+    """A grey value, a colour (3,) or images (..., 3, size, size), in [0, 1], as images of the dtype and device of
+    `like`. InputError: another shape, values beyond [0, 1]."""
+    values = torch.as_tensor(background).to(like)
+    if values.ndim < 2:
+        values = values.view(-1, 1, 1).expand(-1, size, size)
+    if values.ndim >= 3 and values.shape[-3:] in ((1, size, size), (3, size, size)):
+        if not (values.min() >= 0 and values.max() <= 1):
+            raise InputError("background holds values beyond [0, 1]: give a grey value, a colour or an image in [0, 1]")
+        return values.expand(*values.shape[:-3], 3, size, size)
+    raise InputError(
+        f"background of shape {tuple(values.shape)} is none: give a grey value, a colour (3,) or images "
+        f"(3, {size}, {size})"
+    )
+
+
 def behind(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
     """What a background adds to the radiance in front of it, linear (..., 3 or 1, P); shapes as in `develop`.
 
@@ -114,3 +141,8 @@ def check_encoding(encoding: str) -> None:
     """InputError unless the encoding is known."""
     if encoding not in ENCODINGS:
         raise InputError(f"renderer.encoding={encoding}: choose one of {', '.join(ENCODINGS)}")
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """Image values in [0, 1] to uint8, rounded."""
+    return (image * 255).round().to(torch.uint8)

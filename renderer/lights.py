@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from renderer.basis import HARMONICS, Basis
 from renderer.environment import SUFFIXES, read_map
 from renderer.errors import FACTOR, InputError, require_bounded
 from renderer.harmonics import basis, live_coefficients, project, rotate
@@ -56,10 +57,13 @@ def load_light(light: str) -> Tensor:
     )
 
 
-def save_light(path: Path, coefficients: Tensor) -> None:
-    """Write coefficients (49, 3) as JSON, a row [r, g, b] each. `load_light` reads float32 back to the bit."""
+def save_light(path: Path, coefficients: Tensor, basis: Basis = HARMONICS) -> None:
+    """Write the name of a basis and coefficients (size, 3), a row [r, g, b] each, as JSON.
+
+    `load_light` reads float32 back to the bit.
+    """
     rows = ",\n".join(json.dumps(row, allow_nan=False) for row in coefficients.tolist())
-    path.write_text(f"[\n{rows}\n]\n", encoding="utf-8")
+    path.write_text(f'{{"basis": {json.dumps(basis.name)}, "coefficients": [\n{rows}\n]}}\n', encoding="utf-8")
 
 
 def probe(name: str) -> Tensor:
@@ -128,9 +132,14 @@ def _read_coefficients(path: Path) -> Tensor:
     if not path.is_file():
         raise InputError(f"light {path} does not exist: give the path of a .json file of coefficients")
     try:
-        coefficients = torch.tensor(json.loads(path.read_text(encoding="utf-8")), dtype=torch.float32)
-    except (ValueError, TypeError, RuntimeError, OverflowError, RecursionError, OSError) as error:
+        light = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(light, dict):  # the rows alone, of harmonics
+            light = {"basis": HARMONICS.name, "coefficients": light}
+        coefficients = torch.tensor(light["coefficients"], dtype=torch.float32)
+    except (KeyError, ValueError, TypeError, RuntimeError, OverflowError, RecursionError, OSError) as error:
         raise InputError(f"light {path} is not a readable list of coefficients: {error}") from error
+    if light.get("basis") != HARMONICS.name:
+        raise InputError(f"light {path} has the basis {light.get('basis')!r}: give a light of {HARMONICS.name}")
     if coefficients.shape != (COEFFICIENTS, 3) or not (coefficients.abs() <= FACTOR).all():  # NaN is not
         raise InputError(
             f"light {path} has shape {tuple(coefficients.shape)}: it must hold {COEFFICIENTS} rows [r, g, b] of finite "

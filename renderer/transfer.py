@@ -5,7 +5,7 @@ radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactl
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -14,18 +14,19 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer.albedo import surface_albedo
+from renderer.basis import HARMONICS, Basis
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
-from renderer.harmonics import irradiance_basis, live_coefficients
-from renderer.image import PictureSettings
+from renderer.image import PictureSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.shading import smooth_normals
 from renderer.visibility import Backend
 
-DEGREE = 6
-COEFFICIENTS = (DEGREE + 1) ** 2
+DEGREE = HARMONICS.degree
+COEFFICIENTS = HARMONICS.size
+TENSORS = ("transfer", "albedo", "coverage", "pixels")  # of an operator
 BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 
 
@@ -33,34 +34,47 @@ BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 class Operator:
     """What is kept of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
 
-    transfer: (3, K, P), K = 31 live coefficients at degree 6 and P covered pixels; or (1, K, P), a third of the size
-    and the time, where no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
+    transfer: (3, K, P), K live coefficients (31 for harmonics of degree 6) and P covered pixels; or (1, K, P), a third
+    of the size and the time, where no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
     albedo: (3, P), what the one channel is multiplied with; ones where there are three.
     coverage: (P,) in (0, 1], the share of a pixel's samples that the mesh covers.
-    pixels: (P,) int64, row-major indices of the covered pixels; row 0 is the top of the picture.
-    degree: of the lights.
+    pixels: (P,) int64, row-major indices of the covered pixels; row 0 is the top of the image.
+    settings: of the image that they are pixels of. basis: of the lights.
     """
 
     transfer: Tensor
     albedo: Tensor
     coverage: Tensor
     pixels: Tensor
-    degree: int = DEGREE
+    settings: PictureSettings
+    basis: Basis = HARMONICS
+
+    def image(self, lights: Tensor, background: float | Tensor = 0.5) -> Tensor:
+        """Images (..., 3, size, size) in [0, 1] under lights (..., size, 3); differentiable in them.
+
+        background: see `renderer.image.as_background`. InputError: as `radiance`, and for a background that is none.
+        """
+        behind = as_background(background, self.settings.size, lights)
+        coverage = self.coverage.to(lights)
+        return compose(self.radiance(lights), coverage, self.pixels, behind, self.settings.encoding)
 
     def radiance(self, lights: Tensor) -> Tensor:
-        """Linear radiance (..., 3, P) under lights (..., (degree + 1)², 3); differentiable, by `light_gradient`.
+        """Linear radiance (..., 3, P) under lights (..., size, 3); differentiable, by `light_gradient`.
 
-        Computed in the operator's dtype, returned in the lights'. InputError: NaN, or lights of another degree.
+        Computed in the operator's dtype, returned in the lights'. InputError: NaN, or lights of another basis' size.
         """
         require_bounded(lights=lights)
-        if lights.shape[-2:] != ((self.degree + 1) ** 2, 3):
-            raise InputError(f"lights of shape {tuple(lights.shape)} are not of the operator's degree {self.degree}")
+        if lights.shape[-2:] != (self.basis.size, 3):
+            raise InputError(
+                f"lights of shape {tuple(lights.shape)} are not of the operator's {self.basis}: "
+                f"give {self.basis.size} rows"
+            )
         if torch.is_grad_enabled() and lights.requires_grad:
             return _Radiance.apply(lights, self)
         return _radiance(self, lights)
 
     def light_gradient(self, radiance_gradient: Tensor) -> Tensor:
-        """∂C/∂U (..., (degree + 1)², 3) = T ∂C/∂radiance (..., 3, P), without a graph.
+        """∂C/∂U (..., size, 3) = T ∂C/∂radiance (..., 3, P), without a graph.
 
         Exactly zero for the coefficients of bands that cannot reach a diffuse surface. InputError: NaN.
         """
@@ -74,8 +88,7 @@ class Operator:
 
     def to(self, device: torch.device | str) -> "Operator":
         """The same on another device."""
-        names = [field.name for field in fields(self) if field.name != "degree"]
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+        return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS})
 
     # Kept, since at 32² even an index or a look at a dtype counts.
 
@@ -87,12 +100,12 @@ class Operator:
     @cached_property
     def _live(self) -> Tensor:
         """(K,) indices of the coefficients that reach a surface."""
-        return live_coefficients(self.degree).to(self.transfer.device)
+        return self.basis.live.to(self.transfer.device)
 
     @cached_property
     def _places(self) -> Tensor:
-        """((degree + 1)², K): puts the live coefficients in their places, with exact zeros in the others."""
-        return torch.eye((self.degree + 1) ** 2).to(self.transfer)[:, self._live]
+        """(size, K): puts the live coefficients in their places, with exact zeros in the others."""
+        return torch.eye(self.basis.size).to(self.transfer)[:, self._live]
 
 
 class _Radiance(torch.autograd.Function):
@@ -131,20 +144,20 @@ def build_operators(
     settings: PictureSettings,
     backend: Backend,
     gain: float = 1.0,
-    degree: int = DEGREE,
+    basis: Basis = HARMONICS,
     dtype: torch.dtype = torch.float32,
 ) -> list[Operator]:
-    """One operator per camera, for lights of one degree; computed in float64 and stored in `dtype`.
+    """One operator per camera, for lights of one basis; computed in float64 and stored in `dtype`.
 
     gain multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side that the
     camera sees, with normals as the settings say.
     """
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, backend, closed=mesh.closed)
-    return [build_operator(mesh, view, settings, gain, degree, dtype) for view in views]
+    return [build_operator(mesh, view, settings, gain, basis, dtype) for view in views]
 
 
 def build_operator(
-    mesh: Mesh, fragments: Fragments, settings: PictureSettings, gain: float, degree: int, dtype: torch.dtype
+    mesh: Mesh, fragments: Fragments, settings: PictureSettings, gain: float, basis: Basis, dtype: torch.dtype
 ) -> Operator:
     """The operator of one view that has been rasterised; see `build_operators`."""
     require_bounded(gain=torch.tensor(gain))
@@ -155,11 +168,12 @@ def build_operator(
     else:
         albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
     return Operator(
-        transfer=_box_filter(_shades(mesh, fragments, albedo, settings, degree), len(fragments.pixels), dtype),
+        transfer=_box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype),
         albedo=factor.T.to(dtype).contiguous(),
         coverage=fragments.coverage.to(dtype),
         pixels=fragments.pixels,
-        degree=degree,
+        settings=settings,
+        basis=basis,
     )
 
 
@@ -179,13 +193,13 @@ class _Shades:
     basis: Callable[[slice], Tensor]
 
 
-def _shades(mesh: Mesh, fragments: Fragments, albedo: Tensor, settings: PictureSettings, degree: int) -> _Shades:
+def _shades(mesh: Mesh, fragments: Fragments, albedo: Tensor, settings: PictureSettings, basis: Basis) -> _Shades:
     vertices = torch.from_numpy(mesh.vertices)
     if settings.normals == "smooth":
         normals = smooth_normals(fragments, vertices, torch.from_numpy(mesh.faces))
         weights = albedo / fragments.samples**2
-        return _Shades(fragments.pixel, weights, lambda some: irradiance_basis(normals[some], degree))
-    shading = irradiance_basis(face_normals(vertices, fragments.corners) * fragments.facing, degree)
+        return _Shades(fragments.pixel, weights, lambda some: basis.irradiance(normals[some]))
+    shading = basis.irradiance(face_normals(vertices, fragments.corners) * fragments.facing)
     pixel, face, weights = fragments.merge(albedo)
     return _Shades(pixel, weights, lambda some: shading.index_select(0, face[some]))
 

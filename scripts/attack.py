@@ -8,9 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from augment.parameters import KINDS
 from renderer.errors import InputError
-from train.attacks.checks import check
 from train.attacks.experiment import attack_mesh
-from train.attacks.files import write_files
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
 from train.cli import one_sentence_errors, script
@@ -30,9 +28,9 @@ def main(config: DictConfig) -> None:
     for index, item in enumerate(settings.scene.meshes):
         named = read_object(item, settings.label, index)
         attacked = attack_mesh(named, settings, classifier, device)
-        checks = check(attacked, settings.attack.descent(), settings.seed) if settings.attack.checks else None
+        checks = attacked.check() if settings.attack.checks else None
         folder = out / f"{index}_{Path(named.mesh.replace(':', '_')).stem}"
-        write_files(attacked, checks, folder)
+        attacked.save(folder, checks)
         print(format_attack(named.mesh, attacked, checks))
         print(f"pictures, lights, shapes and numbers: {folder}\n")
     OmegaConf.save(config, out / "config.yaml")

@@ -32,11 +32,6 @@ def to_unit(images: Tensor) -> Tensor:
     return images.float() / 255
 
 
-def to_bytes(images: Tensor) -> Tensor:
-    """Float RGB in [0, 1] to uint8, rounded."""
-    return (images * 255).round().to(torch.uint8)
-
-
 def batch_count(pictures: int, batch_size: int) -> int:
     """Batches in a round."""
     return math.ceil(pictures / batch_size)

@@ -11,7 +11,8 @@ from torch import Tensor
 from augment import processes
 from augment.seeding import generator
 from augment.service import Renders
-from train.batches import Round, to_bytes, to_unit
+from renderer.image import to_bytes
+from train.batches import Round, to_unit
 from train.data import Split
 from train.distributed import summed
 

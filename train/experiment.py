@@ -14,11 +14,14 @@ import torchvision
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
+from augment.backgrounds import load_backgrounds
+from augment.objects import load_object
 from augment.phases import Phases
-from augment.scene import Scene, build_objects
+from augment.scene import Scene
 from augment.seeding import stream_seed
 from augment.service import AugmentationService
 from renderer.cache import OperatorCache, TensorCache, cache_folder
+from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
 from renderer.lights import load_light
@@ -190,13 +193,12 @@ def _write_config(config: DictConfig, folder: Path) -> None:
 def _build_service(
     settings: ExperimentSettings, data: DataSet, device: torch.device, phases: Phases
 ) -> AugmentationService:
-    light = load_light(settings.scene.light) * settings.scene.exposure
     scene, labels = None, torch.zeros(0, dtype=torch.int64)
     if settings.augment.renders:
         with phases("operators"), first_process_first():
             scene = _build_scene(settings, data, device)
         labels = torch.tensor([data.classes.index(label) for label in scene.labels])
-    return AugmentationService(settings.augment, scene, labels.to(device), light.to(device), settings.seed, phases)
+    return AugmentationService(settings.augment, scene, labels.to(device), settings.seed, phases)
 
 
 def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
@@ -206,24 +208,34 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         class_index(data.classes, item.label, f"label of scene.meshes[{index}]")
     backend = choose(renderer.visibility)
     console.info("visibility: %s", backend.description)
-    pictures = renderer.pictures(data.size)
     cache, start = OperatorCache(cache_folder(renderer.cache)), time.perf_counter()
-    built = build_objects(objects, settings.views, scene.field_of_view, pictures, backend, cache)
-    scene = Scene(built, scene.backgrounds, pictures, device)
-    _log_skipped(scene, cache, time.perf_counter() - start)
-    return scene
+    built = Scene.grid(
+        [load_object(item) for item in objects],
+        ring(settings.views, scene.field_of_view),
+        load_backgrounds(scene.backgrounds, data.size),
+        (load_light(scene.light) * scene.exposure).to(device),
+        renderer.pictures(data.size),
+        backend,
+        cache,
+    )
+    if settings.augment.relights:
+        _log_skipped(built, cache, start)
+    else:
+        console.info("operators: none are kept, since views are rasterised in every epoch")
+    return built
 
 
-def _log_skipped(scene: Scene, cache: OperatorCache, seconds: float) -> None:
+def _log_skipped(scene: Scene, cache: OperatorCache, start: float) -> None:
     """Say what the examples share and what was left out of them."""
-    tally = cache.tally
+    stacks, tally = scene.stacks, cache.tally
+    covered = sum(len(stack.pixels) for stack in stacks) / len(stacks)
     console.info(
         "operators: %d views for %d examples, %d from the cache, %d built (%.2f s)%s",
         tally.views,
         len(scene),
         tally.loaded,
         tally.built,
-        seconds,
+        time.perf_counter() - start,
         f"; not kept: {cache.problem}" if cache.problem else "",
     )
     console.info(
@@ -231,7 +243,7 @@ def _log_skipped(scene: Scene, cache: OperatorCache, seconds: float) -> None:
         "%.0f %% of the faces (seen by no sample), back faces in %d of %d views (closed meshes)",
         COEFFICIENTS - len(live_coefficients(DEGREE)),
         COEFFICIENTS,
-        100 * (1 - len(scene.pixels) / scene.settings.size**2),
+        100 * (1 - covered / scene.settings.size**2),
         100 * tally.unseen_faces / tally.faces,
         tally.closed,
         tally.views,

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchvision.transforms.functional import to_pil_image
 from torchvision.utils import make_grid
 
-from train.batches import to_bytes
+from renderer.image import to_bytes
 from train.run_folder import read_numbers
 
 METRICS = "metrics.jsonl"

@@ -16,18 +16,18 @@ from PIL import Image
 from torch import Tensor
 
 import augment
-from augment.scene import Scene, SceneObject
+from augment.backgrounds import load_backgrounds
+from augment.objects import SceneObject
+from augment.scene import Conditions, Scene
 from augment.seeding import generator
 from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.image import PictureSettings
+from renderer.image import PictureSettings, to_bytes
 from renderer.lights import ambient, directional
 from renderer.mesh import Mesh, normalise
 from renderer.shapes import SOLIDS, solid
-from renderer.transfer import build_operators
 from renderer.visibility import Backend, choose
-from train.batches import to_bytes
 from train.data import DataSet, Split
 from train.logs import console
 
@@ -136,11 +136,12 @@ def _portraits(
         OrthographicCamera(math.radians(40 + 45 * p), 2 * math.pi * a, 2 + f)
         for p, a, f in zip(polar.tolist(), azimuth.tolist(), field.tolist(), strict=True)
     ]
-    operators = build_operators(normalise(mesh), cameras, settings, backend)
     backgrounds = torch.rand(BACKGROUNDS, generator=draws).tolist()
-    scene = Scene([SceneObject(name, operators)], backgrounds, settings)
     towards = [torch.tensor(camera.axes()[2], dtype=torch.float32) for camera in cameras for _ in backgrounds]
-    return to_bytes(scene.render(torch.stack([light(back, draws) for back in towards])))
+    lights = torch.stack([light(back, draws) for back in towards])
+    behind = load_backgrounds(backgrounds, settings.size)
+    scene = Scene.grid([SceneObject(name, normalise(mesh))], cameras, behind, lights, settings, backend)
+    return to_bytes(scene.render(Conditions(lights), torch.arange(len(scene))).flatten(0, 1))
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -9,7 +9,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from augment.scene import ObjectSettings, count_views
+from augment.objects import ObjectSettings
+from augment.scene import count_views
 from augment.service import AugmentationSettings
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import PictureSettings

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from augment.classifiers.adapter import Classifier
 from augment.classifiers.efficientnet_lite import load_efficientnet_lite
+from augment.classifiers.python_function import load_python
 from augment.classifiers.squeezenet_caffe import NAME as SQUEEZENET_CAFFE
 from augment.classifiers.squeezenet_caffe import load_squeezenet_caffe
 from augment.classifiers.torchvision_models import load_torchvision
@@ -21,13 +22,15 @@ SOURCES: Mapping[str, Callable[..., Classifier]] = {
     **{f"efficientnet_lite{version}": partial(load_efficientnet_lite, version) for version in range(3)},
     SQUEEZENET_CAFFE: load_squeezenet_caffe,
     "torchvision:": load_torchvision,
+    "python:": load_python,
 }
 
 
 def load_classifier(
     name: str, weights: str | Path | None = None, sources: Mapping[str, Callable[..., Classifier]] = SOURCES
 ) -> Classifier:
-    """`efficientnet_lite0` (to 2), `squeezenet_caffe` or `torchvision:NAME`, on the CPU.
+    """`efficientnet_lite0` (to 2), `squeezenet_caffe`, `torchvision:NAME` or `python:package.module:function`, on
+    the CPU.
 
     weights: a local file; None for those that the source brings or downloads. InputError for an unknown name, for
     weights that are missing, damaged or another network's, and where a package or the network is wanting.

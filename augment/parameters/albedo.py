@@ -4,17 +4,17 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from augment.mesh_scene import Conditions, MeshScene
-from augment.parameters.kind import Kind, StepSettings
+from augment.parameters.kind import OfMesh, StepSettings
+from augment.scene import Conditions, Scene
 
 
-class Albedo(Kind):
+class Albedo(OfMesh):
     """What is added to the linear albedo of each face, per channel; the sum is clamped to [0, 1]."""
 
     name = "albedo"
 
-    def __init__(self, scene: MeshScene, settings: StepSettings):
-        super().__init__(scene, scene.vertices.new_zeros(len(scene), scene.faces.numel()), settings)
+    def __init__(self, scene: Scene, settings: StepSettings):
+        super().__init__(scene, settings, [len(item.mesh.faces) for item in scene.objects])
 
-    def apply(self, values: Tensor, conditions: Conditions) -> Conditions:
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return replace(conditions, albedo=values.unflatten(1, (-1, 3)))

@@ -1,14 +1,15 @@
 """What every kind of parameter has: where it starts, its norm-ball, and how it steps down a gradient."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from augment.mesh_scene import Conditions, MeshScene
 from augment.norm_ball import NormBall
+from augment.scene import Conditions, Scene
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
 
 STEPS = ("unit", "raw", "sign")
@@ -28,10 +29,10 @@ class StepSettings:
 
     def __post_init__(self):
         NormBall(self.norm, self.radius)
-        check_step(self.step, self.step_size)
+        check_step(self.step, self.step_size, "attack: ")
 
 
-def check_step(step: str, step_size: float, prefix: str = "") -> None:
+def check_step(step: str, step_size: float, prefix: str) -> None:
     """InputError unless the rule is known and the size positive. prefix: of the settings' names."""
     if step not in STEPS:
         raise InputError(f"{prefix}step={step}: choose one of {', '.join(STEPS)}")
@@ -50,17 +51,20 @@ def direction(gradient: Tensor, step: str) -> Tensor:
 
 
 class Kind(ABC):
-    """One kind of parameter of a scene's E examples. `start` (E, D) is where attacks begin and its balls' centre."""
+    """One kind of parameter of a scene's E examples. `start` (E, D) is where attacks begin and its balls' centre.
+
+    used: (E, D) bool, where examples differ in how many values they use: the others stay as they are. None: all.
+    """
 
     name: str
 
-    def __init__(self, scene: MeshScene, start: Tensor, settings: StepSettings):
-        self.scene, self.start, self.settings = scene, start, settings
+    def __init__(self, scene: Scene, start: Tensor, settings: StepSettings, used: Tensor | None = None):
+        self.scene, self.start, self.settings, self.used = scene, start, settings, used
         self.ball = NormBall(settings.norm, settings.radius)
 
     @abstractmethod
-    def apply(self, values: Tensor, conditions: Conditions) -> Conditions:
-        """The conditions with this part of them set to values (A, D)."""
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """The conditions of examples (A,) with this part of them set to values (A, D)."""
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """The nearest values (A, D) of the examples (A,) within the norm-ball and what is physically possible."""
@@ -68,7 +72,20 @@ class Kind(ABC):
 
     def sample(self, generator: torch.Generator, examples: Tensor) -> Tensor:
         """Uniform draws (A, D) from the balls of the examples (A,), within the domain."""
-        return self.project(self.ball.sample(self.start[examples], generator), examples)
+        used = None if self.used is None else self.used[examples]
+        return self.project(self.ball.sample(self.start[examples], generator, used), examples)
+
+    def sample_as_far(self, values: Tensor, generator: torch.Generator, examples: Tensor) -> Tensor:
+        """`sample` where there is a radius; else a random direction at the L2 distance of values (A, D) from the
+        start, within the domain."""
+        if self.ball.radius is not None:
+            return self.sample(generator, examples)
+        start = self.start[examples].to(values)
+        offset = torch.randn(values.shape, generator=generator).to(values)
+        if self.used is not None:
+            offset = offset * self.used[examples]
+        reach = (values - start).norm(dim=1, keepdim=True)
+        return self.within_domain(start + offset * reach / offset.norm(dim=1, keepdim=True))
 
     def within_domain(self, values: Tensor) -> Tensor:
         """Values (A, D) moved into their domain, a box around the start; by default there is no bound."""
@@ -77,3 +94,14 @@ class Kind(ABC):
     def step(self, gradient: Tensor) -> Tensor:
         """How far to go down a gradient (A, D)."""
         return self.settings.step_size * direction(gradient, self.settings.step)
+
+
+class OfMesh(Kind):
+    """Three values for each of the items, vertices or faces, that a mesh has; a smaller mesh uses the first of them."""
+
+    def __init__(self, scene: Scene, settings: StepSettings, counts: Sequence[int]):
+        """counts: of items, for each object."""
+        start = scene.lights.new_zeros(len(scene), 3 * max(counts))
+        items = 3 * torch.tensor(counts, device=start.device)[scene.object_of]
+        used = torch.arange(start.shape[1], device=start.device) < items[:, None]
+        super().__init__(scene, start, settings, None if used.all() else used)

@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from augment.mesh_scene import MeshScene
+from augment.scene import Scene
 from renderer.camera import OrthographicCamera
 from renderer.image import PictureSettings
 from renderer.lights import ambient
@@ -40,7 +40,7 @@ def stone() -> Mesh:
 
 
 @pytest.fixture
-def make_scene(stone) -> Callable[..., MeshScene]:
+def make_scene(stone) -> Callable[..., Scene]:
     """Three examples of two views each, in light and before backgrounds that nothing clamps. Keywords change that."""
 
     def build(
@@ -51,13 +51,13 @@ def make_scene(stone) -> Callable[..., MeshScene]:
         encoding: str = "linear",
         gain: float = 1.0,
         size: int = SIZE,
-    ) -> MeshScene:
+    ) -> Scene:
         draws = torch.Generator().manual_seed(0)
         light = ambient(torch.full((3,), 0.22)) + 0.03 * torch.randn(49, 3, generator=draws)
         if backgrounds is None:
             backgrounds = 0.2 + 0.6 * torch.rand(len(cameras), 3, size, size, generator=draws)
         settings = PictureSettings(size, samples=2, encoding=encoding)
-        return MeshScene(mesh, cameras, backgrounds, light.to(dtype), settings, choose("software"), gain)
+        return Scene.of_mesh(mesh, cameras, backgrounds, light.to(dtype), settings, choose("software"), gain)
 
     return build
 

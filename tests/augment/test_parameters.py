@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from augment import mesh_scene
-from augment.attack import DescentSettings, Goal, descend
-from augment.mesh_scene import Conditions, MeshScene
+from augment import scene as scene_module
+from augment.descent import DescentSettings, Goal, descend
 from augment.parameters import KINDS, Albedo, Geometry, Kind, Lighting, Pixels, Skylight, StepSettings
 from augment.parameters.kind import STEPS, direction
 from augment.perturbation import Perturbation
 from augment.phases import Phases
+from augment.scene import Conditions, Scene
 from renderer.errors import InputError
 from renderer.lights import mean_luminance
 from renderer.skylight import TURBIDITY, ZENITH, coefficients_by_quadrature
@@ -25,7 +25,7 @@ FREE = StepSettings()
 SKY = (0.9, 0.4, 3.0)
 EVERY = torch.arange(3)
 
-MAKERS: dict[str, Callable[[MeshScene], Kind]] = {
+MAKERS: dict[str, Callable[[Scene], Kind]] = {
     "skylight": partial(Skylight, settings=FREE, zenith=SKY[0], azimuth=SKY[1], turbidity=SKY[2])
 } | {kind.name: partial(kind, settings=FREE) for kind in (Lighting, Geometry, Albedo, Pixels)}
 SIZES = {"lighting": 49 * 3, "skylight": 3, "geometry": 12 * 3, "albedo": 20 * 3, "pixels": 2 * 3 * 6 * 6}
@@ -42,12 +42,12 @@ def test_a_kind_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scen
     scene = make_scene(dtype=dtype)
     kind = MAKERS[name](scene)
     assert kind.start.shape == (3, SIZES[name]) and kind.start.dtype == dtype
-    conditions = kind.apply(kind.start, scene.conditions(EVERY))
+    conditions = kind.apply(kind.start, scene.conditions(EVERY), EVERY)
     if name == "skylight":
         light = conditions.light[0]
-        assert mean_luminance(light) == pytest.approx(mean_luminance(scene.light), rel=1e-6)
+        assert mean_luminance(light) == pytest.approx(mean_luminance(scene.lights[0]), rel=1e-6)
         expected = coefficients_by_quadrature(*SKY)
-        expected *= mean_luminance(scene.light) / mean_luminance(expected)
+        expected *= mean_luminance(scene.lights[0]) / mean_luminance(expected)
         assert (light - expected).norm() < 1e-4 * expected.norm()  # the error of the fit, see `renderer.skylight`
     else:
         pictures = scene.render(scene.conditions(EVERY), EVERY)
@@ -58,14 +58,14 @@ def test_a_kind_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scen
 @pytest.fixture
 def fixed_visibility(monkeypatch) -> None:
     """Whatever moves, each camera sees what it saw first, which is what the analytic gradient assumes."""
-    build, seen = mesh_scene.build_fragments, {}
+    build, seen = scene_module.build_fragments, {}
 
     def still(vertices, faces, cameras, settings, backend, closed=False):
         if cameras[0] not in seen:
             seen[cameras[0]] = build(vertices, faces, cameras, settings, backend, closed=closed)
         return seen[cameras[0]]
 
-    monkeypatch.setattr(mesh_scene, "build_fragments", still)
+    monkeypatch.setattr(scene_module, "build_fragments", still)
 
 
 COMBINATIONS = [
@@ -91,7 +91,7 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
     """Away from the start, with two views that share the values; by each value, or along eight mixtures of several
     kinds'. The differences leave a fourth power of h = 2e-4, times fifth derivatives, and rounding over h."""
     scene, draws = make_scene(encoding=encoding), torch.Generator().manual_seed(2)
-    scene.render(replace(scene.conditions(EVERY), albedo=scene.light.new_zeros(3, 20, 3)), EVERY)  # is what is seen
+    scene.render(replace(scene.conditions(EVERY), albedo=scene.lights.new_zeros(3, 20, 3)), EVERY)  # is what is seen
     problem = Perturbation(scene, [MAKERS[name](scene) for name in names])
     at = problem.start[1] + 0.02 * torch.randn(problem.start.shape[1], generator=draws)
     weights = torch.randn(2, 3, 6, 6, generator=draws, dtype=torch.float64)
@@ -117,8 +117,8 @@ def test_vertices_that_move_along_the_view_have_the_gradient_of_the_picture_rend
         directions = torch.kron(torch.eye(12, dtype=torch.float64), away)
 
         def weighed(values: Tensor, view: int = view) -> Tensor:
-            conditions = geometry.apply(values, scene.conditions(values))
-            pictures = scene.render(conditions, torch.ones(len(values), dtype=torch.int64))
+            example = torch.ones(len(values), dtype=torch.int64)
+            pictures = scene.render(geometry.apply(values, scene.conditions(example), example), example)
             return (pictures[:, view] * weights).sum((1, 2, 3))
 
         values = geometry.start[:1].clone().requires_grad_(True)
@@ -177,10 +177,10 @@ class Exposure(Kind):
 
     name = "exposure"
 
-    def __init__(self, scene: MeshScene, settings: StepSettings):
-        super().__init__(scene, scene.light.new_zeros(len(scene), 1), settings)
+    def __init__(self, scene: Scene, settings: StepSettings):
+        super().__init__(scene, scene.lights.new_zeros(len(scene), 1), settings)
 
-    def apply(self, values: Tensor, conditions: Conditions) -> Conditions:
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return replace(conditions, light=conditions.light * values.exp()[:, :, None])
 
 
@@ -227,7 +227,7 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
         assert projected.dtype == dtype
         moved = [projected] if radius is None else [projected, problem.sample(torch.Generator().manual_seed(0))]
         for sky_values in moved:
-            assert sky.apply(sky_values, scene.conditions(EVERY)).light.isfinite().all()
+            assert sky.apply(sky_values, scene.conditions(EVERY), EVERY).light.isfinite().all()
             assert (ends[0] <= sky_values).all() and (sky_values <= ends[1]).all()
             offset = (sky_values - centre).abs()
             reach = offset.norm(dim=1) if norm == "l2" else offset.amax(1)

@@ -1,17 +1,28 @@
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
 import torch
+import trimesh
 
+import renderer
+from augment import scene as scene_module
+from augment.backgrounds import load_backgrounds
+from augment.descent import DescentSettings, Goal, descend
+from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.parameters import Albedo, Geometry, Lighting, StepSettings
+from augment.perturbation import Perturbation
 from augment.phases import Phases
-from augment.scene import ObjectSettings, Scene, SceneObject, build_objects, count_views
-from augment.service import AugmentationService, AugmentationSettings, LightAttackSettings
+from augment.scene import STACKED, Conditions, Example, Scene, count_views
+from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from renderer.cache import OperatorCache
-from renderer.camera import ring
+from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
 from renderer.image import ENCODINGS, PictureSettings, develop
 from renderer.lights import ambient, probe
-from renderer.mesh import normalise
+from renderer.mesh import Mesh, normalise
 from renderer.shapes import solid
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
@@ -34,17 +45,41 @@ def random_operator(seed: int, count: int) -> Operator:
         albedo=torch.ones(3, count),
         coverage=coverage,
         pixels=torch.randperm(SIZE**2, generator=draws)[:count].sort().values,
+        settings=PictureSettings(size=SIZE),
     )
+
+
+class Given:
+    """In place of an `OperatorCache`: these operators, whatever the mesh."""
+
+    def __init__(self, *operators: Operator):
+        self.left = list(operators)
+
+    def operators(self, mesh, cameras, *settings, **more) -> list[Operator]:
+        return [self.left.pop(0) for _ in cameras]
+
+
+def scene_of(
+    labels: list[str], operators: list[Operator], grey_values: list[float], settings: PictureSettings
+) -> Scene:
+    """As many views of each label's object as there are operators for it."""
+    objects = [SceneObject(label, normalise(solid("plate"))) for label in labels]
+    cameras = ring(len(operators) // len(labels), 2.0)
+    behind = load_backgrounds(grey_values, settings.size)
+    return Scene.grid(objects, cameras, behind, probe("grace"), settings, BACKEND, Given(*operators))
+
+
+def render(scene: Scene, lights: torch.Tensor, examples: torch.Tensor | None = None) -> torch.Tensor:
+    """Of scenes whose examples have one view."""
+    everything = torch.arange(len(scene)) if examples is None else examples
+    return scene.render(Conditions(lights), everything)[:, 0]
 
 
 @pytest.fixture(params=ENCODINGS)
 def scene(request) -> Scene:
     """Two meshes of 2 views over 3 backgrounds; one view covers nothing."""
-    objects = [
-        SceneObject("orange", [random_operator(0, 6), random_operator(1, 4)]),
-        SceneObject("pear", [random_operator(2, 9), random_operator(3, 0)]),
-    ]
-    return Scene(objects, GREYS, PictureSettings(size=SIZE, encoding=request.param))
+    operators = [random_operator(seed, count) for seed, count in enumerate([6, 4, 9, 0])]
+    return scene_of(["orange", "pear"], operators, GREYS, PictureSettings(size=SIZE, encoding=request.param))
 
 
 def random_lights(count: int, seed: int = 0) -> torch.Tensor:
@@ -72,7 +107,7 @@ TOLERANCE = {"rtol": 0, "atol": 13 * 8 * EPS32}
 
 def test_renders_are_the_examples_composed_one_by_one(scene):
     lights = random_lights(12)
-    pictures = scene.render(lights)
+    pictures = render(scene, lights)
     assert pictures.shape == (12, 3, SIZE, SIZE) and len(scene) == 12
     assert pictures.min() >= 0 and pictures.max() <= 1
     torch.testing.assert_close(pictures, composed(scene, lights), **TOLERANCE)
@@ -81,20 +116,20 @@ def test_renders_are_the_examples_composed_one_by_one(scene):
 @pytest.mark.parametrize("examples", [[0], [11], [1, 2], [0, 4, 5, 9], [3, 6, 7, 8, 10], list(range(12))])
 def test_some_examples_are_rendered_as_all_are(scene, examples):
     lights, chosen = random_lights(12), torch.tensor(examples)
-    torch.testing.assert_close(scene.render(lights[chosen], chosen), composed(scene, lights)[chosen], **TOLERANCE)
+    torch.testing.assert_close(render(scene, lights[chosen], chosen), composed(scene, lights)[chosen], **TOLERANCE)
 
 
 def test_examples_are_meshes_by_views_by_backgrounds(scene):
     assert scene.labels == ["orange"] * 6 + ["pear"] * 6
-    free = sorted(set(range(SIZE**2)) - set(scene.pixels.tolist()))
+    free = sorted(set(range(SIZE**2)) - set(scene.stacks[0].pixels.tolist()))
     assert free
-    corner = scene.render(random_lights(12)).flatten(2)[:, :, free[0]]
+    corner = render(scene, random_lights(12)).flatten(2)[:, :, free[0]]
     torch.testing.assert_close(corner, torch.tensor(GREYS * 4)[:, None].expand(12, 3), rtol=0, atol=0)
 
 
 def test_uncovered_pixels_and_dead_coefficients_have_gradients_of_exactly_zero(scene):
     lights = random_lights(12).requires_grad_(True)
-    pictures = scene.render(lights)
+    pictures = render(scene, lights)
     (gradient,) = torch.autograd.grad(pictures.sum(), lights, retain_graph=True)
     assert (gradient[:9, LIVE] != 0).any(dim=2).all()
     assert not gradient[:, DEAD].any() and DEAD.sum() == 18
@@ -108,41 +143,36 @@ def test_uncovered_pixels_and_dead_coefficients_have_gradients_of_exactly_zero(s
 def test_the_gradient_is_the_transfer_where_nothing_clamps():
     """Under the linear encoding and whatever the background."""
     operator = random_operator(4, 7)
-    scene = Scene([SceneObject("orange", [operator])], [0.5], PictureSettings(size=SIZE))
+    scene = scene_of(["orange"], [operator], [0.5], PictureSettings(size=SIZE))
     lights = ambient(torch.full((3,), 0.1)).expand(1, -1, -1).clone().requires_grad_(True)
     weights = torch.randn(1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
-    (gradient,) = torch.autograd.grad(scene.render(lights), lights, weights)
+    (gradient,) = torch.autograd.grad(render(scene, lights), lights, weights)
     expected = torch.einsum("ckp,cp->kc", operator.transfer, weights.view(3, -1)[:, operator.pixels])
     torch.testing.assert_close(gradient[0, LIVE], expected, rtol=0, atol=16 * EPS32)
 
 
 def test_the_clamped_share_counts_covered_values_alone():
     """Radiance ±L₀₀ at three pixels of coverage 1, 1/2 and 1; a second view covers a fourth pixel, always in range."""
-    unit = torch.zeros(3, 31, 3)
+    unit, settings = torch.zeros(3, 31, 3), PictureSettings(size=2)
     unit[:, 0] = torch.tensor([1.0, 0.5, -1.0])
     views = [
-        Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2])),
-        Operator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3])),
+        Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2]), settings),
+        Operator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3]), settings),
     ]
-    scene = Scene([SceneObject("orange", views)], [0.0, 1.0], PictureSettings(size=2))
+    scene = scene_of(["orange"], views, [0.0, 1.0], settings)
     lights = torch.zeros(4, 49, 3)
     lights[:, 0] = torch.tensor([0.9, 1.6, 2.4])
     # Over black: 0.9, 1.6, 2.4; 0.45, 0.8, 1.2; all negative: 2 + 1 + 3 clamped. Over white, half of it at the second
     # pixel: 0.95, 1.3, 1.7, so 2 + 2 + 3.
-    torch.testing.assert_close(scene.clamped_share(lights), torch.tensor([6 / 9, 7 / 9, 0, 0]))
+    shares = scene.clamped_share(Conditions(lights), torch.arange(4))
+    torch.testing.assert_close(shares, torch.tensor([6 / 9, 7 / 9, 0, 0]))
 
 
 def test_a_scene_that_nothing_covers_is_its_backgrounds():
-    scene = Scene([SceneObject("orange", [random_operator(0, 0)])], GREYS, PictureSettings(size=SIZE))
-    pictures = scene.render(random_lights(3))
+    scene = scene_of(["orange"], [random_operator(0, 0)], GREYS, PictureSettings(size=SIZE))
+    pictures = render(scene, random_lights(3))
     torch.testing.assert_close(pictures, torch.tensor(GREYS).view(3, 1, 1, 1).expand_as(pictures), rtol=0, atol=0)
-    assert scene.clamped_share(random_lights(3)).tolist() == [0, 0, 0]
-
-
-@pytest.mark.parametrize("grey", [-0.1, 1.01, 255, float("nan")])
-def test_backgrounds_that_no_picture_has_are_refused(grey):
-    with pytest.raises(InputError, match=r"scene\.backgrounds"):
-        Scene([SceneObject("orange", [random_operator(0, 1)])], [0.5, grey], PictureSettings(size=SIZE))
+    assert scene.clamped_share(Conditions(random_lights(3)), torch.arange(3)).tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -173,36 +203,37 @@ def same(a: Operator, b: Operator) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("transfer", "coverage", "pixels"))
 
 
+def built(items: list[ObjectSettings], cameras: list, settings: PictureSettings, *cache: OperatorCache) -> Scene:
+    """Of all meshes from all cameras over GREYS."""
+    objects = [load_object(item) for item in items]
+    behind = load_backgrounds(GREYS, settings.size)
+    return Scene.grid(objects, cameras, behind, probe("grace"), settings, BACKEND, *cache)
+
+
 @pytest.mark.parametrize(("spec", "name", "seed"), [("solid:plate", "plate", 0), ("solid:table:3", "table", 3)])
-def test_a_solid_is_normalised_and_seen_from_a_ring(spec, name, seed):
-    (built,) = build_objects([ObjectSettings(spec, "thing")], 2, 2.2, SETTINGS, BACKEND)
-    expected = build_operators(normalise(solid(name, seed)), ring(2, 2.2), SETTINGS, BACKEND)
-    assert built.label == "thing" and len(built.operators) == 2
-    assert all(same(*pair) for pair in zip(built.operators, expected, strict=True))
+def test_a_solid_is_normalised_and_named(spec, name, seed):
+    loaded, expected = load_object(ObjectSettings(spec, "thing", gain=2.0)), normalise(solid(name, seed))
+    assert (loaded.label, loaded.gain) == ("thing", 2.0)
+    assert np.array_equal(loaded.mesh.vertices, expected.vertices) and np.array_equal(loaded.mesh.faces, expected.faces)
 
 
 def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
     """A wall in the file's xy plane, 2 wide and 1 high: seen from π/3, it is upright only when y is up."""
     path = tmp_path / "wall.obj"
     path.write_text("v -1 0 0\nv 1 0 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n")
-    level, upright, bright = build_objects(
-        [
-            ObjectSettings(str(path), "wall"),
-            ObjectSettings(str(path), "wall", up="y"),
-            ObjectSettings(str(path), "wall", up="y", gain=2.0),
-        ],
-        4,
-        4.0,
-        PictureSettings(size=32, samples=4),
-        BACKEND,
-    )
+    walls = [
+        ObjectSettings(str(path), "wall"),
+        ObjectSettings(str(path), "wall", up="y"),
+        ObjectSettings(str(path), "wall", up="y", gain=2.0),
+    ]
+    (stack,) = built(walls, [ring(4, 4.0)[1]], PictureSettings(size=32, samples=4)).stacks
     # From azimuth π/2: as wide as it was and sin π/3 high standing, cos π/3 high lying; half a sample's width of 1/64
     # off along the outline of 6 at the most.
-    for built, foreshortening in ((upright, np.sqrt(3) / 2), (level, 0.5)):
-        area = float(built.operators[1].coverage.sum()) / 64
-        assert area == pytest.approx(2 * foreshortening, abs=6 / 64)
-    torch.testing.assert_close(bright.operators[1].albedo, 2 * upright.operators[1].albedo, rtol=0, atol=0)
-    torch.testing.assert_close(bright.operators[1].transfer, upright.operators[1].transfer, rtol=0, atol=0)
+    for coverage, foreshortening in zip(stack.coverage, (0.5, np.sqrt(3) / 2), strict=False):
+        assert float(coverage.sum()) / 64 == pytest.approx(2 * foreshortening, abs=6 / 64)
+    covered = stack.coverage[1, 0] > 0
+    torch.testing.assert_close(stack.albedo[2][:, covered], 2 * stack.albedo[1][:, covered], rtol=0, atol=0)
+    assert torch.equal(stack.transfer[2], stack.transfer[1])
 
 
 @pytest.mark.parametrize(
@@ -218,7 +249,7 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
 )
 def test_a_mesh_that_is_not_there_is_refused(spec, message):
     with pytest.raises(InputError, match=message):
-        build_objects([ObjectSettings(spec, "orange")], 1, 2.0, SETTINGS, BACKEND)
+        load_object(ObjectSettings(spec, "orange"))
 
 
 @pytest.mark.parametrize("gain", [0.0, -1.0, float("nan")])
@@ -227,27 +258,30 @@ def test_a_gain_that_leaves_nothing_is_refused(gain):
         ObjectSettings("solid:orange", "orange", gain=gain)
 
 
+TWO = [ObjectSettings(f"solid:{name}", name) for name in ("plate", "cup")]
+
+
 def test_a_lighting_attack_rasterises_nothing(rasterised):
     """Each mesh is rasterised once, in all views; 30 steps on 24 examples that are never fooled add nothing."""
-    items = [ObjectSettings(f"solid:{name}", name) for name in ("plate", "cup")]
-    objects = build_objects(items, 4, 2, SETTINGS, BACKEND)
-    assert rasterised == [4, 4]
-    scene = Scene(objects, GREYS, SETTINGS)
+    scene = built(TWO, ring(4, 2), SETTINGS)
+    assert rasterised == [] and scene.stacks and rasterised == [4, 4]
     network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 3))
     torch.nn.init.constant_(network[1].bias[0], 1000)
-    settings = AugmentationSettings(attack=LightAttackSettings(max_steps=30))
-    service = AugmentationService(settings, scene, torch.zeros(24, dtype=torch.int64), probe("grace"), 0, Phases())
+    settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=30))
+    service = AugmentationService(settings, scene, torch.zeros(24, dtype=torch.int64), 0, Phases())
     assert service.regenerate(network, number=0).diagnostics["steps"] == 30 and rasterised == [4, 4]
 
 
 def test_a_scene_stores_no_background_pixel_and_no_backgrounds_or_dead_bands_of_a_view():
-    objects = build_objects([ObjectSettings("solid:bottle", "bottle")], 4, 2, SETTINGS, BACKEND)
-    scene = Scene(objects, GREYS, SETTINGS)
-    covered = set(np.concatenate([operator.pixels for operator in objects[0].operators]).tolist())
+    bottle = ObjectSettings("solid:bottle", "bottle")
+    scene = built([bottle], ring(4, 2), SETTINGS)
+    operators = build_operators(load_object(bottle).mesh, ring(4, 2), SETTINGS, BACKEND)
+    covered = set(np.concatenate([operator.pixels for operator in operators]).tolist())
+    (stack,) = scene.stacks
     assert len(scene) == 12 and 0 < len(covered) < 64 / 2
     # 31 live coefficients of 49, and the row of zeros that makes the product fast
-    assert scene.transfer.shape == (4, 3, 32, len(covered)) and not scene.transfer[:, :, 31].any()
-    assert scene.coverage.shape == (4, 1, len(covered)) and scene.pixels.tolist() == sorted(covered)
+    assert stack.transfer.shape == (4, 3, 32, len(covered)) and not stack.transfer[:, :, 31].any()
+    assert stack.coverage.shape == (4, 1, len(covered)) and stack.pixels.tolist() == sorted(covered)
 
 
 def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterised):
@@ -255,8 +289,7 @@ def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterised
     pictures = []
     for calls in ([3, 3], [3, 3]):
         cache = OperatorCache(tmp_path)
-        scene = Scene(build_objects(items, 3, 2, SETTINGS, BACKEND, cache), GREYS, SETTINGS)
-        pictures.append(scene.render(random_lights(18)))
+        pictures.append(render(built(items, ring(3, 2), SETTINGS, cache), random_lights(18)))
         assert rasterised == calls
     assert (cache.tally.loaded, cache.tally.built) == (6, 0)
     assert torch.equal(*pictures)
@@ -264,9 +297,123 @@ def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterised
 
 def test_under_grace_a_plate_is_brighter_from_above_than_from_below():
     """The whole way from a spec to a picture."""
-    (plate,) = build_objects([ObjectSettings("solid:plate", "plate")], 1, 2.0, SETTINGS, BACKEND)
-    scene = Scene([plate], [0.0], SETTINGS)
-    light = probe("grace")[None]
+    scene = built([ObjectSettings("solid:plate", "plate")], ring(1, 2.0), SETTINGS)
+    light = probe("grace").expand(3, -1, -1)
     upside_down = light.clone()
     upside_down[:, 2] *= -1
-    assert scene.render(light).mean() > 1.2 * scene.render(upside_down).mean()
+    assert render(scene, light)[0].mean() > 1.2 * render(scene, upside_down)[0].mean()
+
+
+# ---------------------------------------------------------------------------------------- rows of every kind
+
+
+@pytest.fixture(scope="module", params=[STACKED, 1], ids=["one stack", "a stack per view"])
+def mixed(request) -> Iterator[Scene]:
+    """Two meshes of different sizes in no order, two views per row, own lights, exposures and backgrounds."""
+    views, draws = ring(3, 2.2), torch.Generator().manual_seed(3)
+    rows = [
+        Example(1, (views[0], views[1]), 0),
+        Example(0, (views[2], views[1]), 1, exposure=0.5),
+        Example(1, (views[0], views[2]), 1, exposure=2.0),
+        Example(0, (views[2], views[2]), 2),
+    ]
+    lights = 0.3 * probe("grace").double() + 0.01 * torch.randn(4, 49, 3, generator=draws).double()
+    behind = 0.2 + 0.6 * torch.rand(3, 3, 8, 8, generator=draws)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_module, "STACKED", request.param)
+        yield Scene([load_object(item) for item in TWO], rows, behind, lights, SETTINGS, BACKEND)
+
+
+@pytest.mark.parametrize("by", ["light", "vertices"])
+@pytest.mark.parametrize("examples", [[0, 1, 2, 3], [3, 0], [2, 2, 1]])
+def test_rows_of_several_meshes_are_what_each_is_by_itself(mixed, examples, by):
+    """By stacked operators and by rasterising anew, beside `renderer.render`, which shares no code with the stacks."""
+    chosen, conditions = torch.tensor(examples), mixed.conditions(torch.tensor(examples))
+    if by == "vertices":
+        conditions = replace(conditions, vertices=mixed.vertices[mixed.object_of[chosen]])
+    images = mixed.render(conditions, chosen)
+    assert images.shape == (len(examples), 2, 3, 8, 8)
+    for image, example in zip(images, examples, strict=True):
+        row = mixed.examples[example]
+        light = mixed.lights[example] * row.exposure
+        behind = mixed.backgrounds[row.background].view(3, 8, 8)
+        alone = {"samples": 2, "normals": "flat", "visibility": "software"}
+        expected = renderer.render(mixed.mesh(example), row.cameras, light, 8, behind, **alone)
+        torch.testing.assert_close(image, expected, rtol=0, atol=64 * torch.finfo(torch.float64).eps)
+    assert mixed.labels == ["cup", "plate", "cup", "plate"]
+
+
+def test_each_row_has_the_gradient_that_it_has_by_itself(mixed):
+    draws = torch.Generator().manual_seed(4)
+    weights = torch.randn(4, 2, 3, 8, 8, generator=draws).double()
+
+    def gradient(examples: list[int]) -> torch.Tensor:
+        chosen = torch.tensor(examples)
+        lights = mixed.lights[chosen].clone().requires_grad_(True)
+        images = mixed.render(Conditions(lights), chosen)
+        return torch.autograd.grad((images * weights[chosen]).sum(), lights)[0]
+
+    together = gradient([0, 1, 2, 3])
+    assert together.abs().amax((1, 2)).min() > 1e-3
+    for example in range(4):
+        torch.testing.assert_close(gradient([example])[0], together[example], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [Geometry, Albedo])
+def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_its_own_values_only(mixed, kind):
+    """What is left over has no gradient and is never drawn; the L2 ball is that of the values in use."""
+    own = kind(mixed, StepSettings("l2", 0.2))
+    sizes = [len(item.mesh.vertices if kind is Geometry else item.mesh.faces) for item in mixed.objects]
+    everything, used = torch.arange(4), torch.tensor([3 * sizes[row.object] for row in mixed.examples])
+    assert len(set(sizes)) == 2 and own.start.shape == (4, 3 * max(sizes))
+    drawn = own.sample(torch.Generator().manual_seed(0), everything)
+    beyond = torch.arange(drawn.shape[1]) >= used[:, None]
+    assert beyond.any() and not drawn[beyond].any() and (drawn[~beyond] != 0).all()
+    assert (drawn.norm(dim=1) <= 0.2 + 1e-9).all() and (drawn.norm(dim=1) > 0.19).all()
+    values = own.start.clone().requires_grad_(True)
+    images = mixed.render(own.apply(values, mixed.conditions(everything), everything), everything)
+    (gradient,) = torch.autograd.grad(images.square().sum(), values)
+    assert not gradient[beyond].any() and gradient.any(1).all()
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """A basis that the package does not have: three lamps far away, along the axes, of power from 0 to 1."""
+
+    name = "lamps"
+    size = 3
+    live = torch.arange(3)
+
+    def irradiance(self, normals: torch.Tensor) -> torch.Tensor:
+        return normals.clamp(min=0)
+
+    def within_domain(self, coefficients: torch.Tensor) -> torch.Tensor:
+        return coefficients.clamp(0, 1)
+
+
+def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its_own():
+    """A white box before the camera from above: its top has the power of the lamp above, which falls to 0 at most."""
+    box = SceneObject("box", Mesh.plain(trimesh.creation.box().vertices, trimesh.creation.box().faces))
+    start = torch.tensor([[0.2] * 3, [0.3] * 3, [0.4, 0.5, 0.6]], dtype=torch.float64)
+    above = OrthographicCamera(0.0, 0.0, 0.9)  # nothing but the top
+    scene = Scene.grid([box], [above], load_backgrounds([1.0], 8), start, SETTINGS, BACKEND, basis=Lamps())
+    chosen = torch.zeros(1, dtype=torch.int64)
+    image = scene.render(scene.conditions(chosen), chosen)
+    expected = start[2].view(3, 1, 1).expand_as(image)
+    torch.testing.assert_close(image, expected, rtol=0, atol=8 * torch.finfo(torch.float64).eps)
+
+    light = Lighting(scene, StepSettings("linf", 0.45, "sign", 0.15))
+    problem, goal = Perturbation(scene, [light]), Goal(torch.zeros(1, 1, dtype=torch.int64))
+    dark = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 2)).double()
+    torch.nn.init.constant_(dark[1].weight, 0)
+    with torch.no_grad():
+        dark[1].weight[1], dark[1].bias[:] = -0.01, torch.tensor([5.0, 0.0])  # no darkness is enough
+    result = descend(dark, problem, goal, DescentSettings(5), Phases())
+    lamps = result.values.view(3, 3)
+    torch.testing.assert_close(lamps[:2], start[:2], rtol=0, atol=0)
+    torch.testing.assert_close(lamps[2], torch.tensor([0.0, 0.05, 0.15], dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+def test_a_light_of_another_basis_is_refused():
+    with pytest.raises(InputError, match=r"light of shape \(9, 3\) is not of harmonics of degree 6: give 49 rows"):
+        Scene.of_mesh(solid("plate"), [ring(1, 2.0)], load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, BACKEND)

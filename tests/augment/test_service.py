@@ -3,19 +3,26 @@ import math
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils.data import ConcatDataset, DataLoader
 
+from augment.backgrounds import load_backgrounds
+from augment.objects import ObjectSettings, load_object
+from augment.parameters import StepSettings
 from augment.phases import Phases
-from augment.scene import ObjectSettings, Scene, build_objects
-from augment.service import AugmentationService, AugmentationSettings, LightAttackSettings, RandomLights
+from augment.scene import Conditions, Scene
+from augment.service import AugmentationService, AugmentationSettings, RandomLights, TrainingAttackSettings
+from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.image import PictureSettings
 from renderer.lights import probe
+from renderer.mesh import normalise
+from renderer.shapes import solid
 from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
 LIGHT = probe("grace")
 CLASSES = {"plate": 0, "table": 2}
-SHORT = LightAttackSettings(max_steps=5)
+SHORT = TrainingAttackSettings(max_steps=5)
 SHARES = {"fooled_before", "fooled", "used_all_steps", "zero_gradient", "clamped"}
 
 
@@ -23,8 +30,13 @@ SHARES = {"fooled_before", "fooled", "used_all_steps", "zero_gradient", "clamped
 def scene() -> Scene:
     """The paper's 2 meshes × 10 views × 5 backgrounds, small."""
     settings = PictureSettings(size=8, samples=2)
-    objects = [ObjectSettings(f"solid:{name}", name) for name in CLASSES]
-    return Scene(build_objects(objects, 10, 2.0, settings, choose("software")), [0, 0.25, 0.5, 0.75, 1], settings)
+    objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in CLASSES]
+    behind = load_backgrounds([0, 0.25, 0.5, 0.75, 1], settings.size)
+    return Scene.grid(objects, ring(10, 2.0), behind, LIGHT, settings, choose("software"))
+
+
+def render(scene: Scene, lights: Tensor) -> Tensor:
+    return scene.render(Conditions(lights), torch.arange(len(scene)))[:, 0]
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +58,7 @@ def model(scene, labels) -> nn.Module:
             nn.Linear(1024, 3),
         )
         optimizer = torch.optim.Adam(network.parameters(), lr=0.003)
-        pictures = scene.render(LIGHT.expand(100, -1, -1))
+        pictures = render(scene, LIGHT.expand(100, -1, -1))
         for _ in range(60):
             optimizer.zero_grad()
             nn.functional.cross_entropy(network(pictures), labels).backward()
@@ -58,7 +70,7 @@ def model(scene, labels) -> nn.Module:
 def serve(scene, labels):
     def service(seed: int = 0, phases: Phases | None = None, **settings) -> AugmentationService:
         choices = AugmentationSettings(**{"attack": SHORT, **settings})
-        return AugmentationService(choices, scene, labels, LIGHT, seed, phases or Phases())
+        return AugmentationService(choices, scene, labels, seed, phases or Phases())
 
     return service
 
@@ -69,7 +81,7 @@ def test_without_an_arm_or_examples_the_batch_is_empty(serve, model, settings):
     assert len(renders.images) == len(renders.labels) == 0 and renders.diagnostics == {}
     choices = AugmentationSettings(**settings)
     assert not choices.renders
-    service = AugmentationService(choices, None, torch.zeros(0, dtype=torch.int64), LIGHT, 0, Phases())
+    service = AugmentationService(choices, None, torch.zeros(0, dtype=torch.int64), 0, Phases())
     assert len(service.regenerate(model, 0).labels) == 0
 
 
@@ -132,7 +144,7 @@ def attacked_by_hand(model: nn.Module, scene: Scene, labels: Tensor, step: str, 
     model.eval()
     for index in range(steps + 1):
         lights.requires_grad_(True)
-        images = scene.render(lights)
+        images = render(scene, lights)
         logits = model(images)
         losses, fooled = nn.functional.cross_entropy(logits, labels, reduction="none"), logits.argmax(1) != labels
         if index == 0:
@@ -152,7 +164,7 @@ def attacked_by_hand(model: nn.Module, scene: Scene, labels: Tensor, step: str, 
 
 @pytest.mark.parametrize("step", ["unit", "sign"])
 def test_adversarial_pictures_are_those_of_the_papers_loop(serve, model, scene, labels, step):
-    renders = serve(attack=LightAttackSettings(step, max_steps=10, batch_size=32)).regenerate(model, 0)
+    renders = serve(attack=TrainingAttackSettings(step=step, max_steps=10, batch_size=32)).regenerate(model, 0)
     expected = attacked_by_hand(model, scene, labels, step, steps=10)
     # Ten steps of products in float32 in another order, through a network that amplifies their rounding.
     torch.testing.assert_close(renders.images, expected.pop("images"), rtol=0, atol=10 * 64 * EPS32)
@@ -162,7 +174,7 @@ def test_adversarial_pictures_are_those_of_the_papers_loop(serve, model, scene, 
 
 
 def test_the_attack_raises_the_loss_within_its_budget(serve, model):
-    diagnostics = serve(attack=LightAttackSettings(max_steps=10)).regenerate(model, 0).diagnostics
+    diagnostics = serve(attack=TrainingAttackSettings(max_steps=10)).regenerate(model, 0).diagnostics
     assert diagnostics["fooled_before"] < 0.2 < diagnostics["fooled"]
     assert diagnostics["loss"] > 2 * diagnostics["loss_before"]
     assert 0 < diagnostics["light_change"] <= 0.05 * diagnostics["steps"] + 1e-6 <= 0.5 + 1e-6
@@ -191,7 +203,7 @@ def test_lights_that_continue_begin_where_they_ended_also_after_a_resume(serve, 
 
 
 def test_a_random_start_is_the_random_arms_light(serve, model):
-    still = LightAttackSettings(max_steps=0)
+    still = TrainingAttackSettings(max_steps=0)
     started = serve(start="random", attack=still).regenerate(model, 5)
     random = serve(arm="random").regenerate(model, 5)
     torch.testing.assert_close(started.images, random.images, rtol=0, atol=0)
@@ -199,8 +211,8 @@ def test_a_random_start_is_the_random_arms_light(serve, model):
 
 
 def test_continued_lights_of_another_number_of_examples_are_refused(serve):
-    with pytest.raises(InputError, match=r"augment\.examples: the checkpoint continues 3 lights and the scene has"):
-        serve(lights="continue").load_state_dict({"lights": torch.zeros(3, 49, 3)})
+    with pytest.raises(InputError, match=r"augment\.examples: the checkpoint continues 3 examples and the scene has"):
+        serve(lights="continue").load_state_dict({"values": torch.zeros(3, 147)})
 
 
 @pytest.mark.parametrize(
@@ -210,10 +222,15 @@ def test_continued_lights_of_another_number_of_examples_are_refused(serve):
         (lambda: AugmentationSettings(start="dark"), r"augment\.start=dark: choose one of light, random"),
         (lambda: AugmentationSettings(lights="stay"), r"augment\.lights=stay: choose one of restart, continue"),
         (lambda: AugmentationSettings(examples=-1), r"augment\.examples=-1"),
-        (lambda: LightAttackSettings("newton"), r"augment\.attack\.step=newton: choose one of unit, raw, sign"),
-        (lambda: LightAttackSettings(step_size=0.0), r"augment\.attack\.step_size=0\.0 must be at least"),
-        (lambda: LightAttackSettings(max_steps=-1), r"attack: max_steps=-1"),
-        (lambda: LightAttackSettings(batch_size=0), r"attack: batch_size=0 must be at least 1"),
+        (lambda: TrainingAttackSettings(step="newton"), r"augment\.attack\.step=newton: choose one of unit, raw, sign"),
+        (lambda: TrainingAttackSettings(step_size=0.0), r"augment\.attack\.step_size=0\.0 must be at least"),
+        (lambda: TrainingAttackSettings(max_steps=-1), r"attack: max_steps=-1"),
+        (lambda: TrainingAttackSettings(batch_size=0), r"attack: batch_size=0 must be at least 1"),
+        (lambda: TrainingAttackSettings(restarts=1), r"attack\.restarts draws from the norm-balls: set the radius"),
+        (
+            lambda: AugmentationSettings(arm="random", attack=TrainingAttackSettings(geometry=StepSettings())),
+            r"augment\.attack\.geometry\.radius=null has no random draw: set a radius",
+        ),
         (lambda: RandomLights(amplitude=0.0), r"augment\.random\.amplitude=0\.0"),
         (lambda: RandomLights(amplitude=math.nan), r"augment\.random\.amplitude=nan"),
         (lambda: RandomLights(radius=0.0), r"augment\.random\.radius=0\.0"),
@@ -222,3 +239,73 @@ def test_continued_lights_of_another_number_of_examples_are_refused(serve):
 def test_settings_out_of_range_are_refused(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+SHAPE_AND_PAINT = {
+    "geometry": StepSettings("linf", 0.02, "sign", 0.01),
+    "albedo": StepSettings("linf", 0.1, "sign", 0.05),
+}
+
+
+@pytest.fixture(scope="module")
+def few() -> tuple[Scene, Tensor]:
+    """Both meshes from one view over one grey, since shapes are rasterised in every step."""
+    settings = PictureSettings(size=8, samples=2)
+    objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in CLASSES]
+    scene = Scene.grid(objects, ring(1, 2.0), load_backgrounds([0.5], 8), LIGHT, settings, choose("software"))
+    return scene, torch.tensor(list(CLASSES.values()))
+
+
+@pytest.mark.parametrize("arm", ["random", "adversarial"])
+def test_a_training_attacks_what_a_single_attack_can_within_its_norm_balls(few, model, arm):
+    """Shape and paint at once, of meshes of different sizes and classes; the random arm draws from the same balls."""
+    settings = AugmentationSettings(
+        arm=arm, examples=2, attack=TrainingAttackSettings(**SHAPE_AND_PAINT, max_steps=2, shorten=True)
+    )
+    service = AugmentationService(settings, *few, 0, Phases())
+    first, again = (service.regenerate(model, 0) for _ in range(2))
+    assert first.images.shape == (2, 3, 8, 8) and torch.equal(first.images, again.images)
+    found, values = first.diagnostics, 3 * max(len(item.mesh.vertices) for item in few[0].objects)
+    assert 0 < found["vertices_change"] <= 0.02 * values**0.5 and found["albedo_change"] > 0
+    assert found["light_change"] == 0 and 0 <= found["clamped"] <= 1
+    if arm == "adversarial":
+        assert found["loss"] > found["loss_before"]
+
+
+def test_restarts_go_on_where_no_descent_has_fooled_and_repeat_with_the_epoch(few):
+    scene, _ = few
+    never = nn.Sequential(nn.Flatten(), nn.Linear(192, 3))
+    nn.init.constant_(never[1].bias[0], 1000)
+    attack = TrainingAttackSettings(lighting=StepSettings("l2", 1.0, "unit", 0.1), max_steps=1, restarts=3)
+    choices = AugmentationSettings(examples=2, attack=attack)
+    service = AugmentationService(choices, scene, torch.zeros(2, dtype=torch.int64), 0, Phases())
+    first, again = (service.regenerate(never, 0) for _ in range(2))
+    assert first.diagnostics["steps"] == 4 and first.diagnostics["used_all_steps"] == 1
+    assert first.diagnostics == again.diagnostics and torch.equal(first.images, again.images)
+
+
+def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, monkeypatch, tmp_path):
+    """Built from meshes, label indices and a size; what it gives is what a service around the same scene gives."""
+    monkeypatch.chdir(tmp_path)
+    meshes = [("solid:plate", 0), (normalise(solid("table")), 2)]
+    attack = TrainingAttackSettings(max_steps=2)
+    settings = AugmentationSettings(lights="continue", attack=attack)
+    choices = dict(views=2, backgrounds=[0.25, 0.75], samples=2, visibility="software")
+    service = AugmentationService.from_meshes(meshes, 8, settings, **choices)
+    renders = service.regenerate(model, 0)
+    assert renders.labels.tolist() == [0] * 4 + [2] * 4 and len(service) == len(renders) == 8
+
+    objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in ("plate", "table")]
+    picture, behind = PictureSettings(size=8, samples=2), load_backgrounds([0.25, 0.75], 8)
+    scene = Scene.grid(objects, ring(2, 2.0), behind, LIGHT, picture, choose("software"))
+    same = AugmentationService(AugmentationSettings(examples=8, attack=attack), scene, renders.labels, 0, Phases())
+    assert torch.equal(same.regenerate(model, 0).images, renders.images)
+
+    data = ConcatDataset([[(torch.zeros(3, 8, 8), 0)] * 5, renders])
+    images, labels = next(iter(DataLoader(data, batch_size=13)))
+    assert torch.equal(images[5:], renders.images) and labels.tolist() == [0] * 5 + renders.labels.tolist()
+
+    resumed = AugmentationService.from_meshes(meshes, 8, settings, **choices)
+    resumed.load_state_dict(service.state_dict())
+    assert torch.equal(resumed.regenerate(model, 1).images, service.regenerate(model, 1).images)
+    assert list(tmp_path.iterdir()) == []

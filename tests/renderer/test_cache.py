@@ -12,7 +12,8 @@ import safetensors.torch
 import torch
 
 from renderer import cache as cache_module
-from renderer import visibility
+from renderer import transfer, visibility
+from renderer.basis import Harmonics
 from renderer.cache import OperatorCache, TensorCache, cache_folder, content_key, source_key
 from renderer.camera import OrthographicCamera, ring
 from renderer.image import PictureSettings
@@ -53,9 +54,9 @@ MESHES = {
 
 def same(first: list[Operator], second: list[Operator]) -> bool:
     return all(
-        a.degree == b.degree
-        and all(torch.equal(getattr(a, name), getattr(b, name)) for name in cache_module.TENSORS)
-        and all(getattr(a, name).dtype == getattr(b, name).dtype for name in cache_module.TENSORS)
+        a.basis == b.basis
+        and all(torch.equal(getattr(a, name), getattr(b, name)) for name in transfer.TENSORS)
+        and all(getattr(a, name).dtype == getattr(b, name).dtype for name in transfer.TENSORS)
         for a, b in zip(first, second, strict=True)
     )
 
@@ -74,7 +75,7 @@ def test_a_second_run_builds_nothing_and_has_the_same_operators_to_the_bit(mesh,
         assert (cache.tally.built, cache.tally.loaded, rasterised) == (built, 3 - built, calls)
 
 
-@pytest.mark.parametrize("options", [{"degree": 2}, {"dtype": torch.float64}])
+@pytest.mark.parametrize("options", [{"basis": Harmonics(2)}, {"dtype": torch.float64}])
 def test_operators_of_another_degree_or_dtype_come_back_as_such(options, tmp_path):
     expected = build_operators(PLATE, [CAMERA], SETTINGS, BACKEND, **options)
     for _ in range(2):
@@ -145,7 +146,7 @@ CHANGES = {
     "the samples": {"settings": replace(SETTINGS, samples=3)},
     "the encoding": {"settings": replace(SETTINGS, encoding="srgb")},
     "the gain": {"gain": 1.1},
-    "the degree": {"degree": 2},
+    "the basis": {"basis": Harmonics(2)},
     "the dtype": {"dtype": torch.float64},
     "the back end": {"backend": Backend("other", BACKEND.description)},
     "the renderer's code": {"code": "other"},

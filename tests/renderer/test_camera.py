@@ -65,3 +65,15 @@ def test_depth_is_smaller_where_nearer_and_fits_every_normalised_mesh(camera):
 def test_a_picture_without_width_is_refused(width):
     with pytest.raises(InputError, match="field_of_view"):
         ring(3, width)
+
+
+def test_a_place_moves_the_picture_by_world_units_and_not_the_depth():
+    points, plain = np.random.default_rng(0).normal(size=(20, 3)), OrthographicCamera(1.0, 0.4, 3.0)
+    moved = OrthographicCamera(1.0, 0.4, 3.0, right=0.5, up=-0.2).project(points)
+    np.testing.assert_allclose(moved - plain.project(points), [[1 / 3, -0.4 / 3, 0]] * 20, rtol=0, atol=4 * EPS)
+
+
+@pytest.mark.parametrize("place", [{"right": math.nan}, {"up": math.inf}])
+def test_a_place_that_is_not_finite_is_refused(place):
+    with pytest.raises(InputError, match=r"camera place right=.*: give lengths of at most"):
+        OrthographicCamera(1.0, 0.4, 3.0, **place)

@@ -239,7 +239,10 @@ def test_saved_coefficients_come_back_to_the_bit_and_unscaled(tmp_path):
     light = 100 * torch.randn(49, 3, generator=draws())
     save_light(tmp_path / "light.json", light)
     torch.testing.assert_close(load_light(str(tmp_path / "light.json")), light, rtol=0, atol=0)
-    assert len(json.loads((tmp_path / "light.json").read_text())) == 49
+    written = json.loads((tmp_path / "light.json").read_text())
+    assert written["basis"] == "harmonics" and len(written["coefficients"]) == 49
+    (tmp_path / "rows.json").write_text(json.dumps(written["coefficients"]))
+    torch.testing.assert_close(load_light(str(tmp_path / "rows.json")), light, rtol=0, atol=0)
 
 
 def test_coefficients_that_are_not_finite_are_not_saved(tmp_path):
@@ -256,6 +259,8 @@ ROWS = [[1, 0.5, -2]] * 49
     [
         pytest.param("", "not a readable list", id="empty"),
         pytest.param(json.dumps(ROWS)[:-1], "not a readable list", id="truncated"),
+        pytest.param(json.dumps({"basis": "harmonics"}), "not a readable list", id="no coefficients"),
+        pytest.param(json.dumps({"basis": "lamps", "coefficients": ROWS}), "has the basis 'lamps'", id="another basis"),
         pytest.param("\udcff", "not a readable list", id="bytes"),
         pytest.param('{"light": 1}', "not a readable list", id="object"),
         pytest.param('"grace"', "not a readable list", id="text"),

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre, sph_harm_y
 
 from renderer.albedo import surface_albedo
+from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
@@ -337,12 +338,12 @@ def test_operators_of_any_degree_are_scipys_harmonics(degree):
     box = trimesh.convex.convex_hull(CUBE)
     mesh = Mesh.plain(Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).apply(box.vertices), box.faces, (0.5, 1.0, 0.25))
     settings, camera = PictureSettings(size=4, samples=1), OrthographicCamera(1.0, 0.4, 1.5)
-    [operator] = build_operators(mesh, [camera], settings, BACKEND, degree=degree, dtype=torch.float64)
+    [operator] = build_operators(mesh, [camera], settings, BACKEND, basis=Harmonics(degree), dtype=torch.float64)
     light = draw((degree + 1) ** 2, 3)
     image, coverage = shade_slowly(mesh, camera, light, settings)
     found = np.zeros((16, 3))
     found[operator.pixels] = operator.radiance(light).T
-    assert operator.degree == degree and coverage.sum() > 8
+    assert operator.basis == Harmonics(degree) and coverage.sum() > 8
     # The harmonics are scipy's to 1e-13 and reach 2.6 in band 20; the factors are π at most.
     np.testing.assert_allclose(found.reshape(4, 4, 3), image, rtol=0, atol=1e-13 * math.pi * (degree + 1))
 

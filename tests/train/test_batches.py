@@ -2,8 +2,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from renderer.image import to_bytes
 from train import batches
-from train.batches import PADDING, Round, crop_and_flip, to_bytes, to_unit, training_batches
+from train.batches import PADDING, Round, crop_and_flip, to_unit, training_batches
 
 
 def noise(*shape: int) -> torch.Tensor:

@@ -275,5 +275,5 @@ def test_an_error_of_the_users_input_is_not_followed_by_suggestions(monkeypatch,
 def test_a_page_shows_its_command_as_it_can_be_typed_without_the_machines_folders(
     monkeypatch, script, arguments, shown
 ):
-    monkeypatch.setattr(sys, "argv", [script])
-    assert command_line(arguments) == f"python scripts/{shown}"
+    monkeypatch.setattr(sys, "argv", [script, *arguments])
+    assert command_line() == f"python scripts/{shown}"

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -643,3 +644,22 @@ def test_the_demonstration_is_scored_on_the_pictures_that_it_renders():
     with initialize_config_module("conf", version_base="1.3"):
         settings = read_settings(ExperimentSettings, compose("train", ["run=here"]))
     assert settings.evaluate.photos == settings.data.pictures == "here/rendered_pictures"
+
+
+def test_training_takes_the_attacks_of_scripts_attack_and_the_papers_where_none_is_named():
+    """The keys that were there before any other kind set the paper's step on the light."""
+
+    def kinds(*overrides: str) -> dict:
+        with initialize_config_module("conf", version_base="1.3"):
+            settings = read_settings(ExperimentSettings, compose("train", ["run=here", *overrides]))
+        return {name: asdict(each) for name, each in settings.augment.attack.kinds.items()}
+
+    paper = {"norm": "linf", "radius": None, "step": "unit", "step_size": 0.05}
+    assert kinds() == kinds("experiment=paper") == {"lighting": paper}
+    assert kinds("augment.attack.step=sign", "augment.attack.step_size=0.1") == {
+        "lighting": paper | {"step": "sign", "step_size": 0.1}
+    }
+    with initialize_config_module("conf", version_base="1.3"):
+        alone = compose("attack", ["attack=[geometry,lighting]"]).attack
+    both = kinds("attack@augment.attack=[geometry,lighting]", "augment.attack.geometry.radius=0.01")
+    assert both == {"lighting": dict(alone.lighting), "geometry": dict(alone.geometry) | {"radius": 0.01}}

@@ -49,7 +49,7 @@ def test_classifiers_of_other_sources_are_loaded_by_the_same_name():
     [
         ("run:absent", None, "run=absent holds neither best.pt nor model.safetensors"),
         ("run:absent", "a.pth", "weights=a.pth is not for classifier=run:absent, which has weights of its own: leave"),
-        ("runs/2026-01-01", None, "squeezenet_caffe, torchvision:NAME, run:NAME"),
+        ("runs/2026-01-01", None, "squeezenet_caffe, torchvision:NAME, python:NAME, run:NAME"),
     ],
 )
 def test_what_cannot_be_loaded_is_one_sentence(name, weights, message):

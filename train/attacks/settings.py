@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from augment.attack import DescentSettings
-from augment.parameters import KINDS, StepSettings
+from augment.attacks.settings import AttackSettings
 from renderer.errors import FACTOR, InputError, require_range
 from train.settings import LARGEST_SEED, MOST_VIEWS, RendererSettings
 
@@ -12,53 +11,12 @@ MOST_VERTICES = 10**7  # some 5 GB
 
 
 @dataclass
-class SkylightSettings(StepSettings):
-    """Where the sky begins: zenith and azimuth in degrees, turbidity."""
+class AttackCommandSettings(AttackSettings):
+    """shared: the views share what is attacked. force: go on where nothing is recognised. checks: see `Checks`."""
 
-    zenith: float = 45.0
-    azimuth: float = 0.0
-    turbidity: float = 3.0
-
-
-@dataclass
-class AttackSettings:
-    """What is changed, by which steps, and for how long; None for what stays as it is. See conf/attack.yaml."""
-
-    lighting: StepSettings | None = None
-    skylight: SkylightSettings | None = None
-    geometry: StepSettings | None = None
-    albedo: StepSettings | None = None
-    pixels: StepSettings | None = None
-    max_steps: int = 30
-    shorten: bool = False
-    restarts: int = 0
     shared: bool = False
-    batch_size: int = 32
     force: bool = False
     checks: bool = True
-
-    def __post_init__(self):
-        if self.lighting and self.skylight:
-            raise InputError("attack: lighting and skylight both set the light: choose one of them")
-        if self.restarts < 0:
-            raise InputError(f"attack.restarts={self.restarts} must not be negative")
-        if self.restarts and any(settings.radius is None for settings in self.kinds.values()):
-            raise InputError("attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0")
-        self.descent()
-
-    @property
-    def kinds(self) -> dict[str, StepSettings]:
-        """The settings of what is changed, by name."""
-        return {name: settings for name in KINDS if (settings := getattr(self, name)) is not None}
-
-    def require_kinds(self) -> None:
-        """InputError where nothing is to be changed."""
-        if not self.kinds:
-            raise InputError(f"attack: name what to change, such as attack=lighting; there are {', '.join(KINDS)}")
-
-    def descent(self) -> DescentSettings:
-        """How long a descent lasts."""
-        return DescentSettings(self.max_steps, self.shorten, self.batch_size)
 
 
 @dataclass
@@ -93,7 +51,7 @@ class AttackExperimentSettings:
     seed: int = 0
     out: str = ""
     device: str = "auto"
-    attack: AttackSettings = field(default_factory=AttackSettings)
+    attack: AttackCommandSettings = field(default_factory=AttackCommandSettings)
     scene: AttackSceneSettings = field(default_factory=AttackSceneSettings)
     renderer: RendererSettings = field(default_factory=RendererSettings)
 

@@ -1,7 +1,7 @@
 """An attack's outcome as text for the terminal."""
 
-from train.attacks.checks import Checks
-from train.attacks.experiment import Attacked
+from augment.attacks.checks import Checks
+from augment.attacks.run import Attacked
 
 
 def format_attack(mesh: str, attacked: Attacked, checks: Checks | None) -> str:

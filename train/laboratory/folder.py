@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from augment.scene import load_object
+from augment.objects import load_object
 from augment.seeding import stream_seed
 from renderer.errors import InputError
 from renderer.image import encode
@@ -77,7 +77,7 @@ def read_subject(item: str | dict, index: int) -> Subject:
             f"meshes[{index}]: {named.mesh} has no label: give {{mesh: {named.mesh}, label: CLASS}}, with "
             f"{FOREIGN}NAME for what the network has no class for"
         )
-    return Subject(label, named.mesh, split_parts(load_object(named), named.gain, named.mesh))
+    return Subject(label, named.mesh, split_parts(load_object(named).mesh, named.gain, named.mesh))
 
 
 def _label_of_solid(mesh: str) -> str:

@@ -7,29 +7,28 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
+from renderer.tiles import (
+    CAPTION_SIZE,
+    FAINT,
+    GAP,
+    INK,
+    LINE_HEIGHT,
+    MARGIN,
+    PAPER,
+    TITLE_HEIGHT,
+    TITLE_SIZE,
+    Tile,
+)
 from train.photographs.answers import Answer
 
 TILES_PER_SECTION = 40
 COLUMNS = 10
 PICTURE = 96  # px, the side of an enlarged picture
 FRAME = 4
-GAP = 12
-MARGIN = 24
-TITLE_SIZE, CAPTION_SIZE = 20, 12
-TITLE_HEIGHT, LINE_HEIGHT = 36, 16
-PAPER, INK, FAINT = "white", "#1a1a1a", "#6b6b6b"
 
 CELL = PICTURE + 2 * FRAME
 CAPTION_WIDTH = CELL + GAP - 4
 SHEET_WIDTH = 2 * MARGIN + COLUMNS * CELL + (COLUMNS - 1) * GAP
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A picture, (H, W, 3) uint8 RGB, with lines of text below it: the first in ink, the others faint."""
-
-    picture: np.ndarray
-    caption: tuple[str, ...]
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import NoReturn
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
 
 from renderer.errors import InputError
+from renderer.image_files import read_square
 from train.classes import class_index, nearest_class
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
@@ -20,7 +20,6 @@ FOREIGN = "other_"  # starts the name of a folder whose class the model lacks
 TABLE = "photos.csv"
 SEPARATOR = ";"  # between the sources in a cell of its look_alikes
 SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training) to skip them"
-DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the final size
 
 
 @dataclass(frozen=True)
@@ -194,23 +193,3 @@ def _try_read(path: Path, size: int) -> np.ndarray | Exception:
         return read_square(path, size)
     except Exception as error:  # Pillow's decoders raise almost anything at a broken file
         return error
-
-
-def read_square(path: Path, size: int) -> np.ndarray:
-    """The centre square of a picture as (size, size, 3) uint8. Raises whatever Pillow does at a broken file."""
-    with Image.open(path) as image:
-        # A large JPEG is decoded at 1/2, 1/4 or 1/8 of its size, several times faster.
-        image.draft(None, (DECODED_SIZES * size, DECODED_SIZES * size))
-        upright = ImageOps.exif_transpose(image)
-    return np.asarray(ImageOps.fit(_to_rgb(upright), (size, size), Image.Resampling.LANCZOS))
-
-
-def _to_rgb(image: Image.Image) -> Image.Image:
-    if image.mode == "F":
-        raise ValueError("floating-point pixels have no agreed white")
-    if image.mode.startswith("I"):  # 16 bits per pixel, which Pillow would clip rather than scale
-        image = Image.fromarray(np.clip(np.asarray(image) // 256, 0, 255).astype(np.uint8))
-    if image.has_transparency_data:
-        image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return image.convert("RGB")

@@ -8,15 +8,16 @@ import torch
 from hydra import compose, initialize_config_module
 from PIL import Image
 
-from augment.attack import DescentSettings
+from augment.attacks.checks import check
+from augment.attacks.files import LINES, MAP_HEIGHT, write_files
+from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
+from augment.descent import DescentSettings
 from renderer.environment import read_map, to_map
 from renderer.lights import load_light
 from renderer.mesh import load_mesh
 from renderer.mesh_damage import mesh_damage
-from train.attacks.checks import check
-from train.attacks.experiment import Attacked, attack_mesh
-from train.attacks.files import LINES, MAP_HEIGHT, write_files
+from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.settings import read_object, read_settings
 
@@ -77,7 +78,7 @@ def test_the_light_is_read_back_to_the_bit_and_as_a_map_to_its_precision(tmp_pat
 def test_the_shape_is_read_back_where_the_attack_left_it(tmp_path, suffix, up):
     done = attacked("attack=[geometry]")
     (line,) = written(done, tmp_path)
-    mesh = done.problem.scene.mesh
+    mesh = done.problem.scene.mesh(0)
     moved = mesh.vertices + done.result.values[0].unflatten(0, (-1, 3)).double().numpy()
     found = load_mesh(tmp_path / f"example_000_shape{suffix}", up=up)
     # Half of float32's step below 1, and the file's axes are turned exactly.

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from renderer.albedo import surface_albedo
+from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import basis, basis_gradient
@@ -104,7 +105,7 @@ class Setup:
 def by_operator(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     """Of the image and its gradient by the light, through an operator kept in `dtype`."""
     [operator] = build_operators(
-        setup.mesh, [setup.camera], setup.settings, setup.backend, degree=setup.degree, dtype=dtype
+        setup.mesh, [setup.camera], setup.settings, setup.backend, basis=Harmonics(setup.degree), dtype=dtype
     )
     view, light = setup.view(), setup.light.to(dtype)
     upstream = _upstream(len(view.pixels))

@@ -7,6 +7,7 @@ from math import inf, nan
 import torch
 
 from renderer.albedo import face_albedo, textured_albedo
+from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import build_fragments
 from renderer.harmonics import MAX_DEGREE, basis, rotate
@@ -68,7 +69,7 @@ def _degenerate_settings() -> dict[str, Callable[[], object]]:
     [operator] = build_operators(TRIANGLE, [CAMERA], SETTINGS, BACKEND)
     return {
         "a light of another degree than the operator's": lambda: operator.radiance(light(2)),
-        "degree 21": lambda: _build(degree=MAX_DEGREE + 1),
+        "degree 21": lambda: _build(basis=Harmonics(MAX_DEGREE + 1)),
         "a gain of NaN": lambda: _build(gain=nan),
         "a camera at NaN": lambda: _build(camera=OrthographicCamera(nan, 0, 2)),
         "a frame of no width": lambda: OrthographicCamera(0, 0, 0),

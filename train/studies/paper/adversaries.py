@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from augment.attack import DescentSettings, Goal, Part, Problem, descend
+from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
-from augment.mesh_scene import MeshScene
+from augment.descent import DescentSettings, Goal, Part, Problem, descend
 from augment.parameters import Geometry, Kind, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
+from augment.scene import Scene
 from renderer.errors import InputError
-from train.attacks.experiment import logits_of
 from train.studies.paper.subjects import Subject, random_scene, recognised
 
 STEPS = 30  # the paper's appendix C
@@ -40,7 +40,7 @@ class Attack:
     step: StepSettings
     descent: DescentSettings
 
-    def problem(self, scene: MeshScene) -> Perturbation:
+    def problem(self, scene: Scene) -> Perturbation:
         return Perturbation(scene, [self.kind(scene, self.step)])
 
     def adversaries(self, problem: Problem, classifier: Classifier, label: str, views: int) -> tuple[Tensor, Tensor]:
@@ -84,7 +84,7 @@ def answers(problem: Problem, values: Tensor, examples: Tensor, classifier: Clas
 
 def recognised_parts(
     subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator
-) -> Iterator[tuple[MeshScene, Tensor]]:
+) -> Iterator[tuple[Scene, Tensor]]:
     """Random scenes, each with those of its examples (A,) that the classifier recognises: `count` in all."""
     found = drawn = 0
     while found < count:

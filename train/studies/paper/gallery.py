@@ -9,14 +9,16 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.mesh_scene import Conditions
+from augment.attacks.report_picture import Exhibit, answer_caption, report_picture
+from augment.attacks.run import Attacked
+from augment.attacks.settings import SkylightSettings
+from augment.objects import ObjectSettings
 from augment.parameters import StepSettings
-from augment.scene import ObjectSettings
+from augment.scene import Conditions
 from renderer.errors import InputError
 from renderer.light_sphere import light_sphere
-from train.attacks.experiment import Attacked, attack_mesh
-from train.attacks.report_picture import Exhibit, answer_caption, report_picture
-from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings, AttackSettings, SkylightSettings
+from train.attacks.experiment import attack_mesh
+from train.attacks.settings import AttackCommandSettings, AttackExperimentSettings, AttackSceneSettings
 from train.settings import RendererSettings
 from train.studies.paper.adversaries import LIGHT, SHAPE
 from train.studies.paper.section import Section, SectionSettings, Study
@@ -75,7 +77,7 @@ class Case:
     name: str
     title: str
     item: ObjectSettings
-    attack: AttackSettings
+    attack: AttackCommandSettings
     views: int = 1
     background: float = 0.5
     target: Sequence[str] | None = None
@@ -101,39 +103,51 @@ def cases(lamp: ObjectSettings, orange: ObjectSettings, targets: Sequence[str], 
     evening = SkylightSettings("linf", None, "unit", 0.2, zenith=75.0, turbidity=8.0)
     several = dict(shared=True, max_steps=steps)
     return [
-        Case("lighting", "light", lamp, AttackSettings(lighting=LIGHT, max_steps=steps)),
-        Case("skylight", "skylight, orange", orange, AttackSettings(skylight=evening, max_steps=steps), background=0.0),
-        Case("skylight_lamp", "skylight, lamp", lamp, AttackSettings(skylight=noon, max_steps=steps)),
-        Case("lighting_views", "one light for three views", lamp, AttackSettings(lighting=LIGHT, **several), views=3),
-        Case("geometry", "shape", lamp, AttackSettings(geometry=SHAPE, shorten=True, max_steps=steps)),
+        Case("lighting", "light", lamp, AttackCommandSettings(lighting=LIGHT, max_steps=steps)),
+        Case(
+            "skylight",
+            "skylight, orange",
+            orange,
+            AttackCommandSettings(skylight=evening, max_steps=steps),
+            background=0.0,
+        ),
+        Case("skylight_lamp", "skylight, lamp", lamp, AttackCommandSettings(skylight=noon, max_steps=steps)),
+        Case(
+            "lighting_views",
+            "one light for three views",
+            lamp,
+            AttackCommandSettings(lighting=LIGHT, **several),
+            views=3,
+        ),
+        Case("geometry", "shape", lamp, AttackCommandSettings(geometry=SHAPE, shorten=True, max_steps=steps)),
         Case(
             "geometry_views",
             "one shape for three views",
             lamp,
-            AttackSettings(geometry=WIDER_SHAPE, shorten=True, **several),
+            AttackCommandSettings(geometry=WIDER_SHAPE, shorten=True, **several),
             views=3,
         ),
         Case(
             "illusion",
             "optical illusion: one shape, a target for each view",
             lamp,
-            AttackSettings(geometry=FREE_SHAPE, shorten=True, **several),
+            AttackCommandSettings(geometry=FREE_SHAPE, shorten=True, **several),
             views=len(targets),
             target=targets,
         ),
-        Case("albedo", "albedo of each face", lamp, AttackSettings(albedo=ALBEDO, max_steps=steps)),
+        Case("albedo", "albedo of each face", lamp, AttackCommandSettings(albedo=ALBEDO, max_steps=steps)),
         Case(
             "pixels",
             f"pixels, target {targets[0]}",
             lamp,
-            AttackSettings(pixels=PIXELS, max_steps=steps),
+            AttackCommandSettings(pixels=PIXELS, max_steps=steps),
             target=targets[:1],
         ),
         Case(
             "lighting_geometry",
             "light and shape at once",
             lamp,
-            AttackSettings(lighting=LIGHT, geometry=SHAPE, shorten=True, max_steps=steps),
+            AttackCommandSettings(lighting=LIGHT, geometry=SHAPE, shorten=True, max_steps=steps),
         ),
     ]
 

@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.attack import DescentSettings, Goal, descend
+from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
-from augment.mesh_scene import MeshScene
+from augment.descent import DescentSettings, Goal, descend
 from augment.parameters import KINDS, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
+from augment.scene import Scene
 from augment.seeding import generator
-from train.attacks.experiment import logits_of
 from train.photographs.shares import share
 from train.studies.figures import panels_beside, pyplot, save
 from train.studies.paper.section import Section, SectionSettings, Study
@@ -130,7 +130,7 @@ class Outcome:
 
 @torch.no_grad()
 def attack_ball(
-    scene: MeshScene, classifier: Classifier, label: str, name: str, radius: float, steps: int, draws: torch.Generator
+    scene: Scene, classifier: Classifier, label: str, name: str, radius: float, steps: int, draws: torch.Generator
 ) -> Outcome:
     """Descend and draw in one ball of a space."""
     space = SPACES[name]
@@ -169,7 +169,7 @@ def distance(images: Tensor, before: Tensor) -> Tensor:
     return (images - before).abs().flatten(1).amax(1)
 
 
-def parts(subject: Subject, scene: MeshScene, classifier: Classifier, light: str) -> Iterator[MeshScene]:
+def parts(subject: Subject, scene: Scene, classifier: Classifier, light: str) -> Iterator[Scene]:
     """A scene's examples a few at a time: the gradient of a shape keeps all its images' samples."""
     for examples in torch.arange(len(scene)).split(PART):
         cameras = [scene.cameras[index] for index in examples]

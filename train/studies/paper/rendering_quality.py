@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from train.attacks.experiment import logits_of
 from train.studies.figures import panels_beside, save
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.subjects import FIELDS_OF_VIEW, GREYS, Subject, scene_of

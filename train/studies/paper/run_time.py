@@ -12,14 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from augment.attack import DescentSettings, Goal, descend
+from augment.backgrounds import load_backgrounds
 from augment.cost import adversarial_cost
-from augment.scene import ObjectSettings, Scene, SceneObject, load_object
-from augment.service import AugmentationService, AugmentationSettings, LightAttackSettings
+from augment.descent import DescentSettings, Goal, descend
+from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.scene import Scene
+from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from renderer.camera import ring
 from renderer.image import PictureSettings
 from renderer.lights import load_light
-from renderer.transfer import build_operators
 from renderer.visibility import choose
 from train.photographs.shares import share
 from train.run_classifier import load_classifier
@@ -197,34 +198,36 @@ def stubborn(
     def attack(watch: Stopwatch) -> None:
         descend(classifier, problem, Goal(label, least_likely), descent, watch)
 
-    pixels = int(np.mean([len(scene.operator(camera).pixels) for camera in views]))
     found = milliseconds(attack, classifier, images, label[:, 0], BATCH, passes, turns)
-    return Iteration(setup.name, kind, pixels, *found)
+    return Iteration(setup.name, kind, covered(scene), *found)
 
 
 def training_step(study: Study, settings: RunTimeSettings) -> Iteration:
     """The training's attack at 32² on 100 examples of two meshes."""
     classifier = load_classifier(PRETRAINED)
     label, views = classifier.label(study.label), EXAMPLES // len(study.subjects) // len(GREYS)
-    drawn = PictureSettings(classifier.size)
-    objects = [
-        SceneObject(item.label, build_operators(item.mesh, ring(views, 2.0), drawn, choose(), item.gain))
-        for item in study.subjects
-    ]
-    scene, light = Scene(objects, GREYS, drawn), load_light(study.light)
+    objects = [SceneObject(item.label, item.mesh, item.gain) for item in study.subjects]
+    behind, drawn = load_backgrounds(GREYS, classifier.size), PictureSettings(classifier.size)
+    scene = Scene.grid(objects, ring(views, 2.0), behind, load_light(study.light), drawn, choose())
     with torch.no_grad():
         classifier.function.head.bias[label] += 100
     labels = torch.full((len(scene),), label)
     attack = AugmentationSettings(
-        examples=len(scene), attack=LightAttackSettings(max_steps=settings.passes - 1, batch_size=len(scene))
+        examples=len(scene), attack=TrainingAttackSettings(max_steps=settings.passes - 1, batch_size=len(scene))
     )
 
     def regenerate(watch: Stopwatch) -> None:
-        AugmentationService(attack, scene, labels, light, study.seed, watch).regenerate(classifier, 0)
+        AugmentationService(attack, scene, labels, study.seed, watch).regenerate(classifier, 0)
 
-    images = scene.render(light.expand(len(scene), -1, -1))
+    everything = torch.arange(len(scene))
+    images = scene.render(scene.conditions(everything), everything)[:, 0]
     found = milliseconds(regenerate, classifier, images, labels, len(scene), settings.passes, settings.turns // 2)
-    return Iteration(TRAINING, "lighting", len(scene.pixels), *found)
+    return Iteration(TRAINING, "lighting", len(scene.stacks[0].pixels), *found)
+
+
+def covered(scene: Scene) -> int:
+    """Pixels of a view that the mesh covers, on average."""
+    return int(np.mean([int((each > 0).sum()) for stack in scene.stacks for each in stack.coverage]))
 
 
 def many(setup: Setup) -> Setup:
@@ -239,7 +242,7 @@ def attacks(subject: Subject, study: Study, settings: RunTimeSettings) -> Iterat
     goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
     for example in range(len(scene)):
         one = scene_of(subject, classifier, study.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0])
-        prepared = seconds(lambda one=one: one.operator(one.cameras[0][0]))
+        prepared = seconds(lambda one=one: one.stacks)
         problem = ATTACKS["lighting"].problem(one)
         start = time.process_time()
         result = descend(classifier, problem, goal, DescentSettings(settings.max_steps), Stopwatch())
@@ -319,7 +322,7 @@ def draw(measured: Sequence[Iteration], path: Path) -> None:
 
 def measure(study: Study, settings: RunTimeSettings) -> Section:
     """Iterations by pixels and against the classifier's pass, and whole attacks."""
-    first, solid = study.subjects[0], Subject("solid", load_object(SOLID), study.label)
+    first, solid = study.subjects[0], Subject("solid", load_object(SOLID).mesh, study.label)
     setups = (
         Setup(f"{first.name}, textured, smooth, 2×2 samples", finer(first), 2, "smooth"),
         Setup("solid:orange, flat, 1 sample", finer(solid), 1, "flat"),

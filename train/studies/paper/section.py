@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from augment.classifiers import Classifier
-from augment.scene import ObjectSettings
+from augment.objects import ObjectSettings
 from train.studies.paper.subjects import Subject
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
-from augment.mesh_scene import MeshScene
-from augment.scene import ObjectSettings, load_object
+from augment.objects import ObjectSettings, load_object
+from augment.scene import Scene
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
@@ -19,7 +20,6 @@ from renderer.lights import load_light
 from renderer.mesh import Mesh
 from renderer.subdivision import subdivide
 from renderer.visibility import choose
-from train.attacks.experiment import logits_of
 
 VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
 FIELDS_OF_VIEW = (2.0, 3.0)  # the paper's appendix on rendering quality
@@ -38,7 +38,7 @@ class Subject:
     @classmethod
     def load(cls, item: ObjectSettings) -> "Subject":
         """InputError: as `load_object`."""
-        return cls(Path(item.mesh).stem, load_object(item), item.label, item.gain)
+        return cls(Path(item.mesh).stem, load_object(item).mesh, item.label, item.gain)
 
 
 def finer(subject: Subject) -> Subject:
@@ -46,7 +46,7 @@ def finer(subject: Subject) -> Subject:
     return replace(subject, mesh=subdivide(subject.mesh, VERTICES))
 
 
-def random_scene(subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator) -> MeshScene:
+def random_scene(subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator) -> Scene:
     """Views at π/3 off the zenith (the paper's) and any azimuth, with a field of view of 2 or 3, on a grey."""
     azimuths = (2 * math.pi * torch.rand(count, generator=draws)).tolist()
     fields = torch.randint(len(FIELDS_OF_VIEW), (count,), generator=draws).tolist()
@@ -66,10 +66,10 @@ def scene_of(
     greys: Tensor,
     samples: int = 2,
     normals: str = "smooth",
-) -> MeshScene:
+) -> Scene:
     """A subject before cameras (E × V), each example on a grey (E,)."""
     size = classifier.size
-    return MeshScene(
+    return Scene.of_mesh(
         subject.mesh,
         cameras,
         greys.view(-1, 1, 1, 1).expand(-1, 3, size, size),
@@ -80,7 +80,7 @@ def scene_of(
     )
 
 
-def recognised(scene: MeshScene, classifier: Classifier, label: str) -> Tensor:
+def recognised(scene: Scene, classifier: Classifier, label: str) -> Tensor:
     """(E,) whether the classifier gives all views of an example the label."""
     examples = torch.arange(len(scene))
     with torch.no_grad():
@@ -88,7 +88,7 @@ def recognised(scene: MeshScene, classifier: Classifier, label: str) -> Tensor:
     return (logits_of(classifier, images, 32).argmax(2) == classifier.label(label)).all(1)
 
 
-def recognised_scene(subject: Subject, classifier: Classifier, light: str, count: int, seed: int) -> MeshScene:
+def recognised_scene(subject: Subject, classifier: Classifier, light: str, count: int, seed: int) -> Scene:
     """`count` random examples of a subject that the classifier recognises, drawn until there are as many."""
     draws, cameras, greys = generator(seed, subject.name), [], []
     for _ in range(20):

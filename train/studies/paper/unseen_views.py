@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from augment.classifiers import Classifier
-from augment.mesh_scene import MeshScene
 from augment.perturbation import Perturbation
+from augment.scene import Scene
 from augment.seeding import generator, stream_seed
 from train.photographs.shares import share
 from train.studies.figures import panels_beside, save
@@ -103,7 +103,7 @@ class Together:
 
 
 def attack_views(
-    scene: MeshScene, kind: str, classifier: Classifier, label: str, draws: torch.Generator
+    scene: Scene, kind: str, classifier: Classifier, label: str, draws: torch.Generator
 ) -> dict[str, Tensor]:
     """What one attack on all of a scene's examples, of one view each, ends with: (1, D) for each of STATES."""
     together = Together(ATTACKS[kind].problem(scene))
@@ -112,7 +112,7 @@ def attack_views(
     return dict(zip(STATES, (first, further, random), strict=True))
 
 
-def summary(scene: MeshScene, kind: str, values: Tensor, classifier: Classifier, label: str) -> dict:
+def summary(scene: Scene, kind: str, values: Tensor, classifier: Classifier, label: str) -> dict:
     """How far values (1, D) went, and whether they fool the classifier in every view of a scene."""
     problem, every = ATTACKS[kind].problem(scene), torch.arange(len(scene))
     said = answers(problem, values.expand(len(scene), -1), every, classifier)
@@ -156,7 +156,7 @@ def unseen(subject: Subject, classifier: Classifier, index: int, count: int, lig
             }
 
 
-def _angle(scene: MeshScene, example: int, attacked: MeshScene) -> float:
+def _angle(scene: Scene, example: int, attacked: Scene) -> float:
     """Degrees between an example's azimuth and the nearest that was attacked."""
     azimuth = scene.cameras[example][0].azimuth
     apart = [abs(math.remainder(azimuth - views[0].azimuth, 2 * math.pi)) for views in attacked.cameras]

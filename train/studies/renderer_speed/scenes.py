@@ -9,6 +9,7 @@ import trimesh
 from torch import Tensor
 
 from renderer import reference
+from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import basis
@@ -81,7 +82,7 @@ class View:
 
     def operator(self, samples: int, degree: int = 6, dtype: torch.dtype = torch.float32) -> Operator:
         (operator,) = build_operators(
-            self.mesh, [CAMERA], self.settings(samples), self.backend, degree=degree, dtype=dtype
+            self.mesh, [CAMERA], self.settings(samples), self.backend, basis=Harmonics(degree), dtype=dtype
         )
         return operator.to(self.device)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from augment.scene import load_object
+from augment.objects import load_object
 from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.shapes import solid
@@ -49,7 +49,7 @@ def run(settings: RendererSpeedSettings) -> None:
     description = machine(device)
     bench = Bench(plan, Clock(device, plan.rounds), _backends(), device)
     named = [read_object(item, "", index) for index, item in enumerate(settings.scene.meshes)]
-    meshes = [load_object(item) for item in named] or [solid("orange", seed) for seed in (0, 1)]
+    meshes = [load_object(item).mesh for item in named] or [solid("orange", seed) for seed in (0, 1)]
     findings = _measure(bench, meshes, settings.peers)
     _write(out, findings, description)
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 import trimesh
 
-from augment.attack import DescentSettings
 from augment.classifiers import Classifier
+from augment.descent import DescentSettings
 from augment.parameters import Lighting, StepSettings
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera, ring

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from augment.attack import DescentSettings, descend
+from augment.attacks.run import Attacked, logits_of
+from augment.descent import DescentSettings, descend
 from augment.phases import Phases
 from augment.seeding import generator
-from train.attacks.experiment import Attacked, logits_of
 
 GROWTH = (1, 3, 10)
 

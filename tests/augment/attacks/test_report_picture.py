@@ -5,8 +5,8 @@ import pytest
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from train.attacks.report_picture import SIDE, Exhibit, answer_caption, report_picture
-from train.photographs.contact_sheet import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
+from augment.attacks.report_picture import SIDE, Exhibit, answer_caption, report_picture
+from renderer.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 
 PAPER = 255
 

@@ -8,15 +8,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.mesh_scene import Conditions
+from augment.attacks.checks import Checks
+from augment.attacks.report_picture import Exhibit, answer_caption, report_picture
+from augment.attacks.run import Attacked
+from augment.scene import Conditions
 from renderer.environment import to_map, write_map
 from renderer.light_sphere import light_sphere
 from renderer.lights import save_light
 from renderer.mesh_damage import mesh_damage
 from renderer.mesh_export import export_mesh
-from train.attacks.checks import Checks
-from train.attacks.experiment import Attacked
-from train.attacks.report_picture import Exhibit, answer_caption, report_picture
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
 MAP_HEIGHT = 256
@@ -26,7 +26,7 @@ SPHERE = 192
 def write_files(attacked: Attacked, checks: Checks | None, folder: Path) -> None:
     """Write a folder: attack.jsonl, and for each example a picture and the light and shape that it ended with."""
     folder.mkdir(parents=True, exist_ok=True)
-    everything = torch.arange(len(attacked.problem.scene), device=attacked.result.values.device)
+    everything = attacked.problem.everything
     before = attacked.problem.conditions(attacked.problem.start, everything)
     after = attacked.problem.conditions(attacked.result.values, everything)
     with open(folder / LINES, "w", encoding="utf-8") as file:
@@ -85,11 +85,12 @@ def _numbers(attacked: Attacked, example: int) -> dict:
 def _write_conditions(attacked: Attacked, after: Conditions, example: int, stem: Path) -> Iterator[tuple[str, object]]:
     """What can be used elsewhere: the light, if it was attacked, and the shape."""
     scene, light = attacked.problem.scene, after.light[example].detach().cpu()
-    if not torch.equal(light, scene.light.cpu()):
+    mesh = scene.mesh(example)
+    if not torch.equal(light, scene.lights[example].cpu()):
         save_light(stem.with_name(stem.name + "_light.json"), light)
         write_map(stem.with_name(stem.name + "_light.hdr"), to_map(light, MAP_HEIGHT))
     if after.vertices is not None:
-        vertices = after.vertices[example].detach().cpu().double().numpy()
+        vertices = after.vertices[example, : len(mesh.vertices)].detach().cpu().double().numpy()
         for suffix in (".glb", ".ply"):
-            export_mesh(replace(scene.mesh, vertices=vertices), stem.with_name(stem.name + "_shape" + suffix))
-        yield "shape", asdict(mesh_damage(scene.mesh.vertices, vertices, scene.mesh.faces))
+            export_mesh(replace(mesh, vertices=vertices), stem.with_name(stem.name + "_shape" + suffix))
+        yield "shape", asdict(mesh_damage(mesh.vertices, vertices, mesh.faces))

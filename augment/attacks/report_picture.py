@@ -7,8 +7,7 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from train.batches import to_bytes
-from train.photographs.contact_sheet import (
+from renderer.tiles import (
     CAPTION_SIZE,
     FAINT,
     GAP,
@@ -64,8 +63,7 @@ def report_picture(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
 
 def _tiles(pictures: Tensor, captions: Sequence[tuple[str, ...]]) -> list[Tile]:
     """Tiles of pictures (V, 3, H, W) in [0, 1]."""
-    pixels = to_bytes(pictures.detach().cpu()).permute(0, 2, 3, 1).numpy()
-    return [Tile(picture, caption) for picture, caption in zip(pixels, captions, strict=True)]
+    return [Tile.of(picture, caption) for picture, caption in zip(pictures, captions, strict=True)]
 
 
 def _difference_tiles(differences: Tensor) -> list[Tile]:

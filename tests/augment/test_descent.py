@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.attack import AttackResult, DescentSettings, Goal, descend, descend_repeatedly
+from augment.descent import AttackResult, DescentSettings, Goal, descend, descend_repeatedly
 from augment.norm_ball import NormBall
 from augment.parameters.kind import STEPS, direction
 from augment.phases import Phases

@@ -1,0 +1,134 @@
+"""One call that attacks a classifier through a scene, and its result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from augment.attacks.criteria import Criterion, Misclassification
+from augment.attacks.settings import AttackSettings
+from augment.classifiers.adapter import Classifier
+from augment.descent import AttackResult, Goal, descend_repeatedly
+from augment.parameters import StepSettings
+from augment.perturbation import Perturbation
+from augment.phases import Phases
+from augment.scene import Conditions, Scene
+from augment.seeding import generator
+from renderer.errors import InputError
+
+if TYPE_CHECKING:
+    from augment.attacks.checks import Checks
+
+
+@dataclass(frozen=True)
+class Attacked:
+    """What was attacked and what came of it, for E examples of V views.
+
+    images_before: (E, V, 3, size, size); those after are `images`. logits_before, logits: (E, V, C) of either. result:
+    where the descent ended. seconds: of the descent.
+    """
+
+    problem: Perturbation
+    classifier: Classifier
+    goal: Goal
+    settings: AttackSettings
+    seed: int
+    images_before: Tensor
+    logits_before: Tensor
+    logits: Tensor
+    result: AttackResult
+    seconds: dict[str, float]
+
+    @property
+    def images(self) -> Tensor:
+        """(E, V, 3, size, size) that the attack ended with."""
+        return self.result.images
+
+    @property
+    def success(self) -> Tensor:
+        """(E,) bool: whether the criterion is met in every view."""
+        return self.result.fooled
+
+    @property
+    def steps(self) -> Tensor:
+        """(E,) int64: taken."""
+        return self.result.steps
+
+    @property
+    def conditions(self) -> Conditions:
+        """The lights (E, 49, 3), vertices (E, N, 3), albedos and pixels that the attack ended with; `Conditions`."""
+        return self.problem.conditions(self.result.values, self.problem.everything)
+
+    def check(self) -> Checks:
+        """Random search with as many tries, and success as steps grow: see `augment.attacks.checks.Checks`."""
+        from augment.attacks.checks import check
+
+        return check(self, self.settings.descent(), self.seed)
+
+    def save(self, folder: str | Path, checks: Checks | None = None) -> None:
+        """Write a folder: attack.jsonl and, for each example, an image of before and after, its light and its shape."""
+        from augment.attacks.files import write_files
+
+        write_files(self, checks, Path(folder))
+
+
+def attack(
+    classifier: Classifier,
+    scene: Scene,
+    criterion: Criterion | None = None,
+    settings: AttackSettings | None = None,
+    *,
+    seed: int = 0,
+    force: bool = False,
+) -> Attacked:
+    """Change a scene until a classifier errs, example by example; the classifier is left as it was found.
+
+    criterion: `Misclassification` (the default), `Targeted`, `LeastLikely`. settings: what is changed, within which
+    norm-balls; by default the light, without a limit. seed: of the restarts. force: also where the classifier is wrong
+    to begin with. The scene lies on the classifier's device.
+    InputError where an example is not recognised before, or the classifier lacks a class.
+    """
+    settings = settings or AttackSettings(lighting=StepSettings())
+    settings.require_kinds()
+    problem = settings.problem(scene)
+    images = problem.render(problem.start, problem.everything).detach()
+    before = logits_of(classifier, images, settings.batch_size)
+    labels = torch.tensor([classifier.label(label) for label in scene.labels], device=before.device)
+    if not force:
+        require_recognised(scene, before, labels, classifier)
+    targets = (criterion or Misclassification()).targets(before, classifier)
+    goal = Goal(labels[:, None].expand(-1, scene.views), targets)
+    phases = Phases(problem.start.device)
+    starts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))
+    with phases("attack"):
+        result = descend_repeatedly(classifier, problem, goal, settings.descent(), phases, starts)
+    after = logits_of(classifier, result.images, settings.batch_size)
+    return Attacked(problem, classifier, goal, settings, seed, images, before, after, result, phases.take())
+
+
+@torch.no_grad()
+def logits_of(classifier: Classifier, images: Tensor, batch_size: int) -> Tensor:
+    """(E, V, C) of images (E, V, 3, H, W)."""
+    flat = images.flatten(0, 1)
+    return torch.cat([classifier(batch) for batch in flat.split(batch_size)]).unflatten(0, images.shape[:2])
+
+
+def require_recognised(scene: Scene, logits: Tensor, labels: Tensor, classifier: Classifier) -> None:
+    """InputError, with the classifier's five best answers, unless every image (E, V) is given its label (E,)."""
+    wrong = (logits.argmax(2) != labels[:, None]).nonzero().tolist()
+    if wrong:
+        example, view = wrong[0]
+        shown = scene.objects[scene.examples[example].object]
+        best = logits[example, view].softmax(0).topk(min(5, len(classifier.classes)))
+        answers = ", ".join(
+            f"{classifier.classes[index]} {share:.1%}"
+            for share, index in zip(best.values.tolist(), best.indices.tolist(), strict=True)
+        )
+        raise InputError(
+            f"{len(wrong)} of {logits.shape[0] * logits.shape[1]} pictures of {shown.name} are not recognised as "
+            f"{shown.label!r} before any attack (the first: {answers}): change the scene, or set attack.force=true"
+        )

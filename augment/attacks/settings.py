@@ -1,0 +1,70 @@
+"""What an attack may change, by which steps, and for how long: the same for a training and for a single attack."""
+
+import math
+from dataclasses import dataclass
+
+from augment.descent import DescentSettings
+from augment.parameters import KINDS, Kind, Skylight, StepSettings
+from augment.perturbation import Perturbation
+from augment.scene import Scene
+from renderer.errors import InputError, require_range
+
+
+@dataclass
+class SkylightSettings(StepSettings):
+    """Where the sky begins: zenith and azimuth in degrees, turbidity."""
+
+    zenith: float = 45.0
+    azimuth: float = 0.0
+    turbidity: float = 3.0
+
+
+@dataclass
+class AttackSettings:
+    """None for what stays as it is. restarts: further starts, drawn from the norm-balls, where nothing is fooled yet.
+
+    max_steps, shorten, batch_size: see `DescentSettings`.
+    """
+
+    lighting: StepSettings | None = None
+    skylight: SkylightSettings | None = None
+    geometry: StepSettings | None = None
+    albedo: StepSettings | None = None
+    pixels: StepSettings | None = None
+    max_steps: int = 30
+    shorten: bool = False
+    restarts: int = 0
+    batch_size: int = 32
+
+    def __post_init__(self):
+        if self.lighting and self.skylight:
+            raise InputError("attack: lighting and skylight both set the light: choose one of them")
+        require_range("attack.restarts", self.restarts, 0, 10**6)
+        if self.restarts and any(settings.radius is None for settings in self.kinds.values()):
+            raise InputError("attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0")
+        self.descent()
+
+    @property
+    def kinds(self) -> dict[str, StepSettings]:
+        """The settings of what is changed, by name."""
+        return {name: settings for name in KINDS if (settings := getattr(self, name)) is not None}
+
+    def require_kinds(self) -> None:
+        """InputError where nothing is to be changed."""
+        if not self.kinds:
+            raise InputError(f"attack: name what to change, such as attack=lighting; there are {', '.join(KINDS)}")
+
+    def descent(self) -> DescentSettings:
+        """How long a descent lasts."""
+        return DescentSettings(self.max_steps, self.shorten, self.batch_size)
+
+    def problem(self, scene: Scene) -> Perturbation:
+        """What is changed of a scene."""
+        return Perturbation(scene, [_kind(name, scene, settings) for name, settings in self.kinds.items()])
+
+
+def _kind(name: str, scene: Scene, settings: StepSettings) -> Kind:
+    if name == Skylight.name:
+        angles = math.radians(settings.zenith), math.radians(settings.azimuth)
+        return Skylight(scene, settings, *angles, settings.turbidity)
+    return KINDS[name](scene, settings)

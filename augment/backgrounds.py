@@ -1,0 +1,40 @@
+"""What is behind a mesh: grey values and image files."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from renderer.errors import InputError
+from renderer.image_files import read_image
+
+
+def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
+    """(B, 3, size, size) of grey values or image files, or (B, 1, size, size) where all are grey; in [0, 1]."""
+    images = [load_background(choice, size) for choice in choices]
+    channels = max((len(image) for image in images), default=1)
+    return torch.stack([image.expand(channels, -1, -1) for image in images])
+
+
+def load_background(choice: float | str | Path, size: int) -> Tensor:
+    """A grey value (1, size, size), or an image's centre square (3, size, size), in [0, 1]."""
+    try:
+        grey = float(choice)
+    except ValueError:
+        return _image(Path(choice), size)
+    except TypeError:
+        if isinstance(choice, Path):
+            return _image(choice, size)
+        grey = math.nan
+    if not 0 <= grey <= 1:
+        raise InputError(f"scene.backgrounds={choice}: give grey values in [0, 1] or image files")
+    return torch.full((1, size, size), grey)
+
+
+def _image(path: Path, size: int) -> Tensor:
+    try:
+        return read_image(path, size)
+    except InputError as error:
+        raise InputError(f"scene.backgrounds: {error} or a grey value") from error

@@ -1,0 +1,66 @@
+"""A scene from meshes in one call, with the choices of the commands as keywords."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from augment.backgrounds import load_backgrounds
+from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.scene import Scene
+from renderer.cache import OperatorCache
+from renderer.camera import ring
+from renderer.image import PictureSettings
+from renderer.lights import load_light
+from renderer.mesh import Mesh, normalise
+from renderer.subdivision import subdivide
+from renderer.visibility import choose
+
+Shown = str | Path | Mesh
+
+
+def build_scene(
+    meshes: Sequence[tuple[Shown, str]],
+    size: int,
+    views: int = 1,
+    *,
+    shared: bool = False,
+    backgrounds: Sequence[float | str | Path] = (0.5,),
+    light: str | Tensor = "grace",
+    exposure: float = 1.0,
+    polar: float = 60.0,
+    field_of_view: float = 2.0,
+    vertices: int = 0,
+    samples: int = 2,
+    encoding: str = "linear",
+    normals: str = "smooth",
+    visibility: str = "auto",
+    operators: OperatorCache | None = None,
+    device: torch.device | str = "cpu",
+) -> Scene:
+    """Every mesh from a ring of views over every background, at `size` pixels per side.
+
+    meshes: (file, solid:NAME or `Mesh`; the name of its class) each. shared: the views of an example share one light,
+    shape or colour; otherwise each is an example. backgrounds: grey values or image files. light: coefficients or what
+    `renderer.load_light` takes; exposure multiplies it. polar: degrees off +z. vertices: subdivide until there are
+    more. samples, encoding, normals, visibility: as for `renderer.render`. operators: where rendered views are kept.
+    """
+    coefficients = load_light(light) if isinstance(light, str) else light
+    return Scene.grid(
+        [_object(mesh, label, vertices) for mesh, label in meshes],
+        ring(views, field_of_view, math.radians(polar)),
+        load_backgrounds(backgrounds, size),
+        (coefficients * exposure).to(device),
+        PictureSettings(size, samples, encoding, normals),
+        choose(visibility),
+        operators,
+        shared=shared,
+    )
+
+
+def _object(mesh: Shown, label: str, vertices: int) -> SceneObject:
+    if isinstance(mesh, Mesh):
+        return SceneObject(label, subdivide(normalise(mesh), vertices))
+    return load_object(ObjectSettings(str(mesh), label), vertices)

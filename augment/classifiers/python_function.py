@@ -1,0 +1,54 @@
+"""Networks of one's own: whatever a function of a Python module returns."""
+
+import importlib
+import sys
+from pathlib import Path
+
+from torch import nn
+
+from augment.classifiers.adapter import Classifier
+from renderer.errors import InputError
+
+FORM = "python:package.module:function"
+
+
+def load_python(name: str, weights: str | Path | None = None) -> Classifier:
+    """`package.module:function`, found from the current folder or installed, called without arguments.
+
+    The function returns (module, size, classes): a torch.nn.Module from images (N, 3, size, size), RGB in [0, 1], to
+    logits, and the names of its classes. InputError where there is no such function or it returns something else, and
+    for weights=, since the function loads its own; what the module or the function itself raises is raised.
+    """
+    if weights is not None:
+        raise InputError(f"weights={weights} is not for classifier=python:{name}, which loads its own: leave it out")
+    place, _, attribute = name.partition(":")
+    if not place or not attribute:
+        raise InputError(f"classifier=python:{name} names no function: give {FORM}")
+    made = _function(place, attribute)()
+    if not (isinstance(made, tuple | list) and len(made) == 3):
+        raise InputError(f"classifier=python:{name} returns {type(made).__name__}: return (module, size, classes)")
+    network, size, classes = made
+    if not isinstance(network, nn.Module):
+        raise InputError(f"classifier=python:{name} returns {type(network).__name__} first: return a torch.nn.Module")
+    if not isinstance(size, int) or size < 1:
+        raise InputError(f"classifier=python:{name} returns the size {size!r}: return its images' pixels per side")
+    if isinstance(classes, str) or not all(isinstance(each, str) for each in classes):
+        raise InputError(f"classifier=python:{name} returns no list of class names: return one name per logit")
+    return Classifier(network, size, classes, f"python:{name}")
+
+
+def _function(place: str, attribute: str):
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        module = importlib.import_module(place)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{place}.".startswith(f"{error.name}."):
+            raise  # the module is there and lacks something that it imports itself
+        raise InputError(
+            f"classifier=python:{place}:{attribute}: there is no module {error.name} in the current folder or installed"
+        ) from error
+    function = getattr(module, attribute, None)
+    if not callable(function):
+        raise InputError(f"classifier=python:{place}:{attribute}: {place} has no function {attribute}: name one")
+    return function

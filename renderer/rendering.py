@@ -1,0 +1,106 @@
+"""Meshes to images in one call: `render` by all that can be differentiated, `operators` for many lights."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
+from renderer.fragments import Fragments, build_fragments
+from renderer.image import PictureSettings, as_background, compose
+from renderer.mesh import Mesh
+from renderer.shading import radiance
+from renderer.transfer import Operator, build_operators
+from renderer.visibility import choose
+
+_choose = cache(choose)  # "auto" asks the driver, which takes longer than an image
+
+
+def render(
+    mesh: Mesh,
+    cameras: OrthographicCamera | Sequence[OrthographicCamera],
+    light: Tensor,
+    size: int = 224,
+    background: float | Tensor = 0.5,
+    *,
+    vertices: Tensor | None = None,
+    albedo: Tensor | None = None,
+    gain: float = 1.0,
+    samples: int = 2,
+    encoding: str = "linear",
+    normals: str = "smooth",
+    visibility: str = "auto",
+) -> Tensor:
+    """Images (V, 3, size, size) in [0, 1] of a mesh from V cameras; differentiable in light, vertices and albedo.
+
+    light: ((degree + 1)², 3) coefficients (`load_light`), whose dtype and device the images have. background: see
+    `renderer.image.as_background`; an image per view with (V, 3, size, size). vertices: (N, 3) in place of the mesh's;
+    the gradient holds fixed which face covers each sample. albedo: linear, in place of the mesh's colours, (F, 3) per
+    face, or (H, W, 3) in place of the texture of a mesh that has one. gain multiplies the albedo. samples: per pixel
+    side. encoding: linear or srgb. normals: flat or smooth. visibility: auto, opengl or software.
+    InputError: NaN, shapes that do not fit, unknown choices.
+    """
+    settings = PictureSettings(size, samples, encoding, normals)
+    vertices = _matching(vertices, mesh.vertices.shape, "vertices", torch.from_numpy(mesh.vertices)).to(light)
+    positions = vertices.detach().cpu().double().numpy()
+    views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(visibility), closed=mesh.closed)
+    backgrounds = as_background(background, size, light).expand(len(views), -1, -1, -1)
+    smooth_faces = torch.from_numpy(mesh.faces).to(light.device) if normals == "smooth" else None
+    images = []
+    for view, behind in zip(views, backgrounds, strict=True):
+        seen = view.to(light.device)
+        surface = _albedo(mesh, seen, albedo, encoding).to(light) * gain
+        shade = radiance(seen, vertices, light, surface, smooth_faces)
+        images.append(compose(shade, seen.coverage.to(light), seen.pixels, behind, encoding))
+    return torch.stack(images)
+
+
+def operators(
+    mesh: Mesh,
+    cameras: OrthographicCamera | Sequence[OrthographicCamera],
+    size: int = 224,
+    *,
+    gain: float = 1.0,
+    samples: int = 2,
+    encoding: str = "linear",
+    normals: str = "smooth",
+    visibility: str = "auto",
+) -> list[Operator]:
+    """One operator per camera: images and gradients under any number of lights without another look at the mesh.
+
+    `operator.image(light, background)` is the image that `render` makes, to rounding. Keywords as there.
+    """
+    settings = PictureSettings(size, samples, encoding, normals)
+    return build_operators(mesh, _listed(cameras), settings, _choose(visibility), gain)
+
+
+def _listed(cameras: OrthographicCamera | Sequence[OrthographicCamera]) -> Sequence[OrthographicCamera]:
+    listed = cameras if isinstance(cameras, Sequence) else [cameras]
+    if not listed:
+        raise InputError("cameras is empty: give one camera or several")
+    return listed
+
+
+def _matching(values: Tensor | None, shape: tuple[int, ...], name: str, default: Tensor) -> Tensor:
+    if values is None:
+        return default
+    if values.shape != shape:
+        raise InputError(f"{name} of shape {tuple(values.shape)} does not fit the mesh: give {tuple(shape)}")
+    return values
+
+
+def _albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:
+    """(S, 3) linear albedo at a view's samples."""
+    if albedo is None:
+        return surface_albedo(mesh, view, encoding)
+    if albedo.shape == mesh.faces.shape:
+        return face_albedo(albedo, view)
+    if albedo.ndim == 3 and albedo.shape[2] == 3 and len(mesh.textures) == 1:
+        return textured_albedo(mesh, view, [albedo], encoding)
+    raise InputError(
+        f"albedo of shape {tuple(albedo.shape)} does not fit the mesh: give {tuple(mesh.faces.shape)}, a colour per "
+        "face, or (H, W, 3) for a mesh that has one texture"
+    )

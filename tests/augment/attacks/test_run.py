@@ -1,0 +1,73 @@
+import json
+
+import pytest
+import torch
+from torch import Tensor
+
+import augment
+from augment.attacks.checks import Checks
+from augment.parameters import KINDS
+from renderer.errors import InputError
+from renderer.mesh import Mesh, load_mesh
+from renderer.shapes import solid
+
+CLASSES = ("orange", "lime", "sky", "night")
+SMALL = {"visibility": "software", "field_of_view": 2.4}
+
+
+@pytest.fixture
+def classifier() -> augment.Classifier:
+    """Orange is red, lime is green, sky is blue, night is dark."""
+
+    def mean_colour(images: Tensor) -> Tensor:
+        means = 30 * images.mean((2, 3))
+        return torch.cat([means, 12 - means.sum(1, keepdim=True)], dim=1)
+
+    return augment.Classifier(mean_colour, 8, CLASSES, "by_colour")
+
+
+def test_several_meshes_and_classes_are_attacked_in_one_scene_each_away_from_its_own(classifier):
+    lime = Mesh.plain(solid("orange").vertices, solid("orange").faces, (0.1, 0.9, 0.1))
+    scene = augment.build_scene([("solid:orange", "orange"), (lime, "lime")], 8, views=2, **SMALL)
+    attacked = augment.attack(classifier, scene)
+    assert attacked.goal.decrease.tolist() == [[0], [0], [1], [1]]
+    assert attacked.success.all() and (attacked.steps > 0).all()
+    assert torch.equal(attacked.logits.argmax(2) != attacked.goal.decrease, attacked.success[:, None])
+    assert attacked.images.shape == attacked.images_before.shape == (4, 1, 3, 8, 8)
+
+
+@pytest.mark.parametrize("target", ["lime", ["lime", "night"]])
+def test_shared_views_may_each_have_a_target(classifier, target):
+    scene = augment.build_scene([("solid:orange", "orange")], 8, views=2, shared=True, **SMALL)
+    attacked = augment.attack(classifier, scene, augment.Targeted(target))
+    assert attacked.conditions.light.shape == (1, 49, 3) and attacked.images.shape == (1, 2, 3, 8, 8)
+    names = [target] * 2 if isinstance(target, str) else target
+    assert attacked.goal.increase.tolist() == [[CLASSES.index(name) for name in names]]
+
+
+def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifier, tmp_path):
+    kinds = {name: augment.StepSettings("linf", 0.01, "sign", 0.004) for name in KINDS.keys() - {"skylight"}}
+    scene = augment.build_scene([("solid:orange", "orange")], 8, **SMALL)
+    attacked = augment.attack(classifier, scene, settings=augment.AttackSettings(**kinds, max_steps=4))
+    moved = (attacked.result.values - attacked.problem.start).abs()
+    assert 0.009 < moved.max() <= 0.01 + 1e-6
+    checks = attacked.check()
+    assert isinstance(checks, Checks) and checks.cost < checks.cost_before
+    attacked.save(tmp_path / "new", checks)
+    *lines, last = [json.loads(line) for line in (tmp_path / "new" / "attack.jsonl").read_text().splitlines()]
+    assert lines[0]["largest_change"].keys() == kinds.keys() and last["checks"]["random_search"] == checks.random_search
+    shape = load_mesh(tmp_path / "new" / "example_000_shape.glb")
+    assert len(shape.faces) == len(scene.mesh(0).faces)
+
+
+def test_what_is_not_recognised_or_no_class_is_refused_in_one_sentence(classifier):
+    scene = augment.build_scene([("solid:orange", "lime")], 8, **SMALL)
+    with pytest.raises(InputError, match="1 of 1 pictures of solid:orange are not recognised as 'lime'"):
+        augment.attack(classifier, scene)
+    assert augment.attack(classifier, scene, force=True).result.fooled_before.all()
+    with pytest.raises(InputError, match="has no class 'mango'"):
+        augment.attack(classifier, augment.build_scene([("solid:orange", "mango")], 8, **SMALL))
+    with pytest.raises(InputError, match="names 2 classes for 1 views"):
+        augment.attack(classifier, scene, augment.Targeted(["lime", "sky"]), force=True)
+    with pytest.raises(InputError, match="attack: name what to change"):
+        augment.attack(classifier, scene, settings=augment.AttackSettings(), force=True)

@@ -1,0 +1,69 @@
+import textwrap
+from pathlib import Path
+
+import pytest
+import torch
+
+from augment.classifiers import load_classifier
+from renderer.errors import InputError
+
+SOURCE = """
+from torch import nn
+
+def red_or_not():
+    return nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 2)), 16, ["red", "other"]
+
+def one(): return 3
+def no_module(): return "a", 16, ["red"]
+def no_size(): return nn.Identity(), "16", ["red"]
+def no_classes(): return nn.Identity(), 16, "red"
+value = 4
+"""
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch) -> Path:
+    (tmp_path / "own_networks").mkdir()
+    (tmp_path / "own_networks" / "__init__.py").touch()
+    (tmp_path / "own_networks" / "colour.py").write_text(textwrap.dedent(SOURCE))
+    (tmp_path / "own_networks" / "broken.py").write_text("import a_library_that_is_not_there")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # and taken off again, with what was imported from there
+    return tmp_path
+
+
+def test_a_function_in_the_current_folder_makes_a_classifier():
+    classifier = load_classifier("python:own_networks.colour:red_or_not")
+    assert (classifier.size, classifier.classes) == (16, ("red", "other"))
+    assert classifier(torch.rand(2, 3, 16, 16)).shape == (2, 2)
+    assert classifier.name == "python:own_networks.colour:red_or_not" and not classifier.training
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("own_networks.colour", "names no function: give python:package.module:function"),
+        (":red_or_not", "names no function"),
+        ("own_networks.shape:f", "there is no module own_networks.shape in the current folder or installed"),
+        ("no_such_package.colour:f", "there is no module no_such_package in"),
+        ("own_networks.colour:blue", "own_networks.colour has no function blue"),
+        ("own_networks.colour:value", "has no function value"),
+        ("own_networks.colour:one", r"returns int: return \(module, size, classes\)"),
+        ("own_networks.colour:no_module", "returns str first: return a torch.nn.Module"),
+        ("own_networks.colour:no_size", "returns the size '16'"),
+        ("own_networks.colour:no_classes", "returns no list of class names"),
+    ],
+)
+def test_what_makes_no_classifier_is_refused_in_one_sentence(name, message):
+    with pytest.raises(InputError, match=f"^classifier=python:{name}.*{message}"):
+        load_classifier(f"python:{name}")
+
+
+def test_weights_of_a_file_are_refused():
+    with pytest.raises(InputError, match=r"weights=w\.pt is not for classifier=python:"):
+        load_classifier("python:own_networks.colour:red_or_not", "w.pt")
+
+
+def test_what_a_module_itself_lacks_is_its_own_error():
+    with pytest.raises(ModuleNotFoundError, match="a_library_that_is_not_there"):
+        load_classifier("python:own_networks.broken:f")

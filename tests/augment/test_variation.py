@@ -1,0 +1,120 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+from augment.backgrounds import load_background, load_backgrounds
+from augment.objects import ObjectSettings, load_object
+from augment.phases import Phases
+from augment.scene import Scene
+from augment.seeding import generator
+from augment.service import AugmentationService, AugmentationSettings
+from augment.variation import VariationSettings, vary
+from renderer.camera import ring
+from renderer.errors import InputError
+from renderer.image import PictureSettings
+from renderer.lights import ambient
+from renderer.visibility import choose
+
+SIZE = 48
+LIGHT = ambient(torch.full((3,), 0.1))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A plate twelve times, on black."""
+    plate, settings = load_object(ObjectSettings("solid:plate", "plate")), PictureSettings(SIZE, samples=2)
+    return Scene.grid([plate], ring(12, 6.0), load_backgrounds([0.0], SIZE), LIGHT, settings, choose("software"))
+
+
+def drawn(scene: Scene, seed: int = 0, **settings) -> Scene:
+    return vary(scene, VariationSettings(**settings), generator(seed))
+
+
+def images(scene: Scene) -> Tensor:
+    everything = torch.arange(len(scene))
+    return scene.render(scene.conditions(everything), everything)[:, 0]
+
+
+def outlines(scene: Scene) -> tuple[Tensor, Tensor]:
+    """(E, 2) middles of what is covered, right and up, and (E,) its extent to the right, as shares of the width."""
+    covered = images(scene).sum(1) > 0
+    middles, extents = [], []
+    for mask in covered:
+        rows, columns = torch.nonzero(mask).double().unbind(1)
+        middle = torch.stack([columns.min() + columns.max(), -(rows.min() + rows.max())]) / 2
+        middles.append(middle / SIZE)
+        extents.append((columns.max() - columns.min() + 1) / SIZE)
+    return torch.stack(middles), torch.stack(extents)
+
+
+def test_where_nothing_varies_the_scene_is_its_own(scene):
+    assert drawn(scene) is scene
+
+
+def test_a_place_moves_the_mesh_at_most_so_far_and_keeps_its_size(scene):
+    (middles, extents), (before, extents_before) = outlines(drawn(scene, place=0.3)), outlines(scene)
+    offsets = (middles - before).abs()
+    assert (offsets <= 0.3 + 1 / SIZE).all() and (offsets.amax(0) > 0.2).all()
+    torch.testing.assert_close(extents, extents_before, rtol=0, atol=2 / SIZE)
+
+
+def test_a_scale_magnifies_about_the_middle(scene):
+    (middles, extents), (before, extents_before) = outlines(drawn(scene, scale=[0.5, 1.5])), outlines(scene)
+    factors = extents / extents_before
+    assert 0.4 < factors.min() < 0.8 and 1.2 < factors.max() < 1.6
+    torch.testing.assert_close(middles, before, rtol=0, atol=2 / SIZE)
+
+
+def test_an_exposure_multiplies_the_light_and_builds_no_operator_that_a_cache_has(scene):
+    varied = drawn(scene, exposure=[0.5, 2.0])
+    factors = torch.tensor([row.exposure for row in varied.examples])
+    assert 0.5 <= factors.min() < 0.8 and 1.25 < factors.max() <= 2
+    torch.testing.assert_close(images(varied), images(scene) * factors.view(-1, 1, 1, 1), rtol=1e-5, atol=0)
+    assert varied.cameras == scene.cameras
+
+
+def test_backgrounds_come_from_the_images_of_a_folder(scene, tmp_path):
+    rng, files = np.random.default_rng(0), [tmp_path / "a.png", tmp_path / "below" / "b.jpg"]
+    for file in files:
+        file.parent.mkdir(exist_ok=True)
+        Image.fromarray(rng.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8)).save(file)
+    (tmp_path / "notes.txt").write_text("no image")
+    varied = images(drawn(scene, backgrounds=str(tmp_path)))
+    free = ~(images(scene).sum(1) > 0).any(0)
+    choices = [load_background(file, SIZE)[:, free] for file in files]
+    shown = [[torch.equal(image[:, free], choice) for choice in choices] for image in varied]
+    assert all(sum(row) == 1 for row in shown) and len({tuple(row) for row in shown}) == 2
+
+
+def test_each_epoch_draws_its_own_rows_and_repeats_them(scene):
+    vary_all = VariationSettings(place=0.1, scale=[0.8, 1.2], exposure=[0.5, 2.0])
+    settings = AugmentationSettings(arm="random", examples=12, vary=vary_all)
+    model = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 2))
+    service = AugmentationService(settings, scene, torch.zeros(12, dtype=torch.int64), 0, Phases())
+    first, second, again = (service.regenerate(model, epoch).images for epoch in (0, 1, 0))
+    assert torch.equal(first, again) and not torch.equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"place": -0.1}, r"augment\.vary\.place=-0\.1 must be a share"),
+        ({"place": math.nan}, r"augment\.vary\.place=nan"),
+        ({"scale": [1.0]}, r"augment\.vary\.scale=\[1\.0\]: give \[least, most\]"),
+        ({"scale": [2.0, 1.0]}, r"augment\.vary\.scale"),
+        ({"exposure": [0.0, 1.0]}, r"augment\.vary\.exposure=\[0\.0, 1\.0\]: give \[least, most\], both from 1e-05 to"),
+        ({"exposure": [1.0, math.inf]}, r"augment\.vary\.exposure"),
+    ],
+)
+def test_variations_that_are_none_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        VariationSettings(**settings)
+
+
+def test_a_folder_without_images_is_refused(scene, tmp_path):
+    with pytest.raises(InputError, match=f"augment.vary.backgrounds={tmp_path} holds no image: give a folder"):
+        drawn(scene, backgrounds=str(tmp_path))

@@ -1,0 +1,123 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+import renderer
+from renderer.errors import InputError
+from renderer.image import ENCODINGS, NORMALS, as_background
+from renderer.lights import ambient
+
+EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+CAMERAS = renderer.ring(3, 2.4)
+SMALL = {"size": 9, "visibility": "software"}
+
+
+@pytest.fixture(scope="module")
+def stone() -> renderer.Mesh:
+    """No symmetry, a colour per face."""
+    solid, rng = trimesh.creation.icosahedron(), np.random.default_rng(0)
+    plain = renderer.Mesh.plain(solid.vertices * [1.0, 0.9, 0.8], solid.faces)
+    colors = np.broadcast_to(rng.uniform(0.2, 0.8, (len(solid.faces), 1, 3)), plain.corner_colors.shape)
+    return replace(plain, corner_colors=colors.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def light() -> Tensor:
+    """Nothing clamps under it."""
+    draws = torch.Generator().manual_seed(0)
+    return ambient(torch.full((3,), 0.2).double()) + 0.02 * torch.randn(49, 3, generator=draws).double()
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("normals", NORMALS)
+def test_an_operators_image_is_the_rendered_one(stone, light, encoding, normals):
+    choices = SMALL | {"encoding": encoding, "normals": normals, "gain": 1.2}
+    images = renderer.render(stone, CAMERAS, light, background=0.3, **choices)
+    assert images.shape == (3, 3, 9, 9)
+    for image, operator in zip(images, renderer.operators(stone, CAMERAS, **choices), strict=True):
+        # The operator is in float32: sums of 31 terms below 1, and the slope of 12.92 of the sRGB curve near black.
+        torch.testing.assert_close(operator.image(light, 0.3), image, rtol=0, atol=13 * 8 * EPS32)
+
+
+def test_the_image_is_differentiable_in_light_vertices_and_albedo(stone, light):
+    """By light and albedo it is linear where nothing clamps; the vertices' gradient is `radiance`'s, tested there."""
+    albedo = torch.full((20, 3), 0.5, dtype=torch.float64)
+    inputs = {"light": light, "vertices": torch.from_numpy(stone.vertices), "albedo": albedo}
+    inputs = {name: value.clone().requires_grad_(True) for name, value in inputs.items()}
+    (image,) = renderer.render(stone, CAMERAS[0], **inputs, **SMALL)
+    gradients = dict(zip(inputs, torch.autograd.grad(image.sum(), inputs.values()), strict=True))
+    assert all(gradient.any() for gradient in gradients.values())
+    for name in ("light", "albedo"):
+        change = 1e-3 * torch.randn(inputs[name].shape, generator=torch.Generator().manual_seed(1)).double()
+        moved = renderer.render(stone, CAMERAS[0], **inputs | {name: inputs[name] + change}, **SMALL)
+        found, expected = float((moved - image).detach().sum()), float((gradients[name] * change).sum())
+        assert found == pytest.approx(expected, abs=1e3 * EPS)
+
+
+def test_vertices_and_albedo_take_the_place_of_the_meshs(stone, light):
+    turned = stone.vertices[:, [1, 2, 0]]
+    expected = renderer.render(replace(stone, vertices=turned), CAMERAS, light, **SMALL)
+    found = renderer.render(stone, CAMERAS, light, vertices=torch.from_numpy(turned), **SMALL)
+    assert torch.equal(found, expected)
+    faces = torch.from_numpy(stone.corner_colors[:, 0]).double()
+    expected = renderer.render(stone, CAMERAS, light, **SMALL)
+    found = renderer.render(renderer.Mesh.plain(stone.vertices, stone.faces), CAMERAS, light, albedo=faces, **SMALL)
+    torch.testing.assert_close(found, expected, rtol=0, atol=4 * EPS)
+
+
+def test_a_texture_can_be_taken_in_place_of_the_one_that_a_mesh_has(stone, light):
+    rng = np.random.default_rng(1)
+    textured = replace(
+        renderer.Mesh.plain(stone.vertices, stone.faces),
+        corner_uvs=rng.random((20, 3, 2)).astype(np.float32),
+        texture_ids=np.zeros(20, dtype=np.int32),
+        textures=(rng.integers(0, 256, (4, 5, 3)).astype(np.uint8),),
+    )
+    texture = torch.from_numpy(textured.textures[0]).double() / 255
+    expected = renderer.render(textured, CAMERAS, light, **SMALL)
+    found = renderer.render(textured, CAMERAS, light, albedo=texture, **SMALL)
+    torch.testing.assert_close(found, expected, rtol=0, atol=4 * EPS)
+
+
+def test_backgrounds_are_greys_colours_and_images_of_one_view_or_all(stone, light):
+    empty = replace(stone, vertices=stone.vertices + 10)
+    draws = torch.rand(3, 3, 9, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    colour = torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
+    for given, expected in [
+        (0.25, torch.full((3, 3, 9, 9), 0.25)),
+        (colour, colour.view(1, 3, 1, 1).expand(3, 3, 9, 9)),
+        (draws[0], draws[:1].expand(3, -1, -1, -1)),
+        (draws, draws),
+    ]:
+        found = renderer.render(empty, CAMERAS, light, background=given, **SMALL)
+        torch.testing.assert_close(found, expected.to(found), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("background", [-0.1, math.nan, torch.rand(2), torch.rand(3, 8, 9), torch.full((3, 9, 9), 255)])
+def test_what_is_no_background_is_refused(background):
+    with pytest.raises(InputError, match=r"^background "):
+        as_background(background, 9, torch.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"vertices": torch.zeros(4, 3)}, r"vertices of shape \(4, 3\) does not fit the mesh: give \(12, 3\)"),
+        ({"albedo": torch.zeros(4, 3)}, r"albedo of shape \(4, 3\) does not fit the mesh: give \(20, 3\)"),
+        ({"albedo": torch.zeros(4, 4, 3)}, r"albedo of shape \(4, 4, 3\) does not fit the mesh"),
+        ({"light": torch.full((49, 3), math.nan)}, "light holds NaN"),
+        ({"light": torch.zeros(48, 3)}, r"light has shape \(48, 3\)"),
+        ({"cameras": []}, "cameras is empty"),
+        ({"size": 0}, "size 0 must be at least 1"),
+        ({"encoding": "jpeg"}, "encoding=jpeg"),
+        ({"visibility": "eyes"}, "visibility=eyes"),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(stone, light, wrong, message):
+    with pytest.raises(InputError, match=message):
+        renderer.render(**{"mesh": stone, "cameras": CAMERAS, "light": light.float(), **SMALL, **wrong})
