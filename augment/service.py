@@ -187,9 +187,11 @@ class AugmentationService:
         return {} if self._continued is None else {"values": self._continued.cpu()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` gave; InputError where it is from another number of examples."""
-        if "values" not in state:
+        """Restore what `state_dict` gave; InputError where it is from another number of examples or an old version."""
+        if not state:
             return
+        if "values" not in state:
+            raise InputError("the checkpoint continues lights as an older version kept them: resume with that version")
         if len(state["values"]) != len(self._labels):
             raise InputError(
                 f"augment.examples: the checkpoint continues {len(state['values'])} examples and the scene has "
