@@ -215,7 +215,7 @@ def test_continued_lights_of_another_number_of_examples_are_refused(serve):
         serve(lights="continue").load_state_dict({"values": torch.zeros(3, 147)})
 
 
-def test_lights_that_an_older_version_continued_are_refused():
+def test_lights_that_an_older_version_continued_are_refused(serve):
     with pytest.raises(InputError, match="as an older version kept them"):
         serve(lights="continue").load_state_dict({"lights": torch.zeros(4, 49, 3)})
 
