@@ -69,9 +69,9 @@ def test_the_published_networks_are_classifiers_of_cifar_100(arm):
 
 @pytest.mark.realdata
 @pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
-def test_a_published_network_recognises_most_oranges_in_rgb():
-    """0.74 of every third photograph; none of them with red and blue exchanged."""
-    classifier = load_classifier(f"run:{PRETRAINED / 'adversarial'}")
+def test_the_published_base_recognises_most_oranges_in_rgb():
+    """And hardly one with red and blue exchanged, unlike the networks that were hardened against light."""
+    classifier = load_classifier(f"run:{PRETRAINED / 'none'}")
     paths = sorted((DATA / "photos" / "orange").iterdir())[::9]
     squares = [ImageOps.fit(Image.open(path).convert("RGB"), (32, 32), Image.Resampling.LANCZOS) for path in paths]
     images = torch.from_numpy(np.stack(squares)).permute(0, 3, 1, 2).float() / 255
