@@ -148,9 +148,9 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
     shape = asdict(settings.model)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
     network = WideResNet(len(data.classes), **shape, mean=mean, std=std)
-    facts = {"classes": data.classes, "size": data.size, "encoding": settings.renderer.encoding, **shape}
+    facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
     if settings.train.init_from:
-        checkpoint.start_from(network, checkpoint.describe(network, **facts), Path(settings.train.init_from))
+        checkpoint.start_from(network, facts, Path(settings.train.init_from))
     service = _build_service(settings, data, device, phases)
     model = MixedPrecision(network.to(device), precision)
     described = checkpoint.describe(network, **facts)
