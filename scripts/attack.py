@@ -15,6 +15,7 @@ from train.cli import one_sentence_errors, script
 from train.device import choose_device
 from train.outputs import writable_folder
 from train.run_classifier import load_classifier
+from train.run_folder import sole_writer
 from train.settings import read_object, read_settings
 
 
@@ -25,15 +26,16 @@ def main(config: DictConfig) -> None:
     device = choose_device(settings.device)
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
     out = writable_folder(settings.out, "out")
-    for index, item in enumerate(settings.scene.meshes):
-        named = read_object(item, settings.label, index)
-        attacked = attack_mesh(named, settings, classifier, device)
-        checks = attacked.check() if settings.attack.checks else None
-        folder = out / f"{index}_{Path(named.mesh.replace(':', '_')).stem}"
-        attacked.save(folder, checks)
-        print(format_attack(named.mesh, attacked, checks))
-        print(f"pictures, lights, shapes and numbers: {folder}\n")
-    OmegaConf.save(config, out / "config.yaml")
+    with sole_writer("out", out):
+        for index, item in enumerate(settings.scene.meshes):
+            named = read_object(item, settings.label, index)
+            attacked = attack_mesh(named, settings, classifier, device)
+            checks = attacked.check() if settings.attack.checks else None
+            folder = out / f"{index}_{Path(named.mesh.replace(':', '_')).stem}"
+            attacked.save(folder, checks)
+            print(format_attack(named.mesh, attacked, checks))
+            print(f"pictures, lights, shapes and numbers: {folder}\n")
+        OmegaConf.save(config, out / "config.yaml")
 
 
 @one_sentence_errors

@@ -10,6 +10,7 @@ from train.device import choose_device
 from train.outputs import writable_folder
 from train.photographs import evaluate_photographs, format_summary
 from train.precision import MixedPrecision, choose_precision
+from train.run_folder import sole_writer
 from train.settings import LARGEST_SIZE
 
 
@@ -34,16 +35,18 @@ def main(settings: Settings) -> None:
     device = choose_device(settings.device)
     network = load_network(Path(settings.run), settings.size)
     model = MixedPrecision(network.module.to(device), choose_precision(settings.precision, device))
-    summary = evaluate_photographs(
-        model,
-        network.classes,
-        Path(settings.photos),
-        settings.label,
-        writable_folder(settings.out, "out"),
-        size=network.size,
-        skip_unreadable=settings.skip_unreadable,
-        device=device,
-    )
+    out = writable_folder(settings.out, "out")
+    with sole_writer("out", out):
+        summary = evaluate_photographs(
+            model,
+            network.classes,
+            Path(settings.photos),
+            settings.label,
+            out,
+            size=network.size,
+            skip_unreadable=settings.skip_unreadable,
+            device=device,
+        )
     print(format_summary(summary))
     print(f"\ntable, scores and picture: {settings.out}")
 

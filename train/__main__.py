@@ -43,7 +43,7 @@ def run_arms(config: DictConfig, folder: Path) -> None:
     data = load_data(config)
     arms = {folder / str(arm): OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
     arms[folder] = config
-    with sole_writer(*arms) if processes.index() == 0 else nullcontext():
+    with sole_writer("run", *arms) if processes.index() == 0 else nullcontext():
         with first_process_first():
             if processes.index() == 0:
                 write_pictures(config, data.size)

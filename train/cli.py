@@ -14,6 +14,7 @@ from pathlib import Path
 
 import hydra
 from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
@@ -29,7 +30,6 @@ TEXTS = {  # keys of names and folders
     *("weights", "light", "label", "classifier"),
 }
 NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false", re.IGNORECASE)
-SYNTAX = re.compile(r"""[\[\]{}(),'"$\\]""")  # of Hydra's lists, mappings, functions, choices and quotes
 FOLDERS = re.compile(r"(?<!\w)(~|\.{1,2})?/([^\s,:=]*/)?")  # of a path that does not begin in the clone
 
 
@@ -105,11 +105,23 @@ def quoted(text: str) -> str:
 
 
 def _as_text(argument: str) -> str:
-    """The override, quoted where its value is text that Hydra would take for a number, or not at all: 1.10, schäl."""
+    """The override, quoted where its value is text that Hydra would take for something else, or not at all.
+
+    Such are numbers (1.10), the names of what is there (a,b) and what its grammar has no rule for (schäl).
+    """
     key, _, value = argument.partition("=")
-    mistaken = NUMBER.fullmatch(value) or (not value.isascii() and not SYNTAX.search(value))
     is_text = not TEXTS.isdisjoint(key.lstrip("+").split("."))
-    return f"{key}={quoted(value)}" if is_text and mistaken else argument
+    if is_text and (NUMBER.fullmatch(value) or os.path.lexists(value) or not _is_grammatical(argument)):
+        return f"{key}={quoted(value)}"
+    return argument
+
+
+def _is_grammatical(override: str) -> bool:
+    try:
+        OverridesParser.create().parse_override(override)
+    except HydraException:
+        return False
+    return True
 
 
 def script(function: Callable, settings: type | None = None) -> None:

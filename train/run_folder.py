@@ -35,13 +35,14 @@ def locked(folder: Path) -> Iterator[bool]:
 
 
 @contextmanager
-def sole_writer(*folders: Path) -> Iterator[None]:
-    """InputError where another process trains in one of the folders; none may begin to until they are left."""
+def sole_writer(key: str, *folders: Path) -> Iterator[None]:
+    """InputError naming the key where another process writes in one of the folders; none may until they are left."""
     with ExitStack() as stack:
         for folder in folders:
             if not stack.enter_context(locked(folder)):
                 raise InputError(
-                    f"run={folder} is in training elsewhere: let it end, or choose another folder with run="
+                    f"{key}={folder} is being written by another process: let it end, or choose another folder with "
+                    f"{key}="
                 )
         yield
 

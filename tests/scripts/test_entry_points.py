@@ -13,6 +13,7 @@ from PIL import Image
 
 from train.checkpoint import BEST, save
 from train.cli import USER_ERROR
+from train.run_folder import LOCK, sole_writer
 from train.wideresnet import WideResNet
 
 ROOT = Path(__file__).parents[2]
@@ -59,9 +60,17 @@ def test_folders_whose_names_look_like_numbers_or_have_no_utf_8_are_scored(call,
     assert call(*EVALUATE, "out=1e3") == 0
     assert "1 pictures of orange, 1 of other things" in capsys.readouterr().out
     assert {path.name for path in (here / "1e3").iterdir()} == {
-        *("photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png")
+        *("photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK)
     }
     assert r"other_\udcff/a.png" in (here / "1e3" / "photographs.csv").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("command", [EVALUATE, ["attack", "classifier=run:1.10"], ["lab"]], ids=lambda given: given[0])
+def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
+    with sole_writer("out", here / "out"):
+        assert call(*command, "out=out") == USER_ERROR
+    assert capsys.readouterr().err.startswith("error: out=out is being written by another process: let it end, or ")
+    assert {path.name for path in (here / "out").iterdir()} <= {LOCK}
 
 
 WRONG = [

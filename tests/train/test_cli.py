@@ -98,7 +98,7 @@ def test_two_commands_do_not_train_in_one_folder(tmp_path, tiny_npz, held):
             tmp_path, "run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", *SMALL, "train.resume=true"
         )
     assert done.returncode == USER_ERROR
-    assert done.stderr.startswith(f"error: run={tmp_path / held} is in training elsewhere: let it end")
+    assert done.stderr.startswith(f"error: run={tmp_path / held} is being written by another process: let it end")
     assert not list(tmp_path.rglob("config.yaml")) and not list(tmp_path.rglob("metrics.jsonl"))
 
 
@@ -176,10 +176,17 @@ def test_quoted_text_is_read_as_it_is(text):
         ("out=true", "out='true'"),
         ("run=schäl", "run='schäl'"),
         ("run=a\udcff", "run='a\udcff'"),
-        *((same, same) for same in ["train.epochs=3", "photos=null", "photos=2024,2025", "run=a", "2024", "run='ä'"]),
+        ("photos=it's", "photos='it\\'s'"),
+        ("out=a;b", "out='a;b'"),
+        ("photos=x,y", "photos='x,y'"),
+        ("weights=null", "weights='null'"),
+        *((same, same) for same in ["train.epochs=3", "photos=none", "photos=2024,2025", "run=a", "2024", "run='ä'"]),
     ],
 )
-def test_a_folder_that_looks_like_a_number_stays_text(monkeypatch, argument, passed):
+def test_the_name_of_a_folder_stays_text_whatever_it_looks_like_to_hydra(monkeypatch, tmp_path, argument, passed):
+    for there in ("x,y", "null"):
+        (tmp_path / there).mkdir()
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["train", argument])
     with_suggestions(lambda: None, "train")
     assert sys.argv[1:] == [passed]

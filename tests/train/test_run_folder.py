@@ -26,7 +26,8 @@ def run(finished, tmp_path) -> Path:
 
 def test_a_folder_has_one_writer_at_a_time_and_all_asked_for_are_held_or_none(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
-    with sole_writer(b), pytest.raises(InputError, match=rf"run={b} is in training elsewhere"), sole_writer(a, b):
+    held = pytest.raises(InputError, match=rf"run={b} is being written by another process")
+    with sole_writer("run", b), held, sole_writer("run", a, b):
         pass
     for folder in (a, b):
         FileLock(folder / LOCK).acquire(blocking=False)

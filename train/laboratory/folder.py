@@ -25,6 +25,7 @@ from train.laboratory.shots import Shot, draw_shots
 from train.laboratory.studio import photograph
 from train.outputs import writable_folder
 from train.photographs.folder import FOREIGN, TABLE
+from train.run_folder import LOCK, sole_writer
 from train.settings import read_object
 
 DESCRIPTION = "lab.json"
@@ -47,12 +48,20 @@ def write_laboratory(settings: LabSettings) -> int:
     InputError: a folder that is not empty; meshes that cannot be read or have no label; none of the label under study
     or none beside it; Mitsuba is not installed.
     """
-    out = Path(settings.out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"out={out} is not an empty folder: name another, or delete it")
-    writable_folder(out, "out")
+    out = writable_folder(settings.out, "out")
     subjects = [read_subject(item, index) for index, item in enumerate(settings.meshes)]
-    sittings, hidden, rows = _sittings(subjects, settings), not sys.stderr.isatty(), []
+    sides = [[item for item in subjects if (item.label == settings.label) is wanted] for wanted in (True, False)]
+    if not all(sides):
+        raise InputError(f"meshes: name at least one of label={settings.label} and one of something else")
+    with sole_writer("out", out):
+        if any(path.name != LOCK for path in out.iterdir()):
+            raise InputError(f"out={out} is not an empty folder: name another, or delete it")
+        return _write(_sittings(sides, settings), settings, out)
+
+
+def _write(sittings: Iterator[tuple[int, Shot, Subject]], settings: LabSettings, out: Path) -> int:
+    """Photograph and write; the number of photographs."""
+    hidden, rows = not sys.stderr.isatty(), []
     for light, shot, subject in tqdm(sittings, "photographs", 2 * settings.lights, leave=False, disable=hidden):
         path = Path(subject.label) / f"{light:04d}_{shot.family}.png"
         (out / path).parent.mkdir(parents=True, exist_ok=True)
@@ -89,11 +98,8 @@ def _label_of_solid(mesh: str) -> str:
     return FOREIGN + name if name in LOOK_ALIKES else name
 
 
-def _sittings(subjects: list[Subject], settings: LabSettings) -> Iterator[tuple[int, Shot, Subject]]:
+def _sittings(sides: list[list[Subject]], settings: LabSettings) -> Iterator[tuple[int, Shot, Subject]]:
     """Each light with its number, once with an object of the label and once with another; either side takes turns."""
-    sides = [[item for item in subjects if (item.label == settings.label) is wanted] for wanted in (True, False)]
-    if not all(sides):
-        raise InputError(f"meshes: name at least one of label={settings.label} and one of something else")
     shots = draw_shots(settings.lights, settings.patterns, settings.brightness, settings.seed)
     for light, shot in enumerate(shots):
         for side in sides:
