@@ -5,10 +5,10 @@ from dataclasses import dataclass, fields
 from typing import Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment import processes
-from augment.cost import adversarial_cost
 from augment.model_state import as_found
 from augment.phases import Phases
 from renderer.errors import require_range
@@ -118,6 +118,18 @@ class Part:
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         return self.problem.project(values, self.examples[examples])
+
+
+def adversarial_cost(logits: Tensor, decrease: Tensor, increase: Tensor | None = None) -> Tensor:
+    """-CE(f, L_d) + CE(f, L_i) per example, the paper's equation 1, which an attack decreases. (E,)
+
+    logits: (E, classes). decrease: (E,) int64, the classes whose confidence falls. increase: (E,) int64, those whose
+    confidence rises; None attacks without a target.
+    """
+    cost = -F.cross_entropy(logits, decrease, reduction="none")
+    if increase is not None:
+        cost = cost + F.cross_entropy(logits, increase, reduction="none")
+    return cost
 
 
 def descend_repeatedly(

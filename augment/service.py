@@ -13,8 +13,7 @@ from augment.attacks.settings import AttackSettings
 from augment.build import Shown, build_scene
 from augment.descent import AttackResult, Goal, Part, descend_repeatedly
 from augment.model_state import as_found
-from augment.parameters import Albedo, Geometry, Lighting, StepSettings
-from augment.parameters.kind import check_step
+from augment.parameters import Albedo, Geometry, Lighting, StepSettings, check_step
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene

@@ -8,11 +8,13 @@ from functools import partial
 from pathlib import Path
 
 from augment.classifiers.adapter import Classifier
-from augment.classifiers.efficientnet_lite import load_efficientnet_lite
+from augment.classifiers.imagenet import (
+    SQUEEZENET_CAFFE,
+    load_efficientnet_lite,
+    load_squeezenet_caffe,
+    load_torchvision,
+)
 from augment.classifiers.python_function import load_python
-from augment.classifiers.squeezenet_caffe import NAME as SQUEEZENET_CAFFE
-from augment.classifiers.squeezenet_caffe import load_squeezenet_caffe
-from augment.classifiers.torchvision_models import load_torchvision
 from renderer.errors import InputError
 
 __all__ = ["SOURCES", "Classifier", "load_classifier"]

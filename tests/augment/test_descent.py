@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from augment.descent import AttackResult, DescentSettings, Goal, descend, descend_repeatedly
 from augment.norm_ball import NormBall
-from augment.parameters.kind import STEPS, direction
+from augment.parameters import STEPS, direction
 from augment.phases import Phases
 from renderer.errors import InputError
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from augment import scene as scene_module
 from augment.descent import DescentSettings, Goal, descend
-from augment.parameters import KINDS, Albedo, Geometry, Kind, Lighting, Pixels, Skylight, StepSettings
-from augment.parameters.kind import STEPS, direction
+from augment.parameters import KINDS, STEPS, Albedo, Geometry, Kind, Lighting, Pixels, Skylight, StepSettings, direction
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene

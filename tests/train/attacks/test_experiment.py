@@ -11,8 +11,7 @@ from augment.attacks import run
 from augment.attacks.checks import Checks, check
 from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
-from augment.cost import adversarial_cost
-from augment.descent import DescentSettings, descend_repeatedly
+from augment.descent import DescentSettings, adversarial_cost, descend_repeatedly
 from augment.parameters import KINDS
 from renderer.camera import ring
 from renderer.errors import InputError

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.backgrounds import load_backgrounds
-from augment.cost import adversarial_cost
-from augment.descent import DescentSettings, Goal, descend
+from augment.descent import DescentSettings, Goal, adversarial_cost, descend
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.scene import Scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings

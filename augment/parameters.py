@@ -1,8 +1,12 @@
-"""What every kind of parameter has: where it starts, its norm-ball, and how it steps down a gradient."""
+"""What an attack may change: lighting, skylight, geometry, albedo, pixels.
+
+A kind of parameter turns flat values (A, D) into a part of the conditions that a mesh is rendered under; any of them
+can be attacked at once.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -11,8 +15,11 @@ from torch import Tensor
 from augment.norm_ball import NormBall
 from augment.scene import Conditions, Scene
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
+from renderer.lights import mean_luminance
+from renderer.skylight import TURBIDITY, ZENITH, coefficients
 
 STEPS = ("unit", "raw", "sign")
+TURBIDITY_UNIT = 4.0  # its domain spans 2 of them, as the zenith's and the azimuth's span about 1.6 and 6
 
 
 @dataclass
@@ -105,3 +112,88 @@ class OfMesh(Kind):
         items = 3 * torch.tensor(counts, device=start.device)[scene.object_of]
         used = torch.arange(start.shape[1], device=start.device) < items[:, None]
         super().__init__(scene, start, settings, None if used.all() else used)
+
+
+class Lighting(Kind):
+    """Every coefficient of the light, within the domain of the scene's basis; the start is the examples' own."""
+
+    name = "lighting"
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        super().__init__(scene, scene.lights.flatten(1), settings)
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        return replace(conditions, light=values.unflatten(1, (-1, 3)))
+
+    def within_domain(self, values: Tensor) -> Tensor:
+        return self.scene.basis.within_domain(values.unflatten(1, (-1, 3))).flatten(1)
+
+
+class Skylight(Kind):
+    """Three values: zenith, azimuth, turbidity / 4. The sky is scaled to the mean luminance of the example's own light
+    where the attack starts, and by the same factor elsewhere."""
+
+    name = "skylight"
+
+    def __init__(self, scene: Scene, settings: StepSettings, zenith: float, azimuth: float, turbidity: float):
+        start = torch.tensor([zenith, azimuth, turbidity / TURBIDITY_UNIT], dtype=torch.float64).to(scene.lights)
+        super().__init__(scene, start.expand(len(scene), -1), settings)
+        sky = mean_luminance(coefficients(zenith, azimuth, turbidity))
+        scales = [mean_luminance(light) / sky for light in scene.lights]
+        self._scale = torch.tensor(scales, dtype=torch.float64, device=start.device)[:, None, None]
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        zenith, azimuth, turbidity = values.unbind(1)
+        sky = coefficients(zenith, azimuth, turbidity * TURBIDITY_UNIT) * self._scale[examples]
+        return replace(conditions, light=sky.to(conditions.light))
+
+    def within_domain(self, values: Tensor) -> Tensor:
+        zenith, azimuth, turbidity = values.unbind(1)
+        low, high = (limit / TURBIDITY_UNIT for limit in TURBIDITY)
+        return torch.stack([zenith.clamp(*ZENITH), azimuth, turbidity.clamp(low, high)], dim=1)
+
+
+class Geometry(OfMesh):
+    """Displacements of all vertices, in world units; the mesh spans [-1, 1]. The gradient sees how normals turn."""
+
+    name = "geometry"
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        super().__init__(scene, settings, [len(item.mesh.vertices) for item in scene.objects])
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        vertices = self.scene.vertices[self.scene.object_of[examples]]
+        return replace(conditions, vertices=vertices + values.unflatten(1, (-1, 3)))
+
+
+class Albedo(OfMesh):
+    """What is added to the linear albedo of each face, per channel; the sum is clamped to [0, 1]."""
+
+    name = "albedo"
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        super().__init__(scene, settings, [len(item.mesh.faces) for item in scene.objects])
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        return replace(conditions, albedo=values.unflatten(1, (-1, 3)))
+
+
+class Pixels(Kind):
+    """What is added to each image's values, background included; the sum is clamped to [0, 1].
+
+    One step of the radius along the sign is FGSM (Goodfellow et al. 2014); several smaller ones are the iterated
+    method, and with random restarts PGD (Madry et al. 2017).
+    """
+
+    name = "pixels"
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        values = scene.views * 3 * scene.settings.size**2
+        super().__init__(scene, scene.lights.new_zeros(len(scene), values), settings)
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        size = self.scene.settings.size
+        return replace(conditions, pixels=values.unflatten(1, (self.scene.views, 3, size, size)))
+
+
+KINDS = {kind.name: kind for kind in (Lighting, Skylight, Geometry, Albedo, Pixels)}
