@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment import processes
+from augment.memory import BatchSize
 from augment.model_state import as_found
 from augment.phases import Phases
 from renderer.errors import require_range
@@ -20,7 +21,7 @@ class DescentSettings:
 
     max_steps: renders after the first; the paper's appendix C has 30. shorten: a step after which the cost has not
     fallen is taken back and tried at half its length, since the gradient of geometry holds visibility fixed.
-    batch_size: pictures per pass through the classifier.
+    batch_size: pictures per pass through the classifier, fewer where memory runs out.
     """
 
     max_steps: int = 30
@@ -164,14 +165,14 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
     steps, fooled = torch.zeros_like(active), torch.zeros_like(active, dtype=torch.bool)
     cost, length = values.new_full((len(values),), torch.inf), values.new_ones(len(values), 1)
     candidate, slope = values.clone(), torch.zeros_like(values)
-    predicted = torch.zeros_like(goal.decrease)
+    predicted, batch_size = torch.zeros_like(goal.decrease), BatchSize(settings.batch_size)
     with as_found(model):
         for step in range(settings.max_steps + 1):
             chosen = candidate[active].requires_grad_(True)
             rendered = problem.render(chosen, active)
             aim = goal.of(active)
             with phases("attack_classifier"):
-                seen = _classifier_pass(model, rendered.detach(), aim, settings.batch_size)
+                seen = _classifier_pass(model, rendered.detach(), aim, batch_size)
             (gradient,) = torch.autograd.grad(rendered, chosen, seen.gradient)
             reached = aim.reached(seen.predicted)
             if step == 0:
@@ -192,19 +193,20 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
     return AttackResult(values, images, steps, fooled_before, fooled, cost_before, cost, predicted, zero_gradient)
 
 
-def _classifier_pass(model: nn.Module, pictures: Tensor, goal: Goal, batch_size: int) -> _Pass:
+def _classifier_pass(model: nn.Module, pictures: Tensor, goal: Goal, batch_size: BatchSize) -> _Pass:
     views, flat = pictures.shape[1], pictures.flatten(0, 1)
     decrease, increase = goal.decrease.flatten(), None if goal.increase is None else goal.increase.flatten()
-    gradient, costs, predicted = torch.empty_like(flat), [], []
-    for begin in range(0, len(flat), batch_size):
-        part = slice(begin, begin + batch_size)
+    gradient = torch.empty_like(flat)
+
+    def judge(part: slice) -> tuple[Tensor, Tensor]:
         batch = flat[part].detach().requires_grad_(True)
         logits = model(batch)
         cost = adversarial_cost(logits, decrease[part], None if increase is None else increase[part])
         (by_picture,) = torch.autograd.grad(cost.sum(), batch)
         gradient[part] = by_picture  # laid out as the pictures are, not as the network's channels
-        costs.append(cost.detach())
-        predicted.append(logits.detach().argmax(1))
+        return cost.detach(), logits.detach().argmax(1)
+
+    costs, predicted = zip(*batch_size.map(judge, len(flat)), strict=True)
     return _Pass(
         torch.cat(costs).unflatten(0, (-1, views)).sum(1),
         torch.cat(predicted).unflatten(0, (-1, views)),

@@ -12,6 +12,7 @@ from augment import processes
 from augment.attacks.settings import AttackSettings
 from augment.build import Shown, build_scene
 from augment.descent import AttackResult, Goal, Part, descend_repeatedly
+from augment.memory import BatchSize
 from augment.model_state import as_found
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings, check_step
 from augment.perturbation import Perturbation
@@ -203,7 +204,8 @@ class AugmentationService:
         with torch.no_grad():
             images = problem.render(values, problem.everything)[:, 0]
         with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
-            logits = torch.cat([model(batch) for batch in images.split(self.settings.attack.batch_size)])
+            batches = BatchSize(self.settings.attack.batch_size).map(lambda part: model(images[part]), len(images))
+            logits = torch.cat(list(batches))
         diagnostics = {
             "fooled": _mean(logits.argmax(1) != self._labels),
             "loss": _mean(nn.functional.cross_entropy(logits, self._labels)),

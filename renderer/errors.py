@@ -14,6 +14,11 @@ class InputError(ValueError):
     """
 
 
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether memory ran out: a GPU's, that of torch's allocator on the CPU, or Python's."""
+    return isinstance(error, torch.OutOfMemoryError | MemoryError) or "can't allocate memory" in str(error)
+
+
 def require_range(name: str, value: float | None, least: float, most: float) -> None:
     """InputError naming a setting that lies outside of what can be meant, NaN included; None is not set."""
     if value is not None and not least <= value <= most:

@@ -75,6 +75,18 @@ def load(path: Path) -> dict[str, Any]:
         raise InputError(f"checkpoint {path} lacks its model or architecture: give one that `python -m train` wrote")
     if not whole:
         raise InputError(f"checkpoint {path} is damaged: its content is not what its hash says; use another one")
+    return _checked(state, path)
+
+
+def _checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The state; InputError for what anyone may have written, with a right hash: weights that are none, or of later."""
+    weights, version = state["model"], state["architecture"].get("version", 1)
+    if not isinstance(version, int) or version > VERSION:
+        raise InputError(f"checkpoint {path} was written by a later version ({version!r}): install that one")
+    if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise InputError(f"checkpoint {path} holds other things than weights under model: use another one")
+    if not_finite := [name for name, value in weights.items() if not value.isfinite().all()]:
+        raise InputError(f"checkpoint {path} has NaN or infinity in {not_finite[0]}: use another one")
     return state
 
 
@@ -130,8 +142,6 @@ def _sync_folder(folder: Path) -> None:
 
 def load_weights(network: nn.Module, weights: Mapping[str, torch.Tensor], path: Path) -> None:
     """Fill the network; InputError naming the file where the weights belong to another architecture."""
-    if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise InputError(f"checkpoint {path} holds other things than weights under model: use another one")
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in weights.items()}
     if expected != found:
@@ -200,13 +210,12 @@ def load_network(run: Path, size: int | None = None) -> TrainedNetwork:
 
 
 def _pop_images(shape: dict[str, Any], path: Path) -> tuple[int | None, str]:
-    """Take from a description what it says of the images, their size and encoding, and which version it is of.
+    """Take from a description what it says of the images, their size and encoding, and its version.
 
-    InputError where that is a later one, or where a file from elsewhere says what cannot be meant.
+    InputError where a file from elsewhere says what cannot be meant.
     """
-    version, size = shape.pop("version", 1), shape.pop("size", None)
-    if not isinstance(version, int) or version > VERSION:
-        raise InputError(f"checkpoint {path} was written by a later version ({version!r}): install that one")
+    shape.pop("version", None)
+    size = shape.pop("size", None)
     if size is not None and not (isinstance(size, int) and 1 <= size <= LARGEST_SIZE):
         raise InputError(f"checkpoint {path} says size={size!r}, not pixels per side up to {LARGEST_SIZE}: use another")
     encoding = shape.pop("encoding", "linear")
@@ -235,4 +244,4 @@ def _load_published(path: Path) -> dict[str, Any]:
             raise ValueError("it is no object of keys and values")
     except (SafetensorError, KeyError, ValueError, RecursionError, OSError) as error:
         raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error
-    return {"model": weights, "architecture": architecture}
+    return _checked({"model": weights, "architecture": architecture}, path)

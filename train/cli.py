@@ -19,7 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
-from renderer.errors import InputError
+from renderer.errors import InputError, is_out_of_memory
 from train.settings import read_settings
 
 USER_ERROR = 2
@@ -49,6 +49,8 @@ def one_sentence(error: Exception) -> str | None:
             return f"{error.filename} cannot be read or written: {error.strerror}"
         case OSError() if error.errno in NO_ROOM:
             return f"what was to be written found no room: {error.strerror}"
+        case RuntimeError() | MemoryError() if is_out_of_memory(error):
+            return "memory ran out: ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
     return None
 
 

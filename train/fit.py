@@ -1,9 +1,9 @@
 """The training loop: each round regenerates the renders and trains on data and renders; an epoch of rounds ends with
 validation and a checkpoint."""
 
-import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from augment import processes
 from augment.phases import Phases
 from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
-from renderer.errors import InputError
+from renderer.errors import InputError, is_out_of_memory
 from train import checkpoint
 from train.batches import Round, batch_count, training_batches
 from train.data import Split
@@ -26,7 +26,7 @@ from train.graphs import FixedSizes, compiles, training_pass
 from train.interruption import Interruption
 from train.logs import RunLog, console
 from train.moving_average import MovingAverage
-from train.precision import MixedPrecision
+from train.precision import PRECISIONS, MixedPrecision
 from train.random_state import random_state, restore_random_state
 from train.recipe import TrainSettings
 from train.schedule import SCHEDULES
@@ -110,6 +110,8 @@ class Trainer:
                     self._end_epoch(validation, log)
                 ending = interruption.requested()
                 if ending or self._checkpoint_is_due():
+                    if self._under_way:
+                        self._check_finite(float(self._under_way.sums[0]), self.epoch + 1)
                     with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
                         self._save()
                 if ending:
@@ -136,7 +138,16 @@ class Trainer:
         if problem:
             console.warning("%s: going on from the one before", problem)
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or the next one would take the place of the whole
-        self.load_state_dict(state)
+        try:
+            _require_whole(state)
+            self.load_state_dict(state)
+        except InputError:
+            raise
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            raise InputError(
+                f"the checkpoint in {self.folder} holds what no run wrote ({' '.join(str(error).split())}): restore "
+                f"{checkpoint.LAST}, or start in another folder with run="
+            ) from error
 
     def state_dict(self) -> dict[str, Any]:
         """All that a run needs to go on as if it had never ended; bfloat16 needs no loss scaler."""
@@ -204,8 +215,9 @@ class Trainer:
             self._set_learning_rate((self.epoch + so_far.step / total) / settings.epochs)
             images = self._distort(images, labels, self.epoch * total + so_far.step)
             self.optimizer.zero_grad(set_to_none=True)
-            loss, hits = self._training_pass(images, labels)
-            loss.backward()
+            with _one_error_out_of_memory(f"train.batch_size={settings.batch_size}"):
+                loss, hits = self._training_pass(images, labels)
+                loss.backward()
             self.optimizer.step()
             if self._average:
                 self._average.update(self.model)
@@ -226,7 +238,7 @@ class Trainer:
         with self.phases("evaluation"):
             validated = evaluate(self._scored, validation)
         self.epoch += 1
-        self._check_finite(trained["loss"] + validated["loss"])
+        self._check_finite(trained["loss"] + validated["loss"], self.epoch)
         self._select(validated["accuracy"])
         with self.phases("input_output"):
             if len(now.renders.labels):
@@ -238,11 +250,18 @@ class Trainer:
         every, last = self.settings.checkpoint_every, self.settings.epochs
         return self._under_way is None and (self.epoch % every == 0 or self.epoch == last)
 
-    def _check_finite(self, loss: float) -> None:
-        if not math.isfinite(loss):
+    def _check_finite(self, loss: float, epoch: int) -> None:
+        """InputError naming what is NaN or infinite, before any of it is kept."""
+        network = self.model.network
+        tensors = {f"weight {name}": value for name, value in network.state_dict().items()}
+        tensors |= {f"gradient of {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
+        tensors["loss"] = torch.tensor(loss)
+        finite = torch.stack([value.isfinite().all().to(self._device) for value in tensors.values()]).tolist()
+        if not all(finite):
+            name = list(tensors)[finite.index(False)]
             raise InputError(
-                f"train.learning_rate={self.settings.learning_rate} made the loss infinite in epoch {self.epoch}: "
-                "set a lower one"
+                f"train.learning_rate={self.settings.learning_rate} made the {name} NaN or infinite in epoch {epoch}: "
+                "set a lower one; the checkpoint before, if any, is kept"
             )
 
     def _select(self, accuracy: float) -> None:
@@ -294,6 +313,28 @@ class Trainer:
             sum(seconds.get(name, 0.0) for name in PHASES),
             seconds.get("attack", 0.0),
         )
+
+
+def _require_whole(state: Mapping[str, Any]) -> None:
+    """ValueError for a state, with a right hash, in which a run cannot have been."""
+    epoch, history = state["epoch"], state["history"]
+    if not isinstance(epoch, int) or not isinstance(history, list) or len(history) != epoch:
+        raise ValueError(f"after epoch {epoch!r} it has other than as many lines of history")
+    if state["precision"] not in PRECISIONS:
+        raise ValueError(f"precision {state['precision']!r}")
+    if not isinstance(state["random_state"], Mapping):
+        raise ValueError("no random state")
+
+
+@contextmanager
+def _one_error_out_of_memory(setting: str) -> Iterator[None]:
+    """InputError naming the setting where memory runs out."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise InputError(f"{setting} needs more memory than there is: set a lower one") from error
 
 
 def _progress(batches: Iterable, first: int, total: int, description: str) -> Iterable:

@@ -13,6 +13,7 @@ from augment.attacks.criteria import Criterion, Misclassification
 from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier
 from augment.descent import AttackResult, Goal, descend_repeatedly
+from augment.memory import BatchSize
 from augment.parameters import StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
@@ -114,7 +115,8 @@ def attack(
 def logits_of(classifier: Classifier, images: Tensor, batch_size: int) -> Tensor:
     """(E, V, C) of images (E, V, 3, H, W)."""
     flat = images.flatten(0, 1)
-    return torch.cat([classifier(batch) for batch in flat.split(batch_size)]).unflatten(0, images.shape[:2])
+    logits = BatchSize(batch_size).map(lambda part: classifier(flat[part]), len(flat))
+    return torch.cat(list(logits)).unflatten(0, images.shape[:2])
 
 
 def require_recognised(scene: Scene, logits: Tensor, labels: Tensor, classifier: Classifier) -> None:

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,7 +12,7 @@ from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.checkpoint import LAST
-from train.cli import USER_ERROR, command_line, one_sentence_errors, quoted, with_suggestions
+from train.cli import USER_ERROR, command_line, one_sentence, one_sentence_errors, quoted, with_suggestions
 from train.experiment import load_data, prepare
 from train.outputs import Folders
 from train.run_folder import locked
@@ -190,6 +191,11 @@ def test_the_name_of_a_folder_stays_text_whatever_it_looks_like_to_hydra(monkeyp
     monkeypatch.setattr(sys, "argv", ["train", argument])
     with_suggestions(lambda: None, "train")
     assert sys.argv[1:] == [passed]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("x"), RuntimeError("can't allocate memory")])
+def test_memory_that_runs_out_is_one_sentence(error):
+    assert one_sentence(error).startswith("memory ran out: ask for fewer or smaller images")
 
 
 def test_what_is_no_users_fault_keeps_its_traceback():

@@ -1,5 +1,7 @@
 import copy
+import itertools
 import math
+import signal
 
 import pytest
 import torch
@@ -247,10 +249,76 @@ def test_a_loss_that_is_not_finite_ends_the_run_with_the_last_good_checkpoint(tm
     trainer = make_trainer(tmp_path)
     losses = iter([1.0, math.nan])
     monkeypatch.setattr(fit, "evaluate", lambda *arguments: {"loss": next(losses), "accuracy": 0.5})
-    with pytest.raises(InputError, match=r"train.learning_rate=0.05 made the loss infinite in epoch 2"):
+    with pytest.raises(InputError, match=r"train.learning_rate=0.05 made the loss NaN or infinite in epoch 2"):
         fit_noise(trainer)
     assert checkpoint.load(tmp_path / checkpoint.LAST)["epoch"] == 1
     assert [line["epoch"] for line in read_metrics(tmp_path)] == [1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"history": "x"}, "lines of history"),
+        ({"history": []}, "lines of history"),
+        ({"epoch": -1}, "after epoch -1"),
+        ({"epoch": "x"}, "after epoch 'x'"),
+        ({"optimizer": {}}, "param_groups"),
+        ({"optimizer": [1]}, "holds what no run wrote"),
+        ({"precision": "int3"}, "precision 'int3'"),
+        ({"random_state": "x"}, "no random state"),
+        ({"under_way": {"step": 1}}, "holds what no run wrote"),
+        ({"model": []}, "other things than weights"),
+        ({"architecture": {**ARCHITECTURE, "version": 99}}, "later version"),
+    ],
+)
+def test_a_forged_checkpoint_with_a_right_hash_is_refused_in_one_sentence(tmp_path, changes, message):
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    checkpoint.save(tmp_path / checkpoint.LAST, checkpoint.load(tmp_path / checkpoint.LAST) | changes)
+    with pytest.raises(InputError, match=message) as caught:
+        make_trainer(tmp_path).resume()
+    assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_weights_of_nan_are_not_gone_on_with(tmp_path):
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    state = checkpoint.load(tmp_path / checkpoint.LAST)
+    state["model"]["stem.weight"].fill_(math.nan)
+    checkpoint.save(tmp_path / checkpoint.LAST, state)
+    with pytest.raises(InputError, match=r"last.pt has NaN or infinity in stem.weight: use another one"):
+        make_trainer(tmp_path).resume()
+
+
+@pytest.mark.parametrize("ended", ["by itself", "by a signal"])
+def test_weights_that_are_not_finite_are_named_and_the_last_good_checkpoint_stays(tmp_path, monkeypatch, ended):
+    trainer, steps = make_trainer(tmp_path), itertools.count(1)
+    whole = trainer._training_pass
+
+    def spoilt(images, labels):
+        loss, hits = whole(images, labels)
+        if next(steps) < 5:  # the second of three steps of the second epoch
+            return loss, hits
+        if ended == "by a signal":
+            signal.raise_signal(signal.SIGTERM)
+        return loss * math.inf, hits
+
+    monkeypatch.setattr(trainer, "_training_pass", spoilt)
+    with pytest.raises(InputError, match=r"0.05 made the weight stem.weight NaN or infinite in epoch 2: set a lower"):
+        fit_noise(trainer)
+    assert checkpoint.load(tmp_path / checkpoint.LAST)["epoch"] == 1
+
+
+@pytest.mark.parametrize(
+    "error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(), RuntimeError("can't allocate memory: you ")]
+)
+def test_where_memory_runs_out_in_training_the_setting_is_named(tmp_path, monkeypatch, error):
+    trainer = make_trainer(tmp_path)
+
+    def too_large(images, labels):
+        raise error
+
+    monkeypatch.setattr(trainer, "_training_pass", too_large)
+    with pytest.raises(InputError, match=r"train.batch_size=16 needs more memory than there is: set a lower one"):
+        fit_noise(trainer)
 
 
 def test_training_learns_what_can_be_told_apart(tmp_path):
