@@ -146,3 +146,8 @@ def check_encoding(encoding: str) -> None:
 def to_bytes(image: Tensor) -> Tensor:
     """Image values in [0, 1] to uint8, rounded."""
     return (image * 255).round().to(torch.uint8)
+
+
+def to_unit(images: Tensor) -> Tensor:
+    """uint8 pictures to float32 RGB in [0, 1]."""
+    return images.float() / 255

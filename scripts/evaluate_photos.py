@@ -6,10 +6,9 @@ from pathlib import Path
 from renderer.errors import require_range
 from train.checkpoint import load_network
 from train.cli import script
-from train.device import choose_device
+from train.device import MixedPrecision, choose_device, choose_precision
 from train.outputs import writable_folder
 from train.photographs import evaluate_photographs, format_summary
-from train.precision import MixedPrecision, choose_precision
 from train.run_folder import sole_writer
 from train.settings import LARGEST_SIZE
 

@@ -12,7 +12,7 @@ from typing import Any
 import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor, nn
+from torch import Tensor, cuda, get_rng_state, nn, set_rng_state
 
 from renderer.errors import InputError
 from renderer.image import ENCODINGS
@@ -245,3 +245,15 @@ def _load_published(path: Path) -> dict[str, Any]:
     except (SafetensorError, KeyError, ValueError, RecursionError, OSError) as error:
         raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error
     return _checked({"model": weights, "architecture": architecture}, path)
+
+
+def random_state() -> dict[str, Tensor | list[Tensor]]:
+    """The CPU's and, where there are any, the GPUs'."""
+    return {"cpu": get_rng_state(), "cuda": cuda.get_rng_state_all() if cuda.is_available() else []}
+
+
+def restore_random_state(state: dict[str, Tensor | list[Tensor]]) -> None:
+    """What `random_state` gave, on as many GPUs as there were and are."""
+    set_rng_state(state["cpu"])
+    for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
+        cuda.set_rng_state(values, device)

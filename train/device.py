@@ -1,13 +1,26 @@
-"""Where and how to compute."""
+"""Where and how to compute: device and threads, mixed precision, CUDA graphs."""
 
+import functools
 import os
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
 
+from augment import processes
 from renderer.errors import InputError
+from renderer.image import to_unit
+from train.logs import console
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
+PRECISIONS = ("auto", "bfloat16", "float32")
+MEASUREMENTS = 8
+COMPILE = ("auto", "always", "never")
+SIZES = (16, 32, 64, 128, 512)  # of a batch in eval mode: attacks, whose examples leave when fooled, and evaluation
+RECOMPILE_LIMIT = 4 * len(SIZES)  # each with and without gradients, which torch's 8 are too few for
 
 
 def choose_device(name: str) -> torch.device:
@@ -48,3 +61,116 @@ def _quota() -> int:
         return max(1, int(quota) // int(period))
     except (OSError, ValueError):  # no such file, or "max 100000"
         return os.cpu_count() or 1
+
+
+class MixedPrecision(nn.Module):
+    """A network run in channels-last layout under autocast: float32 images in, float32 logits out.
+
+    The precision stays inside, so that nothing else (the renderer's products, the loss) is rounded to bfloat16.
+    """
+
+    def __init__(self, network: nn.Module, precision: str):
+        super().__init__()
+        self.network = network.to(memory_format=torch.channels_last)
+        self.precision = precision
+
+    def forward(self, images: Tensor) -> Tensor:
+        images = images.contiguous(memory_format=torch.channels_last)
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            return self.network(images).float()
+
+
+def choose_precision(precision: str, device: torch.device) -> str:
+    """ "bfloat16" or "float32"; "auto" takes the faster on this device by a short measurement."""
+    if precision not in PRECISIONS:
+        raise InputError(f"train.precision={precision}: choose one of {', '.join(PRECISIONS)}")
+    return _faster_precision(device) if precision == "auto" else precision
+
+
+@functools.cache
+def _faster_precision(device: torch.device) -> str:
+    """The faster of the two for a training step of a typical convolution; measured once per process."""
+    if device.type == "cuda":
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    with torch.random.fork_rng(devices=[]):
+        layer = MixedPrecision(nn.Conv2d(64, 64, 3, padding=1, bias=False), "float32")
+        images = torch.rand(32, 64, 32, 32)
+    candidates = ("bfloat16", "float32")
+    seconds = {precision: [] for precision in candidates}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # threads that wait for a busy core would blur the comparison
+    try:
+        for precision in candidates * MEASUREMENTS:  # in turn; the least counts, so a busy machine disturbs both alike
+            seconds[precision].append(_step_time(layer, images, precision))
+    finally:
+        torch.set_num_threads(threads)
+    best = {precision: min(times) for precision, times in seconds.items()}
+    measured = ", ".join(f"{1000 * best[precision]:.1f} ms in {precision}" for precision in candidates)
+    console.info("precision: a convolution's training step takes %s", measured)
+    return min(candidates, key=best.get)
+
+
+def _step_time(layer: MixedPrecision, images: Tensor, precision: str) -> float:
+    layer.precision = precision
+    start = time.perf_counter()
+    layer(images).sum().backward()
+    return time.perf_counter() - start
+
+
+def compiles(choice: str, device: torch.device) -> bool:
+    """Whether to compile.
+
+    "auto" does on one GPU where a trial succeeds; several processes wait for each other inside a pass.
+    """
+    if choice != "auto":
+        return choice == "always"
+    return device.type == "cuda" and processes.count() == 1 and compiler_works(device)
+
+
+@functools.cache
+def compiler_works(device: torch.device) -> bool:
+    """Whether torch.compile can build here, which takes a C compiler and Python's headers; says so where it cannot."""
+    try:
+        torch.compile(torch.exp)(torch.zeros(2, device=device))
+    except Exception as error:  # of torch's, of Triton's or of the compiler's
+        reason = " ".join(str(error).splitlines()[:2])
+        console.warning("compile: torch.compile fails here, so that training is slower: %s", reason)
+        return False
+    return True
+
+
+def training_pass(model: nn.Module, label_smoothing: float, compiled: bool) -> Callable[[Tensor, Tensor], tuple]:
+    """A function of uint8 pictures (B, 3, H, W) and labels (B,): the mean cross entropy, and how many are right.
+
+    compiled: torch forgets what it compiled before, since its limit counts the graphs of all runs of a process.
+    """
+
+    def loss_and_hits(images: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+        logits = model(to_unit(images))
+        loss = F.cross_entropy(logits, labels, label_smoothing=label_smoothing)
+        return loss, (logits.detach().argmax(1) == labels).sum()
+
+    if not compiled:
+        return loss_and_hits
+    torch.compiler.reset()
+    return torch.compile(loss_and_hits, mode="reduce-overhead", dynamic=False)
+
+
+class FixedSizes(nn.Module):
+    """A model in eval mode at a few batch sizes, each a CUDA graph of its own; smaller batches are filled up.
+
+    Rows do not influence each other in eval mode. In training mode, and for larger batches, the model as it is.
+    """
+
+    def __init__(self, model: nn.Module, backend: str = "cudagraphs"):
+        super().__init__()
+        self.model = model
+        self._graphs = torch.compile(model.forward, backend=backend, dynamic=False)
+        torch._dynamo.config.recompile_limit = RECOMPILE_LIMIT
+
+    def forward(self, images: Tensor) -> Tensor:
+        if self.training or len(images) > SIZES[-1]:
+            return self.model(images)
+        size = next(size for size in SIZES if len(images) <= size)
+        filled = torch.cat([images, images.new_zeros(size - len(images), *images.shape[1:])])
+        return self._graphs(filled)[: len(images)].clone()  # the next replay writes over a graph's result

@@ -10,8 +10,7 @@ from torchvision.transforms import v2
 from augment import processes
 from augment.model_state import as_found
 from augment.seeding import generator, stream_seed
-from renderer.image import to_bytes
-from train.batches import to_unit
+from renderer.image import to_bytes, to_unit
 
 Distort = Callable[[Tensor, Tensor, int], Tensor]  # uint8 images (B, 3, H, W), labels (B,) and the step to images
 

@@ -38,13 +38,11 @@ from train.data import (
     load_npz,
     stratified_split,
 )
-from train.device import choose_device, set_deterministic, set_threads
+from train.device import MixedPrecision, choose_device, choose_precision, set_deterministic, set_threads
 from train.distributed import first_process_first
-from train.evaluation import evaluate
-from train.fit import Trainer
+from train.fit import Trainer, evaluate
 from train.logs import NoLog, RunLog, console
 from train.photographs import FIGURES, evaluate_photographs, find_figure, find_photographs, format_summary
-from train.precision import MixedPrecision, choose_precision
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
 from train.settings import (

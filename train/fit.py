@@ -8,28 +8,38 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
+from torch import nn
 from tqdm import tqdm
 
 from augment import processes
+from augment.model_state import eval_mode
 from augment.phases import Phases
 from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError, is_out_of_memory
+from renderer.image import to_unit
 from train import checkpoint
-from train.batches import Round, batch_count, training_batches
+from train.checkpoint import random_state, restore_random_state
 from train.data import Split
+from train.device import PRECISIONS, FixedSizes, MixedPrecision, compiles, training_pass
 from train.distortions import distortion
 from train.distributed import replicated, summed
-from train.epoch import PHASES, EpochUnderWay, put_last, rounds_of_epoch, with_room
-from train.evaluation import evaluate
-from train.graphs import FixedSizes, compiles, training_pass
+from train.epoch import (
+    PHASES,
+    EpochUnderWay,
+    Round,
+    batch_count,
+    put_last,
+    rounds_of_epoch,
+    training_batches,
+    with_room,
+)
 from train.interruption import Interruption
 from train.logs import RunLog, console
-from train.moving_average import MovingAverage
-from train.precision import PRECISIONS, MixedPrecision
-from train.random_state import random_state, restore_random_state
-from train.recipe import TrainSettings
-from train.schedule import SCHEDULES
+from train.recipe import SCHEDULES, MovingAverage, TrainSettings
+
+BATCH = 512  # of images when a network is scored
 
 
 class Trainer:
@@ -341,3 +351,20 @@ def _progress(batches: Iterable, first: int, total: int, description: str) -> It
     """A progress bar on a terminal, nothing elsewhere."""
     hidden = not sys.stderr.isatty()
     return tqdm(batches, initial=first, total=total, desc=description, leave=False, disable=hidden)
+
+
+@torch.no_grad()
+def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
+    """Mean cross entropy and top-1 accuracy in eval mode; the model's mode is restored.
+
+    Every process of a run scores its share of the pictures; all get the result.
+    """
+    share = slice(processes.index(), None, processes.count())
+    loss_sum, correct = totals = torch.zeros(2, device=split.images.device)
+    with eval_mode(model):
+        for images, labels in zip(split.images[share].split(BATCH), split.labels[share].split(BATCH), strict=True):
+            logits = model(to_unit(images))
+            loss_sum += F.cross_entropy(logits, labels, reduction="sum")
+            correct += (logits.argmax(1) == labels).sum()
+    loss_sum, correct = summed(totals).tolist()
+    return {"loss": loss_sum / len(split), "accuracy": correct / len(split)}

@@ -5,7 +5,7 @@ from torch import nn
 from torchvision.transforms import v2
 
 from augment import processes
-from train.batches import to_unit
+from renderer.image import to_unit
 from train.distortions import DISTORTIONS, RADIUS, TRANSFORMS, distortion
 from train.wideresnet import WideResNet
 

@@ -11,15 +11,13 @@ from torch import nn
 from augment.phases import Phases
 from augment.service import Renders
 from renderer.errors import InputError
-from train import checkpoint, evaluation, fit
+from train import checkpoint, fit
 from train.data import Split
+from train.device import MixedPrecision
 from train.epoch import put_last, rounds_of_epoch, with_room
-from train.evaluation import evaluate
-from train.fit import Trainer
+from train.fit import Trainer, evaluate
 from train.logs import RunLog, read_metrics
-from train.precision import MixedPrecision
-from train.recipe import TrainSettings
-from train.schedule import cosine
+from train.recipe import TrainSettings, cosine
 from train.wideresnet import WideResNet
 
 ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
@@ -148,7 +146,7 @@ def test_an_epochs_images_are_drawn_anew_and_are_never_more_than_there_are():
 
 @pytest.mark.parametrize("training", [True, False])
 def test_evaluation_is_the_mean_over_all_pictures_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
-    monkeypatch.setattr(evaluation, "BATCH", 7)
+    monkeypatch.setattr(fit, "BATCH", 7)
     torch.manual_seed(0)
     model = WideResNet(3, 10, 1, dropout=0.5).train(training)
     before = copy.deepcopy(model.state_dict())

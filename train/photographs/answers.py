@@ -8,7 +8,7 @@ import torch
 
 from augment.model_state import eval_mode
 from renderer.errors import InputError
-from train.batches import to_unit
+from renderer.image import to_unit
 from train.photographs.folder import Photograph
 
 

@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from renderer.errors import InputError
-from train.batches import Round, training_batches
 from train.data import Split, load_npz
+from train.epoch import Round, training_batches
 from train.recipe import TrainSettings
 from train.settings import ExperimentSettings
 from train.studies.training_speed import peak

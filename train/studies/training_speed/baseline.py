@@ -10,10 +10,10 @@ from torch.utils.data import DataLoader, Dataset
 from torchvision import transforms
 
 from augment.phases import Phases
-from train.batches import PADDING
 from train.data import Split
-from train.dropout import Dropout
+from train.epoch import PADDING
 from train.recipe import TrainSettings
+from train.wideresnet import Dropout
 
 
 class Images(Dataset):

@@ -11,8 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import require_range
 from train.data import DataSet, Split, channel_statistics, stratified_split
+from train.device import choose_precision
 from train.experiment import load_data
-from train.precision import choose_precision
 from train.settings import ExperimentSettings, read_settings
 from train.studies.training_speed.arm import Arm
 from train.studies.training_speed.baseline import Baseline, build_loader

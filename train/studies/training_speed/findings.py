@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from statistics import median
 
-from train.batches import batch_count
-from train.epoch import PHASES
+from train.epoch import PHASES, batch_count
 from train.studies.targets import Target
 from train.studies.training_speed.arm import EPOCH
 from train.studies.training_speed.peak import TRAINING

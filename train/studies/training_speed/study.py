@@ -5,8 +5,7 @@ from dataclasses import fields
 from omegaconf import DictConfig, OmegaConf
 
 from train.cli import command_line
-from train.device import choose_device, set_deterministic, set_threads
-from train.graphs import compiles
+from train.device import choose_device, compiles, set_deterministic, set_threads
 from train.outputs import writable_file
 from train.settings import ExperimentSettings, read_settings
 from train.studies.figures import pyplot

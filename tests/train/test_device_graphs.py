@@ -4,8 +4,8 @@ import torch.nn.functional as F
 from torch._dynamo.exc import BackendCompilerFailed
 
 from augment.model_state import eval_mode
-from train import graphs
-from train.graphs import RECOMPILE_LIMIT, SIZES, FixedSizes, compiler_works, compiles, training_pass
+from train import device as compute
+from train.device import RECOMPILE_LIMIT, SIZES, FixedSizes, compiler_works, compiles, training_pass
 from train.wideresnet import WideResNet
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda")
@@ -33,7 +33,7 @@ class Recorded:
     [("auto", GPU, True), ("auto", CPU, False), ("always", CPU, True), ("never", GPU, False)],
 )
 def test_one_gpu_compiles_unless_told(monkeypatch, choice, device, expected):
-    monkeypatch.setattr(graphs, "compiler_works", lambda device: True)
+    monkeypatch.setattr(compute, "compiler_works", lambda device: True)
     assert compiles(choice, device) == expected
 
 
@@ -41,8 +41,8 @@ def test_a_gpu_without_a_compiler_trains_all_the_same(monkeypatch, caplog):
     def no_compiler(images):
         raise BackendCompilerFailed("inductor", RuntimeError("Failed to find C compiler."), None)
 
-    monkeypatch.setattr(graphs.torch, "compile", lambda function: no_compiler)
-    monkeypatch.setattr(graphs.torch, "zeros", lambda size, device: None)
+    monkeypatch.setattr(compute.torch, "compile", lambda function: no_compiler)
+    monkeypatch.setattr(compute.torch, "zeros", lambda size, device: None)
     compiler_works.cache_clear()
     assert not compiles("auto", GPU) and compiles("always", GPU)
     assert not compiles("auto", GPU)
@@ -52,7 +52,7 @@ def test_a_gpu_without_a_compiler_trains_all_the_same(monkeypatch, caplog):
 
 
 def test_several_processes_do_not_compile_unless_told(monkeypatch):
-    monkeypatch.setattr(graphs.processes, "count", lambda: 2)
+    monkeypatch.setattr(compute.processes, "count", lambda: 2)
     assert not compiles("auto", GPU) and compiles("always", GPU)
 
 

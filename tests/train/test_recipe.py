@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from train.schedule import SCHEDULES, cosine, one_cycle, step
+from train.recipe import SCHEDULES, cosine, one_cycle, step
 
 
 @pytest.mark.parametrize("epochs", [10, 50, 150, 200])

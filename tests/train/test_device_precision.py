@@ -5,8 +5,8 @@ import torch
 from torch import nn
 
 from renderer.errors import InputError
-from train import precision
-from train.precision import MixedPrecision, choose_precision
+from train import device
+from train.device import MixedPrecision, choose_precision
 from train.wideresnet import WideResNet
 
 CPU = torch.device("cpu")
@@ -52,7 +52,7 @@ def test_autocast_ends_with_the_forward_pass(network):
 
 
 def test_auto_chooses_one_and_leaves_random_state_and_threads():
-    precision._faster_precision.cache_clear()
+    device._faster_precision.cache_clear()
     torch.manual_seed(3)
     state, threads = torch.get_rng_state(), torch.get_num_threads()
     torch.set_num_threads(2)
@@ -74,14 +74,14 @@ def test_auto_takes_the_faster_by_its_best_time(monkeypatch, faster):
             return 2.0
         return 1.0 if steps.count(name) > 1 else 100.0  # once, something else had the core
 
-    monkeypatch.setattr(precision, "_step_time", step_time)
-    precision._faster_precision.cache_clear()
+    monkeypatch.setattr(device, "_step_time", step_time)
+    device._faster_precision.cache_clear()
     try:
         assert choose_precision("auto", CPU) == faster
         assert choose_precision("auto", CPU) == faster
     finally:
-        precision._faster_precision.cache_clear()
-    assert len(steps) == 2 * precision.MEASUREMENTS  # once per process
+        device._faster_precision.cache_clear()
+    assert len(steps) == 2 * device.MEASUREMENTS  # once per process
 
 
 def test_a_named_precision_is_taken_as_it_is_and_another_refused():

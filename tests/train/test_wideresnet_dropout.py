@@ -2,7 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from train.dropout import Dropout
+from train.wideresnet import Dropout
 
 LAYOUTS = [torch.contiguous_format, torch.channels_last]
 

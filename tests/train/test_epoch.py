@@ -2,9 +2,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from renderer.image import to_bytes
-from train import batches
-from train.batches import PADDING, Round, crop_and_flip, to_unit, training_batches
+from renderer.image import to_bytes, to_unit
+from train import epoch as epochs
+from train.epoch import PADDING, Round, crop_and_flip, training_batches
 
 
 def noise(*shape: int) -> torch.Tensor:
@@ -58,7 +58,7 @@ def test_fewer_pictures_than_a_batch_fill_it_several_times():
 def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, pictures_at_once):
     images, labels = noise(50, 3, 8, 8), torch.arange(50)
     whole = list(training_batches(images, labels, 8, 0, whole_epoch(images, 1), flips))
-    monkeypatch.setattr(batches, "CHUNK_BYTES", pictures_at_once * 3 * 8 * 8)
+    monkeypatch.setattr(epochs, "CHUNK_BYTES", pictures_at_once * 3 * 8 * 8)
     for first in range(len(whole) + 1):
         rest = list(training_batches(images, labels, 8, 0, whole_epoch(images, 1), flips, first))
         assert len(rest) == len(whole) - first
