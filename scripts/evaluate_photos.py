@@ -1,14 +1,18 @@
-"""Score a trained network on a folder of photographs: python scripts/evaluate_photos.py run=... photos=..."""
+"""Score a network on a folder of photographs: python scripts/evaluate_photos.py run=... photos=...
+
+classifier= takes any other network, by a name that scripts/attack.py knows.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from renderer.errors import require_range
-from train.checkpoint import load_network
+from augment.classifiers import Classifier
+from renderer.errors import InputError, require_range
 from train.cli import script
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.outputs import writable_folder
 from train.photographs import evaluate_photographs, format_summary
+from train.run_classifier import load_classifier, load_run
 from train.run_folder import sole_writer
 from train.settings import LARGEST_SIZE
 
@@ -17,7 +21,9 @@ from train.settings import LARGEST_SIZE
 class Settings:
     """conf/evaluate_photos.yaml."""
 
-    run: str
+    run: str | None
+    classifier: str | None
+    weights: str | None
     photos: str
     label: str
     out: str
@@ -28,12 +34,16 @@ class Settings:
 
     def __post_init__(self):
         require_range("size", self.size, 1, LARGEST_SIZE)
+        if (self.run is None) == (self.classifier is None):
+            raise InputError("give one network: run=FOLDER, or classifier=NAME")
+        if self.classifier and self.size:
+            raise InputError(f"size={self.size} is for run=FOLDER: a classifier has a size of its own, leave it out")
 
 
 def main(settings: Settings) -> None:
     device = choose_device(settings.device)
-    network = load_network(Path(settings.run), settings.size)
-    model = MixedPrecision(network.module.to(device), choose_precision(settings.precision, device))
+    network = _load(settings)
+    model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
     with sole_writer("out", out):
         summary = evaluate_photographs(
@@ -48,6 +58,12 @@ def main(settings: Settings) -> None:
         )
     print(format_summary(summary))
     print(f"\ntable, scores and picture: {settings.out}")
+
+
+def _load(settings: Settings) -> Classifier:
+    if settings.run is None:
+        return load_classifier(settings.classifier, settings.weights)
+    return load_run(settings.run, settings.weights, settings.size)
 
 
 if __name__ == "__main__":

@@ -24,11 +24,10 @@ from train.laboratory.settings import LabSettings
 from train.laboratory.shots import Shot, draw_shots
 from train.laboratory.studio import photograph
 from train.outputs import writable_folder
-from train.photographs.folder import FOREIGN, TABLE
+from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
 from train.run_folder import LOCK, sole_writer
 from train.settings import read_object
 
-DESCRIPTION = "lab.json"
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may decide a pixel
 COLUMNS = ("path", "source_tag", "light", "mesh", "brightness")
 

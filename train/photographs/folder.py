@@ -18,6 +18,7 @@ from train.classes import class_index, nearest_class
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 FOREIGN = "other_"  # starts the name of a folder whose class the model lacks
 TABLE = "photos.csv"
+DESCRIPTION = "lab.json"  # of a folder that scripts/lab.py made
 SEPARATOR = ";"  # between the sources in a cell of its look_alikes
 SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training) to skip them"
 
@@ -64,7 +65,9 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
 
 def left_out(folder: Path) -> list[PurePosixPath]:
     """The files of a folder, as `find_photographs` searches it, that are of no kind that is read; sorted."""
-    return sorted(path for path in _files(folder) if not _is_picture(folder, path) and str(path) != TABLE)
+    return sorted(
+        path for path in _files(folder) if not _is_picture(folder, path) and str(path) not in (TABLE, DESCRIPTION)
+    )
 
 
 def _picture_paths(folder: Path) -> list[PurePosixPath]:

@@ -100,6 +100,7 @@ def test_a_folder_that_cannot_be_read_is_refused_by_name(tmp_path, monkeypatch):
 
 def test_what_is_of_no_kind_that_is_read_is_told(tmp_path):
     touch(tmp_path, "orange/a.JFIF", "orange/b.HEIC", "orange/c.avif", "orange/.d.heic", "photos.csv", "notes.txt")
+    touch(tmp_path, "lab.json")  # the project's own
     os.mkfifo(tmp_path / "orange" / "pipe.jpg")  # opened, it would be waited for
     (tmp_path / "photos.csv").write_text("path,source_tag\n")
     assert [str(photograph.path) for photograph in find_photographs(tmp_path, CLASSES, "orange")] == ["orange/a.JFIF"]
