@@ -1,12 +1,17 @@
+import importlib.metadata
 import importlib.util
 import os
+import re
 import shutil
+import socket
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("renderer", "augment", "train", "conf")
@@ -22,6 +27,33 @@ def test_every_folder_of_modules_is_a_package_that_is_installed():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     with_modules = {Path(name).parent.as_posix().replace("/", ".") for name in sources() if name.endswith(".py")}
     assert set(settings["packages"]) == with_modules
+
+
+def dependencies() -> list[Requirement]:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return [Requirement(line) for line in project["dependencies"]]
+
+
+def test_the_versions_that_are_tested_as_the_oldest_are_the_lower_bounds():
+    lines = [line for line in (ROOT / "tests" / "oldest.txt").read_text().splitlines() if not line.startswith("#")]
+    oldest = dict(line.split("==") for line in lines)
+    assert oldest.keys() == {each.name for each in dependencies()}
+    for each in dependencies():
+        (lower,) = (Version(bound.version) for bound in each.specifier if bound.operator == ">=")
+        assert Version(oldest[each.name]).release[: len(lower.release)] == lower.release, each
+
+
+@pytest.mark.parametrize("name", [each.name for each in dependencies()])
+def test_what_is_needed_is_under_a_licence_that_binds_no_user(name):
+    about = importlib.metadata.metadata(name)
+    classifiers = [line for line in about.get_all("Classifier", []) if line.startswith("License")]
+    words = " ".join([about.get("License-Expression") or "", (about.get("License") or "")[:100], *classifiers])
+    assert re.search(r"MIT|BSD|Apache|Python Software Foundation|MPL-2.0", words) and "GPL" not in words
+
+
+def test_the_tests_themselves_reach_no_network():
+    with pytest.raises(AssertionError, match="without the user's word"), socket.socket() as door:
+        door.connect(("192.0.2.1", 80))  # reserved for documentation
 
 
 @pytest.fixture(scope="module")

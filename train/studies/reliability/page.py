@@ -1,0 +1,55 @@
+"""The page: what was tried at which door, and what came of it."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from train.studies.page import joined, versions
+from train.tables import markdown
+
+INTRODUCTION = """\
+# Reliability
+
+Made by `{command}`. {versions} Of {all:,} hostile inputs {tried:,} were tried, drawn at random, each at a
+command in a process and a folder of its own, with good files that the project makes for everything else.
+
+- *Used*: exit status 0, where what is meant can be clear. *Refused*: exit status 2 and one sentence that names the file
+  or the key, or Hydra's own words of an override that it cannot read, with status 1.
+- *Mishandled*: a traceback, another status, a hang of {patience} s, code from an input that ran, damage that was taken
+  without a word, or a sentence that names neither file nor key. Each of the last column is listed below.
+"""
+NO_FAULTS = "Nothing was mishandled."
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """status: see `Ending`. fault: None where all was as it should be."""
+
+    door: str
+    kind: str
+    name: str
+    status: int | None
+    fault: str | None
+
+
+def failures(outcomes: Iterable[Outcome]) -> list[str]:
+    return [f"{each.door}: {each.name!r}: {each.fault}" for each in outcomes if each.fault]
+
+
+def page(outcomes: Sequence[Outcome], command: str, number: int, patience: float) -> str:
+    """Markdown. number: of the inputs there are."""
+    introduction = INTRODUCTION.format(
+        command=command, versions=versions(), tried=len(outcomes), all=number, patience=patience
+    )
+    pairs = list(dict.fromkeys((each.door, each.kind) for each in outcomes))
+    rows = [_row(*pair, [each for each in outcomes if (each.door, each.kind) == pair]) for pair in pairs]
+    total = _row("all", "", outcomes)
+    table = markdown(["door", "kind", "tried", "used", "refused", "mishandled"], [*rows, total])
+    faults = failures(outcomes)
+    listed = "\n".join(f"- {fault}" for fault in faults) if faults else NO_FAULTS
+    return joined([introduction, table, "## Mishandled", listed])
+
+
+def _row(door: str, kind: str, outcomes: Sequence[Outcome]) -> list[str | int]:
+    fates = Counter("mishandled" if each.fault else "refused" if each.status else "used" for each in outcomes)
+    return [door, kind, len(outcomes), *(fates[fate] for fate in ("used", "refused", "mishandled"))]

@@ -1,0 +1,139 @@
+"""Every trial: a door, what is hostile about it, and what may come of it."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from train.cli import USER_ERROR
+from train.studies.reliability.damages import damages
+from train.studies.reliability.doors import DOORS, Door, given
+from train.studies.reliability.edits import CODE_RAN
+from train.studies.reliability.process import USUAL, Ending, Surroundings, conduct
+
+NAMES = [
+    *("2024", "1e3", "true", "null", "2024-01-01", "1.10", "0x10", "a b", " a", "a,b", "[a]", "{a}", "(a)", "-a", "~a"),
+    *("a=b", "=1+1", "$a", "${oc.env:HOME}", "a'b", 'a"b', "a\\b", "a:b", "a;b", "#a", "%s", "*", "\x1b[31m", "a\nb"),
+    *("a" * 200, "a" * 300, "ünï", "日本", "a\udcffb"),
+]
+VALUES = ["-1", "0", "0.5", "nan", "inf", "1e30", "1000000000000", "abc", "[]", "{a: 1}", "null", "''"]
+CROWDED = {"no room": Surroundings(largest=1000), "output to a full disk": Surroundings(output="/dev/full")}
+NOWHERE = ("background.png", "background.png/a", "/proc/none", "/dev/full", "a" * 300)  # where no folder can be made
+HYDRA = "Set the environment variable HYDRA_FULL_ERROR=1"  # ends what Hydra says of its own, in more lines than one
+
+
+@dataclass(frozen=True)
+class Trial:
+    """prepare: what makes a copy of the corpus hostile. named: words, one of which a refusal must have.
+
+    refused: whether no other outcome is right.
+    """
+
+    door: Door
+    kind: str
+    name: str
+    command: Sequence[str]
+    named: tuple[str, ...] = ()
+    refused: bool = False
+    prepare: Callable[[Path], object] = lambda folder: None
+    around: Surroundings = USUAL
+
+    def conduct(self, corpus: Path, folder: Path) -> tuple[Ending, str | None]:
+        """How it ended, in a copy of the corpus, and what is wrong with that."""
+        shutil.copytree(corpus, folder, symlinks=True)
+        self.prepare(folder)
+        ending = conduct(self.command, folder, self.around)
+        return ending, "code ran" if (folder / CODE_RAN).exists() else self.fault(ending)
+
+    def fault(self, ending: Ending) -> str | None:
+        """What is wrong with an outcome; None for a success and for a refusal as it should be."""
+        lines = [
+            line for line in ending.errors.splitlines() if "found in sys.modules" not in line
+        ]  # runpy's, of a fork
+        match ending.status:
+            case None:
+                return "hung"
+            case 0 if self.refused:
+                return "taken"
+            case 0:
+                return None
+            case 1 if lines and lines[-1].startswith((HYDRA, "Nearest")) and "Traceback" not in ending.errors:
+                return None
+            case status if status != USER_ERROR or len(lines) != 1 or not lines[0].startswith("error: "):
+                return f"status {status}: {' | '.join(lines[-2:])}"
+        if self.named and not any(word in lines[0] for word in self.named):
+            return f"neither {' nor '.join(self.named)} is named: {lines[0]}"
+        return None
+
+
+def all_trials(door: Door) -> Iterator[Trial]:
+    yield from file_trials(door)
+    yield from name_trials(door)
+    if door is next(each for each in DOORS if each.config == door.config):
+        yield from setting_trials(door)
+    yield from place_trials(door)
+
+
+def file_trials(door: Door) -> Iterator[Trial]:
+    """Every damage of every file that it reads."""
+    for key, files in door.inputs.items():
+        for file in files:
+            command = door.command(key.replace("{}", given(file)))
+            named = (file.rpartition("/")[2], given(file), key.partition("=")[0])
+            for damage in damages(file):
+
+                def prepare(folder: Path, edit=damage.edit, file=file) -> None:
+                    edit(folder / file)
+
+                yield Trial(door, damage.kind, f"{file}: {damage.name}", command, named, damage.refused, prepare)
+
+
+def name_trials(door: Door) -> Iterator[Trial]:
+    """Odd names of good files."""
+    for key, files in door.inputs.items():
+        good = given(files[0])
+        for name in NAMES:
+            odd = name + Path(good).suffix
+
+            def prepare(folder: Path, good=good, odd=odd) -> None:
+                if len(odd) < 256:
+                    os.rename(folder / good, folder / odd)
+
+            yield Trial(door, "odd names", f"{key}: {name!r}", door.command(key.replace("{}", odd)), prepare=prepare)
+
+
+def setting_trials(door: Door) -> Iterator[Trial]:
+    """Values that each setting may not have been meant for."""
+    under_hydra = GlobalHydra.instance().is_initialized()
+    with nullcontext() if under_hydra else initialize_config_module("conf", version_base="1.3"):
+        groups = [override for override in door.arguments if override.startswith(("data=", "attack=", "augment="))]
+        keys = list(_leaves(compose(door.config, groups)))
+    for key in [*keys, "unknown"]:
+        for value in VALUES:
+            command = door.command(f"{key}={value}")
+            yield Trial(door, "settings", f"{key}={value}", command, (key, key.rpartition(".")[2], "has no class"))
+
+
+def place_trials(door: Door) -> Iterator[Trial]:
+    """Outputs without a place, and disks without room."""
+    for name, around in CROWDED.items():
+        yield Trial(door, "outputs", name, door.command(), around=around)
+    if door.out:
+        key = next(override.partition("=")[0] for override in door.arguments if f"={door.out}" in override)
+        for place in NOWHERE:
+            yield Trial(door, "outputs", f"{key}={place}", door.command(f"{key}={place}"), (key,), refused=True)
+
+
+def _leaves(node: DictConfig, prefix: str = "") -> Iterator[str]:
+    for key in node:
+        child = node._get_node(key)
+        if OmegaConf.is_dict(child) and not child._is_none():
+            yield from _leaves(child, f"{prefix}{key}.")
+        else:
+            yield prefix + key
