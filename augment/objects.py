@@ -1,6 +1,6 @@
 """What a scene shows: meshes from files or solids, each with the name of its class."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, load_mesh, normalise
@@ -41,6 +41,14 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
     InputError: as `load_mesh` and `solid`.
     """
     return SceneObject(item.label, subdivide(_load(item), vertices), item.gain, item.mesh)
+
+
+def another_individual(item: SceneObject, seed: int) -> SceneObject:
+    """Another of the same kind, where the object is a solid named without a seed, and otherwise the object itself."""
+    kind, *rest = item.name.split(":")
+    if kind != "solid" or len(rest) != 1:
+        return item
+    return replace(item, mesh=normalise(solid(rest[0], seed)))
 
 
 def _load(item: ObjectSettings) -> Mesh:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -77,7 +77,8 @@ class Scene:
     Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
     (`OperatorStack`), equal views share one, and what a background adds to an image is kept. Where vertices move, their
     view is rasterised anew each time. light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are
-    those of the images. basis: what lights are coefficients of; 49 harmonics, unless another is given.
+    those of the images. basis: what lights are coefficients of; 49 harmonics, unless another is given. taken: what a
+    camera makes of rendered images (A, V, 3, size, size) of examples (A,), differentiable; see `Snapshot`.
     """
 
     def __init__(
@@ -90,13 +91,14 @@ class Scene:
         backend: Backend,
         operators: OperatorCache | None = None,
         basis: Basis = HARMONICS,
+        taken: Callable[[Tensor, Tensor], Tensor] | None = None,
     ):
         if light.shape[-2:] != (basis.size, 3):
             raise InputError(f"light of shape {tuple(light.shape)} is not of {basis}: give {basis.size} rows")
         if not (backgrounds.min() >= 0 and backgrounds.max() <= 1):
             raise InputError("scene.backgrounds: give values in [0, 1]")
         self.objects, self.examples = list(objects), list(examples)
-        self.settings, self.backend, self.basis = settings, backend, basis
+        self.settings, self.backend, self.basis, self._taken = settings, backend, basis, taken
         self.backgrounds = backgrounds.flatten(2).to(light)
         self.lights = light.expand(len(examples), *light.shape[-2:])
         self.views = len(self.examples[0].cameras)  # per example
@@ -145,16 +147,27 @@ class Scene:
         examples = [Example(0, tuple(views), index) for index, views in enumerate(cameras)]
         return cls([SceneObject("", mesh, gain)], examples, backgrounds, light, settings, backend, operators)
 
-    def with_rows(
-        self, examples: Sequence[Example], backgrounds: Tensor | None = None, operators: OperatorCache | None = None
-    ) -> Scene:
-        """The same objects in other rows, as many as before; None for the same backgrounds and operators' cache."""
-        behind = self.backgrounds.unflatten(2, (self.settings.size, -1)) if backgrounds is None else backgrounds
-        kept = operators or self._cache
-        return Scene(self.objects, examples, behind, self.lights, self.settings, self.backend, kept, self.basis)
+    def with_rows(self, examples: Sequence[Example], **changed) -> Scene:
+        """Other rows, as many as before, of the same scene but for what is given: keywords are the constructor's."""
+        same = {
+            "objects": self.objects,
+            "backgrounds": self.images_behind,
+            "light": self.lights,
+            "settings": self.settings,
+            "backend": self.backend,
+            "operators": self._cache,
+            "basis": self.basis,
+            "taken": self._taken,
+        }
+        return Scene(examples=examples, **same | changed)
 
     def __len__(self) -> int:
         return len(self.examples)
+
+    @property
+    def images_behind(self) -> Tensor:
+        """The backgrounds as they were given, (B, 3 or 1, size, size)."""
+        return self.backgrounds.unflatten(2, (self.settings.size, -1))
 
     @cached_property
     def cameras(self) -> list[tuple[OrthographicCamera, ...]]:
@@ -195,6 +208,7 @@ class Scene:
         covered = [develop_composite(layer.composite, self.settings.encoding) for layer in layers]
         images = _Placed.apply(canvas, [(layer.rows, layer.pixels) for layer in layers], *covered)
         images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
+        images = images if self._taken is None else self._taken(images, examples)
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
 
     @torch.no_grad()

@@ -1,17 +1,24 @@
-"""Rows drawn afresh: where a mesh lies in the frame, how large, how bright, and before which image."""
+"""Rows drawn afresh: which individual is shown, from where, in which light, before what, and through which camera."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from augment.objects import another_individual
 from augment.scene import Example, Scene
+from augment.snapshot import SnapshotSettings, draw_snapshot
 from renderer.cache import OperatorCache
-from renderer.errors import FACTOR, InputError
+from renderer.errors import FACTOR, InputError, require_range
+from renderer.harmonics import irradiance_basis, live_coefficients
+from renderer.image import clamp, decode, encode
 from renderer.image_files import SUFFIXES, read_image
+from renderer.lights import load_light
+from renderer.transfer import DEGREE
 
 UNCHANGED = (1.0, 1.0)
 
@@ -22,17 +29,26 @@ class VariationSettings:
 
     place: the mesh's middle is moved by at most this share of the frame's width, to either side and up and down.
     scale, exposure: [least, most] that its size in the frame and the light are multiplied by, uniform in the logarithm.
-    backgrounds: a folder of images, each example before one of them.
+    backgrounds: a folder of images, each example before one of them. individuals: every solid that is named without a
+    seed is another of its kind. turn: degrees that the camera goes around the mesh, at most, to either side and up and
+    down. lights: each example is in one of these, as `load_light` takes them. lit: a background is a wall that faces
+    the camera in the example's light. snapshot: what a camera makes of the pictures.
     """
 
     place: float = 0.0
     scale: list[float] = field(default_factory=lambda: list(UNCHANGED))
     exposure: list[float] = field(default_factory=lambda: list(UNCHANGED))
     backgrounds: str | None = None
+    individuals: bool = False
+    turn: float = 0.0
+    lights: list[str] = field(default_factory=list)
+    lit: bool = False
+    snapshot: SnapshotSettings = field(default_factory=SnapshotSettings)
 
     def __post_init__(self):
         if not 0 <= self.place <= 1:
             raise InputError(f"augment.vary.place={self.place} must be a share of the frame's width, from 0 to 1")
+        require_range("augment.vary.turn", self.turn, 0, 180)
         for name in ("scale", "exposure"):
             limits = getattr(self, name)
             if len(limits) != 2 or not 1 / FACTOR <= limits[0] <= limits[1] <= FACTOR:
@@ -43,12 +59,13 @@ class VariationSettings:
     @property
     def moves(self) -> bool:
         """Whether views change, which then are rasterised in every round."""
-        return self.place > 0 or tuple(self.scale) != UNCHANGED
+        return self.place > 0 or tuple(self.scale) != UNCHANGED or self.turn > 0 or self.individuals
 
     @property
     def varies(self) -> bool:
         """Whether anything is drawn at all."""
-        return self.moves or tuple(self.exposure) != UNCHANGED or self.backgrounds is not None
+        of_light = tuple(self.exposure) != UNCHANGED or self.lights or self.lit
+        return bool(self.moves or of_light or self.backgrounds is not None or self.snapshot.changes)
 
 
 def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
@@ -64,12 +81,26 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> S
         replace(_moved(row, *moved, size) if settings.moves else row, exposure=row.exposure * bright)
         for row, moved, size, bright in zip(scene.examples, place.tolist(), scale, exposure, strict=True)
     ]
-    backgrounds = None
+    changed = {}
     if settings.backgrounds is not None:
-        backgrounds = _images(Path(settings.backgrounds), len(scene), scene.settings.size, draws)
+        changed["backgrounds"] = _images(Path(settings.backgrounds), len(scene), scene.settings.size, draws)
         rows = [replace(row, background=index) for index, row in enumerate(rows)]
-    # Views that never come again are not worth a place on the disk.
-    return scene.with_rows(rows, backgrounds, OperatorCache() if settings.moves else None)
+    if settings.turn:
+        angles = _angles(settings.turn, len(rows), draws)
+        rows = [_turned(row, *each) for row, each in zip(rows, angles, strict=True)]
+    if settings.individuals:
+        seeds = torch.randint(2**31, (len(scene.objects),), generator=draws).tolist()
+        changed["objects"] = [another_individual(item, seed) for item, seed in zip(scene.objects, seeds, strict=True)]
+    if settings.lights:
+        which = torch.randint(len(settings.lights), (len(rows),), generator=draws)
+        changed["light"] = torch.stack([load_light(light) for light in settings.lights])[which].to(scene.lights)
+    if settings.snapshot.changes:
+        snapshot = draw_snapshot(settings.snapshot, len(rows), scene.settings, draws)
+        changed["taken"] = snapshot.to(scene.lights.device)
+    if settings.moves:  # views that never come again are not worth a place on the disk
+        changed["operators"] = OperatorCache()
+    varied = scene.with_rows(rows, **changed)
+    return _with_lit_walls(varied) if settings.lit else varied
 
 
 def _between(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
@@ -92,3 +123,29 @@ def _images(folder: Path, count: int, size: int, draws: torch.Generator) -> Tens
         raise InputError(f"augment.vary.backgrounds={folder} holds no image: give a folder of .jpg or .png files")
     chosen = torch.randint(len(files), (count,), generator=draws).tolist()
     return torch.stack([read_image(files[index], size) for index in chosen])
+
+
+def _angles(most: float, count: int, draws: torch.Generator) -> list[list[float]]:
+    """(count, 2) in radians, uniform, `most` in degrees."""
+    return (math.radians(most) * (2 * torch.rand(count, 2, generator=draws, dtype=torch.float64) - 1)).tolist()
+
+
+def _turned(row: Example, polar: float, azimuth: float) -> Example:
+    def turned(camera):
+        return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
+
+    return replace(row, cameras=tuple(turned(camera) for camera in row.cameras))
+
+
+def _with_lit_walls(scene: Scene) -> Scene:
+    """Each row before its own background, times the irradiance of a surface that faces the row's first camera."""
+    towards = torch.from_numpy(np.stack([row.cameras[0].axes()[2] for row in scene.examples]))
+    exposures = torch.tensor([row.exposure for row in scene.examples])[:, None]
+    live = scene.lights.cpu().double()[:, live_coefficients(DEGREE)]
+    irradiance = torch.einsum("ek,ekc->ec", irradiance_basis(towards, DEGREE), live) * exposures
+    images = scene.images_behind[[row.background for row in scene.examples]]
+    encoding = scene.settings.encoding
+    lit = encode(clamp(decode(images, encoding) * irradiance.to(images)[:, :, None, None]), encoding)
+    return scene.with_rows(
+        [replace(row, background=index) for index, row in enumerate(scene.examples)], backgrounds=lit
+    )

@@ -1,22 +1,27 @@
+import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 from torch import Tensor, nn
 
 from augment.backgrounds import load_background, load_backgrounds
-from augment.objects import ObjectSettings, load_object
+from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.phases import Phases
 from augment.scene import Scene
 from augment.seeding import generator
 from augment.service import AugmentationService, AugmentationSettings
+from augment.snapshot import SnapshotSettings
 from augment.variation import VariationSettings, vary
 from renderer.camera import ring
 from renderer.errors import InputError
-from renderer.image import PictureSettings
-from renderer.lights import ambient
+from renderer.image import PictureSettings, decode
+from renderer.lights import ambient, probe
+from renderer.mesh import Mesh
 from renderer.visibility import choose
 
 SIZE = 48
@@ -90,6 +95,55 @@ def test_backgrounds_come_from_the_images_of_a_folder(scene, tmp_path):
     assert all(sum(row) == 1 for row in shown) and len({tuple(row) for row in shown}) == 2
 
 
+def test_a_turn_moves_the_camera_at_most_so_far_around_the_mesh(scene):
+    def angles(of: Scene) -> Tensor:
+        return torch.tensor([[row.cameras[0].polar, row.cameras[0].azimuth] for row in of.examples])
+
+    offsets = torch.rad2deg(angles(drawn(scene, turn=40.0)) - angles(scene)).abs()
+    assert (offsets <= 40).all() and (offsets.amax(0) > 25).all()
+
+
+def test_individuals_are_drawn_of_solids_without_a_seed_alone(scene):
+    kinds = ["solid:plate", "solid:plate:0", "solid:orange"]
+    objects = [load_object(ObjectSettings(name, name)) for name in kinds]
+    settings, row = PictureSettings(SIZE, samples=2), scene.examples[0]
+    rows = [replace(row, object=index) for index in range(3)]
+    mixed = Scene(objects, rows, load_backgrounds([0.0], SIZE), LIGHT, settings, choose("software"))
+    first, second = (drawn(mixed, seed, individuals=True).objects for seed in (0, 1))
+    assert first[1] is objects[1] and [item.label for item in first] == kinds
+    for index in (0, 2):
+        colors = [each[index].mesh.corner_colors for each in (objects, first, second)]
+        assert not any(np.array_equal(a, b) for a, b in itertools.combinations(colors, 2))
+
+
+def test_lights_are_shared_out_among_the_examples(scene):
+    varied = drawn(scene, lights=["eucalyptus", "st_peters"])
+    choices = torch.stack([probe("eucalyptus"), probe("st_peters")])
+    counts = (varied.lights[:, None] == choices).flatten(2).all(2).sum(0)
+    assert counts.sum() == 12 and (counts > 0).all()
+
+
+def test_a_lit_background_is_a_wall_that_faces_the_camera():
+    """It looks as the middle of a white ball does, and is white or grey in the same light."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    settings = PictureSettings(SIZE, samples=2, encoding="srgb", normals="smooth")
+    white = SceneObject("ball", Mesh.plain(ball.vertices, ball.faces, (1.0, 1.0, 1.0)))
+    behind = load_backgrounds([1.0, 0.5], SIZE)
+    balls = Scene.grid([white], ring(3, 2.5), behind, probe("grace"), settings, choose("software"))
+    seen = decode(images(drawn(balls, lit=True, exposure=[0.3, 0.6])), "srgb")
+    middle, corner = seen[:, :, SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1], seen[:, :, 0, 0]
+    middle = middle.mean((2, 3))
+    white, grey = corner[::2], corner[1::2] / decode(torch.tensor(0.5), "srgb")
+    torch.testing.assert_close(white, middle[::2], rtol=0.01, atol=0)  # the middle is four pixels wide
+    torch.testing.assert_close(grey, middle[1::2], rtol=0.01, atol=0)
+
+
+def test_a_camera_takes_what_the_scene_renders(scene):
+    darker = images(drawn(scene, snapshot=SnapshotSettings(white_balance=1.0))) / images(scene)
+    gains = darker.flatten(2).nanmean(2)
+    assert 0.5 <= gains.min() < 0.7 and 1.4 < gains.max() <= 2.001
+
+
 def test_each_epoch_draws_its_own_rows_and_repeats_them(scene):
     vary_all = VariationSettings(place=0.1, scale=[0.8, 1.2], exposure=[0.5, 2.0])
     settings = AugmentationSettings(arm="random", examples=12, vary=vary_all)
@@ -108,6 +162,7 @@ def test_each_epoch_draws_its_own_rows_and_repeats_them(scene):
         ({"scale": [2.0, 1.0]}, r"augment\.vary\.scale"),
         ({"exposure": [0.0, 1.0]}, r"augment\.vary\.exposure=\[0\.0, 1\.0\]: give \[least, most\], both from 1e-05 to"),
         ({"exposure": [1.0, math.inf]}, r"augment\.vary\.exposure"),
+        ({"turn": 200.0}, r"augment\.vary\.turn"),
     ],
 )
 def test_variations_that_are_none_are_refused(settings, message):

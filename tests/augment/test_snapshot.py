@@ -1,0 +1,83 @@
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from augment.seeding import generator
+from augment.snapshot import Snapshot, SnapshotSettings, draw_snapshot
+from renderer.errors import InputError
+from renderer.image import PictureSettings, decode, encode
+
+SIZE, COUNT = 12, 40
+IMAGES = torch.rand(COUNT, 2, 3, SIZE, SIZE, generator=generator(0), dtype=torch.float64)
+EVERY = torch.arange(COUNT)
+
+
+def taken(images=IMAGES, examples=EVERY, encoding="srgb", **settings) -> torch.Tensor:
+    picture = PictureSettings(SIZE, encoding=encoding)
+    return draw_snapshot(SnapshotSettings(**settings), COUNT, picture, generator(1))(images, examples)
+
+
+def test_a_camera_that_changes_nothing_gives_the_render():
+    torch.testing.assert_close(taken(), IMAGES, rtol=0, atol=1e-6)  # the draws are single precision
+    assert not SnapshotSettings().changes and SnapshotSettings(noise=0.1).changes
+
+
+def test_a_pattern_multiplies_the_light_of_object_and_background_alike():
+    """Beneath it, a share of the scene's own light is left."""
+    ratio = decode(taken(patterns=1.0, ambient=[0.2, 0.2]), "srgb") / decode(IMAGES, "srgb")
+    torch.testing.assert_close(ratio[:, 0], ratio[:, 1], rtol=1e-5, atol=0)
+    assert 0.2 - 1e-5 <= ratio.min() < 0.25 and 0.99 < ratio.max() <= 1 + 1e-5
+    untouched = (taken(patterns=0.5) == taken()).flatten(1).all(1).double().mean()
+    assert 0.3 < untouched < 0.7
+
+
+def test_white_balance_is_a_gain_of_each_channel_in_stops():
+    dark = encode(decode(IMAGES, "srgb") / 4, "srgb")
+    stops = (decode(taken(dark, white_balance=1.0), "srgb") / decode(dark, "srgb")).log2().flatten(3)
+    torch.testing.assert_close(stops, stops[..., :1].expand_as(stops), rtol=0, atol=1e-4)
+    assert -1.001 < stops.min() < -0.8 and 0.8 < stops.max() < 1.001
+
+
+def test_a_blur_is_scipys_gaussian_of_the_linear_light():
+    blur = torch.linspace(0.3, 1.2, COUNT)
+    camera = Snapshot(torch.ones(COUNT, 3, 1, 1), blur, torch.zeros(COUNT, 3, SIZE, SIZE), "srgb")
+    light = decode(camera(IMAGES, EVERY), "srgb")
+    for index in range(0, COUNT, 13):
+        sharp, sigma = decode(IMAGES[index], "srgb").numpy(), (0, 0, float(blur[index]), float(blur[index]))
+        expected = gaussian_filter(sharp, sigma, mode="nearest", radius=(0, 0, 3, 3))
+        torch.testing.assert_close(light[index], torch.from_numpy(expected), rtol=0, atol=1e-5)
+
+
+def test_noise_has_the_deviation_that_was_drawn_for_the_picture():
+    grey = torch.full_like(IMAGES, 0.5)
+    deviations = (taken(grey, noise=0.1) - grey).flatten(1).std(1)
+    assert deviations.max() < 0.12 and deviations.min() < 0.03 and 0.035 < deviations.mean() < 0.065
+
+
+def test_examples_keep_their_own_draws_in_any_order():
+    settings = {"patterns": 1.0, "white_balance": 0.5, "blur": 1.0, "noise": 0.05}
+    some = torch.tensor([7, 3])
+    torch.testing.assert_close(taken(IMAGES[some], some, **settings), taken(**settings)[some], rtol=0, atol=1e-12)
+
+
+def test_pictures_are_differentiable_in_the_render():
+    camera = Snapshot(torch.full((1, 3, 1, 1), 0.5), torch.tensor([0.8]), torch.zeros(1, 3, 4, 4), "srgb")
+    images = 0.2 + 0.5 * IMAGES[:1, :1, :, :4, :4]
+    assert torch.autograd.gradcheck(lambda values: camera(values, torch.tensor([0])), images.requires_grad_(True))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"patterns": 1.5}, r"augment\.vary\.snapshot\.patterns"),
+        ({"blur": -1.0}, r"augment\.vary\.snapshot\.blur"),
+        ({"noise": float("nan")}, r"augment\.vary\.snapshot\.noise"),
+        (
+            {"ambient": [0.5, 0.2]},
+            r"augment\.vary\.snapshot\.ambient=\[0\.5, 0\.2\]: give \[least, most\], from 0 to 1",
+        ),
+    ],
+)
+def test_settings_beyond_their_range_are_refused(settings, message):
+    with pytest.raises(InputError, match=message):
+        SnapshotSettings(**settings)
