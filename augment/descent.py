@@ -14,6 +14,8 @@ from augment.model_state import as_found
 from augment.phases import Phases
 from renderer.errors import require_range
 
+NO_CLASS = -1  # in place of a class that does not count
+
 
 @dataclass
 class DescentSettings:
@@ -53,8 +55,9 @@ class Problem(Protocol):
 class Goal:
     """Per example and view, the class whose confidence falls and, where there is a target, the one whose rises.
 
-    decrease: (E, V) int64. increase: the same, or None for an attack that takes any error. An example is fooled where
-    every view is given its target, or without one, anything but `decrease`.
+    decrease: (E, V) int64, NO_CLASS where the target alone counts. increase: the same, or None for an attack that takes
+    any error, as it does where it is NO_CLASS. An example is fooled where every view is given its target, or without
+    one, anything but `decrease`.
     """
 
     decrease: Tensor
@@ -66,7 +69,10 @@ class Goal:
 
     def reached(self, predicted: Tensor) -> Tensor:
         """(E,) bool, for predicted classes (E, V)."""
-        return (predicted != self.decrease if self.increase is None else predicted == self.increase).all(1)
+        erred = predicted != self.decrease
+        if self.increase is None:
+            return erred.all(1)
+        return torch.where(self.increase == NO_CLASS, erred, predicted == self.increase).all(1)
 
 
 @dataclass(frozen=True)
@@ -125,11 +131,11 @@ def adversarial_cost(logits: Tensor, decrease: Tensor, increase: Tensor | None =
     """-CE(f, L_d) + CE(f, L_i) per example, the paper's equation 1, which an attack decreases. (E,)
 
     logits: (E, classes). decrease: (E,) int64, the classes whose confidence falls. increase: (E,) int64, those whose
-    confidence rises; None attacks without a target.
+    confidence rises; None attacks without a target. NO_CLASS in either leaves its term out.
     """
-    cost = -F.cross_entropy(logits, decrease, reduction="none")
+    cost = -F.cross_entropy(logits, decrease, reduction="none", ignore_index=NO_CLASS)
     if increase is not None:
-        cost = cost + F.cross_entropy(logits, increase, reduction="none")
+        cost = cost + F.cross_entropy(logits, increase, reduction="none", ignore_index=NO_CLASS)
     return cost
 
 

@@ -11,7 +11,8 @@ from torch.utils.data import Dataset
 from augment import processes
 from augment.attacks.settings import AttackSettings
 from augment.build import Shown, build_scene
-from augment.descent import AttackResult, Goal, Part, descend_repeatedly
+from augment.descent import NO_CLASS, AttackResult, Goal, Part, descend_repeatedly
+from augment.labels import is_right, label_loss
 from augment.memory import BatchSize
 from augment.model_state import as_found
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings, check_step
@@ -96,6 +97,8 @@ class AugmentationSettings:
             for name, settings in self.attack.kinds.items():
                 if name != Lighting.name and settings.radius is None:
                     raise InputError(f"augment.attack.{name}.radius=null has no random draw: set a radius")
+        if self.lights == "continue" and self.vary.individuals:
+            raise InputError("augment.lights=continue goes on with the last shapes: set augment.vary.individuals=false")
 
     @property
     def renders(self) -> bool:
@@ -132,11 +135,24 @@ class AugmentationService:
     Where several processes train together, each attacks its share of the examples, and all get all renders.
     """
 
-    def __init__(self, settings: AugmentationSettings, scene: Scene | None, labels: Tensor, seed: int, phases: Phases):
-        """scene: None where nothing is rendered; one view per example. labels: (E,) int64 classes."""
+    def __init__(
+        self,
+        settings: AugmentationSettings,
+        scene: Scene | None,
+        labels: Tensor,
+        seed: int,
+        phases: Phases,
+        label: int | None = None,
+    ):
+        """scene: None where nothing is rendered; one view per example. labels: (E,) int64, see `augment.labels`.
+
+        label: the class that is to be told from look-alikes, the examples of all other labels: attacks light these
+        towards it. None: every attack leads away from the example's own class.
+        """
         self.settings = settings
         self._scene = scene
         self._labels = labels
+        self._label = label
         self._seed = seed
         self._phases = phases
         self._continued: Tensor | None = None
@@ -207,13 +223,13 @@ class AugmentationService:
             batches = BatchSize(self.settings.attack.batch_size).map(lambda part: model(images[part]), len(images))
             logits = torch.cat(list(batches))
         diagnostics = {
-            "fooled": _mean(logits.argmax(1) != self._labels),
-            "loss": _mean(nn.functional.cross_entropy(logits, self._labels)),
+            "fooled": _mean(~is_right(logits.argmax(1), self._labels)),
+            "loss": _mean(label_loss(logits, self._labels)),
         }
         return Renders(images, self._labels, diagnostics | _changes(problem, values))
 
     def _adversarial(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
-        attack, goal = self.settings.attack, Goal(self._labels[:, None])
+        attack, goal = self.settings.attack, self._goal()
         mine = processes.share(len(problem.start)).to(problem.start.device)
         part = Part(problem, mine, self._start(problem, number)[mine])
         draws = generator(self._seed, number, "restart")
@@ -224,6 +240,13 @@ class AugmentationService:
             self._continued = result.values
         diagnostics = self._attack_diagnostics(result) | _changes(problem, result.values)
         return Renders(result.images[:, 0], self._labels, diagnostics)
+
+    def _goal(self) -> Goal:
+        if self._label is None:
+            return Goal(self._labels[:, None])
+        decrease = torch.where(self._labels < 0, NO_CLASS, self._labels)
+        increase = torch.where(self._labels == self._label, NO_CLASS, self._label)
+        return Goal(decrease[:, None], increase[:, None])
 
     def _start(self, problem: Perturbation, number: int) -> Tensor:
         if self._continued is not None:

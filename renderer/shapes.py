@@ -9,6 +9,7 @@ points with a paint of its own; a stroke starts where the one before it ended. T
 back to the axis, counter-clockwise around the solid's half section.
 """
 
+import colorsys
 from collections.abc import Callable
 from dataclasses import replace
 from difflib import get_close_matches
@@ -235,11 +236,34 @@ def ball(rng: np.random.Generator) -> Mesh:
     return Mesh.plain(0.95 * directions, sphere.faces, skin)
 
 
+def fruit(rng: np.random.Generator) -> Mesh:
+    """A made-up fruit: between a ball, a lemon and an apple, of two shades of any hue but an orange's."""
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    directions = np.array(sphere.vertices)
+    from_pole = np.arccos(np.clip(np.abs(directions[:, 2]), 0, 1))
+    length = rng.uniform(0.75, 1.35)
+    pores = _ripples(rng, directions, wavelength=0.2)
+    relief = 1 + rng.uniform(0, 0.004) * pores + rng.uniform(0, 0.03) * _ripples(rng, directions, wavelength=2.0)
+    ends = rng.uniform(0, 0.15) if length > 1 else -rng.uniform(0, 0.3)  # nipples or dimples
+    vertices = relief[:, None] * directions * [1, 1, length]
+    vertices[:, 2] += np.sign(directions[:, 2]) * ends * _bump(from_pole / 0.3)
+    hue = rng.uniform(0.14, 1.02)
+    shades = [
+        colorsys.hsv_to_rgb(np.clip(hue + turn, 0.14, 1.02) % 1, rng.uniform(0.1, 0.95), rng.uniform(0.3, 0.95))
+        for turn in (0, rng.uniform(-0.1, 0.1))
+    ]
+    weight = 0.5 + 0.3 * _ripples(rng, directions, rng.uniform(0.3, 2.0)) + 0.1 * pores
+    return Mesh.plain(0.95 * vertices / np.abs(vertices).max(), sphere.faces, _mix(*map(np.array, shades), weight))
+
+
 SOLIDS: dict[str, Callable[[np.random.Generator], Mesh]] = {
     make.__name__: make for make in (orange, apple, pear, sweet_pepper, mushroom, bottle, cup, plate, lamp, table)
 }
-# What an orange is told apart from, beside the fruit above: not in CIFAR-100, and never trained on.
-LOOK_ALIKES: dict[str, Callable[[np.random.Generator], Mesh]] = {make.__name__: make for make in (lemon, peach, ball)}
+# What an orange is told apart from, beside the fruit above: not in CIFAR-100. All but `fruit`, which is for training,
+# are kept for measuring.
+LOOK_ALIKES: dict[str, Callable[[np.random.Generator], Mesh]] = {
+    make.__name__: make for make in (lemon, peach, ball, fruit)
+}
 
 
 def _revolve(*strokes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

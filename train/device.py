@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from augment import processes
+from augment.labels import is_right, label_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.logs import console
@@ -140,15 +140,15 @@ def compiler_works(device: torch.device) -> bool:
 
 
 def training_pass(model: nn.Module, label_smoothing: float, compiled: bool) -> Callable[[Tensor, Tensor], tuple]:
-    """A function of uint8 pictures (B, 3, H, W) and labels (B,): the mean cross entropy, and how many are right.
+    """A function of uint8 pictures (B, 3, H, W) and labels (B,): the mean `label_loss`, and how many are right.
 
     compiled: torch forgets what it compiled before, since its limit counts the graphs of all runs of a process.
     """
 
     def loss_and_hits(images: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
         logits = model(to_unit(images))
-        loss = F.cross_entropy(logits, labels, label_smoothing=label_smoothing)
-        return loss, (logits.detach().argmax(1) == labels).sum()
+        loss = label_loss(logits, labels, label_smoothing).mean()
+        return loss, is_right(logits.detach().argmax(1), labels).sum()
 
     if not compiled:
         return loss_and_hits

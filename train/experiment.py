@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
 from augment.backgrounds import load_backgrounds
+from augment.labels import anything_but
 from augment.objects import load_object
 from augment.phases import Phases
 from augment.scene import Scene
@@ -47,9 +48,9 @@ from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
 from train.settings import (
     LARGEST_SIZE,
+    OTHER,
     SMALLEST_SIZE,
     ExperimentSettings,
-    read_object,
     read_settings,
     require_same_settings,
 )
@@ -191,24 +192,27 @@ def _write_config(config: DictConfig, folder: Path) -> None:
 def _build_service(
     settings: ExperimentSettings, data: DataSet, device: torch.device, phases: Phases
 ) -> AugmentationService:
-    scene, labels = None, torch.zeros(0, dtype=torch.int64)
+    scene, labels, label = None, torch.zeros(0, dtype=torch.int64), None
     if settings.augment.renders:
         with phases("operators"), first_process_first():
             scene = _build_scene(settings, data, device)
-        labels = torch.tensor([data.classes.index(label) for label in scene.labels])
-    return AugmentationService(settings.augment, scene, labels.to(device), settings.seed, phases)
+        under_study = class_index(data.classes, settings.label, "label")
+        number = {OTHER: anything_but(under_study)} | {name: index for index, name in enumerate(data.classes)}
+        labels = torch.tensor([number[name] for name in scene.labels])
+        label = under_study if settings.scene.look_alikes else None
+    return AugmentationService(settings.augment, scene, labels.to(device), settings.seed, phases, label)
 
 
 def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
     scene, renderer = settings.scene, settings.renderer
-    objects = [read_object(item, settings.label, index) for index, item in enumerate(scene.meshes)]
-    for index, item in enumerate(objects):
-        class_index(data.classes, item.label, f"label of scene.meshes[{index}]")
+    for key, item in settings.objects.items():
+        if item.label != OTHER:
+            class_index(data.classes, item.label, f"label of {key}")
     backend = choose(renderer.visibility)
     console.info("visibility: %s", backend.description)
     cache, start = OperatorCache(cache_folder(renderer.cache)), time.perf_counter()
     built = Scene.grid(
-        [load_object(item) for item in objects],
+        [load_object(item) for item in settings.objects.values()],
         ring(settings.views, scene.field_of_view),
         load_backgrounds(scene.backgrounds, data.size),
         (load_light(scene.light) * scene.exposure).to(device),

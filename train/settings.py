@@ -22,6 +22,7 @@ CIRCUMSTANCES = (
     *("run", "sweep", "launcher", "compare", "versions", "renderer.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
+OTHER = "other"  # in place of the class of a look-alike that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "rendered_pictures", "test")  # other sub-folders and scores of a run
 SMALLEST_SIZE, LARGEST_SIZE = 5, 4096  # pixels per side: 4 are padded by reflection
@@ -51,9 +52,12 @@ class DataSettings:
 
 @dataclass
 class SceneSettings:
-    """What is rendered. meshes: each a file, a `solid:NAME`, or a mapping with ObjectSettings' keys."""
+    """What is rendered. meshes: each a file, a `solid:NAME`, or a mapping with ObjectSettings' keys. look_alikes: the
+    same, of what `label` is to be told from; of no class, unless a mapping names one.
+    """
 
     meshes: list = field(default_factory=list)
+    look_alikes: list = field(default_factory=list)
     backgrounds: list[float] = field(default_factory=list)
     views: int | None = None
     field_of_view: float = 2.0
@@ -146,7 +150,20 @@ class ExperimentSettings:
     def views(self) -> int:
         """Views per mesh; see `count_views`."""
         scene = self.scene
-        return count_views(self.augment.examples, len(scene.meshes), len(scene.backgrounds), scene.views)
+        objects = len(scene.meshes) + len(scene.look_alikes) if scene.meshes else 0
+        return count_views(self.augment.examples, objects, len(scene.backgrounds), scene.views)
+
+    @property
+    def objects(self) -> dict[str, ObjectSettings]:
+        """By their keys, the meshes of the scene, and its look-alikes, of the class OTHER where they name none."""
+        objects = {}
+        for key, label in (("meshes", self.label), ("look_alikes", OTHER)):
+            for index, item in enumerate(getattr(self.scene, key)):
+                objects[f"scene.{key}[{index}]"] = read_object(item, label, index, f"scene.{key}")
+        for key, item in objects.items():
+            if key.startswith("scene.look_alikes") and item.label == self.label:
+                raise InputError(f"{key} is of the class {self.label}: name it in scene.meshes, or leave it out")
+        return objects
 
 
 def read_settings(kind: type, config: DictConfig, parent: str = ""):

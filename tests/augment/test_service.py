@@ -6,11 +6,13 @@ from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
 from augment.backgrounds import load_backgrounds
+from augment.labels import anything_but
 from augment.objects import ObjectSettings, load_object
 from augment.parameters import StepSettings
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
 from augment.service import AugmentationService, AugmentationSettings, RandomLights, TrainingAttackSettings
+from augment.variation import VariationSettings
 from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.image import PictureSettings
@@ -314,3 +316,35 @@ def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, mon
     resumed.load_state_dict(service.state_dict())
     assert torch.equal(resumed.regenerate(model, 1).images, service.regenerate(model, 1).images)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_look_alikes_are_lit_towards_the_label_and_the_label_away_from_it(serve, scene, model, labels):
+    """Tables are `other`, anything but a plate: there every step raises the plate's probability."""
+    other = torch.where(labels == 0, labels, anything_but(0))
+    service = AugmentationService(AugmentationSettings(attack=SHORT), scene, other, 0, Phases(), label=0)
+    renders = service.regenerate(model, 0)
+    model.eval()
+    with torch.no_grad():
+        before, after = (
+            model(images).softmax(1)[:, 0] for images in (render(scene, LIGHT.expand(100, -1, -1)), renders.images)
+        )
+    model.train()
+    rises = torch.where(labels == 0, before - after, after - before)
+    assert (rises >= -1e-5).all() and (rises[labels == 0] > 0).any() and (rises[labels != 0] > 0).any()
+    assert torch.equal(renders.labels, other)
+
+
+def test_a_look_alike_of_a_class_of_its_own_is_fooled_only_as_the_label(scene, labels, model):
+    service = AugmentationService(AugmentationSettings(attack=SHORT), scene, labels, 0, Phases(), label=0)
+    result = service.regenerate(model, 0)
+    model.eval()
+    with torch.no_grad():
+        predicted = model(result.images).argmax(1)
+    model.train()
+    fooled = torch.where(labels == 0, predicted != 0, predicted == 0)
+    assert result.diagnostics["fooled"] == pytest.approx(fooled.double().mean())
+
+
+def test_lights_that_continue_keep_their_shapes():
+    with pytest.raises(InputError, match=r"augment\.lights=continue goes on with the last shapes"):
+        AugmentationSettings(lights="continue", vary=VariationSettings(individuals=True))

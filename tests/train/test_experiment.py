@@ -16,6 +16,7 @@ import trimesh
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+from augment.labels import anything_but
 from renderer.errors import InputError
 from train import checkpoint, fit
 from train.data import DataSet
@@ -413,6 +414,21 @@ def test_meshes_of_several_classes_are_rendered_with_their_own_labels(tiny, tmp_
     assert len(renders.images.unique(dim=0)) == 12
 
 
+def test_look_alikes_follow_the_meshes_and_are_anything_but_the_label_unless_they_name_a_class(
+    tiny, tmp_path, monkeypatch
+):
+    trained = []
+    put_last = fit.put_last
+    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
+    look_alikes = "scene.look_alikes=['solid:fruit', {mesh: 'solid:pear', label: pear}]"
+    config = tiny("train.epochs=1", "scene.meshes=['solid:orange']", look_alikes, "augment.examples=6")
+    run(config, load_data(config), tmp_path)
+    (renders,) = trained
+    orange = 1
+    assert renders.labels.tolist() == [orange] * 2 + [anything_but(orange)] * 2 + [2] * 2
+    assert np.isfinite(read_metrics(tmp_path)[0]["train/loss"])
+
+
 # ---------------------------------------------------------------------------------------- what a run leaves
 
 
@@ -591,6 +607,10 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], r"scene.meshes\[0\].lable: Key 'lable'"),
         (["scene.meshes=[{label: orange}]", "augment.examples=2"], r"mesh"),
         (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
+        (
+            ["scene.look_alikes=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
+            r"scene.look_alikes\[0\] is of the class orange: name it in scene.meshes",
+        ),
         (["scene.exposure=0"], "scene.exposure=0.0 must be at least"),
         (["scene.exposure=1e30"], r"scene.exposure=1e\+30 must be at least 1e-05 and at most 100000"),
         (["scene.views=1000000000000"], "scene.views=1000000000000 must be at least 1 and at most 100000"),

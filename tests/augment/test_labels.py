@@ -1,0 +1,35 @@
+import pytest
+import torch
+from scipy.special import log_softmax, softmax
+
+from augment.labels import anything_but, is_right, label_loss
+
+EPS = torch.finfo(torch.float64).eps
+LOGITS = 3 * torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+CLASSES = torch.tensor([0, 1, 2, 3, 4, 0])
+EXCLUDED = torch.tensor([anything_but(label) for label in CLASSES.tolist()])
+
+
+def test_anything_but_a_class_costs_minus_the_logarithm_of_all_others_probability():
+    others = 1 - softmax(LOGITS.numpy(), axis=1)[range(6), CLASSES]
+    torch.testing.assert_close(label_loss(LOGITS, EXCLUDED), -torch.from_numpy(others).log(), rtol=0, atol=32 * EPS)
+    smoothed = label_loss(LOGITS, EXCLUDED, label_smoothing=0.1)
+    torch.testing.assert_close(smoothed, label_loss(LOGITS, EXCLUDED), rtol=0, atol=0)
+
+
+def test_a_class_costs_the_cross_entropy_beside_one_that_is_excluded():
+    mixed = torch.where(torch.arange(6) % 2 == 0, CLASSES, EXCLUDED)
+    expected = -torch.from_numpy(log_softmax(LOGITS.numpy(), axis=1))[torch.arange(6), CLASSES]
+    torch.testing.assert_close(label_loss(LOGITS, mixed)[::2], expected[::2], rtol=16 * EPS, atol=16 * EPS)
+
+
+def test_the_gradient_is_exact_and_finite_where_the_excluded_class_is_certain():
+    assert torch.autograd.gradcheck(lambda logits: label_loss(logits, EXCLUDED), LOGITS.clone().requires_grad_(True))
+    certain = torch.tensor([[100.0, 0.0, 0.0]], requires_grad=True)
+    label_loss(certain, torch.tensor([anything_but(0)])).sum().backward()
+    torch.testing.assert_close(certain.grad, torch.tensor([[1.0, -0.5, -0.5]]))
+
+
+@pytest.mark.parametrize(("predicted", "label", "right"), [(2, 2, True), (1, 2, False), (2, -3, False), (0, -3, True)])
+def test_what_is_right(predicted, label, right):
+    assert is_right(torch.tensor([predicted]), torch.tensor([label])).tolist() == [right]
