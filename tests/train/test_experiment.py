@@ -17,6 +17,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from augment.labels import anything_but
+from augment.variation import VariationSettings
 from renderer.errors import InputError
 from train import checkpoint, fit
 from train.data import DataSet
@@ -658,6 +659,26 @@ def test_every_experiment_is_a_configuration_that_runs_on_other_data_too(tiny_np
         config = compose("train", [*choices, "data=npz", f"data.path={tiny_npz}", "run=here"])
     assert read_settings(ExperimentSettings, config).evaluate.photos is None
     assert len(load_data(config).train) == 60
+
+
+def test_the_papers_renders_are_as_they_are_and_have_no_look_alikes():
+    with initialize_config_module("conf", version_base="1.3"):
+        settings = read_settings(ExperimentSettings, compose("train", ["experiment=paper", "run=here"]))
+    assert settings.augment.vary == VariationSettings() and settings.scene.look_alikes == []
+
+
+def test_another_class_takes_a_label_meshes_and_look_alikes_alone(tiny, tmp_path, monkeypatch):
+    trained = []
+    put_last = fit.put_last
+    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
+    meshes = ["label=pear", "scene.meshes=['solid:pear']", "scene.look_alikes=[{mesh: 'solid:apple', label: apple}]"]
+    small = ["augment.examples=8", "augment.every=30", "augment.lights=restart", "train.epochs=1"]
+    config = tiny("experiment=best", "train.init_from=null", *meshes, *small)
+    run(config, load_data(config), tmp_path)
+    first, second = trained
+    apple, pear = 0, 2
+    assert first.labels.tolist() == second.labels.tolist() == [pear] * 4 + [apple] * 4
+    assert len(torch.cat([first.images, second.images]).unique(dim=0)) == 16
 
 
 def test_the_demonstration_is_scored_on_the_pictures_that_it_renders():
