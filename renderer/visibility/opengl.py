@@ -42,7 +42,7 @@ void main() {
 def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """Ids by the contract in `renderer.visibility`, for finite points.
 
-    InputError: no EGL device, or a driver that renders wrong ids.
+    InputError: no EGL device, or a driver that renders wrong ids or fails.
     """
     with _context() as context:
         return _draw(context, points, _in_one_order(faces, closed), resolution, closed)
@@ -67,6 +67,8 @@ def _context() -> Iterator[moderngl.Context]:
     try:
         _check(context)
         yield context
+    except moderngl.Error as error:
+        raise InputError(f"the OpenGL driver failed ({error}): set renderer.visibility=software") from error
     finally:
         context.release()
 

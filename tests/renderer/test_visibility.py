@@ -522,6 +522,24 @@ def test_without_egl_opengl_is_refused(no_egl):
         choose("opengl")
 
 
+def test_a_driver_that_goes_away_while_it_draws_is_one_sentence_and_its_context_is_released(monkeypatch):
+    released = []
+
+    class Context:
+        def release(self):
+            released.append(self)
+
+    def fail(*_, **__):
+        raise moderngl.Error("cannot create buffer")
+
+    monkeypatch.setattr(moderngl, "create_context", lambda **_: Context())
+    monkeypatch.setattr(opengl, "_check", lambda context: None)
+    monkeypatch.setattr(opengl, "_draw", fail)
+    with pytest.raises(InputError, match=r"driver failed \(cannot create buffer\): set renderer.visibility=software"):
+        opengl.rasterise(np.zeros((1, 3, 3)), np.array([[0, 1, 2]]), 4, closed=False)
+    assert len(released) == 1
+
+
 def test_an_unknown_back_end_is_refused():
     with pytest.raises(InputError, match=r"renderer\.visibility=vulkan: choose one of auto, opengl, software"):
         choose("vulkan")
