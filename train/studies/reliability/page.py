@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from train.studies.page import joined, versions
+from train.studies.page import joined, versions, wrapped
 from train.tables import markdown
 
 INTRODUCTION = """\
@@ -47,7 +47,7 @@ def page(outcomes: Sequence[Outcome], command: str, number: int, patience: float
     table = markdown(["door", "kind", "tried", "used", "refused", "mishandled"], [*rows, total])
     faults = failures(outcomes)
     listed = "\n".join(f"- {fault}" for fault in faults) if faults else NO_FAULTS
-    return joined([introduction, table, "## Mishandled", listed])
+    return joined([wrapped(introduction), table, "## Mishandled", listed])
 
 
 def _row(door: str, kind: str, outcomes: Sequence[Outcome]) -> list[str | int]:

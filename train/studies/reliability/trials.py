@@ -22,7 +22,7 @@ NAMES = [
     *("a=b", "=1+1", "$a", "${oc.env:HOME}", "a'b", 'a"b', "a\\b", "a:b", "a;b", "#a", "%s", "*", "\x1b[31m", "a\nb"),
     *("a" * 200, "a" * 300, "ünï", "日本", "a\udcffb"),
 ]
-VALUES = ["-1", "0", "0.5", "nan", "inf", "1e30", "1000000000000", "abc", "[]", "{a: 1}", "null", "''"]
+VALUES = ["-1", "0", "0.5", "nan", "inf", "1e+30", "1000000000000", "abc", "[]", "{a: 1}", "null", "''"]
 CROWDED = {"no room": Surroundings(largest=1000), "output to a full disk": Surroundings(output="/dev/full")}
 NOWHERE = ("background.png", "background.png/a", "/proc/none", "/dev/full", "a" * 300)  # where no folder can be made
 HYDRA = "Set the environment variable HYDRA_FULL_ERROR=1"  # ends what Hydra says of its own, in more lines than one
@@ -117,7 +117,9 @@ def setting_trials(door: Door) -> Iterator[Trial]:
     for key in [*keys, "unknown"]:
         for value in VALUES:
             command = door.command(f"{key}={value}")
-            yield Trial(door, "settings", f"{key}={value}", command, (key, key.rpartition(".")[2], "has no class"))
+            yield Trial(
+                door, "settings", f"{key}={value}", command, (key, key.rpartition(".")[2], value.strip("'") or key)
+            )
 
 
 def place_trials(door: Door) -> Iterator[Trial]:
