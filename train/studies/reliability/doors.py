@@ -23,6 +23,7 @@ class Door:
 
     config: the name of its configuration. inputs: what it reads, by an override in which {} stands for the file or its
     folder; the first file of each is the one that it is given unless told otherwise. out: the folder that it writes.
+    renewed: a file that it makes anew, whatever it holds.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Door:
     arguments: tuple[str, ...]
     inputs: dict[str, tuple[str, ...]]
     out: str | None = "out"
+    renewed: str | None = None
 
     def command(self, *changed: str) -> list[str]:
         """For `conduct`; changed overrides replace those that the door has for the same keys."""
@@ -69,6 +71,7 @@ DOORS = [
         (*DATA, *SCENE, *TRAINING[:5], "train.epochs=2", *TRAINING[6:], "train.resume=true"),
         {"run={}": tuple(f"{RUN}/{name}" for name in ("last.pt", "config.yaml", "metrics.jsonl"))},
         None,
+        renewed=f"{RUN}/metrics.jsonl",
     ),
     Door(
         "attack.py",

@@ -46,7 +46,7 @@ def run(settings: ReliabilitySettings) -> list[str]:
     trials = [trial for name in settings.doors or BY_NAME for trial in all_trials(BY_NAME[name])]
     drawn = np.random.default_rng(settings.seed).permutation(len(trials))[: settings.draws]
     outcomes = {}
-    with TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder, suppress(KeyboardInterrupt):
         corpus = prepare(Path(folder))
         for number in tqdm(drawn, "trials", disable=not sys.stderr.isatty()):
             outcomes[number] = outcome(trials[number], corpus)

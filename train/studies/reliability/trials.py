@@ -91,7 +91,8 @@ def file_trials(door: Door) -> Iterator[Trial]:
                 def prepare(folder: Path, edit=damage.edit, file=file) -> None:
                     edit(folder / file)
 
-                yield Trial(door, damage.kind, f"{file}: {damage.name}", command, named, damage.refused, prepare)
+                refused = damage.refused and file != door.renewed
+                yield Trial(door, damage.kind, f"{file}: {damage.name}", command, named, refused, prepare)
 
 
 def name_trials(door: Door) -> Iterator[Trial]:
