@@ -36,7 +36,10 @@ def locked(folder: Path) -> Iterator[bool]:
 
 @contextmanager
 def sole_writer(key: str, *folders: Path) -> Iterator[None]:
-    """InputError naming the key where another process writes in one of the folders; none may until they are left."""
+    """InputError naming the key where another process writes in one of the folders; none may until they are left.
+
+    A folder in which nothing was written is not left behind.
+    """
     with ExitStack() as stack:
         for folder in folders:
             if not stack.enter_context(locked(folder)):
@@ -44,7 +47,13 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
                     f"{key}={folder} is being written by another process: let it end, or choose another folder with "
                     f"{key}="
                 )
-        yield
+        try:
+            yield
+        finally:
+            for folder in folders:
+                if [path.name for path in folder.iterdir()] == [LOCK]:
+                    (folder / LOCK).unlink()
+                    folder.rmdir()
 
 
 def read_config(path: Path) -> DictConfig:
