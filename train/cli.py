@@ -113,17 +113,18 @@ def _as_text(argument: str) -> str:
     """
     key, _, value = argument.partition("=")
     is_text = not TEXTS.isdisjoint(key.lstrip("+").split("."))
-    if is_text and (NUMBER.fullmatch(value) or os.path.lexists(value) or not _is_grammatical(argument)):
+    if is_text and (NUMBER.fullmatch(value) or _is_misread(argument, value, os.path.lexists(value))):
         return f"{key}={quoted(value)}"
     return argument
 
 
-def _is_grammatical(override: str) -> bool:
+def _is_misread(override: str, value: str, exists: bool) -> bool:
+    """Whether Hydra's grammar has no rule for a value, or reads the name of what is there as something else."""
     try:
-        OverridesParser.create().parse_override(override)
+        read = OverridesParser.create().parse_override(override)
     except HydraException:
-        return False
-    return True
+        return True
+    return exists and (read.is_sweep_override() or read.value() != value)
 
 
 def script(function: Callable, settings: type | None = None) -> None:
