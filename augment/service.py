@@ -20,6 +20,7 @@ from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
 from augment.seeding import generator
+from augment.specimens import Specimens, choose_specimens
 from augment.variation import VariationSettings, vary
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.lights import perturb
@@ -115,12 +116,14 @@ class AugmentationSettings:
 class Renders(Dataset):
     """Labelled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
 
+    specimens: a few of those that fool, with what they were before; None where that is not known any more.
     As a data set, pairs of an image on the CPU and its label as a number: `data + renders` is both.
     """
 
     images: Tensor
     labels: Tensor
     diagnostics: Mapping[str, float]
+    specimens: Specimens | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -222,11 +225,13 @@ class AugmentationService:
         with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
             batches = BatchSize(self.settings.attack.batch_size).map(lambda part: model(images[part]), len(images))
             logits = torch.cat(list(batches))
+        fooled = ~is_right(logits.argmax(1), self._labels)
         diagnostics = {
-            "fooled": _mean(~is_right(logits.argmax(1), self._labels)),
+            "fooled": _mean(fooled),
             "loss": _mean(label_loss(logits, self._labels)),
         }
-        return Renders(images, self._labels, diagnostics | _changes(problem, values))
+        specimens = choose_specimens(model, problem, values, fooled, self._labels)
+        return Renders(images, self._labels, diagnostics | _changes(problem, values), specimens)
 
     def _adversarial(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
         attack, goal = self.settings.attack, self._goal()
@@ -239,7 +244,9 @@ class AugmentationService:
         if self.settings.lights == "continue":
             self._continued = result.values
         diagnostics = self._attack_diagnostics(result) | _changes(problem, result.values)
-        return Renders(result.images[:, 0], self._labels, diagnostics)
+        newly_fooled = result.fooled & ~result.fooled_before
+        specimens = choose_specimens(model, problem, result.values, newly_fooled, self._labels)
+        return Renders(result.images[:, 0], self._labels, diagnostics, specimens)
 
     def _goal(self) -> Goal:
         if self._label is None:

@@ -113,10 +113,10 @@ class Trainer:
             while self.epoch < self.settings.epochs:
                 rounds = self._rounds(len(train))
                 if self._under_way is None:
-                    self._under_way = EpochUnderWay.begun(self._regenerate(rounds[0]))
+                    self._under_way = EpochUnderWay.begun(self._regenerate(rounds[0], log))
                 else:
                     restore_random_state(self._random_state)
-                if self._train(mixed, rounds, interruption):
+                if self._train(mixed, rounds, interruption, log):
                     self._end_epoch(validation, log)
                 ending = interruption.requested()
                 if ending or self._checkpoint_is_due():
@@ -194,12 +194,16 @@ class Trainer:
         every = self.service.settings.every
         return rounds_of_epoch(images, len(self.service), self.seed, self.epoch, self.settings.images_per_epoch, every)
 
-    def _regenerate(self, now: Round) -> Renders:
+    def _regenerate(self, now: Round, log: RunLog) -> Renders:
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
-            return self.service.regenerate(self._attacked, now.number)
+            renders = self.service.regenerate(self._attacked, now.number)
+        if renders.specimens:
+            with self.phases("input_output"):  # now, since a run that goes on within the epoch makes no others
+                log.specimens(renders.specimens, self.architecture["classes"], self.epoch + 1)
+        return renders
 
-    def _train(self, mixed: Split, rounds: Sequence[Round], interruption: Interruption) -> bool:
+    def _train(self, mixed: Split, rounds: Sequence[Round], interruption: Interruption, log: RunLog) -> bool:
         """Take the steps of what is left of the epoch; whether all were taken, since a signal ends them early."""
         steps = [batch_count(len(each.rows), self.settings.batch_size) for each in rounds]
         while True:
@@ -211,7 +215,7 @@ class Trainer:
                 return True
             if interruption.requested():
                 return False
-            self._under_way.next_round(self._regenerate(rounds[index + 1]))
+            self._under_way.next_round(self._regenerate(rounds[index + 1], log))
 
     def _train_round(self, mixed: Split, now: Round, before: int, total: int, interruption: Interruption) -> None:
         """The rest of a round. before: the epoch's steps in earlier rounds; total: in all."""

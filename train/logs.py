@@ -16,8 +16,10 @@ from torch import Tensor
 from torchvision.transforms.functional import to_pil_image
 from torchvision.utils import make_grid
 
+from augment.specimens import Specimens
 from renderer.image import to_bytes
 from train.run_folder import read_numbers
+from train.specimens import SUFFIX, write_specimens
 
 METRICS = "metrics.jsonl"
 console = logging.getLogger("train")
@@ -65,6 +67,11 @@ class RunLog:
         image = Summary.Image(height=height, width=width, colorspace=channels, encoded_image_string=png.getvalue())
         self._show(epoch, summary=Summary(value=[Summary.Value(tag="renders", image=image)]))
 
+    def specimens(self, specimens: Specimens, classes: Sequence[str], epoch: int) -> None:
+        """A few of the epoch's renders that fool, with what they were before, in renders/."""
+        self._renders.mkdir(exist_ok=True)
+        write_specimens(self._renders / f"epoch_{epoch:03d}{SUFFIX}", specimens, classes)
+
     def _show(self, step: int, **content) -> None:
         """Write an event for TensorBoard, at once; torch's SummaryWriter has a thread, whose errors nobody catches."""
         with open(self._board, "ab") as file:
@@ -78,6 +85,9 @@ class NoLog:
         pass
 
     def renders(self, images: Tensor, epoch: int) -> None:
+        pass
+
+    def specimens(self, specimens: Specimens, classes: Sequence[str], epoch: int) -> None:
         pass
 
 

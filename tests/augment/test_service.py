@@ -348,3 +348,23 @@ def test_a_look_alike_of_a_class_of_its_own_is_fooled_only_as_the_label(scene, l
 def test_lights_that_continue_keep_their_shapes():
     with pytest.raises(InputError, match=r"augment\.lights=continue goes on with the last shapes"):
         AugmentationSettings(lights="continue", vary=VariationSettings(individuals=True))
+
+
+def test_specimens_are_of_examples_that_the_attack_turned_and_show_both_sides(scene, labels, model):
+    service = AugmentationService(
+        AugmentationSettings(attack=TrainingAttackSettings(max_steps=30, step_size=0.5)), scene, labels, 0, Phases()
+    )
+    renders = service.regenerate(model, 0)
+    found = renders.specimens
+    assert renders.diagnostics["fooled"] > renders.diagnostics["fooled_before"] and 0 < len(found) <= 4
+    assert (found.answers_before.argmax(1) == found.labels).all() and (found.answers.argmax(1) != found.labels).all()
+    assert torch.equal(found.lights_before, LIGHT.expand(len(found), -1, -1))
+    for images, lights, answers in [
+        (found.images_before, found.lights_before, found.answers_before),
+        (found.images, found.lights, found.answers),
+    ]:
+        everything = [render(scene, light.expand(len(scene), -1, -1)) for light in lights]
+        gaps = [(image - shown).flatten(1).abs().amax(1).min() for image, shown in zip(images, everything, strict=True)]
+        assert max(gaps) < 100 * EPS32
+        with torch.no_grad():
+            torch.testing.assert_close(answers, model.eval()(images).softmax(1))
