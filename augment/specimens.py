@@ -34,7 +34,7 @@ class Specimens:
 def choose_specimens(
     model: nn.Module, problem: Perturbation, values: Tensor, fooled: Tensor, labels: Tensor
 ) -> Specimens:
-    """Up to MOST of the examples that are `fooled` (E,), evenly drawn, under values (E, D); the model is left as it was.
+    """Up to MOST of the examples that are `fooled` (E,), evenly drawn, under values (E, D); the model stays as it was.
 
     The problem's examples are of one view each.
     """

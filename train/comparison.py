@@ -15,7 +15,7 @@ from train.photographs.bootstrap import interval, replicate_difference
 from train.photographs.figures import OVERALL, Pool, figures, find_figure, pool_all, pool_answers, replicate_figures
 from train.report import RunSummary, complete, group_by_settings, varied_settings
 from train.settings import PHOTOGRAPHS
-from train.tables import aligned
+from train.tables import Table
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,13 @@ def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], sou
 
 
 def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str = PHOTOGRAPHS) -> str:
-    """Markdown tables of runs: accuracy, figures on photographs by source, and seconds per epoch and phase.
+    """`comparison_tables` as Markdown."""
+    tables = comparison_tables(runs, exclude, photographs)
+    return "\n\n".join(f"### {table.title}\n\n{table}" for table in tables)
+
+
+def comparison_tables(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str) -> list[Table]:
+    """Tables of runs: accuracy, figures on photographs by source, and seconds per epoch and phase.
 
     Runs that differ only in the seed are a group; a table for each group shows how far it is from the first one.
     exclude: sources that the pooled figures leave out; photographs: the sub-folder of each run with its scores.
@@ -102,21 +108,17 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photog
     for run in runs:
         with complete(run.folder):
             _accuracy_table([run]), _seconds_table([run])
-    sections = [("Accuracy on the test set", _accuracy_table(runs)), ("Seconds per epoch", _seconds_table(runs))]
+    tables = [_accuracy_table(runs), _seconds_table(runs)]
     if evaluations := read_evaluations(runs, exclude, photographs):
         pooled = f"all but {', '.join(exclude)}" if exclude else "all"
-        label = evaluations[0].label
-        sections[1:1] = [
-            *(
-                (f"Photographs: {figure_title(name, label)}", _figure_table(evaluations, name, pooled))
-                for name in FIGURES
-            ),
-            *_difference_sections(evaluations, pooled),
+        tables[1:1] = [
+            *(_figure_table(evaluations, name, pooled) for name in FIGURES),
+            *_difference_tables(evaluations, pooled),
         ]
-    return "\n\n".join(f"### {title}\n\n{table}" for title, table in sections)
+    return tables
 
 
-def _accuracy_table(runs: Sequence[RunSummary]) -> str:
+def _accuracy_table(runs: Sequence[RunSummary]) -> Table:
     header = ["augment", "seed", "selected on validation", "at epoch", "last epoch"]
     rows = [
         [
@@ -128,17 +130,18 @@ def _accuracy_table(runs: Sequence[RunSummary]) -> str:
         ]
         for run in runs
     ]
-    return aligned(header, rows)
+    return Table("Accuracy on the test set", header, rows)
 
 
-def _figure_table(evaluations: Sequence[Evaluation], name: str, pooled: str) -> str:
+def _figure_table(evaluations: Sequence[Evaluation], name: str, pooled: str) -> Table:
     """A figure by source, a column per run; without the sources that have none."""
     rows = [
         [source or pooled, *(format_interval(find_figure(run.figures[source], name)) for run in evaluations)]
         for source in evaluations[0].pools
     ]
     header = ["source", *(f"{_name(run, evaluations)}, seed {run.seed}" for run in evaluations)]
-    return aligned(header, [row for row in rows if set(row[1:]) != {"-"}])
+    title = f"Photographs: {figure_title(name, evaluations[0].label)}"
+    return Table(title, header, [row for row in rows if set(row[1:]) != {"-"}])
 
 
 def _name(evaluation: Evaluation, evaluations: Sequence[Evaluation]) -> str:
@@ -148,12 +151,12 @@ def _name(evaluation: Evaluation, evaluations: Sequence[Evaluation]) -> str:
     return ", ".join([run.arm, *(f"{key}={run.settings.get(key)}" for key in varied_settings(alike))])
 
 
-def _difference_sections(evaluations: Sequence[Evaluation], pooled: str) -> list[tuple[str, str]]:
-    """A title and a table for each group of runs but the first: how far it is from the first, by source and figure."""
+def _difference_tables(evaluations: Sequence[Evaluation], pooled: str) -> list[Table]:
+    """A table for each group of runs but the first: how far it is from the first, by source and figure."""
     by_folder = {evaluation.run.folder: evaluation for evaluation in evaluations}
     groups = group_by_settings([evaluation.run for evaluation in evaluations])
     reference, *others = [[by_folder[run.folder] for run in group] for group in groups]
-    sections = []
+    tables = []
     for group in others:
         rows = [
             [source or pooled, *(_format_difference(difference(group, reference, source, name)) for name in FIGURES)]
@@ -161,8 +164,8 @@ def _difference_sections(evaluations: Sequence[Evaluation], pooled: str) -> list
         ]
         header = ["source", *(figure_title(name, evaluations[0].label) for name in FIGURES)]
         names = f"{_name(group[0], evaluations)} minus {_name(reference[0], evaluations)}"
-        sections.append((f"{names}, {_format_seeds(group, reference)}", aligned(header, rows)))
-    return sections
+        tables.append(Table(f"{names}, {_format_seeds(group, reference)}", header, rows))
+    return tables
 
 
 def _format_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> str:
@@ -175,10 +178,10 @@ def _format_difference(figure: dict) -> str:
     return f"{figure['value']:+.3f} [{figure['low']:+.3f}, {figure['high']:+.3f}]" if figure else "-"
 
 
-def _seconds_table(runs: Sequence[RunSummary]) -> str:
+def _seconds_table(runs: Sequence[RunSummary]) -> Table:
     """Means per epoch; the operators are built once a run. The own share is the attack outside the classifier."""
     header = ["augment", *PHASES, "attack's own share", "attack's share of the epoch", "operators, once"]
-    return aligned(header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
+    return Table("Seconds per epoch", header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
 
 
 def _seconds_row(seconds: dict[str, float]) -> list[str]:

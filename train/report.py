@@ -17,7 +17,7 @@ from train.logs import METRICS, read_metrics
 from train.photographs import FIGURES, SUMMARY, figure_title, find_figure, format_interval
 from train.run_folder import CONFIG, read_config, read_json
 from train.settings import decisive_settings
-from train.tables import aligned
+from train.tables import Table, aligned
 
 RECIPE = (
     "epochs",
@@ -91,7 +91,13 @@ def complete(folder: Path) -> Iterator[None]:
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
-    """Markdown tables, one row per run, and the contact sheets.
+    """`headline_tables` as Markdown, and the contact sheets."""
+    sheets = [f"picture: {run.folder / folder / 'contact_sheet.png'}" for run in runs for folder in run.photographs]
+    return "\n\n".join(filter(None, [*map(_titled, headline_tables(runs)), "\n".join(sheets)]))
+
+
+def headline_tables(runs: Sequence[RunSummary]) -> list[Table]:
+    """One row per run.
 
     The first table has what the runs differ in, accuracy and time; one for each folder of photographs has its figures.
     """
@@ -99,28 +105,32 @@ def format_table(runs: Sequence[RunSummary]) -> str:
     header = ["augment", *varied, "seed"]
     names = [[*_name(run, varied), str(run.config.seed)] for run in runs]
     scores = [[f"{run.scores['test/accuracy']:.3f}", f"{_epoch_seconds(run):.1f}"] for run in runs]
-    tables = [_beside(header, names, ["test accuracy", "seconds per epoch"], scores)]
+    tables = [_beside("", header, names, ["test accuracy", "seconds per epoch"], scores)]
     for folder in _folders(runs):
         figures = [[format_interval(figure) for figure in _figures(run, folder)] for run in runs]
-        tables.append(f"{folder}:\n{_beside(header, names, _titles(runs), figures)}")
-    sheets = [f"picture: {run.folder / folder / 'contact_sheet.png'}" for run in runs for folder in run.photographs]
-    return "\n\n".join(filter(None, [*tables, "\n".join(sheets)]))
+        tables.append(_beside(folder, header, names, _titles(runs), figures))
+    return tables
 
 
 def format_spread(runs: Sequence[RunSummary]) -> str:
-    """The same tables, a row per group of runs that differ only in the seed: mean ± standard deviation; "" if none."""
+    """`spread_tables` as Markdown."""
+    return "\n\n".join(map(_titled, spread_tables(runs)))
+
+
+def spread_tables(runs: Sequence[RunSummary]) -> list[Table]:
+    """Those tables with a row per group of runs that differ only in the seed: mean ± standard deviation; [] if none."""
     groups = [group for group in group_by_settings(runs) if len(group) > 1]
     if not groups:
-        return ""
+        return []
     varied = varied_settings(runs)
     header = ["augment", *varied, "seeds"]
     names = [[*_name(group[0], varied), str(len(group))] for group in groups]
     accuracies = [[_spread([run.scores["test/accuracy"] for run in group])] for group in groups]
-    tables = [_beside(header, names, ["test accuracy"], accuracies)]
+    tables = [_beside("", header, names, ["test accuracy"], accuracies)]
     for folder in _folders(runs):
         figures = [[_spread(values) for values in _values(group, folder)] for group in groups]
-        tables.append(f"{folder}:\n{_beside(header, names, _titles(runs), figures)}")
-    return "\n\n".join(tables)
+        tables.append(_beside(folder, header, names, _titles(runs), figures))
+    return tables
 
 
 def group_by_settings(runs: Sequence[RunSummary]) -> list[list[RunSummary]]:
@@ -151,9 +161,15 @@ def _name(run: RunSummary, varied: Sequence[str]) -> list[str]:
     return [run.arm, *(str(run.settings.get(key)) for key in varied)]
 
 
-def _beside(names_header: list[str], names: list[list[str]], header: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table whose rows begin with names."""
-    return aligned([*names_header, *header], [[*name, *row] for name, row in zip(names, rows, strict=True)])
+def _titled(table: Table) -> str:
+    return f"{table.title}:\n{table}" if table.title else str(table)
+
+
+def _beside(
+    title: str, names_header: list[str], names: list[list[str]], header: list[str], rows: list[list[str]]
+) -> Table:
+    """A table whose rows begin with names."""
+    return Table(title, [*names_header, *header], [[*name, *row] for name, row in zip(names, rows, strict=True)])
 
 
 def _epoch_seconds(run: RunSummary) -> float:

@@ -14,7 +14,7 @@ from omegaconf._utils import get_yaml_loader
 
 from renderer.errors import InputError
 
-CONFIG, LOCK = "config.yaml", ".lock"
+CONFIG, LOCK, FAILURE = "config.yaml", ".lock", "failed.txt"
 LARGEST_CONFIG, LARGEST_FILE = 2**20, 2**28  # bytes; a run has written 300 for each of its epochs
 
 
@@ -54,6 +54,21 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
                 if [path.name for path in folder.iterdir()] == [LOCK]:
                     (folder / LOCK).unlink()
                     folder.rmdir()
+
+
+def state(folder: Path) -> str:
+    """What became of a run that is not finished."""
+    if not folder.exists():
+        return "not begun"
+    with locked(folder) as ours:
+        if not ours:
+            return "in training"
+    failure = folder / FAILURE
+    return (
+        f"failed: {failure.read_text(encoding='utf-8', errors='replace').strip()}"
+        if failure.exists()
+        else "interrupted"
+    )
 
 
 def read_config(path: Path) -> DictConfig:

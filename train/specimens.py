@@ -17,6 +17,7 @@ from renderer.image import to_bytes
 
 SUFFIX = ".safetensors"
 LARGEST_SIDE = 128  # pixels; larger images are reduced
+KINDS, NAMES = ("images", "lights"), ("before", "after")
 DEGREES = 50  # more than any light has bands
 
 
@@ -52,9 +53,9 @@ def read_specimens(path: Path) -> list[tuple[str, Side, Side]]:
             raise ValueError("there is no such file")
         with safe_open(path, "pt") as file:
             answers = json.loads(file.metadata()["answers"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118: no mapping
+            tensors = {f"{kind}_{name}": file.get_tensor(f"{kind}_{name}") for kind in KINDS for name in NAMES}
         labels = [str(label) for label in answers["label"]]
-        sides = [_sides(tensors, answers, name, len(labels)) for name in ("before", "after")]
+        sides = [_sides(tensors, answers, name, len(labels)) for name in NAMES]
         return list(zip(labels, *sides, strict=True))
     except Exception as error:  # safetensors raises a kind of its own
         raise InputError(f"{path} is damaged or of another version ({' '.join(str(error).split())})") from error

@@ -31,10 +31,9 @@ from train.cli import one_sentence, one_sentence_errors
 from train.experiment import load_data, run, write_pictures
 from train.logs import console
 from train.report import format_spread, format_table, is_finished, summarise
-from train.run_folder import locked
+from train.run_folder import FAILURE, locked, state
 from train.settings import CIRCUMSTANCES, differing_settings
 
-FAILURE = "failed.txt"
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 NEEDS = {  # launcher: its extra and the package in it
     "joblib": ("joblib", "hydra-joblib-launcher"),
@@ -204,20 +203,5 @@ def format_sweep(folders: Sequence[Path]) -> str:
     parts = [f"{len(finished)} of {len(folders)} cells are finished"]
     if finished:
         parts += filter(None, [format_table(finished), format_spread(finished)])
-    parts += [f"{folder}: {_state(folder)}" for folder in folders if not is_finished(folder)]
+    parts += [f"{folder}: {state(folder)}" for folder in folders if not is_finished(folder)]
     return "\n" + "\n\n".join(parts)
-
-
-def _state(folder: Path) -> str:
-    """Of a cell that is not finished."""
-    if not folder.exists():
-        return "not begun"
-    with locked(folder) as ours:
-        if not ours:
-            return "in training"
-    failure = folder / FAILURE
-    return (
-        f"failed: {failure.read_text(encoding='utf-8', errors='replace').strip()}"
-        if failure.exists()
-        else "interrupted"
-    )

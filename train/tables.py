@@ -1,6 +1,19 @@
 """Markdown tables: the one place where they are written."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a title, which may be empty; as text, aligned Markdown without the title."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[object]]
+
+    def __str__(self) -> str:
+        return aligned(self.header, self.rows)
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -20,9 +20,9 @@ from train.__main__ import main
 from train.checkpoint import LAST
 from train.cli import USER_ERROR
 from train.logs import read_metrics
-from train.run_folder import LOCK, locked
+from train.run_folder import FAILURE, LOCK, locked
 from train.settings import decisive_settings
-from train.sweep import FAILURE, cell_name, check_launcher, format_sweep, run_cell
+from train.sweep import cell_name, check_launcher, format_sweep, run_cell
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
