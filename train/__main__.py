@@ -20,6 +20,7 @@ from train.interruption import Interrupted
 from train.logs import console
 from train.report import format_table, summarise
 from train.run_folder import sole_writer
+from train.showcase import report_of
 from train.sweep import check_launcher, run_cell
 
 
@@ -61,6 +62,7 @@ def _train_arms(arms: Mapping[Path, DictConfig], data: DataSet, folder: Path) ->
             raise
     if processes.index() == 0:
         console.info("\n%s", format_table([summarise(path) for path in arms]))
+        console.info("%s", report_of([folder], folder))
 
 
 def resume_command(folder: Path) -> str:

@@ -13,7 +13,7 @@ from train.photographs.answers import Answer
 from train.photographs.answers_table import ANSWERS, read_answers
 from train.photographs.bootstrap import interval, replicate_difference
 from train.photographs.figures import OVERALL, Pool, figures, find_figure, pool_all, pool_answers, replicate_figures
-from train.report import RunSummary, complete, group_by_settings, varied_settings
+from train.report import RunSummary, complete, group_by_settings, name_among
 from train.settings import PHOTOGRAPHS
 from train.tables import Table
 
@@ -145,10 +145,7 @@ def _figure_table(evaluations: Sequence[Evaluation], name: str, pooled: str) -> 
 
 
 def _name(evaluation: Evaluation, evaluations: Sequence[Evaluation]) -> str:
-    """The run's arm, and the settings that it does not share with all other runs of this arm."""
-    run = evaluation.run
-    alike = [other.run for other in evaluations if other.run.arm == run.arm]
-    return ", ".join([run.arm, *(f"{key}={run.settings.get(key)}" for key in varied_settings(alike))])
+    return name_among(evaluation.run, [other.run for other in evaluations])
 
 
 def _difference_tables(evaluations: Sequence[Evaluation], pooled: str) -> list[Table]:

@@ -147,6 +147,12 @@ def varied_settings(runs: Sequence[RunSummary]) -> list[str]:
     return [key for key in keys if any(run.settings.get(key) != runs[0].settings.get(key) for run in runs)]
 
 
+def name_among(run: RunSummary, runs: Sequence[RunSummary]) -> str:
+    """The run's arm, and the settings that it does not share with all others of the runs of this arm."""
+    alike = [other for other in runs if other.arm == run.arm]
+    return ", ".join([run.arm, *(f"{key}={run.settings.get(key)}" for key in varied_settings(alike))])
+
+
 def publish_run(folder: Path, out: Path) -> None:
     """Write a finished run's selected network as half-precision safetensors, and a card beside it."""
     run = summarise(folder)

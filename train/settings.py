@@ -183,7 +183,7 @@ def decisive_settings(config: DictConfig) -> dict[str, object]:
     own = re.compile(f"^{re.escape(str(settings.get('run')))}(?=/|$)")
     return {
         key: own.sub("${run}", value) if isinstance(value, str) else value
-        for key, value in _dotted(settings)
+        for key, value in dotted(settings)
         if key not in CIRCUMSTANCES
     }
 
@@ -214,10 +214,11 @@ def require_same_settings(folder: Path, config: DictConfig) -> None:
             )
 
 
-def _dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
+def dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
+    """The values of nested settings by dotted key."""
     for key, value in node.items():
         if isinstance(value, dict) and prefix + key not in CIRCUMSTANCES:
-            yield from _dotted(value, f"{prefix}{key}.")
+            yield from dotted(value, f"{prefix}{key}.")
         else:
             yield prefix + key, value
 

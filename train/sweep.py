@@ -33,6 +33,7 @@ from train.logs import console
 from train.report import format_spread, format_table, is_finished, summarise
 from train.run_folder import FAILURE, locked, state
 from train.settings import CIRCUMSTANCES, differing_settings
+from train.showcase import report_of
 
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 NEEDS = {  # launcher: its extra and the package in it
@@ -160,8 +161,9 @@ class SweepReport(Callback):
         signal.signal(signal.SIGTERM, _stop)
 
     @_one_outcome
-    def on_multirun_end(self, **_) -> None:
+    def on_multirun_end(self, config: DictConfig, **_) -> None:
         atexit.unregister(self._print)
+        print(report_of([folder for folder in self.folders if folder.exists()], Path(config.hydra.sweep.dir)))
         self._print()
         if not all(map(is_finished, self.folders)):
             sys.exit(1)

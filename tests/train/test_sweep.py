@@ -35,6 +35,7 @@ SMALL = [
 def undone(monkeypatch) -> list:
     """What a sweep leaves in its process: a handler, which is put back, and calls to come at exit, which are listed."""
     calls = []
+    monkeypatch.setattr(sweep, "report_of", lambda folders, out: f"report: {len(folders)} in {out}")
     monkeypatch.setattr(sweep.atexit, "register", calls.append)
     monkeypatch.setattr(sweep.atexit, "unregister", calls.remove)
     handler = signal.getsignal(signal.SIGTERM)
@@ -147,6 +148,7 @@ def test_a_second_call_skips_finished_cells_and_shows_them_again(run_sweep, cell
     assert run_sweep(swept, "seed=0,1") == 0
     assert files() == before
     printed = capsys.readouterr().out
+    assert f"report: 2 in {swept}\n" in printed
     assert [line for line in printed.splitlines() if line.startswith("finished before")] == [
         f"finished before: {cell(swept, f'seed={seed}')}" for seed in (0, 1)
     ]

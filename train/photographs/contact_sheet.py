@@ -70,12 +70,17 @@ def _section(title: str, colour: str, asked: Sequence[tuple[Answer, np.ndarray]]
     ordered = sorted(asked, key=lambda pair: -pair[0].probability)
     if len(ordered) > TILES_PER_SECTION:
         title += f" ({TILES_PER_SECTION} drawn evenly from the surest to the least sure)"
-        drawn = np.linspace(0, len(ordered) - 1, TILES_PER_SECTION).round().astype(int)
-        ordered = [ordered[index] for index in drawn]
-    return Section(title, colour, [Tile(picture, _caption(answer)) for answer, picture in ordered])
+        ordered = evenly(ordered, TILES_PER_SECTION)
+    return Section(title, colour, [Tile(picture, caption(answer)) for answer, picture in ordered])
 
 
-def _caption(answer: Answer) -> tuple[str, ...]:
+def evenly(ordered: Sequence, count: int) -> list:
+    """`count` of a sequence at equal distances, first and last among them; all where there are no more."""
+    drawn = np.linspace(0, len(ordered) - 1, min(count, len(ordered))).round().astype(int)
+    return [ordered[index] for index in drawn]
+
+
+def caption(answer: Answer) -> tuple[str, ...]:
     """The prediction and, where it is wrong, the true class below it."""
     said = f"{answer.probability:.0%} {answer.prediction}"
     if answer.true_rank == 1:

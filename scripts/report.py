@@ -1,0 +1,40 @@
+"""A page to look at, of runs, sweeps and attacks: python scripts/report.py runs/sweep"""
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from renderer.errors import InputError
+from train.cli import quoted, script
+from train.outputs import writable_folder
+from train.showcase import write_report
+
+
+@dataclass
+class Settings:
+    """conf/report.yaml."""
+
+    runs: list[str]
+    out: str | None
+
+    def __post_init__(self):
+        if not self.runs:
+            raise InputError("runs is empty: give the folders of runs, sweeps or attacks")
+
+
+def main(settings: Settings) -> None:
+    out = settings.out or os.path.commonpath([Path(run).absolute() for run in settings.runs])
+    print(f"report: {write_report([Path(run) for run in settings.runs], writable_folder(out, 'out'))}")
+
+
+def _as_overrides(arguments: list[str]) -> list[str]:
+    """Folders without a key are those of `runs`."""
+    folders = [each for each in arguments if each[0:1] not in ("-", "") and (Path(each).exists() or "=" not in each)]
+    rest = [each for each in arguments if each not in folders]
+    return [*rest, f"runs=[{','.join(map(quoted, folders))}]"] if folders else rest
+
+
+if __name__ == "__main__":
+    sys.argv[1:] = _as_overrides(sys.argv[1:])
+    script(main, Settings)

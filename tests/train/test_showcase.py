@@ -1,0 +1,119 @@
+"""The report, of runs in every state, as a file and in a browser."""
+
+import base64
+import json
+import re
+import shlex
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+
+from renderer.errors import InputError
+from train.report import summarise
+from train.settings import decisive_settings
+from train.showcase import report_of, write_report
+from train.showcase.command import training_command
+
+HOSTILE = "<script>alert(1)</script>|*x*"
+
+
+class Sources(HTMLParser):
+    """The page's tags, addresses and alternative texts."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.tags, self.addresses, self.alts = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.addresses += [value for name, value in attrs if name in ("src", "href")]
+        self.alts += [dict(attrs).get("alt")] if tag == "img" else []
+
+
+@pytest.fixture(scope="module")
+def page(finished, made_up_run, tmp_path_factory) -> Path:
+    """Of a finished run, one of another arm, and such as are still going, failed, damaged, or from elsewhere."""
+    folder = tmp_path_factory.mktemp("all")
+    shutil.copytree(finished, folder / "finished")
+    made_up_run(folder / "plain")
+    made_up_run(folder / "old", "none", {"photographs": {"recall": {"value": 0.5}}})
+    for name in ("going", "damaged", "failed"):
+        (folder / name).mkdir()
+    (folder / "going" / "metrics.jsonl").write_text('{"epoch": 1, "train/accuracy": 0.5}\n{"epo')
+    (folder / "damaged" / "metrics.jsonl").write_bytes(b"\xff{\n")
+    (folder / "failed" / "failed.txt").write_text(HOSTILE)
+    attack = folder / "attacks" / HOSTILE.replace("/", "_")
+    attack.mkdir(parents=True)
+    line = {"example": 0, "label": [HOSTILE], "answer": ["b"], "confidence": [0.5], "fooled": True, "steps": 3}
+    (attack / "attack.jsonl").write_text(json.dumps(line) + "\n")
+    return write_report([folder], folder / "out")
+
+
+def test_a_page_loads_nothing_escapes_what_files_say_and_tells_pictures_in_words(page):
+    text = page.read_text()
+    found = Sources(text)
+    assert {address.partition(":")[0] for address in found.addresses if address[0] != "#"} == {"data"}
+    assert "script" not in found.tags and "&lt;script&gt;" in text
+    assert found.alts and all(found.alts)
+    assert len(text) < 10 * 2**20
+
+
+def test_runs_in_every_state_are_shown_or_named(page):
+    text = page.read_text()
+    assert re.search(r"<td[^>]*>[^<]*/going</td><td>interrupted</td><td>1</td>", text)
+    assert re.search(r"<td[^>]*>[^<]*/failed</td><td>failed: &lt;script", text)
+    assert re.search(r"/damaged</td><td[^>]*>cannot be read", text)
+    assert "1 attacks" in text and "1 of 1" in text
+
+
+def test_markdown_says_the_same_and_its_pictures_are_there(page):
+    text = (page.parent / "report.md").read_text()
+    pictures = re.findall(r"!\[.*\]\((.*)\)", text)
+    found = Sources(page.read_text())
+    assert len(pictures) == len(found.alts) and "<script>" not in text
+    for name, address in zip(pictures, [each for each in found.addresses if each.startswith("data:")], strict=True):
+        assert (page.parent / name).read_bytes() == base64.b64decode(address.partition(",")[2])
+    assert re.findall(r"^## (.*)$", text, re.M)[:2] == ["In short", "Arms"]
+
+
+def test_the_lights_that_fooled_are_shown(page):
+    assert re.search(r'alt="orange before: called [^"]*; a ball in its light"', page.read_text())
+
+
+@pytest.mark.parametrize(
+    "overrides", [[], ["augment=none", "seed=3"], ["attack@augment.attack=[lighting,geometry]", "label=apple"]]
+)
+def test_the_command_makes_the_same_settings_again(tmp_path, made_up_run, overrides):
+    config = summarise(made_up_run(tmp_path / "run", "adversarial", None, *overrides)).config
+    words = shlex.split(training_command(config))[3:]
+    with initialize_config_module("conf", version_base="1.3"):
+        again = compose("train", words)
+    expected, found = ({**decisive_settings(each), "data.pictures": None} for each in (config, again))
+    assert {key: value for key, value in found.items() if key in expected} == expected
+
+
+def test_where_there_is_nothing_one_sentence_says_so(tmp_path):
+    with pytest.raises(InputError, match="holds no run and no attack"):
+        write_report([tmp_path], tmp_path)
+    assert report_of([tmp_path / "no"], tmp_path).startswith("no report: runs: ")
+
+
+def test_a_browser_shows_it_without_overflow_wide_and_narrow_light_and_dark(page):
+    api = pytest.importorskip("playwright.sync_api")
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no Chromium")
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        for width, scheme in ((1280, "light"), (400, "dark")):
+            view, asked = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme), []
+            view.on("request", lambda request, asked=asked: asked.append(request.url))
+            view.goto(page.as_uri())
+            assert view.evaluate("document.documentElement.scrollWidth") <= width
+            assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
+            assert [url for url in asked if not url.startswith("data:")] == [page.as_uri()]
+        browser.close()

@@ -1,0 +1,66 @@
+"""The command that trains a run, or makes an attack, again: what its configuration has otherwise than the defaults."""
+
+import json
+import re
+import shlex
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from augment.parameters import KINDS
+from train.cli import quoted
+from train.settings import dotted
+
+CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "out", "train.resume", "data.pictures")
+DATA = ("cifar100", "npz", "folder")  # besides the default
+PLAIN = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_/][\w./:-]*", re.ASCII | re.IGNORECASE)
+
+
+def training_command(config: DictConfig) -> str:
+    return _command("python -m train", "train", config, "attack@augment.attack", config.augment.attack)
+
+
+def attack_command(config: DictConfig) -> str:
+    return _command("python scripts/attack.py", "attack", config, "attack", config.attack)
+
+
+def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapping) -> str:
+    """Also of a run from another version, whose keys this one may lack; they are left out."""
+    kinds = [kind for kind in KINDS if kind in attack]
+    chosen = [f"{group}=[{','.join(kinds)}]"] if kinds else []
+    if config.get("data", {}).get("name") in DATA:
+        chosen.append(f"data={config.data.name}")
+    with _no_other_hydra(), initialize_config_module("conf", version_base="1.3"):
+        defaults = dict(dotted(OmegaConf.to_container(compose(name, chosen))))
+    own = dict(dotted(OmegaConf.to_container(config)))
+    changed = {key: value for key, value in own.items() if key in defaults and value != defaults[key]}
+    overrides = [f"{key}={_value(value)}" for key, value in changed.items() if not _is_circumstance(key)]
+    return shlex.join([*start.split(), *chosen, *overrides])
+
+
+@contextmanager
+def _no_other_hydra() -> Iterator[None]:
+    """The one of the command that writes the report steps aside."""
+    other, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().hydra = other
+
+
+def _is_circumstance(key: str) -> bool:
+    return any(key == each or key.startswith(f"{each}.") for each in CIRCUMSTANCES)
+
+
+def _value(value: object) -> str:
+    """In Hydra's grammar."""
+    if isinstance(value, str):
+        return value if PLAIN.fullmatch(value) else quoted(value)
+    if isinstance(value, list):
+        return f"[{','.join(map(_value, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_value(each)}" for key, each in value.items()) + "}"
+    return json.dumps(value)

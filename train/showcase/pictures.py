@@ -1,0 +1,141 @@
+"""Small pictures from the files of runs and attacks; what cannot be read is left out."""
+
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from renderer.errors import InputError
+from renderer.image_files import read_square
+from renderer.light_sphere import light_sphere
+from renderer.tiles import Tile
+from train.photographs.answers import Answer
+from train.photographs.contact_sheet import caption, evenly
+from train.showcase.blocks import Gallery, Picture
+from train.showcase.folders import Attack
+from train.specimens import SUFFIX, Side, read_specimens
+
+TILE, SPHERE = 96, 64  # pixels
+TILES = 8  # photographs of each kind
+WIDEST = 720  # pixels of a grid of renders, 1100 of an attack's picture
+EXAMPLES = 6  # of an attack
+
+
+def encoded(image: Image.Image, alt: str, width: int, text: str = "") -> Picture:
+    """As PNG where few pixels are to be seen as they are, else as JPEG."""
+    file, small = io.BytesIO(), max(image.size) <= 2 * TILE
+    image.convert("RGB").save(file, "PNG" if small else "JPEG", optimize=True, quality=82)
+    return Picture(file.getvalue(), "png" if small else "jpeg", alt, width, text)
+
+
+def from_file(path: Path, alt: str, widest: int, text: str = "") -> list[Picture]:
+    """The picture of a file, reduced to a width; [] where there is none that can be read."""
+    try:
+        with Image.open(path) as image:
+            shown = image.convert("RGB")
+    except Exception:  # Pillow's decoders raise almost anything at a broken file
+        return []
+    shown.thumbnail((widest, 4 * widest))
+    return [encoded(shown, alt, shown.width, text)]
+
+
+def first_middle_last(paths: Sequence[Path]) -> list[tuple[int, Path]]:
+    """Of files named epoch_NUMBER, with the numbers."""
+    numbered = sorted((int(path.stem.removeprefix("epoch_")), path) for path in paths if path.stem[6:].isdigit())
+    return evenly(numbered, 3) if numbered else []
+
+
+def renders(folder: Path, arm: str) -> Gallery:
+    """The renders of a run's first, middle and last epoch."""
+    return Gallery(
+        arm,
+        [
+            picture
+            for epoch, path in first_middle_last([*(folder / "renders").glob("epoch_*.png")])
+            for picture in from_file(path, f"Renders of epoch {epoch}, {arm}", WIDEST, f"epoch {epoch}")
+        ],
+    )
+
+
+def specimens(folder: Path, arm: str) -> Iterator[Gallery]:
+    """What fooled in the first, middle and last epoch with specimens: renders and lights, before and after."""
+    for epoch, path in first_middle_last([*(folder / "renders").glob(f"epoch_*{SUFFIX}")]):
+        try:
+            rows = read_specimens(path)
+        except InputError:
+            continue
+        shown = [picture for label, *sides in rows for picture in _sides(label, sides)]
+        yield Gallery(f"{arm}, epoch {epoch}", shown)
+
+
+def _sides(label: str, sides: Sequence[Side]) -> Iterator[Picture]:
+    for when, side in zip(("before", "after"), sides, strict=True):
+        image = Image.fromarray(side.image.permute(1, 2, 0).numpy()).resize((TILE, TILE), Image.Resampling.NEAREST)
+        sphere = Image.fromarray(Tile.of(light_sphere(side.light, SPHERE), ()).picture)
+        pair = Image.new("RGB", (TILE + SPHERE, TILE), "white")
+        pair.paste(image)
+        pair.paste(sphere, (TILE, (TILE - SPHERE) // 2))
+        said = f"{side.confidence:.0%} {side.answer}"
+        yield encoded(pair, f"{label} {when}: called {said}; a ball in its light", pair.width, f"{when}: {said}")
+
+
+def photographs(answers: Sequence[Answer], folder: Path, label: str, arm: str) -> Iterator[Gallery]:
+    """Hits, misses and false alarms from the surest to the least sure, with the network's answers."""
+    mine = [answer for answer in answers if answer.photograph.label == label]
+    kinds = {
+        "recognised": [answer for answer in mine if answer.prediction == label],
+        "called something else": [answer for answer in mine if answer.prediction != label],
+        f"others called {label}": [
+            answer for answer in answers if answer.photograph.label != label and answer.prediction == label
+        ],
+    }
+    for kind, group in kinds.items():
+        chosen = evenly(sorted(group, key=lambda answer: -answer.probability), TILES) if group else []
+        tiles = [picture for answer in chosen for picture in _photograph(answer, folder)]
+        if tiles:
+            yield Gallery(f"{arm}: {kind}, {len(tiles)} of {len(group)}", tiles)
+
+
+def _photograph(answer: Answer, folder: Path) -> list[Picture]:
+    path = answer.photograph.path
+    if path.is_absolute() or ".." in path.parts or not (folder / path).is_file():
+        return []
+    try:
+        square = read_square(folder / path, TILE)
+    except Exception:  # as above
+        return []
+    said = " / ".join(caption(answer))
+    return [encoded(Image.fromarray(square), f"{answer.photograph.label}, called {said}", TILE, said)]
+
+
+def attack_pictures(attack: Attack) -> Gallery:
+    """Before, after, their difference and the lights, of examples drawn evenly."""
+    shown = []
+    for line in evenly(attack.examples, EXAMPLES) if attack.examples else []:
+        example, answer = int(line["example"]), ", ".join(map(str, line["answer"]))
+        alt = f"Example {example}: before, after, their difference and the lights; called {answer} in the end"
+        outcome = f"example {example}: {'fooled' if line['fooled'] else 'not fooled'} after {int(line['steps'])} steps"
+        shown += from_file(attack.folder / f"example_{example:03d}.png", alt, 1100, outcome)
+    return Gallery("", shown)
+
+
+def headline_tiles(folder: Path, count: int) -> list[tuple[np.ndarray, str, np.ndarray, str]]:
+    """Images (H, W, 3) uint8 and answers, before and after, of a run's newest specimens that were right before."""
+    for _, path in reversed(first_middle_last([*(folder / "renders").glob(f"epoch_*{SUFFIX}")])):
+        try:
+            rows = read_specimens(path)
+        except InputError:
+            continue
+        turned = [(before, after) for label, before, after in rows if before.answer == label != after.answer]
+        if turned:
+            return [
+                tuple(part for side in sides for part in (side.image.permute(1, 2, 0).numpy(), _said(side)))
+                for sides in turned[:count]
+            ]
+    return []
+
+
+def _said(side: Side) -> str:
+    return f"{side.answer}\n{side.confidence:.0%}"

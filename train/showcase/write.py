@@ -1,0 +1,102 @@
+"""One report as HTML that loads nothing, and as Markdown with its pictures beside it."""
+
+import base64
+import html
+import re
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from train.settings import PHOTOGRAPHS
+from train.showcase import answer, sections
+from train.showcase.blocks import Block, Code, Gallery, Picture, Section
+from train.showcase.folders import find
+from train.showcase.headline import headline
+from train.tables import Table, shown
+
+PAGE, MARKDOWN, PICTURES, HEADLINE = "report.html", "report.md", "report_files", "report.png"
+MIME = {"svg": "image/svg+xml", "png": "image/png", "jpeg": "image/jpeg"}
+
+
+def write_report(folders: Sequence[Path], out: Path) -> Path:
+    """Write report.html, report.md with report_files/, and report.png, of runs and attacks in folders and below them.
+
+    Returns the page. What cannot be read is named in it. InputError as of `find`.
+    """
+    runs, attacks, problems = find(folders)
+    arms = sections.arms_of(runs)
+    scored = sorted({name for group in arms.values() for run in group for name in run.summary.photographs})
+    name = PHOTOGRAPHS if PHOTOGRAPHS in scored or not scored else scored[0]
+    told = [answer.of_runs(arms, name)] if arms else []
+    told += [answer.of_attacks(attacks)] if attacks else []
+    top = headline({arm: group[0].summary for arm, group in arms.items()}, name) if arms else None
+    first = [*told, *([Gallery("", [top])] if top else []), *problems]
+    parts = [Section("In short", first), *(sections.of_runs(runs) if runs else ()), *sections.of_attacks(attacks)]
+    parts = [part for part in map(_without_empty, parts) if part.blocks]
+    done = sum(run.summary is not None for run in runs)
+    about = f"{done} of {len(runs)} runs finished, {len(attacks)} attacks"
+
+    out.mkdir(parents=True, exist_ok=True)
+    if top:
+        (out / HEADLINE).write_bytes(top.data)
+    (out / PAGE).write_text(_rendered("page.html.jinja", parts, about, _data_uri), encoding="utf-8", errors="replace")
+    shutil.rmtree(out / PICTURES, ignore_errors=True)
+    text = _rendered("page.md.jinja", parts, about, lambda picture: _beside(picture, out))
+    (out / MARKDOWN).write_text(re.sub(r"\n{3,}", "\n\n", text), encoding="utf-8", errors="replace")
+    return out / PAGE
+
+
+def _without_empty(section: Section) -> Section:
+    return Section(
+        section.title, [block for block in section.blocks if not isinstance(block, Gallery) or block.pictures]
+    )
+
+
+def _rendered(template: str, parts: Sequence[Section], about: str, source) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("train.showcase"),
+        autoescape=template.endswith("html.jinja"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"kind": _kind, "shown": shown, "source": source, "md": _escaped, "fenced": _fenced}
+    return environment.get_template(template).render(sections=parts, about=about)
+
+
+def _kind(block: Block) -> str:
+    return {Table: "table", Gallery: "gallery", Code: "code"}.get(type(block), "text")
+
+
+def _data_uri(picture: Picture) -> str:
+    return f"data:{MIME[picture.kind]};base64,{base64.b64encode(picture.data).decode()}"
+
+
+def _beside(picture: Picture, out: Path) -> str:
+    folder = out / PICTURES
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{len(list(folder.iterdir())):03d}.{picture.kind}"
+    path.write_bytes(picture.data)
+    return f"{PICTURES}/{path.name}"
+
+
+def _escaped(text: object) -> str:
+    """A name from a file as Markdown's text: neither markup nor HTML."""
+    plain = " ".join(html.escape(str(text), quote=False).split())
+    return re.sub(r"([\\`*_\[\]|#!])", r"\\\1", plain)
+
+
+def _fenced(text: str) -> str:
+    longest = max(map(len, re.findall("`+", text)), default=2)
+    fence = "`" * max(3, longest + 1)
+    return f"{fence}\n{text}\n{fence}"
+
+
+def report_of(folders: Sequence[Path], out: Path) -> str:
+    """What the end of a training says of the report: its path, or why there is none; it never fails the run."""
+    try:
+        return f"report: {write_report(folders, out)}"
+    except Exception as error:  # what was trained is whole, whatever its pictures look like
+        return f"no report: {error}"
