@@ -17,6 +17,7 @@ from renderer.image import to_bytes
 
 SUFFIX = ".safetensors"
 LARGEST_SIDE = 128  # pixels; larger images are reduced
+OTHER = "other things"  # whose label is anything but a class
 KINDS, NAMES = ("images", "lights"), ("before", "after")
 DEGREES = 50  # more than any light has bands
 
