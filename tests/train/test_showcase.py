@@ -49,7 +49,8 @@ def page(finished, made_up_run, tmp_path_factory) -> Path:
     attack = folder / "attacks" / HOSTILE.replace("/", "_")
     attack.mkdir(parents=True)
     line = {"example": 0, "label": [HOSTILE], "answer": ["b"], "confidence": [0.5], "fooled": True, "steps": 3}
-    (attack / "attack.jsonl").write_text(json.dumps(line) + "\n")
+    lines = [line, line | {"example": 1, "steps": 0, "fooled_before": True}]
+    (attack / "attack.jsonl").write_text("".join(json.dumps(each) + "\n" for each in lines))
     return write_report([folder], folder / "out")
 
 
@@ -67,7 +68,7 @@ def test_runs_in_every_state_are_shown_or_named(page):
     assert re.search(r"<td[^>]*>[^<]*/going</td><td>interrupted</td><td>1</td>", text)
     assert re.search(r"<td[^>]*>[^<]*/failed</td><td>failed: &lt;script", text)
     assert re.search(r"/damaged</td><td[^>]*>cannot be read", text)
-    assert "1 attacks" in text and "1 of 1" in text
+    assert "1 attacks" in text and "in 1 of 2, 1 more being wrong before any step" in text
 
 
 def test_markdown_says_the_same_and_its_pictures_are_there(page):

@@ -55,9 +55,11 @@ def _difference(scored: Mapping[str, Sequence], name: str) -> str:
 
 def of_attacks(attacks: Sequence[Attack]) -> str:
     fooled, total = sum(map(count_fooled, attacks)), sum(len(attack.examples) for attack in attacks)
+    before = sum(bool(line.get("fooled_before")) for attack in attacks for line in attack.examples)
+    wrong = f", {before} more being wrong before any step" if before else ""
     draws = [share for attack in attacks if isinstance(share := attack.checks.get("random_search"), int | float)]
     random = f"; random search with as many tries fools {sum(draws) / len(draws):.0%}" if draws else ""
     return (
         f"Asked: can a change of the scene fool the classifier in {total} examples? "
-        f"Answered: it does in {fooled} of {total}{random}."
+        f"Answered: it does in {fooled} of {total}{wrong}{random}."
     )

@@ -66,7 +66,7 @@ def _draw_bars(axes, arms: Sequence[tuple[str, RunSummary]], photographs: str) -
             axes.annotate(f"{value:.2f}", (min(1, figure["high"]) + 0.02, at), va="center", fontsize=9)
     axes.set(xlim=(0, 1.15), xticks=(0, 0.5, 1), yticks=range(len(FIGURES)), yticklabels=FIGURES.values())
     axes.invert_yaxis()
-    axes.set_title(f"{photographs}, one seed an arm, 95 % intervals over images", fontsize=9)
+    axes.set_title(f"{photographs}: one seed an arm, 95 % intervals", fontsize=9)
 
 
 def _told(run: RunSummary, photographs: str) -> str:

@@ -116,7 +116,8 @@ def attack_pictures(attack: Attack) -> Gallery:
     for line in evenly(attack.examples, EXAMPLES) if attack.examples else []:
         example, answer = int(line["example"]), ", ".join(map(str, line["answer"]))
         alt = f"Example {example}: before, after, their difference and the lights; called {answer} in the end"
-        outcome = f"example {example}: {'fooled' if line['fooled'] else 'not fooled'} after {int(line['steps'])} steps"
+        fooled = "wrong before any step" if line.get("fooled_before") else "fooled" if line["fooled"] else "not fooled"
+        outcome = f"example {example}: {fooled}, {int(line['steps'])} steps"
         shown += from_file(attack.folder / f"example_{example:03d}.png", alt, 1100, outcome)
     return Gallery("", shown)
 

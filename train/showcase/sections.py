@@ -216,7 +216,8 @@ def of_attacks(attacks: Sequence[Attack]) -> Iterator[Section]:
 
 
 def count_fooled(attack: Attack) -> int:
-    return sum(bool(line["fooled"]) for line in attack.examples)
+    """Without those that were wrong before any step."""
+    return sum(bool(line["fooled"]) and not line.get("fooled_before") for line in attack.examples)
 
 
 def _attack_reproduction(attack: Attack) -> list[Block]:
