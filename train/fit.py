@@ -305,7 +305,7 @@ class Trainer:
         checkpoint.save(self.folder / checkpoint.LAST, state, self.folder / checkpoint.PREVIOUS)
 
     def _report(self, log: RunLog, trained: dict, validated: dict, diagnostics: Mapping[str, float]) -> None:
-        seconds = self.phases.take()
+        seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()  # one resumed after its last attack has no more
         scalars = {
             **{f"train/{name}": value for name, value in trained.items()},
             **{f"validation/{name}": value for name, value in validated.items()},
