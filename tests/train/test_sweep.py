@@ -402,7 +402,11 @@ def test_submitits_executor_trains_cells_in_jobs(tiny_npz, cell, tmp_path):
     done = command(folder, f"data.path={tiny_npz}", "launcher=submitit_local")
     assert done.returncode == 0, done.stderr
     trained = cell(folder, "train.epochs=1")
-    assert {path for path in folder.iterdir() if path.is_dir()} == {trained, folder / ".submitit", folder / "report_files"}
+    assert {path for path in folder.iterdir() if path.is_dir()} == {
+        trained,
+        folder / ".submitit",
+        folder / "report_files",
+    }
     assert [row[:2] for row in rows(done.stdout)] == [["augment", "seed"], ["none", "0"]]
     (log,) = (folder / ".submitit").glob("*/*_log.out")
     assert "epoch 1/1" in log.read_text() and "epoch 1/1" not in done.stdout
