@@ -13,6 +13,7 @@ from torch import Tensor
 from renderer.errors import InputError
 from train import checkpoint
 from train.logs import METRICS, read_metrics
+from train.showcase.write import PICTURES
 
 SECONDS = "seconds/"
 logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it says of every resumed run that it was
@@ -93,9 +94,16 @@ def board(run: Path) -> dict[str, list[tuple[int, float | bytes]]]:
 
 
 def file_differences(run: Path, reference: Path) -> Iterator[str]:
-    """Images of renders, and files of the photographs' scores, that are missing, too many or of other bytes."""
+    """Images of renders, and files of the photographs' scores, that are missing, too many or of other bytes.
+
+    The report's pictures are left out: they show the seconds.
+    """
     found, expected = (
-        {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.glob("*/*")}
+        {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in folder.glob("*/*")
+            if path.parent.name != PICTURES
+        }
         for folder in (run, reference)
     )
     yield from sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
