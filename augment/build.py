@@ -31,6 +31,7 @@ def build_scene(
     light: str | Tensor = "grace",
     exposure: float = 1.0,
     polar: float = 60.0,
+    azimuth: float = 0.0,
     field_of_view: float = 2.0,
     vertices: int = 0,
     samples: int = 2,
@@ -44,13 +45,14 @@ def build_scene(
 
     meshes: (file, solid:NAME or `Mesh`; the name of its class) each. shared: the views of an example share one light,
     shape or colour; otherwise each is an example. backgrounds: grey values or image files. light: coefficients or what
-    `renderer.load_light` takes; exposure multiplies it. polar: degrees off +z. vertices: subdivide until there are
+    `renderer.load_light` takes; exposure multiplies it. polar: degrees off +z; azimuth: of the first view,
+    off +x. vertices: subdivide until there are
     more. samples, encoding, normals, visibility: as for `renderer.render`. operators: where rendered views are kept.
     """
     coefficients = load_light(light) if isinstance(light, str) else light
     return Scene.grid(
         [_object(mesh, label, vertices) for mesh, label in meshes],
-        ring(views, field_of_view, math.radians(polar)),
+        ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
         load_backgrounds(backgrounds, size),
         (coefficients * exposure).to(device),
         PictureSettings(size, samples, encoding, normals),

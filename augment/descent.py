@@ -69,10 +69,14 @@ class Goal:
 
     def reached(self, predicted: Tensor) -> Tensor:
         """(E,) bool, for predicted classes (E, V)."""
+        return self.reached_in_views(predicted).all(1)
+
+    def reached_in_views(self, predicted: Tensor) -> Tensor:
+        """(E, V) bool, for predicted classes (E, V)."""
         erred = predicted != self.decrease
         if self.increase is None:
-            return erred.all(1)
-        return torch.where(self.increase == NO_CLASS, erred, predicted == self.increase).all(1)
+            return erred
+        return torch.where(self.increase == NO_CLASS, erred, predicted == self.increase)
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,9 @@ class OrthographicCamera:
         return points @ (self.axes() * scale[:, None]).T + np.array([self.right, self.up, 0.0]) * scale
 
 
-def ring(views: int, field_of_view: float, polar: float = math.pi / 3) -> list[OrthographicCamera]:
-    """Cameras at one polar angle and equally spaced azimuths from 0 (the paper's appendix C: π/3 and 10)."""
-    return [OrthographicCamera(polar, 2 * math.pi * view / views, field_of_view) for view in range(views)]
+def ring(
+    views: int, field_of_view: float, polar: float = math.pi / 3, azimuth: float = 0.0
+) -> list[OrthographicCamera]:
+    """Cameras at one polar angle and equally spaced azimuths from a first (the paper's appendix C: π/3 and 10)."""
+    azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
+    return [OrthographicCamera(polar, each, field_of_view) for each in azimuths]

@@ -17,7 +17,8 @@ GROWTH = (1, 3, 10)
 class Checks:
     """Shares of the examples, in [0, 1], and mean costs.
 
-    cost_fell: of those that were not fooled to begin with. random_search: fooled by any of as many draws as the attack
+    cost_fell: of those that were not fooled to begin with. success, random_search and success_by_steps: of those that
+    were recognised before. random_search: fooled by any of as many draws as the attack
     had passes, each as far from the start as the attack may go or went. success_by_steps: fooled within the steps, ×3
     and ×10.
     """
@@ -51,8 +52,8 @@ def check(attacked: Attacked, descent: DescentSettings, seed: int) -> Checks:
         cost=float(result.cost.mean()),
         cost_fell=_share(fell[open_cases]) if open_cases.any() else 1.0,
         zero_gradient=_share(result.zero_gradient),
-        success=_share(result.fooled),
-        random_search=_share(_random_search(attacked, descent, seed)),
+        success=_share(result.fooled[attacked.recognised]),
+        random_search=_share(_random_search(attacked, descent, seed)[attacked.recognised]),
         success_by_steps=_success_by_steps(attacked, descent),
     )
 
@@ -79,8 +80,8 @@ def _success_by_steps(attacked: Attacked, descent: DescentSettings) -> dict[int,
         attacked.classifier, attacked.problem, attacked.goal, longest, Phases(attacked.problem.start.device)
     )
     limits = [descent.max_steps * factor for factor in GROWTH]
-    return {limit: _share(result.fooled & (result.steps <= limit)) for limit in limits}
+    return {limit: _share((result.fooled & (result.steps <= limit))[attacked.recognised]) for limit in limits}
 
 
 def _share(values: Tensor) -> float:
-    return float(values.double().mean())
+    return float(values.double().mean()) if len(values) else 0.0

@@ -60,16 +60,20 @@ def _exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Con
 
 def _numbers(attacked: Attacked, example: int) -> dict:
     result, classes = attacked.result, attacked.classifier.classes
-    confidences = attacked.logits[example].softmax(1)
+    before, after = (logits[example].softmax(1) for logits in (attacked.logits_before, attacked.logits))
     return {
+        "recognised": bool(attacked.recognised[example]),
         "fooled_before": bool(result.fooled_before[example]),
         "fooled": bool(result.fooled[example]),
+        "fooled_in_views": attacked.success_in_views[example].tolist(),
         "steps": int(result.steps[example]),
         "cost_before": float(result.cost_before[example]),
         "cost": float(result.cost[example]),
         "label": [classes[index] for index in attacked.goal.decrease[example].tolist()],
-        "answer": [classes[index] for index in confidences.argmax(1).tolist()],
-        "confidence": confidences.amax(1).tolist(),
+        "answer_before": [classes[index] for index in before.argmax(1).tolist()],
+        "confidence_before": before.amax(1).tolist(),
+        "answer": [classes[index] for index in after.argmax(1).tolist()],
+        "confidence": after.amax(1).tolist(),
         "largest_change": {
             kind.name: float((part - start).abs().max())
             for kind, part, start in zip(

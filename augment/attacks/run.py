@@ -55,6 +55,16 @@ class Attacked:
         return self.result.fooled
 
     @property
+    def success_in_views(self) -> Tensor:
+        """(E, V) bool: whether the criterion is met in each view."""
+        return self.goal.reached_in_views(self.logits.argmax(2))
+
+    @property
+    def recognised(self) -> Tensor:
+        """(E,) bool: whether every view was given its label before, so that the attack can be credited with more."""
+        return (self.logits_before.argmax(2) == self.goal.decrease).all(1)
+
+    @property
     def steps(self) -> Tensor:
         """(E,) int64: taken."""
         return self.result.steps

@@ -3,6 +3,7 @@
 Files of weights are read without running code from them, and checked against the network that they are to fill.
 """
 
+import hashlib
 import importlib
 import re
 from collections.abc import Mapping
@@ -32,6 +33,7 @@ CLASSES = tuple(SqueezeNet1_0_Weights.DEFAULT.meta["categories"])
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
 SQUEEZENET_CAFFE = "squeezenet_caffe"
 _CAFFE_SIZE = 227
+_CAFFE_BIAS = "0e39fe11b7decc597cc07679a428b0259045b62c49580144774961387f92626e"  # SHA-256 of its first bias
 _CAFFE_MEAN = (104, 117, 123)  # blue, green, red, of 255
 
 
@@ -49,6 +51,7 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
         )
     published = published_weights(model, weights)
     state = _download(published, name) if weights is None else read_weights(weights)
+    _require_not_caffes(state, weights or published.url, name)
     network = build_network(model, published)
     fill(network, _current_keys(model, state), weights or published.url, name)
     transforms = published.transforms()
@@ -139,6 +142,16 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
     fill(network, read_weights(weights), weights, SQUEEZENET_CAFFE)
     normalise = Normalise(mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
     return Classifier(nn.Sequential(normalise, network), _CAFFE_SIZE, CLASSES, SQUEEZENET_CAFFE)
+
+
+def _require_not_caffes(state: Mapping[str, Tensor], source: str | Path, name: str) -> None:
+    """InputError for SqueezeNet's weights from Caffe, which fit torchvision's network but take other units."""
+    bias = state.get("features.0.bias")
+    if bias is not None and hashlib.sha256(bias.float().numpy().tobytes()).hexdigest() == _CAFFE_BIAS:
+        raise InputError(
+            f"weights={source} were trained in Caffe, on pictures in other units than {name} takes: "
+            f"set classifier={SQUEEZENET_CAFFE}"
+        )
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:

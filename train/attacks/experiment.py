@@ -36,7 +36,7 @@ def build_scene(item: ObjectSettings, settings: AttackExperimentSettings, size: 
     scene, renderer = settings.scene, settings.renderer
     return Scene.grid(
         [load_object(item, scene.vertices)],
-        ring(scene.views, scene.field_of_view, math.radians(scene.polar)),
+        ring(scene.views, scene.field_of_view, math.radians(scene.polar), math.radians(scene.azimuth)),
         load_backgrounds(scene.backgrounds, size),
         (load_light(scene.light) * scene.exposure).to(device),
         renderer.pictures(size),

@@ -21,12 +21,14 @@ class AttackCommandSettings(AttackSettings):
 
 @dataclass
 class AttackSceneSettings:
-    """What is rendered. meshes: as in training. polar: degrees. vertices: subdivide until there are more."""
+    """What is rendered. meshes: as in training. polar, azimuth: degrees, of the first
+    view. vertices: subdivide until there are more."""
 
     meshes: list = field(default_factory=lambda: ["solid:orange:0"])
     backgrounds: list = field(default_factory=lambda: [0.5])
     views: int = 1
     polar: float = 60.0
+    azimuth: float = 0.0
     field_of_view: float = 2.0
     vertices: int = 0
     light: str = "grace"

@@ -2,17 +2,16 @@
 
 from augment.attacks.checks import Checks
 from augment.attacks.run import Attacked
+from train.photographs.shares import share
 
 
 def format_attack(mesh: str, attacked: Attacked, checks: Checks | None) -> str:
     """A paragraph on one mesh's attack, without a newline at the end."""
     result = attacked.result
-    total, already = len(result.fooled), int(result.fooled_before.sum())
     kinds = "+".join(kind.name for kind in attacked.problem.kinds)
     steps = result.steps[result.fooled & ~result.fooled_before].double()
     lines = [
-        f"{mesh}: {kinds} against {attacked.classifier.name}: {int(result.fooled.sum())} of {total} examples fooled"
-        + (f", {already} of them before any step" if already else "")
+        f"{mesh}: {kinds} against {attacked.classifier.name}: {_success(attacked)}"
         + (f"; median of {steps.median():.0f} steps" if len(steps) else "")
         + f" ({attacked.seconds['attack']:.1f} s)",
     ]
@@ -25,3 +24,17 @@ def format_attack(mesh: str, attacked: Attacked, checks: Checks | None) -> str:
             *(f"warning: {warning}" for warning in checks.warnings),
         ]
     return "\n".join(lines)
+
+
+def _success(attacked: Attacked) -> str:
+    """Among what was recognised before the attack, in examples and in views, with the 95 % Wilson interval."""
+    recognised = attacked.recognised
+    found = share(int(attacked.success[recognised].sum()), int(recognised.sum()))
+    if not found["n"]:
+        return f"none of {len(recognised)} examples was recognised before: there is nothing to count"
+    text = "{hits} of {n} examples fooled [{low:.0%}, {high:.0%}]".format(**found)
+    if attacked.success_in_views.shape[1] > 1:
+        views = attacked.success_in_views[recognised]
+        text += f", {int(views.sum())} of {views.numel()} views"
+    wrong = int((~recognised).sum())
+    return text + (f"; {wrong} not recognised before, which do not count" if wrong else "")

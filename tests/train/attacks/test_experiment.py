@@ -32,6 +32,10 @@ def mean_colour(images: Tensor) -> Tensor:
     return torch.cat([means, 12 - means.sum(1, keepdim=True)], dim=1)
 
 
+def sky_in_the_dark(images: Tensor) -> Tensor:
+    return 30 * images.mean((2, 3)) + 30 * (images[:, :1, 0, 0] < 0.1) * torch.tensor([0, 0, 1])
+
+
 def by_colour(classes: Sequence[str] = CLASSES) -> Classifier:
     return Classifier(mean_colour, SIZE, classes, "by_colour")
 
@@ -246,6 +250,33 @@ def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_f
     done = attacked("scene.views=2", "attack.force=true", classifier=deaf)
     assert done.result.fooled_before.all() and not done.result.steps.any()
     assert done.result.zero_gradient.all()
+    assert format_attack("mesh", done, None).startswith("mesh: lighting against callable: none of 2 examples was")
+    found = check(done, DescentSettings(1), 0)
+    assert (found.success, found.random_search, set(found.success_by_steps.values())) == (0, 0, {0})
+
+
+def test_success_is_counted_among_what_was_recognised_before():
+    """Before the dark background the picture is not recognised; wrong as it is, it is nothing that the attack did."""
+    dark = Classifier(sky_in_the_dark, SIZE, CLASSES[:3])
+    done = attacked("scene.backgrounds=[0.5,0.0]", "attack.force=true", "attack.max_steps=30", classifier=dark)
+    assert done.recognised.tolist() == [True, False] and done.success.tolist() == [True, True]
+    assert "1 of 1 examples fooled [21%, 100%]; 1 not recognised before, which do not count" in format_attack(
+        "mesh", done, None
+    )
+
+
+def test_views_that_share_a_light_are_counted_one_by_one_too():
+    """No light makes the picture before it both green and blue, so that of two views with a target each one remains."""
+    done = attacked("target=[lime,sky]", "scene.views=2", "attack.shared=true", "attack.max_steps=30")
+    assert done.success_in_views.shape == (1, 2)
+    views = int(done.success_in_views.sum())
+    assert f"{int(done.success)} of 1 examples fooled" in (text := format_attack("mesh", done, None))
+    assert f", {views} of 2 views" in text
+
+
+def test_the_ring_of_views_begins_at_the_azimuth():
+    done = attacked("scene.views=2", "scene.azimuth=30", "attack.max_steps=0")
+    assert [camera.azimuth for (camera,) in done.problem.scene.cameras] == pytest.approx([math.pi / 6, 7 * math.pi / 6])
 
 
 # ---------------------------------------------------------------------------------------- checks

@@ -53,6 +53,10 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(tmp_path):
         assert line["label"] == ["orange"]
         assert line["answer"] == [CLASSES[done.logits[example, 0].argmax()]]
         assert line["confidence"] == [pytest.approx(shares[example].max().item())]
+        before = done.logits_before[example].softmax(1)
+        assert line["answer_before"] == [CLASSES[before.argmax()]]
+        assert line["confidence_before"] == [pytest.approx(before.max().item())]
+        assert line["recognised"] is (before.argmax().item() == 0)
         change = (done.result.values[example] - done.problem.start[example]).abs().max().item()
         assert line["largest_change"] == {"lighting": change} and change > 0
 
