@@ -12,7 +12,7 @@ from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.scene import Scene
 from renderer.cache import OperatorCache
 from renderer.camera import ring
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, normalise
 from renderer.subdivision import subdivide
@@ -55,7 +55,7 @@ def build_scene(
         ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
         load_backgrounds(backgrounds, size),
         (coefficients * exposure).to(device),
-        PictureSettings(size, samples, encoding, normals),
+        ImageSettings(size, samples, encoding, normals),
         choose(visibility),
         operators,
         shared=shared,

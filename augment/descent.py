@@ -23,7 +23,7 @@ class DescentSettings:
 
     max_steps: renders after the first; the paper's appendix C has 30. shorten: a step after which the cost has not
     fallen is taken back and tried at half its length, since the gradient of geometry holds visibility fixed.
-    batch_size: pictures per pass through the classifier, fewer where memory runs out.
+    batch_size: images per pass through the classifier, fewer where memory runs out.
     """
 
     max_steps: int = 30
@@ -36,13 +36,13 @@ class DescentSettings:
 
 
 class Problem(Protocol):
-    """What is attacked: E examples of V views each, whose pictures follow from values (E, D); `start` is where they
+    """What is attacked: E examples of V views each, whose images follow from values (E, D); `start` is where they
     begin."""
 
     start: Tensor
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Pictures (A, V, 3, H, W) in [0, 1] of the values (A, D) of examples (A,)."""
+        """Images (A, V, 3, H, W) in [0, 1] of the values (A, D) of examples (A,)."""
 
     def step(self, gradient: Tensor) -> Tensor:
         """How far to go down a gradient (A, D)."""
@@ -106,7 +106,7 @@ class AttackResult:
 
 @dataclass(frozen=True)
 class _Pass:
-    """What a classifier makes of A examples: the cost's gradient is by their pictures (A, V, 3, H, W)."""
+    """What a classifier makes of A examples: the cost's gradient is by their images (A, V, 3, H, W)."""
 
     cost: Tensor
     predicted: Tensor
@@ -203,8 +203,8 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
     return AttackResult(values, images, steps, fooled_before, fooled, cost_before, cost, predicted, zero_gradient)
 
 
-def _classifier_pass(model: nn.Module, pictures: Tensor, goal: Goal, batch_size: BatchSize) -> _Pass:
-    views, flat = pictures.shape[1], pictures.flatten(0, 1)
+def _classifier_pass(model: nn.Module, images: Tensor, goal: Goal, batch_size: BatchSize) -> _Pass:
+    views, flat = images.shape[1], images.flatten(0, 1)
     decrease, increase = goal.decrease.flatten(), None if goal.increase is None else goal.increase.flatten()
     gradient = torch.empty_like(flat)
 
@@ -212,8 +212,8 @@ def _classifier_pass(model: nn.Module, pictures: Tensor, goal: Goal, batch_size:
         batch = flat[part].detach().requires_grad_(True)
         logits = model(batch)
         cost = adversarial_cost(logits, decrease[part], None if increase is None else increase[part])
-        (by_picture,) = torch.autograd.grad(cost.sum(), batch)
-        gradient[part] = by_picture  # laid out as the pictures are, not as the network's channels
+        (by_image,) = torch.autograd.grad(cost.sum(), batch)
+        gradient[part] = by_image  # laid out as the images are, not as the network's channels
         return cost.detach(), logits.detach().argmax(1)
 
     costs, predicted = zip(*batch_size.map(judge, len(flat)), strict=True)

@@ -11,7 +11,7 @@ from torch import nn
 def eval_mode(model: nn.Module) -> Iterator[None]:
     """Eval mode inside; each module's own mode restored after, since a frozen layer may differ from the whole."""
     training = [module for module in model.modules() if module.training]
-    if training:  # setting the mode of a large network takes as long as rendering a picture
+    if training:  # setting the mode of a large network takes as long as rendering an image
         model.eval()
     try:
         yield

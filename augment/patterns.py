@@ -1,4 +1,4 @@
-"""Patterns that a projector throws onto a picture: stripes, checkers, halves and solid colours, drawn at random."""
+"""Patterns that a projector throws onto an image: stripes, checkers, halves and solid colours, drawn at random."""
 
 import math
 from collections.abc import Callable

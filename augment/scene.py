@@ -20,7 +20,7 @@ from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import PictureSettings, behind, clamp, clamped, develop_composite
+from renderer.image import ImageSettings, behind, clamp, clamped, develop_composite
 from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.visibility import Backend
@@ -87,7 +87,7 @@ class Scene:
         examples: Sequence[Example],
         backgrounds: Tensor,
         light: Tensor,
-        settings: PictureSettings,
+        settings: ImageSettings,
         backend: Backend,
         operators: OperatorCache | None = None,
         basis: Basis = HARMONICS,
@@ -138,7 +138,7 @@ class Scene:
         cameras: Sequence[Sequence[OrthographicCamera]],
         backgrounds: Tensor,
         light: Tensor,
-        settings: PictureSettings,
+        settings: ImageSettings,
         backend: Backend,
         gain: float = 1.0,
         operators: OperatorCache | None = None,

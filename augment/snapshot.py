@@ -1,4 +1,4 @@
-"""Pictures as a camera takes them: a thrown pattern, white balance, blur and noise after the render."""
+"""Images as a camera takes them: a thrown pattern, white balance, blur and noise after the render."""
 
 from dataclasses import dataclass, field
 
@@ -7,18 +7,18 @@ from torch import Tensor
 
 from augment.patterns import draw_patterns
 from renderer.errors import InputError, require_range
-from renderer.image import PictureSettings, clamp, decode, encode
+from renderer.image import ImageSettings, clamp, decode, encode
 
 REACH = 3  # pixels to either side that a blur takes in
 
 
 @dataclass
 class SnapshotSettings:
-    """What a camera makes of each picture, uniform up to these; by default nothing.
+    """What a camera makes of each image, uniform up to these; by default nothing.
 
-    patterns: the share of pictures under a pattern that a projector throws. ambient: [least, most] of the scene's own
+    patterns: the share of images under a pattern that a projector throws. ambient: [least, most] of the scene's own
     light beneath it. white_balance: stops, up or down, of each channel. blur: standard deviation in pixels. noise:
-    standard deviation of the picture's values.
+    standard deviation of the image's values.
     """
 
     patterns: float = 0.0
@@ -35,17 +35,17 @@ class SnapshotSettings:
 
     @property
     def changes(self) -> bool:
-        """Whether pictures are any other than the renders."""
+        """Whether images are any other than the renders."""
         return max(self.patterns, self.white_balance, self.blur, self.noise) > 0
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What becomes of the pictures of E examples, each part as it was drawn.
+    """What becomes of the images of E examples, each part as it was drawn.
 
     gains: (E, 3, 1 or size, 1 or size), what the linear light of object and background is multiplied by: the thrown
     pattern, times the white balance's gain of each channel. blur: (E,) standard deviation of a Gaussian, in pixels, 0
-    for none. noise: (E, 3, size, size), added to the picture's values.
+    for none. noise: (E, 3, size, size), added to the image's values.
     """
 
     gains: Tensor
@@ -57,15 +57,15 @@ class Snapshot:
         return Snapshot(self.gains.to(device), self.blur.to(device), self.noise.to(device), self.encoding)
 
     def __call__(self, images: Tensor, examples: Tensor) -> Tensor:
-        """Pictures (A, V, 3, size, size) of examples (A,) as they are photographed; differentiable in them."""
+        """Images (A, V, 3, size, size) of examples (A,) as they are photographed; differentiable in them."""
         light = decode(images, self.encoding) * self.gains[examples, None]
-        picture = encode(clamp(_blurred(light, self.blur[examples])), self.encoding)
-        return clamp(picture + self.noise[examples, None])
+        image = encode(clamp(_blurred(light, self.blur[examples])), self.encoding)
+        return clamp(image + self.noise[examples, None])
 
 
-def draw_snapshot(settings: SnapshotSettings, count: int, picture: PictureSettings, draws: torch.Generator) -> Snapshot:
+def draw_snapshot(settings: SnapshotSettings, count: int, image: ImageSettings, draws: torch.Generator) -> Snapshot:
     """What is drawn for each of `count` examples, on the CPU."""
-    thrown = draw_patterns(count, picture.size, draws)
+    thrown = draw_patterns(count, image.size, draws)
     low, high = settings.ambient
     ambient = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
     none = torch.rand(count, 1, 1, 1, generator=draws) >= settings.patterns
@@ -73,8 +73,8 @@ def draw_snapshot(settings: SnapshotSettings, count: int, picture: PictureSettin
     stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
     blur = settings.blur * torch.rand(count, generator=draws)
     deviation = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
-    noise = deviation * torch.randn(count, 3, picture.size, picture.size, generator=draws)
-    return Snapshot(light * 2**stops, blur, noise, picture.encoding)
+    noise = deviation * torch.randn(count, 3, image.size, image.size, generator=draws)
+    return Snapshot(light * 2**stops, blur, noise, image.encoding)
 
 
 def _blurred(images: Tensor, sigma: Tensor) -> Tensor:

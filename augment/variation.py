@@ -32,7 +32,7 @@ class VariationSettings:
     backgrounds: a folder of images, each example before one of them. individuals: every solid that is named without a
     seed is another of its kind. turn: degrees that the camera goes around the mesh, at most, to either side and up and
     down. lights: each example is in one of these, as `load_light` takes them. lit: a background is a wall that faces
-    the camera in the example's light. snapshot: what a camera makes of the pictures.
+    the camera in the example's light. snapshot: what a camera makes of the images.
     """
 
     place: float = 0.0

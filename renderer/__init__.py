@@ -7,7 +7,7 @@ __getattr__, __dir__, __all__ = attach(
     {
         "camera": ["OrthographicCamera", "ring"],
         "errors": ["InputError"],
-        "image": ["PictureSettings"],
+        "image": ["ImageSettings"],
         "lights": ["load_light", "save_light"],
         "mesh": ["Mesh", "load_mesh", "normalise"],
         "mesh_export": ["export_mesh"],

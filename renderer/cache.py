@@ -19,7 +19,7 @@ from torch import Tensor
 from renderer.basis import HARMONICS, Basis
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.mesh import Mesh
 from renderer.transfer import TENSORS, Operator, build_operator
 from renderer.visibility import Backend
@@ -152,7 +152,7 @@ class OperatorCache(TensorCache):
         self,
         mesh: Mesh,
         cameras: Sequence[OrthographicCamera],
-        settings: PictureSettings,
+        settings: ImageSettings,
         backend: Backend,
         gain: float = 1.0,
         basis: Basis = HARMONICS,
@@ -177,5 +177,5 @@ def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
     return {name: getattr(operator, name) for name in TENSORS} | {"counts": counts}
 
 
-def _unpack(view: Mapping[str, Tensor], settings: PictureSettings, basis: Basis) -> Operator:
+def _unpack(view: Mapping[str, Tensor], settings: ImageSettings, basis: Basis) -> Operator:
     return Operator(**{name: view[name] for name in TENSORS}, settings=settings, basis=basis)

@@ -12,8 +12,8 @@ from renderer.errors import LARGEST, InputError, require_range
 class OrthographicCamera:
     """A parallel projection from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
 
-    field_of_view: width of the square picture in world units; a normalised mesh spans at most [-1, 1] per axis.
-    right, up: where the origin lies in the picture, in world units from its middle.
+    field_of_view: width of the square image in world units; a normalised mesh spans at most [-1, 1] per axis.
+    right, up: where the origin lies in the image, in world units from its middle.
     InputError where the field of view is not positive, an angle is not finite, or any is too large.
     """
 
@@ -41,7 +41,7 @@ class OrthographicCamera:
     def project(self, points: np.ndarray) -> np.ndarray:
         """World points (V, 3) to normalised device coordinates (V, 3): x right, y up, z depth.
 
-        The picture is [-1, 1]² in x and y. Depth is smaller where nearer and in [-1, 1] within 2 world units of the
+        The image is [-1, 1]² in x and y. Depth is smaller where nearer and in [-1, 1] within 2 world units of the
         origin, which every normalised mesh (radius at most √3) is.
         """
         scale = np.array([2 / self.field_of_view, 2 / self.field_of_view, -1 / 2])

@@ -5,7 +5,7 @@ Maps are tensors (H, W, 3) of linear RGB radiance in the layout of `renderer.har
 
 Blender's Environment Texture lies so too and needs no rotation. Mitsuba 3's `envmap` has y up and the middle column
 towards +z, as OpenEXR defines such maps: a `to_world` of the rows (0, 0, 1), (1, 0, 0), (0, 1, 0) brings it here. Both
-shade with albedo / π where this project leaves out the π: a strength of π gives the same picture.
+shade with albedo / π where this project leaves out the π: a strength of π gives the same image.
 """
 
 import math
@@ -49,7 +49,7 @@ def read_map(path: Path) -> Tensor:
     """
     if not path.is_file():
         raise InputError(f"environment map {path} does not exist: give the path of an .npy, .hdr or .exr file")
-    texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_picture(path)
+    texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
     radiance = texels[..., _color_channels(path, names)]
     if not np.isfinite(radiance).all():
         raise InputError(f"environment map {path} holds NaN or infinity: give a map of finite radiance")
@@ -78,7 +78,7 @@ def write_map(path: Path, radiance: Tensor) -> None:
             with path.open("wb") as file:  # given a path, NumPy appends .npy to .NPY
                 np.save(file, radiance.numpy())
         else:
-            _write_picture(path, _to_rgbe_precision(radiance) if suffix == ".hdr" else radiance)
+            _write_image(path, _to_rgbe_precision(radiance) if suffix == ".hdr" else radiance)
     except OSError as error:
         raise InputError(f"environment map {path} cannot be written: {error}") from error
 
@@ -100,13 +100,13 @@ def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     return array, names
 
 
-def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+def _read_image(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     openimageio = _openimageio(path)
     file = openimageio.ImageInput.open(str(path))
     if file is None:
-        raise InputError(f"environment map {path} is not a readable picture: {_first_line(openimageio.geterror())}")
+        raise InputError(f"environment map {path} is not a readable image: {_first_line(openimageio.geterror())}")
     if file.format_name() not in ("hdr", "openexr"):
-        raise InputError(f"environment map {path} is a {file.format_name()} picture: give an .hdr or .exr file")
+        raise InputError(f"environment map {path} is a {file.format_name()} image: give an .hdr or .exr file")
     spec = file.spec()
     if spec.roi != spec.roi_full or spec.get_int_attribute("Orientation", 1) != 1:
         raise InputError(f"environment map {path} is stored cropped or turned: save it whole, its top row first")
@@ -116,7 +116,7 @@ def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     return texels, spec.channelnames
 
 
-def _write_picture(path: Path, radiance: Tensor) -> None:
+def _write_image(path: Path, radiance: Tensor) -> None:
     openimageio = _openimageio(path)
     height, width, channels = radiance.shape
     file = openimageio.ImageOutput.create(str(path))

@@ -1,4 +1,4 @@
-"""What a view sees of a mesh: the covered samples of a picture, each with its pixel and its face.
+"""What a view sees of a mesh: the covered samples of an image, each with its pixel and its face.
 
 Rasterised once and then held fixed, while light, albedo or the positions of the vertices are differentiated.
 """
@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from renderer.camera import OrthographicCamera
 from renderer.errors import require_finite
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.visibility import Backend
 
 BLOCK = 2**14  # samples at a time
@@ -22,15 +22,15 @@ BLOCK = 2**14  # samples at a time
 
 @dataclass(frozen=True)
 class Fragments:
-    """S covered samples of a picture of size² pixels and samples² samples each; they see G faces in P pixels.
+    """S covered samples of an image of size² pixels and samples² samples each; they see G faces in P pixels.
 
-    pixels: (P,) int64, row-major indices of the covered pixels, ascending; row 0 is the top of the picture.
+    pixels: (P,) int64, row-major indices of the covered pixels, ascending; row 0 is the top of the image.
     coverage: (P,) float64 in (0, 1], the share of a pixel's samples that the mesh covers.
     faces: (G,) int64, the mesh's faces that any sample sees, ascending; the others are neither shaded nor moved.
     corners: (G, 3) int64, their vertices. facing: (G, 1) float64, -1 where the camera sees a face from behind.
     outlines: (G, 3, 2) float64, their corners as projected, x right and y up in [-1, 1].
     pixel, face: (S,) int64, indices into `pixels` and `faces`; samples of a pixel lie together.
-    sample: (S,) int64, their place in the picture: pixel by pixel, and row by row within a pixel.
+    sample: (S,) int64, their place in the image: pixel by pixel, and row by row within a pixel.
     """
 
     size: int
@@ -124,14 +124,14 @@ def build_fragments(
     vertices: np.ndarray,
     faces: np.ndarray,
     cameras: Sequence[OrthographicCamera],
-    settings: PictureSettings,
+    settings: ImageSettings,
     backend: Backend,
     closed: bool = False,
 ) -> list[Fragments]:
     """Rasterise a mesh of vertices (V, 3) and faces (F, 3), once per camera.
 
     closed: the mesh is watertight and its faces are counter-clockwise from outside (`Mesh.closed`), so that the ones
-    seen from behind need not be drawn, unless the near plane cuts the mesh open. A mesh outside the picture has no
+    seen from behind need not be drawn, unless the near plane cuts the mesh open. A mesh outside the image has no
     fragments; that is no error. InputError: NaN.
     """
     require_finite(vertices=torch.from_numpy(vertices))
@@ -141,7 +141,7 @@ def build_fragments(
     return [_fragments(view, faces, view_ids, settings) for view, view_ids in zip(points, ids, strict=True)]
 
 
-def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settings: PictureSettings) -> Fragments:
+def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settings: ImageSettings) -> Fragments:
     size, samples = settings.size, settings.samples
     by_pixel = ids.reshape(size, samples, size, samples).swapaxes(1, 2).reshape(-1)
     hits = np.flatnonzero(by_pixel >= 0)

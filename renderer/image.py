@@ -1,4 +1,4 @@
-"""Radiance to picture: background, clamp and encoding, in one place and last, since clamping is not linear."""
+"""Radiance to image: background, clamp and encoding, in one place and last, since clamping is not linear."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,12 @@ from renderer.errors import InputError, require_bounded
 
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
-MOST_SAMPLES = 2**15  # in a row of a picture: a billion in all of it
+MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
 
 
 @dataclass(frozen=True)
-class PictureSettings:
-    """Picture size in pixels, samples per pixel side, encoding, and a normal per face or interpolated vertex normals.
+class ImageSettings:
+    """Image size in pixels, samples per pixel side, encoding, and a normal per face or interpolated vertex normals.
 
     InputError: none of the first two, an unknown choice.
     """
@@ -39,10 +39,10 @@ class PictureSettings:
 
 
 def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
-    """Picture values in [0, 1] as a classifier sees them.
+    """Image values in [0, 1] as a classifier sees them.
 
     radiance: (..., 3, P) linear, already weighted with coverage. coverage: (..., 1, P) in [0, 1].
-    background: (..., 3 or 1, 1 or P) picture values behind the surface. Returns (..., 3, P). InputError: NaN.
+    background: (..., 3 or 1, 1 or P) image values behind the surface. Returns (..., 3, P). InputError: NaN.
     """
     require_bounded(radiance=radiance)
     return develop_composite(radiance + behind(coverage, background, encoding), encoding)
@@ -119,7 +119,7 @@ class _Clamp(torch.autograd.Function):
 
 
 def encode(linear: Tensor, encoding: str) -> Tensor:
-    """Linear values in [0, 1] to picture values: unchanged, or the sRGB transfer function (IEC 61966-2-1)."""
+    """Linear values in [0, 1] to image values: unchanged, or the sRGB transfer function (IEC 61966-2-1)."""
     check_encoding(encoding)
     if encoding == "linear":
         return linear
@@ -128,13 +128,13 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
     return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
 
 
-def decode(picture: Tensor, encoding: str) -> Tensor:
+def decode(image: Tensor, encoding: str) -> Tensor:
     """Inverse of `encode`. Under "linear" a texture's values are taken as the albedo as they stand."""
     check_encoding(encoding)
     if encoding == "linear":
-        return picture
-    curve = ((picture.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
-    return torch.where(picture <= 0.04045, picture / 12.92, curve)
+        return image
+    curve = ((image.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(image <= 0.04045, image / 12.92, curve)
 
 
 def check_encoding(encoding: str) -> None:
@@ -149,5 +149,5 @@ def to_bytes(image: Tensor) -> Tensor:
 
 
 def to_unit(images: Tensor) -> Tensor:
-    """uint8 pictures to float32 RGB in [0, 1]."""
+    """uint8 images to float32 RGB in [0, 1]."""
     return images.float() / 255

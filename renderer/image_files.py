@@ -25,7 +25,7 @@ def read_image(path: Path, size: int) -> Tensor:
 
 
 def read_square(path: Path, size: int) -> np.ndarray:
-    """The centre square of a picture as (size, size, 3) uint8. Raises whatever Pillow does at a broken file."""
+    """The centre square of an image as (size, size, 3) uint8. Raises whatever Pillow does at a broken file."""
     with Image.open(path) as image:
         # A large JPEG is decoded at 1/2, 1/4 or 1/8 of its size, several times faster.
         image.draft(None, (DECODED_SIZES * size, DECODED_SIZES * size))

@@ -1,4 +1,4 @@
-"""A light as a picture: a white ball in it."""
+"""A light as an image: a white ball in it."""
 
 import math
 
@@ -15,7 +15,7 @@ _OBLIQUE = OrthographicCamera(math.pi / 3, 0.0, 2.0)  # the first of `renderer.c
 
 
 def light_sphere(light: Tensor, size: int, camera: OrthographicCamera = _OBLIQUE) -> Tensor:
-    """A diffuse white ball in a light ((degree + 1)², 3), which fills a square picture as the camera sees it, on white.
+    """A diffuse white ball in a light ((degree + 1)², 3), which fills a square image as the camera sees it, on white.
 
     Returns (3, size, size) float32, sRGB-encoded in [0, 1]. The pixel's value before encoding is irradiance / π, so
     that even light of radiance 1 is white; what is darker than black or brighter than white is clamped. A diffuse ball

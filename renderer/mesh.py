@@ -224,11 +224,11 @@ def _corner_colors(visual: Visuals, faces: np.ndarray) -> tuple[np.ndarray, Imag
 
 
 def _material(material: Material) -> tuple[np.ndarray, Image.Image | None]:
-    """A material's colour (3,) in [0, 1], white where the file gives none, and its picture."""
+    """A material's colour (3,) in [0, 1], white where the file gives none, and its image."""
     if isinstance(material, PBRMaterial):
         factor, image = material.baseColorFactor, material.baseColorTexture
         return np.ones(3) if factor is None else _unit_rgb(factor), image
-    # trimesh puts a grey colour, or a grey picture, where the file has none; what it has is under its own name.
+    # trimesh puts a grey colour, or a grey image, where the file has none; what it has is under its own name.
     image = None if material.image == empty_material().image else material.image
     return np.clip(material.kwargs.get("kd", np.ones(3)), 0, 1), image
 

@@ -47,7 +47,7 @@ def _textured_part(mesh: Mesh, texture_id: int) -> trimesh.Trimesh:
     corners = np.concatenate([mesh.corner_colors[here], mesh.corner_uvs[here]], axis=-1)
     ids, values, faces = _split(mesh.faces[here], corners)
     material = PBRMaterial(
-        name=f"texture {texture_id}",  # trimesh would take pictures of the same bytes and other sizes for one
+        name=f"texture {texture_id}",  # trimesh would take images of the same bytes and other sizes for one
         baseColorTexture=Image.fromarray(mesh.textures[texture_id]) if texture_id >= 0 else None,
         metallicFactor=0.0,
         roughnessFactor=1.0,

@@ -10,7 +10,7 @@ from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import PictureSettings, as_background, compose
+from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.transfer import Operator, build_operators
@@ -43,7 +43,7 @@ def render(
     side. encoding: linear or srgb. normals: flat or smooth. visibility: auto, opengl or software.
     InputError: NaN, shapes that do not fit, unknown choices.
     """
-    settings = PictureSettings(size, samples, encoding, normals)
+    settings = ImageSettings(size, samples, encoding, normals)
     vertices = _matching(vertices, mesh.vertices.shape, "vertices", torch.from_numpy(mesh.vertices)).to(light)
     positions = vertices.detach().cpu().double().numpy()
     views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(visibility), closed=mesh.closed)
@@ -73,7 +73,7 @@ def operators(
 
     `operator.image(light, background)` is the image that `render` makes, to rounding. Keywords as there.
     """
-    settings = PictureSettings(size, samples, encoding, normals)
+    settings = ImageSettings(size, samples, encoding, normals)
     return build_operators(mesh, _listed(cameras), settings, _choose(visibility), gain)
 
 

@@ -18,7 +18,7 @@ PAPER, INK, FAINT = "white", "#1a1a1a", "#6b6b6b"
 class Tile:
     """An image, (H, W, 3) uint8 RGB, with lines of text below it: the first in ink, the others faint."""
 
-    picture: np.ndarray
+    image: np.ndarray
     caption: tuple[str, ...]
 
     @staticmethod

@@ -18,7 +18,7 @@ from renderer.basis import HARMONICS, Basis
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import PictureSettings, as_background, compose
+from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.shading import smooth_normals
@@ -46,7 +46,7 @@ class Operator:
     albedo: Tensor
     coverage: Tensor
     pixels: Tensor
-    settings: PictureSettings
+    settings: ImageSettings
     basis: Basis = HARMONICS
 
     def image(self, lights: Tensor, background: float | Tensor = 0.5) -> Tensor:
@@ -141,7 +141,7 @@ def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
 def build_operators(
     mesh: Mesh,
     cameras: Sequence[OrthographicCamera],
-    settings: PictureSettings,
+    settings: ImageSettings,
     backend: Backend,
     gain: float = 1.0,
     basis: Basis = HARMONICS,
@@ -157,7 +157,7 @@ def build_operators(
 
 
 def build_operator(
-    mesh: Mesh, fragments: Fragments, settings: PictureSettings, gain: float, basis: Basis, dtype: torch.dtype
+    mesh: Mesh, fragments: Fragments, settings: ImageSettings, gain: float, basis: Basis, dtype: torch.dtype
 ) -> Operator:
     """The operator of one view that has been rasterised; see `build_operators`."""
     require_bounded(gain=torch.tensor(gain))
@@ -193,7 +193,7 @@ class _Shades:
     basis: Callable[[slice], Tensor]
 
 
-def _shades(mesh: Mesh, fragments: Fragments, albedo: Tensor, settings: PictureSettings, basis: Basis) -> _Shades:
+def _shades(mesh: Mesh, fragments: Fragments, albedo: Tensor, settings: ImageSettings, basis: Basis) -> _Shades:
     vertices = torch.from_numpy(mesh.vertices)
     if settings.normals == "smooth":
         normals = smooth_normals(fragments, vertices, torch.from_numpy(mesh.faces))

@@ -34,7 +34,7 @@ def main(config: DictConfig) -> None:
             folder = out / f"{index}_{Path(named.mesh.replace(':', '_')).stem}"
             attacked.save(folder, checks)
             print(format_attack(named.mesh, attacked, checks))
-            print(f"pictures, lights, shapes and numbers: {folder}\n")
+            print(f"images, lights, shapes and numbers: {folder}\n")
         OmegaConf.save(config, out / "config.yaml")
 
 

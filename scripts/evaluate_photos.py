@@ -57,7 +57,7 @@ def main(settings: Settings) -> None:
             device=device,
         )
     print(format_summary(summary))
-    print(f"\ntable, scores and picture: {settings.out}")
+    print(f"\ntable, scores and image: {settings.out}")
 
 
 def _load(settings: Settings) -> Classifier:

@@ -13,14 +13,14 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.slow
-def test_the_demonstration_ends_with_a_table_that_shows_the_effect_and_a_picture(tmp_path):
+def test_the_demonstration_ends_with_a_table_that_shows_the_effect_and_a_image(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-m", "train"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
     )
-    *_, pictures = re.findall(r"^picture: (.*)$", done.stdout, re.M)
-    folder = Path(pictures).parents[1]
-    assert Path(pictures).read_bytes().startswith(b"\x89PNG")
+    *_, images = re.findall(r"^image: (.*)$", done.stdout, re.M)
+    folder = Path(images).parents[1]
+    assert Path(images).read_bytes().startswith(b"\x89PNG")
     recall = {
         arm: json.loads((path / "photographs" / "summary.json").read_text())["recall"]["value"]
         for arm, path in [("none", folder / "none"), ("adversarial", folder)]

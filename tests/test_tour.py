@@ -23,8 +23,8 @@ def test_the_tour_runs_from_the_root_of_a_clone_and_fools_the_network(tour):
     assert int(recognised) > 0 and int(fooled) >= 0.9 * int(recognised)
 
 
-def test_the_tour_is_kept_with_its_pictures_and_without_a_machines_path(tour):
+def test_the_tour_is_kept_with_its_images_and_without_a_machines_path(tour):
     cells = [cell for cell in tour.cells if cell.cell_type == "code"]
-    pictures = [output for cell in cells for output in cell.outputs if "image/png" in output.get("data", {})]
-    assert len(pictures) >= 7 and not any(output.output_type == "error" for cell in cells for output in cell.outputs)
+    images = [output for cell in cells for output in cell.outputs if "image/png" in output.get("data", {})]
+    assert len(images) >= 7 and not any(output.output_type == "error" for cell in cells for output in cell.outputs)
     assert TOUR.stat().st_size < 500_000 and "/home/" not in TOUR.read_text() and "/work/" not in TOUR.read_text()

@@ -15,7 +15,7 @@ from augment import processes
 from train.cli import one_sentence_errors, quoted, with_suggestions
 from train.data import DataSet
 from train.distributed import announce, announced, first_process_first, process_group
-from train.experiment import load_data, prepare, write_pictures
+from train.experiment import load_data, prepare, write_images
 from train.interruption import Interrupted
 from train.logs import console
 from train.report import format_table, summarise
@@ -47,7 +47,7 @@ def run_arms(config: DictConfig, folder: Path) -> None:
     with sole_writer("run", *arms) if processes.index() == 0 else nullcontext():
         with first_process_first():
             if processes.index() == 0:
-                write_pictures(config, data.size)
+                write_images(config, data.size)
         _train_arms(arms, data, folder)
 
 

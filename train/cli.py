@@ -26,7 +26,7 @@ USER_ERROR = 2
 LONGEST_NAME = 200  # characters
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 TEXTS = {  # keys of names and folders
-    *("run", "sweep", "init_from", "out", "keep", "photos", "photographs", "path", "pictures", "cache"),
+    *("run", "sweep", "init_from", "out", "keep", "photos", "photographs", "path", "images", "cache"),
     *("weights", "light", "label", "classifier"),
 }
 NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false", re.IGNORECASE)

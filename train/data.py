@@ -1,4 +1,4 @@
-"""Labelled pictures as uint8 arrays: CIFAR-100, an .npz file, a folder of class folders, or rendered shapes."""
+"""Labelled images as uint8 arrays: CIFAR-100, an .npz file, a folder of class folders, or rendered shapes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ class DataSet:
 
 
 def stratified_split(split: Split, share: float, seed: int, key: str = "data.validation") -> tuple[Split, Split]:
-    """(train, held out) with the share of every class's pictures, rounded, held out. InputError names the key."""
+    """(train, held out) with the share of every class's images, rounded, held out. InputError names the key."""
     if not 0 < share < 1:
         raise InputError(f"{key}={share} must lie between 0 and 1")
     held_out = torch.zeros(len(split), dtype=torch.bool)
@@ -58,8 +58,8 @@ def stratified_split(split: Split, share: float, seed: int, key: str = "data.val
         count = round(share * len(members))
         if not 0 < count < len(members):
             raise InputError(
-                f"{key}={share} of the {len(members)} pictures of class {int(label)} is all or nothing: "
-                "add pictures or change the share"
+                f"{key}={share} of the {len(members)} images of class {int(label)} is all or nothing: "
+                "add images or change the share"
             )
         held_out[members[torch.randperm(len(members), generator=draws)[:count]]] = True
     return split[~held_out], split[held_out]
@@ -112,13 +112,13 @@ def load_npz(path: str) -> DataSet:
 
 
 def load_folder(path: str, size: int, test_share: float) -> DataSet:
-    """Class folders of pictures, or `train` and `test` folders of them; centre squares reduced to size × size.
+    """Class folders of images, or `train` and `test` folders of them; centre squares reduced to size × size.
 
     Without a `test` folder, that share of every class is held out as the test split.
     """
     root = Path(path)
     if not root.is_dir():
-        raise InputError(f"data.path={path} is not a folder: give a folder with one folder of pictures per class")
+        raise InputError(f"data.path={path} is not a folder: give a folder with one folder of images per class")
     divided = (root / "train").is_dir() and (root / "test").is_dir()
     train_root = root / "train" if divided else root
     folders = [entry.name for entry in train_root.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
@@ -126,10 +126,10 @@ def load_folder(path: str, size: int, test_share: float) -> DataSet:
     if len(classes) < 2:
         raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
     if passed_over := left_out(root):
-        console.warning("%d files in %s are no pictures that are read: %s", len(passed_over), root, _some(passed_over))
+        console.warning("%d files in %s are no images that are read: %s", len(passed_over), root, _some(passed_over))
     train = _folder_split(train_root, classes, size)
     if empty := set(range(len(classes))).difference(train.labels.tolist()):
-        raise InputError(f"{train_root / classes[min(empty)]} holds no picture: put some there or remove the folder")
+        raise InputError(f"{train_root / classes[min(empty)]} holds no image: put some there or remove the folder")
     if divided:
         return DataSet(classes, train, _folder_split(root / "test", classes, size))
     return DataSet(classes, *stratified_split(train, test_share, seed=0, key="data.test_share"))

@@ -37,9 +37,9 @@ class Round:
     rows: Tensor
 
 
-def batch_count(pictures: int, batch_size: int) -> int:
+def batch_count(images: int, batch_size: int) -> int:
     """Batches in a round."""
-    return math.ceil(pictures / batch_size)
+    return math.ceil(images / batch_size)
 
 
 def training_batches(
@@ -47,9 +47,9 @@ def training_batches(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """One shuffled round of (images (B, 3, H, W) uint8, labels (B,)): this process's share of every batch.
 
-    Reflect-pads by 4 and crops, then flips half of the pictures: "random" ones, or "alternating", each picture in every
+    Reflect-pads by 4 and crops, then flips half of the images: "random" ones, or "alternating", each image in every
     other epoch. All batches have one shape, as the device's graphs need; the last one is filled up with the round's
-    first pictures. All draws are made on the CPU and moved over once, so that they are the same on every device and for
+    first images. All draws are made on the CPU and moved over once, so that they are the same on every device and for
     any number of processes. first: the batch to begin with.
     """
     order = _order(now.rows, batch_size, generator(seed, now.number, "batches"))
@@ -73,15 +73,15 @@ def _order(rows: Tensor, batch_size: int, draws: torch.Generator) -> Tensor:
     return order[places].view(-1, batch_size)
 
 
-def _flipped(order: Tensor, pictures: int, seed: int, now: Round, flips: str) -> Tensor:
+def _flipped(order: Tensor, images: int, seed: int, now: Round, flips: str) -> Tensor:
     if flips == "random":
         return torch.randint(0, 2, order.shape, generator=generator(seed, now.number, "flips"), dtype=torch.bool)
-    in_even_epochs = torch.randint(0, 2, (pictures,), generator=generator(seed, "flips"), dtype=torch.bool)
+    in_even_epochs = torch.randint(0, 2, (images,), generator=generator(seed, "flips"), dtype=torch.bool)
     return in_even_epochs[order] ^ bool(now.epoch % 2)
 
 
 def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:
-    """The chosen pictures (B,) shifted by (2, B) rows and columns, mirrored at the border, and flipped where (B,)."""
+    """The chosen images (B,) shifted by (2, B) rows and columns, mirrored at the border, and flipped where (B,)."""
     height, width = images.shape[2:]
     rows = _reflect(torch.arange(height, device=images.device) + shifts[0, :, None], height)
     columns = torch.arange(width, device=images.device).expand(len(chosen), -1)
@@ -99,7 +99,7 @@ def _reflect(index: Tensor, size: int) -> Tensor:
 
 
 def with_room(split: Split, count: int) -> Split:
-    """The split's pictures and, behind them, room for a round's renders."""
+    """The split's images and, behind them, room for a round's renders."""
     images, labels = split.images, split.labels
     return Split(
         torch.cat([images, images.new_zeros(count, *images.shape[1:])]), torch.cat([labels, labels.new_zeros(count)])
@@ -107,7 +107,7 @@ def with_room(split: Split, count: int) -> Split:
 
 
 def put_last(split: Split, renders: Renders) -> None:
-    """Overwrite the split's last pictures with the renders, as 8-bit pictures."""
+    """Overwrite the split's last images with the renders, as 8-bit images."""
     first = len(split) - len(renders.labels)
     split.images[first:] = to_bytes(renders.images)
     split.labels[first:] = renders.labels
@@ -133,7 +133,7 @@ def rounds_of_epoch(
 class EpochUnderWay:
     """How far an epoch has come.
 
-    renders: of the round under way. sums: loss and hits over the pictures this process has seen (2,). history: the
+    renders: of the round under way. sums: loss and hits over the images this process has seen (2,). history: the
     diagnostics of each round's renders so far. step: steps taken, in all rounds.
     """
 

@@ -74,19 +74,18 @@ def load_data(config: DictConfig) -> DataSet:
         loaded = loaders[data.name]()
     if not SMALLEST_SIZE <= loaded.size <= LARGEST_SIZE:
         raise InputError(
-            f"data.path={data.path} has pictures of {loaded.size} pixels per side: give {SMALLEST_SIZE} to "
-            f"{LARGEST_SIZE}"
+            f"data.path={data.path} has images of {loaded.size} pixels per side: give {SMALLEST_SIZE} to {LARGEST_SIZE}"
         )
     return loaded
 
 
-def write_pictures(config: DictConfig, size: int) -> None:
-    """Write the rendered held-out pictures that `data=shapes` is scored on, where the configuration asks for them."""
-    if config.data.name == "shapes" and config.data.pictures:
-        console.info("writing held-out renders in hard light (not photographs) to %s", config.data.pictures)
+def write_images(config: DictConfig, size: int) -> None:
+    """Write the rendered held-out images that `data=shapes` is scored on, where the configuration asks for them."""
+    if config.data.name == "shapes" and config.data.images:
+        console.info("writing held-out renders in hard light (not photographs) to %s", config.data.images)
         cache = TensorCache(cache_folder(config.renderer.cache))
-        with _one_error_without_room(config.data.pictures):
-            write_held_out(Path(str(config.data.pictures)), size, config.data.seed, cache)
+        with _one_error_without_room(config.data.images):
+            write_held_out(Path(str(config.data.images)), size, config.data.seed, cache)
 
 
 def run(config: DictConfig, data: DataSet, folder: Path) -> None:
@@ -110,7 +109,7 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
     @_one_error_without_room(folder)
     def train_and_score() -> None:
         console.info(
-            "%s pictures, %s classes; %s, %s, %d threads, %d processes",
+            "%s images, %s classes; %s, %s, %d threads, %d processes",
             len(train),
             len(data.classes),
             device,
@@ -216,7 +215,7 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         ring(settings.views, scene.field_of_view),
         load_backgrounds(scene.backgrounds, data.size),
         (load_light(scene.light) * scene.exposure).to(device),
-        renderer.pictures(data.size),
+        renderer.images(data.size),
         backend,
         cache,
     )

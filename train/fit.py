@@ -361,7 +361,7 @@ def _progress(batches: Iterable, first: int, total: int, description: str) -> It
 def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
     """Mean cross entropy and top-1 accuracy in eval mode; the model's mode is restored.
 
-    Every process of a run scores its share of the pictures; all get the result.
+    Every process of a run scores its share of the images; all get the result.
     """
     share = slice(processes.index(), None, processes.count())
     loss_sum, correct = totals = torch.zeros(2, device=split.images.device)

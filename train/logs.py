@@ -1,4 +1,4 @@
-"""Scalars and pictures of a run: TensorBoard, one JSON line per epoch, and a line on the console."""
+"""Scalars and images of a run: TensorBoard, one JSON line per epoch, and a line on the console."""
 
 import io
 import json

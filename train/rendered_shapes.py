@@ -1,6 +1,6 @@
 """A small labelled data set that the project renders itself, so that the experiment runs with nothing downloaded.
 
-Training and test pictures stand in soft, even light, as stock photographs do. The held-out pictures, written to a
+Training and test images stand in soft, even light, as stock photographs do. The held-out images, written to a
 folder and scored like photographs, show other individuals in hard light from one side: every class under the same
 lights before the same cameras, so that nothing but the thing itself tells one from another. They are renders.
 """
@@ -23,7 +23,7 @@ from augment.seeding import generator
 from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.image import PictureSettings, to_bytes
+from renderer.image import ImageSettings, to_bytes
 from renderer.lights import ambient, directional
 from renderer.mesh import Mesh, normalise
 from renderer.shapes import SOLIDS, solid
@@ -32,8 +32,8 @@ from train.data import DataSet, Split
 from train.logs import console
 
 CLASSES = tuple(sorted(SOLIDS))
-SETTINGS = PictureSettings(samples=4)
-VIEWS, BACKGROUNDS = 5, 4  # pictures per individual: every view on every background, each in a light of its own
+SETTINGS = ImageSettings(samples=4)
+VIEWS, BACKGROUNDS = 5, 4  # images per individual: every view on every background, each in a light of its own
 HELD_OUT_PER_CLASS = 60
 SOURCE = "rendered, hard light"
 CODE = RENDERER + source_key(Path(augment.__file__).parent, Path(__file__).parent)
@@ -51,13 +51,13 @@ class Part:
 
 
 def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
-    """That many training and test pictures of every class, in even light; whole individuals (20 pictures) each.
+    """That many training and test images of every class, in even light; whole individuals (20 images) each.
 
-    The cache keeps the pictures, not the operators: every one of those is used for four pictures and never again.
+    The cache keeps the images, not the operators: every one of those is used for four images and never again.
     """
     if train < 1 or test < 1:
         raise InputError(
-            f"data.train_per_class={train} and data.test_per_class={test} must be at least 1 picture per class"
+            f"data.train_per_class={train} and data.test_per_class={test} must be at least 1 image per class"
         )
     settings = replace(SETTINGS, size=size)
     splits = [
@@ -68,7 +68,7 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
 
 
 def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None = None) -> None:
-    """Class folders of PNG pictures in hard light; photos.csv calls them rendered and numbers the lights."""
+    """Class folders of PNG images in hard light; photos.csv calls them rendered and numbers the lights."""
     settings = replace(SETTINGS, size=size)
     part = Part("held out", hard_light, same_for_all=True)
     split = _render_split(HELD_OUT_PER_CLASS, seed, part, settings, cache or TensorCache())
@@ -99,7 +99,7 @@ def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
     return ambient(0.06 * tint) + directional(direction, strength * tint)
 
 
-def _render_split(per_class: int, seed: int, part: Part, settings: PictureSettings, cache: TensorCache) -> Split:
+def _render_split(per_class: int, seed: int, part: Part, settings: ImageSettings, cache: TensorCache) -> Split:
     key = content_key(CODE, CLASSES, per_class, seed, part.name, settings)
     kept = cache.read(key)
     if kept is None:
@@ -108,12 +108,12 @@ def _render_split(per_class: int, seed: int, part: Part, settings: PictureSettin
         source = f"rendered; not kept: {cache.problem}" if cache.problem else "rendered"
     else:
         source = "from the cache"
-    console.info("%s pictures: %d %s", part.name, len(kept["images"]), source)
+    console.info("%s images: %d %s", part.name, len(kept["images"]), source)
     return Split(kept["images"], torch.arange(len(CLASSES)).repeat_interleave(per_class))
 
 
-def _render(per_class: int, seed: int, part: Part, settings: PictureSettings) -> Tensor:
-    """Pictures of every class, in order: uint8 (classes × per_class, 3, size, size)."""
+def _render(per_class: int, seed: int, part: Part, settings: ImageSettings) -> Tensor:
+    """Images of every class, in order: uint8 (classes × per_class, 3, size, size)."""
     backend = choose("software")
     individuals = math.ceil(per_class / (VIEWS * BACKGROUNDS))
     draws = seeds = generator(seed, part.name)
@@ -122,15 +122,15 @@ def _render(per_class: int, seed: int, part: Part, settings: PictureSettings) ->
         if part.same_for_all:
             draws, seeds = generator(seed, part.name), generator(seed, part.name, name)
         meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(individuals))
-        pictures = [_portraits(name, mesh, part.light, settings, backend, draws) for mesh in meshes]
-        images.append(torch.cat(pictures)[:per_class])
+        portraits = [_portraits(name, mesh, part.light, settings, backend, draws) for mesh in meshes]
+        images.append(torch.cat(portraits)[:per_class])
     return torch.cat(images)
 
 
 def _portraits(
-    name: str, mesh: Mesh, light: Lights, settings: PictureSettings, backend: Backend, draws: torch.Generator
+    name: str, mesh: Mesh, light: Lights, settings: ImageSettings, backend: Backend, draws: torch.Generator
 ) -> Tensor:
-    """20 pictures of one individual: uint8 (20, 3, size, size)."""
+    """20 images of one individual: uint8 (20, 3, size, size)."""
     polar, azimuth, field = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
     cameras = [
         OrthographicCamera(math.radians(40 + 45 * p), 2 * math.pi * a, 2 + f)

@@ -92,7 +92,7 @@ def complete(folder: Path) -> Iterator[None]:
 
 def format_table(runs: Sequence[RunSummary]) -> str:
     """`headline_tables` as Markdown, and the contact sheets."""
-    sheets = [f"picture: {run.folder / folder / 'contact_sheet.png'}" for run in runs for folder in run.photographs]
+    sheets = [f"image: {run.folder / folder / 'contact_sheet.png'}" for run in runs for folder in run.photographs]
     return "\n\n".join(filter(None, [*map(_titled, headline_tables(runs)), "\n".join(sheets)]))
 
 

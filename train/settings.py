@@ -13,7 +13,7 @@ from augment.objects import ObjectSettings
 from augment.scene import count_views
 from augment.service import AugmentationSettings
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from train.recipe import TrainSettings
 from train.run_folder import CONFIG, read_config
 
@@ -24,9 +24,9 @@ CIRCUMSTANCES = (
 )
 OTHER = "other"  # in place of the class of a look-alike that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
-RESERVED = ("renders", "rendered_pictures", "test")  # other sub-folders and scores of a run
+RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
 SMALLEST_SIZE, LARGEST_SIZE = 5, 4096  # pixels per side: 4 are padded by reflection
-MOST_PICTURES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
+MOST_IMAGES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
 
 
 @dataclass
@@ -41,13 +41,13 @@ class DataSettings:
     train_per_class: int = 300
     test_per_class: int = 60
     seed: int = 0
-    pictures: str | None = None
+    images: str | None = None
 
     def __post_init__(self):
         require_range("data.size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
         require_range("data.seed", self.seed, 0, LARGEST_SEED)
         for name in ("train_per_class", "test_per_class"):
-            require_range(f"data.{name}", getattr(self, name), 1, MOST_PICTURES)
+            require_range(f"data.{name}", getattr(self, name), 1, MOST_IMAGES)
 
 
 @dataclass
@@ -82,9 +82,9 @@ class RendererSettings:
     normals: str = "flat"
     cache: str | None = "auto"
 
-    def pictures(self, size: int) -> PictureSettings:
-        """Of pictures with `size` pixels per side."""
-        return PictureSettings(size, self.samples, self.encoding, self.normals)
+    def images(self, size: int) -> ImageSettings:
+        """Of images with `size` pixels per side."""
+        return ImageSettings(size, self.samples, self.encoding, self.normals)
 
 
 @dataclass

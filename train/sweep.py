@@ -28,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from train import checkpoint
 from train.cli import one_sentence, one_sentence_errors
-from train.experiment import load_data, run, write_pictures
+from train.experiment import load_data, run, write_images
 from train.logs import console
 from train.report import format_spread, format_table, is_finished, summarise
 from train.run_folder import FAILURE, locked, state
@@ -113,7 +113,7 @@ def _train(config: DictConfig, folder: Path) -> None:
     OmegaConf.resolve(config)
     config.train.resume = checkpoint.exists(folder)
     data = load_data(config)
-    write_pictures(config, data.size)
+    write_images(config, data.size)
     run(config, data, folder)
 
 

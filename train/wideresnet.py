@@ -15,7 +15,7 @@ LEVELS = 2**16
 
 
 class WideResNet(nn.Module):
-    """WRN-depth-width for small pictures of any size.
+    """WRN-depth-width for small images of any size.
 
     Takes (N, 3, H, W) RGB in [0, 1], normalises with the data's own mean and std inside, gives logits (N, classes).
     depth is 6n + 4: n blocks of two convolutions in each of three groups.

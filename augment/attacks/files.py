@@ -1,4 +1,4 @@
-"""What an attack leaves behind: pictures, lights, shapes, and all numbers as JSON lines."""
+"""What an attack leaves behind: images, lights, shapes, and all numbers as JSON lines."""
 
 import json
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from augment.attacks.checks import Checks
-from augment.attacks.report_picture import Exhibit, answer_caption, report_picture
+from augment.attacks.figure import Exhibit, answer_caption, save_figure
 from augment.attacks.run import Attacked
 from augment.scene import Conditions
 from renderer.environment import to_map, write_map
@@ -24,7 +24,7 @@ SPHERE = 192
 
 
 def write_files(attacked: Attacked, checks: Checks | None, folder: Path) -> None:
-    """Write a folder: attack.jsonl, and for each example a picture and the light and shape that it ended with."""
+    """Write a folder: attack.jsonl, and for each example an image and the light and shape that it ended with."""
     folder.mkdir(parents=True, exist_ok=True)
     everything = attacked.problem.everything
     before = attacked.problem.conditions(attacked.problem.start, everything)
@@ -32,19 +32,19 @@ def write_files(attacked: Attacked, checks: Checks | None, folder: Path) -> None
     with open(folder / LINES, "w", encoding="utf-8") as file:
         for example in range(len(everything)):
             stem = folder / f"example_{example:03d}"
-            _write_picture(attacked, before, after, example, stem.with_suffix(".png"))
+            _write_image(attacked, before, after, example, stem.with_suffix(".png"))
             numbers = _numbers(attacked, example) | dict(_write_conditions(attacked, after, example, stem))
             file.write(json.dumps({"example": example, **numbers}) + "\n")
         if checks is not None:
             file.write(json.dumps({"checks": asdict(checks), "warnings": checks.warnings}) + "\n")
 
 
-def _write_picture(attacked: Attacked, before: Conditions, after: Conditions, example: int, path: Path) -> None:
+def _write_image(attacked: Attacked, before: Conditions, after: Conditions, example: int, path: Path) -> None:
     sides = [
         (attacked.images_before, attacked.logits_before, before),
         (attacked.result.images, attacked.logits, after),
     ]
-    report_picture(*(_exhibit(attacked, *side, example) for side in sides), path)
+    save_figure(*(_exhibit(attacked, *side, example) for side in sides), path)
 
 
 def _exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Conditions, example: int) -> Exhibit:

@@ -141,6 +141,6 @@ def require_recognised(scene: Scene, logits: Tensor, labels: Tensor, classifier:
             for share, index in zip(best.values.tolist(), best.indices.tolist(), strict=True)
         )
         raise InputError(
-            f"{len(wrong)} of {logits.shape[0] * logits.shape[1]} pictures of {shown.name} are not recognised as "
+            f"{len(wrong)} of {logits.shape[0] * logits.shape[1]} images of {shown.name} are not recognised as "
             f"{shown.label!r} before any attack (the first: {answers}): change the scene, or set attack.force=true"
         )

@@ -1,4 +1,4 @@
-"""What makes a network attackable: one module that takes pictures as the renderer makes them, and names its classes."""
+"""What makes a network attackable: one module that takes images as the renderer makes them, and names its classes."""
 
 import difflib
 from collections import Counter
@@ -12,14 +12,14 @@ from renderer.errors import InputError
 
 
 class Classifier(nn.Module):
-    """A frozen classifier: pictures (N, 3, size, size), RGB in [0, 1], to logits (N, C); differentiable in the pixels.
+    """A frozen classifier: images (N, 3, size, size), RGB in [0, 1], to logits (N, C); differentiable in the pixels.
 
-    name: for messages. size: pixels per side; pictures are to be rendered at it, nothing is resized here. classes:
+    name: for messages. size: pixels per side; images are to be rendered at it, nothing is resized here. classes:
     the C names, each once. The parameters need no gradient and the mode is eval, whatever `train` is told.
     """
 
     def __init__(self, function: Callable[[Tensor], Tensor], size: int, classes: Sequence[str], name: str = "callable"):
-        """function: any callable from such pictures to logits. A module is moved with this one, frozen and put in eval
+        """function: any callable from such images to logits. A module is moved with this one, frozen and put in eval
         mode. InputError for a class name that occurs twice, since labels are found by name."""
         super().__init__()
         self.function = function
@@ -31,10 +31,10 @@ class Classifier(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, images: Tensor) -> Tensor:
-        """InputError for pictures of another size, and for a callable that gives no logits or none with a gradient."""
+        """InputError for images of another size, and for a callable that gives no logits or none with a gradient."""
         if images.shape[1:] != (3, self.size, self.size):
             raise InputError(
-                f"classifier={self.name} takes pictures (N, 3, {self.size}, {self.size}), not {tuple(images.shape)}: "
+                f"classifier={self.name} takes images (N, 3, {self.size}, {self.size}), not {tuple(images.shape)}: "
                 f"render at {self.size} pixels per side"
             )
         logits = self.function(images)
@@ -63,7 +63,7 @@ class Classifier(nn.Module):
 
 
 class Normalise(nn.Module):
-    """Pictures (N, 3, H, W), RGB in [0, 1], to what a network was trained on: (x − mean) / std per channel.
+    """Images (N, 3, H, W), RGB in [0, 1], to what a network was trained on: (x − mean) / std per channel.
 
     mean, std: in units of [0, 1] and in the network's own order of channels. bgr: whether that order is blue first.
     The result is laid out channels last, in which a CPU convolves about a quarter faster.

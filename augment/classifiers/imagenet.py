@@ -149,7 +149,7 @@ def _require_not_caffes(state: Mapping[str, Tensor], source: str | Path, name: s
     bias = state.get("features.0.bias")
     if bias is not None and hashlib.sha256(bias.float().numpy().tobytes()).hexdigest() == _CAFFE_BIAS:
         raise InputError(
-            f"weights={source} were trained in Caffe, on pictures in other units than {name} takes: "
+            f"weights={source} were trained in Caffe, on images in other units than {name} takes: "
             f"set classifier={SQUEEZENET_CAFFE}"
         )
 

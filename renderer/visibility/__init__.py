@@ -3,11 +3,11 @@
 rasterise(points, faces, resolution, closed) -> ids
 
 points      (N, V, 3) float64, the vertices as N views project them: x right, y up, both in [-1, 1] across
-            a square picture; z is depth, smaller is nearer, and surface outside [-1, 1) is clipped
+            a square image; z is depth, smaller is nearer, and surface outside [-1, 1) is clipped
 faces       (F, 3) integer; drawn from both sides unless closed
 resolution  samples per side R; sample (i, j) sits at x = (2j + 1)/R - 1, y = 1 - (2i + 1)/R
 closed      promises a watertight mesh within the range of depths, its faces counter-clockwise seen from outside, and
-            leaves out the faces that wind clockwise in the picture: the same samples are covered, with the same ids
+            leaves out the faces that wind clockwise in the image: the same samples are covered, with the same ids
             but where a face turned away is as near as the nearest within rounding, as along outlines
 ids         (N, R, R) int32, row 0 at the top: the nearest face's index, the lower one where depths tie, or -1
 

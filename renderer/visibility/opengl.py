@@ -34,7 +34,7 @@ FRAGMENT_SHADER = """
 flat in int face;
 layout(location = 0) out int id;
 void main() {
-    id = face + 1;  // 0 is what the picture is cleared to
+    id = face + 1;  // 0 is what the image is cleared to
 }
 """
 
@@ -102,7 +102,7 @@ def _draw(
     framebuffer = context.framebuffer([texture], context.depth_renderbuffer(size))
     framebuffer.use()
     context.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if closed else moderngl.NOTHING))
-    context.front_face = "cw"  # counter-clockwise in the picture, whose rows go down
+    context.front_face = "cw"  # counter-clockwise in the image, whose rows go down
     context.depth_func = "<"  # of equal depths the face drawn first stays, the one with the lower index
 
     ids = np.empty((len(points), *size), dtype=np.int32)

@@ -19,8 +19,8 @@ FACES, PARTS = 2**14, 2**13  # faces, and their rows or samples, at a time: what
 def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """Ids by the contract in `renderer.visibility`, for finite points."""
     ids = np.empty((len(points), resolution, resolution), dtype=np.int32)
-    for view, picture in zip(points, ids, strict=True):
-        picture[:] = _keys(view, faces, resolution, closed).reshape(picture.shape)  # of which an id is the lower half
+    for view, image in zip(points, ids, strict=True):
+        image[:] = _keys(view, faces, resolution, closed).reshape(image.shape)  # of which an id is the lower half
     return ids
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from augment.scene import Scene
 from renderer.camera import OrthographicCamera
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.lights import ambient
 from renderer.mesh import Mesh
 from renderer.visibility import choose
@@ -22,7 +22,7 @@ FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth 
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> Iterator[None]:
-    """Pictures and networks are so small that threads would wait for each other."""
+    """Images and networks are so small that threads would wait for each other."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -56,7 +56,7 @@ def make_scene(stone) -> Callable[..., Scene]:
         light = ambient(torch.full((3,), 0.22)) + 0.03 * torch.randn(49, 3, generator=draws)
         if backgrounds is None:
             backgrounds = 0.2 + 0.6 * torch.rand(len(cameras), 3, size, size, generator=draws)
-        settings = PictureSettings(size, samples=2, encoding=encoding)
+        settings = ImageSettings(size, samples=2, encoding=encoding)
         return Scene.of_mesh(mesh, cameras, backgrounds, light.to(dtype), settings, choose("software"), gain)
 
     return build
@@ -64,7 +64,7 @@ def make_scene(stone) -> Callable[..., Scene]:
 
 @pytest.fixture
 def make_linear() -> Callable[..., nn.Module]:
-    """A classifier whose logits are linear in the picture: random weights (classes, 3·size²), a bias for class 0."""
+    """A classifier whose logits are linear in the image: random weights (classes, 3·size²), a bias for class 0."""
 
     def build(
         classes: int, bias: float = 0.0, size: int = SIZE, dtype: torch.dtype = torch.float64, seed: int = 1

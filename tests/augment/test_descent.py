@@ -22,7 +22,7 @@ def random(*shape: int, seed: int) -> Tensor:
 
 
 class Linear(nn.Module):
-    """Two classes, logits linear in the picture. `seen` counts the pictures it was shown."""
+    """Two classes, logits linear in the image. `seen` counts the images it was shown."""
 
     def __init__(self, weight: Tensor, bias: float = 0.0):
         super().__init__()
@@ -40,7 +40,7 @@ WEIGHT, CAMERAS = random(2, 12, seed=0), random(2, DIMENSIONS, 12, seed=1) / 4
 
 @dataclass
 class LinearScene:
-    """Pictures that are linear in the values: each view by its camera, each example in another tint."""
+    """Images that are linear in the values: each view by its camera, each example in another tint."""
 
     start: Tensor
     rule: str = "unit"
@@ -55,8 +55,8 @@ class LinearScene:
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         self.rendered.index_add_(0, examples, torch.ones_like(examples))
-        pictures = torch.einsum("ad,vdp->avp", values, CAMERAS[: self.views])
-        return (pictures * (1 + examples.double() / 10)[:, None, None]).unflatten(2, PIXELS)
+        images = torch.einsum("ad,vdp->avp", values, CAMERAS[: self.views])
+        return (images * (1 + examples.double() / 10)[:, None, None]).unflatten(2, PIXELS)
 
     def step(self, gradient: Tensor) -> Tensor:
         return self.size * direction(gradient, self.rule)
@@ -109,8 +109,8 @@ def test_on_a_linear_classifier_every_step_is_as_in_closed_form(step, size):
             assert float(cost[row]) == pytest.approx(-math.log1p(math.exp(-margin)), rel=128 * EPS)
     assert {0, 6} < taken  # examples that were fooled at once, on the way, and never
     assert torch.equal(result.predicted[:, 0] != classes, result.fooled)
-    pictures = problem.render(result.values, torch.arange(16))
-    torch.testing.assert_close(result.images, pictures, rtol=0, atol=16 * EPS)
+    images = problem.render(result.values, torch.arange(16))
+    torch.testing.assert_close(result.images, images, rtol=0, atol=16 * EPS)
     assert not result.zero_gradient.any()
 
 
@@ -169,7 +169,7 @@ def test_a_goal_is_reached_when_every_view_is_given_what_was_asked(decrease, inc
 
 
 class Bowl(nn.Module):
-    """Two classes; the margin of the first over the second is 1 + the square of the picture's value."""
+    """Two classes; the margin of the first over the second is 1 + the square of the image's value."""
 
     def forward(self, images: Tensor) -> Tensor:
         margin = 1 + images.flatten(1).square().sum(1)
@@ -187,7 +187,7 @@ class Detour(nn.Module):
 
 @dataclass
 class Axis:
-    """Pictures of one value, which steps of 1.5 cross."""
+    """Images of one value, which steps of 1.5 cross."""
 
     start: Tensor
 
@@ -239,7 +239,7 @@ def test_a_step_that_fools_is_kept_whatever_its_cost():
 
 
 class Waves(LinearScene):
-    """Pictures that oscillate with the values."""
+    """Images that oscillate with the values."""
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         return (1 + super().render(values, examples).sin()) / 2
@@ -268,7 +268,7 @@ def test_with_shortened_steps_towards_the_least_likely_class_the_cost_never_rise
 
 @pytest.mark.parametrize("step", STEPS)
 def test_a_zero_gradient_leaves_the_values_and_is_told(step):
-    """The second example's picture is clamped all over."""
+    """The second example's image is clamped all over."""
 
     class Clamped(LinearScene):
         def render(self, values: Tensor, examples: Tensor) -> Tensor:
@@ -406,8 +406,8 @@ def test_the_model_and_the_random_state_are_left_as_they_were(fails_at, grad_mod
     model = Watched(None if fails_at == "render" else fails_at).train()
     model.network[1].eval()
     problem = (Fragile if fails_at == "render" else LinearScene)(random(4, DIMENSIONS, seed=3))
-    pictures = LinearScene(problem.start).render(problem.start, torch.arange(4))[:, 0]
-    classes = small_network().eval()(pictures).argmax(1)
+    images = LinearScene(problem.start).render(problem.start, torch.arange(4))[:, 0]
+    classes = small_network().eval()(images).argmax(1)
     with torch.set_grad_enabled(grad_mode):
         before = model.state()
         try:

@@ -49,9 +49,9 @@ def test_a_kind_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scen
         expected *= mean_luminance(scene.lights[0]) / mean_luminance(expected)
         assert (light - expected).norm() < 1e-4 * expected.norm()  # the error of the fit, see `renderer.skylight`
     else:
-        pictures = scene.render(scene.conditions(EVERY), EVERY)
+        images = scene.render(scene.conditions(EVERY), EVERY)
         rounding = 64 * torch.finfo(dtype).eps
-        torch.testing.assert_close(scene.render(conditions, EVERY), pictures, rtol=0, atol=rounding)
+        torch.testing.assert_close(scene.render(conditions, EVERY), images, rtol=0, atol=rounding)
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
     torch.testing.assert_close(directions @ gradient[0], expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
 
 
-def test_vertices_that_move_along_the_view_have_the_gradient_of_the_picture_rendered_anew(make_scene):
+def test_vertices_that_move_along_the_view_have_the_gradient_of_the_image_rendered_anew(make_scene):
     """No outline moves then, and so every change is one of normals: the one test in which nothing is held fixed."""
     scene, draws = make_scene(), torch.Generator().manual_seed(2)
     geometry, weights = Geometry(scene, FREE), torch.randn(3, 6, 6, generator=draws, dtype=torch.float64)
@@ -117,8 +117,8 @@ def test_vertices_that_move_along_the_view_have_the_gradient_of_the_picture_rend
 
         def weighed(values: Tensor, view: int = view) -> Tensor:
             example = torch.ones(len(values), dtype=torch.int64)
-            pictures = scene.render(geometry.apply(values, scene.conditions(example), example), example)
-            return (pictures[:, view] * weights).sum((1, 2, 3))
+            images = scene.render(geometry.apply(values, scene.conditions(example), example), example)
+            return (images[:, view] * weights).sum((1, 2, 3))
 
         values = geometry.start[:1].clone().requires_grad_(True)
         (gradient,) = torch.autograd.grad(weighed(values), values)
@@ -128,7 +128,7 @@ def test_vertices_that_move_along_the_view_have_the_gradient_of_the_picture_rend
 
 
 def attack(model: torch.nn.Module, problem: Perturbation, goal: Goal, steps: int) -> tuple[Tensor, Tensor]:
-    """(values, pictures) that a descent of so many steps ends with."""
+    """(values, images) that a descent of so many steps ends with."""
     result = descend(model, problem, goal, DescentSettings(steps, batch_size=4), Phases())
     return result.values, result.images
 
@@ -137,26 +137,26 @@ def attack(model: torch.nn.Module, problem: Perturbation, goal: Goal, steps: int
 def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, grey):
     """x + ε sign(∂CE/∂x), clamped, with ∂CE/∂x = Σ (p_c - [c = y]) W_c; before black and white backgrounds too."""
     scene, epsilon = make_scene(backgrounds=torch.full((3, 3, 6, 6), grey)), 8 / 255
-    model, pictures = make_linear(4), scene.render(scene.conditions(EVERY), EVERY)
-    logits = model(pictures.flatten(0, 1)).detach()
+    model, before = make_linear(4), scene.render(scene.conditions(EVERY), EVERY)
+    logits = model(before.flatten(0, 1)).detach()
     truth = logits.argmax(1)
     slopes = (logits.softmax(1) - torch.nn.functional.one_hot(truth, 4)) @ model[1].weight.detach()
     problem = Perturbation(scene, [Pixels(scene, StepSettings("linf", epsilon, "sign", epsilon))])
     _, images = attack(model, problem, Goal(truth.view(3, 2)), steps=1)
-    expected = (pictures + epsilon * slopes.sign().view_as(pictures)).clamp(0, 1)
+    expected = (before + epsilon * slopes.sign().view_as(before)).clamp(0, 1)
     assert torch.equal(images, expected)
-    assert ((images - pictures).abs() > 0.99 * epsilon).double().mean() > 0.4
+    assert ((images - before).abs() > 0.99 * epsilon).double().mean() > 0.4
 
 
 @pytest.mark.parametrize(("steps", "reach"), [(2, 0.02), (3, 0.03), (9, 0.03)])
 def test_iterated_steps_on_pixels_stop_at_the_radius(make_scene, make_linear, steps, reach):
     scene = make_scene(backgrounds=torch.ones(3, 3, 6, 6))
-    model, pictures = make_linear(2, bias=50.0), scene.render(scene.conditions(EVERY), EVERY)
+    model, before = make_linear(2, bias=50.0), scene.render(scene.conditions(EVERY), EVERY)
     problem = Perturbation(scene, [Pixels(scene, StepSettings("linf", 0.03, "sign", 0.01))])
     classes = torch.zeros(3, 2, dtype=torch.int64)
     _, images = attack(model, problem, Goal(classes, classes + 1), steps)
     downhill = (model[1].weight[1] - model[1].weight[0]).detach().sign().view(3, 6, 6)
-    torch.testing.assert_close(images, (pictures + reach * downhill).clamp(0, 1), rtol=0, atol=4 * EPS)
+    torch.testing.assert_close(images, (before + reach * downhill).clamp(0, 1), rtol=0, atol=4 * EPS)
 
 
 def test_a_random_start_makes_it_projected_gradient_descent_within_the_same_ball(make_scene, make_linear):

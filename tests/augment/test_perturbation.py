@@ -25,13 +25,13 @@ def attack(model: nn.Module, problem: Perturbation, goal: Goal, steps: int, **se
 
 
 def towards(problem: Perturbation, increase: int | None = 1) -> Goal:
-    """Every picture's class 0 falls and another, or none in particular, rises."""
+    """Every image's class 0 falls and another, or none in particular, rises."""
     classes = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
     return Goal(classes, None if increase is None else classes + increase)
 
 
 def light_slope(scene: Scene, weight: Tensor) -> Tensor:
-    """(E, 49, 3) the derivative by the light of weight · pictures, summed over views, from the operators alone."""
+    """(E, 49, 3) the derivative by the light of weight · images, summed over views, from the operators alone."""
     slope = torch.zeros(len(scene), 49, 3, dtype=weight.dtype)
     for row, cameras in enumerate(scene.cameras):
         operators = build_operators(scene.mesh(row), cameras, scene.settings, scene.backend, dtype=weight.dtype)
@@ -255,7 +255,7 @@ def test_with_shortened_steps_no_shape_is_worse_than_the_one_before_when_rendere
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_hundreds_of_examples_are_attacked_in_one_batch_and_the_same_each_time(make_scene, make_linear, dtype):
-    """300 pictures of ten cameras, from random lights of a seed; whether fooled at once, on the way or never."""
+    """300 images of ten cameras, from random lights of a seed; whether fooled at once, on the way or never."""
     cameras = [[camera] for _ in range(30) for camera in ring(10, 2.2)]
     scene, model = make_scene(cameras=cameras, dtype=dtype), make_linear(6, dtype=dtype, seed=2)
     problem = Perturbation(scene, [Lighting(scene, StepSettings("l2", 0.4, step_size=0.1))])

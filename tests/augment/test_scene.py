@@ -20,7 +20,7 @@ from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
-from renderer.image import ENCODINGS, PictureSettings, develop
+from renderer.image import ENCODINGS, ImageSettings, develop
 from renderer.lights import ambient, probe
 from renderer.mesh import Mesh, normalise
 from renderer.shapes import solid
@@ -29,7 +29,7 @@ from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
 BACKEND = choose("software")
-SETTINGS = PictureSettings(size=8, samples=2)
+SETTINGS = ImageSettings(size=8, samples=2)
 SIZE = 5
 GREYS = [0.0, 0.25, 1.0]
 LIVE = live_coefficients(6)
@@ -37,7 +37,7 @@ DEAD = torch.ones(49, dtype=torch.bool).index_fill(0, LIVE, False)
 
 
 def random_operator(seed: int, count: int) -> Operator:
-    """Covers `count` random pixels of a picture of SIZE², dark enough that clamping is the exception."""
+    """Covers `count` random pixels of an image of SIZE², dark enough that clamping is the exception."""
     draws = torch.Generator().manual_seed(seed)
     coverage = 0.1 + 0.9 * torch.rand(count, generator=draws)
     return Operator(
@@ -45,7 +45,7 @@ def random_operator(seed: int, count: int) -> Operator:
         albedo=torch.ones(3, count),
         coverage=coverage,
         pixels=torch.randperm(SIZE**2, generator=draws)[:count].sort().values,
-        settings=PictureSettings(size=SIZE),
+        settings=ImageSettings(size=SIZE),
     )
 
 
@@ -59,9 +59,7 @@ class Given:
         return [self.left.pop(0) for _ in cameras]
 
 
-def scene_of(
-    labels: list[str], operators: list[Operator], grey_values: list[float], settings: PictureSettings
-) -> Scene:
+def scene_of(labels: list[str], operators: list[Operator], grey_values: list[float], settings: ImageSettings) -> Scene:
     """As many views of each label's object as there are operators for it."""
     objects = [SceneObject(label, normalise(solid("plate"))) for label in labels]
     cameras = ring(len(operators) // len(labels), 2.0)
@@ -79,7 +77,7 @@ def render(scene: Scene, lights: torch.Tensor, examples: torch.Tensor | None = N
 def scene(request) -> Scene:
     """Two meshes of 2 views over 3 backgrounds; one view covers nothing."""
     operators = [random_operator(seed, count) for seed, count in enumerate([6, 4, 9, 0])]
-    return scene_of(["orange", "pear"], operators, GREYS, PictureSettings(size=SIZE, encoding=request.param))
+    return scene_of(["orange", "pear"], operators, GREYS, ImageSettings(size=SIZE, encoding=request.param))
 
 
 def random_lights(count: int, seed: int = 0) -> torch.Tensor:
@@ -91,14 +89,14 @@ def random_lights(count: int, seed: int = 0) -> torch.Tensor:
 def composed(scene: Scene, lights: torch.Tensor) -> torch.Tensor:
     """Every example by itself: (E, 3, SIZE, SIZE)."""
     operators = [random_operator(seed, count) for seed, count in enumerate([6, 4, 9, 0])]
-    pictures = []
+    images = []
     for light, (operator, grey) in zip(lights, [(o, g) for o in operators for g in GREYS], strict=True):
         canvas = torch.full((3, SIZE**2), grey)
         radiance = torch.einsum("kc,ckp->cp", light[LIVE], operator.transfer)
         behind = torch.full((1, 1), grey)
         canvas[:, operator.pixels] = develop(radiance, operator.coverage[None], behind, scene.settings.encoding)
-        pictures.append(canvas.view(3, SIZE, SIZE))
-    return torch.stack(pictures)
+        images.append(canvas.view(3, SIZE, SIZE))
+    return torch.stack(images)
 
 
 # A product of 31 terms below 1 in another order, and the slope of 12.92 of the sRGB curve near black.
@@ -107,10 +105,10 @@ TOLERANCE = {"rtol": 0, "atol": 13 * 8 * EPS32}
 
 def test_renders_are_the_examples_composed_one_by_one(scene):
     lights = random_lights(12)
-    pictures = render(scene, lights)
-    assert pictures.shape == (12, 3, SIZE, SIZE) and len(scene) == 12
-    assert pictures.min() >= 0 and pictures.max() <= 1
-    torch.testing.assert_close(pictures, composed(scene, lights), **TOLERANCE)
+    images = render(scene, lights)
+    assert images.shape == (12, 3, SIZE, SIZE) and len(scene) == 12
+    assert images.min() >= 0 and images.max() <= 1
+    torch.testing.assert_close(images, composed(scene, lights), **TOLERANCE)
 
 
 @pytest.mark.parametrize("examples", [[0], [11], [1, 2], [0, 4, 5, 9], [3, 6, 7, 8, 10], list(range(12))])
@@ -129,21 +127,21 @@ def test_examples_are_meshes_by_views_by_backgrounds(scene):
 
 def test_uncovered_pixels_and_dead_coefficients_have_gradients_of_exactly_zero(scene):
     lights = random_lights(12).requires_grad_(True)
-    pictures = render(scene, lights)
-    (gradient,) = torch.autograd.grad(pictures.sum(), lights, retain_graph=True)
+    images = render(scene, lights)
+    (gradient,) = torch.autograd.grad(images.sum(), lights, retain_graph=True)
     assert (gradient[:9, LIVE] != 0).any(dim=2).all()
     assert not gradient[:, DEAD].any() and DEAD.sum() == 18
     uncovered = torch.ones(12, SIZE**2)
     for view, (seed, count) in enumerate(enumerate([6, 4, 9, 0])):
         uncovered[3 * view : 3 * view + 3, random_operator(seed, count).pixels] = 0
-    (gradient,) = torch.autograd.grad(pictures, lights, uncovered.view(12, 1, SIZE, SIZE).expand_as(pictures))
+    (gradient,) = torch.autograd.grad(images, lights, uncovered.view(12, 1, SIZE, SIZE).expand_as(images))
     assert not gradient.any()
 
 
 def test_the_gradient_is_the_transfer_where_nothing_clamps():
     """Under the linear encoding and whatever the background."""
     operator = random_operator(4, 7)
-    scene = scene_of(["orange"], [operator], [0.5], PictureSettings(size=SIZE))
+    scene = scene_of(["orange"], [operator], [0.5], ImageSettings(size=SIZE))
     lights = ambient(torch.full((3,), 0.1)).expand(1, -1, -1).clone().requires_grad_(True)
     weights = torch.randn(1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
     (gradient,) = torch.autograd.grad(render(scene, lights), lights, weights)
@@ -153,7 +151,7 @@ def test_the_gradient_is_the_transfer_where_nothing_clamps():
 
 def test_the_clamped_share_counts_covered_values_alone():
     """Radiance ±L₀₀ at three pixels of coverage 1, 1/2 and 1; a second view covers a fourth pixel, always in range."""
-    unit, settings = torch.zeros(3, 31, 3), PictureSettings(size=2)
+    unit, settings = torch.zeros(3, 31, 3), ImageSettings(size=2)
     unit[:, 0] = torch.tensor([1.0, 0.5, -1.0])
     views = [
         Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2]), settings),
@@ -169,9 +167,9 @@ def test_the_clamped_share_counts_covered_values_alone():
 
 
 def test_a_scene_that_nothing_covers_is_its_backgrounds():
-    scene = scene_of(["orange"], [random_operator(0, 0)], GREYS, PictureSettings(size=SIZE))
-    pictures = render(scene, random_lights(3))
-    torch.testing.assert_close(pictures, torch.tensor(GREYS).view(3, 1, 1, 1).expand_as(pictures), rtol=0, atol=0)
+    scene = scene_of(["orange"], [random_operator(0, 0)], GREYS, ImageSettings(size=SIZE))
+    images = render(scene, random_lights(3))
+    torch.testing.assert_close(images, torch.tensor(GREYS).view(3, 1, 1, 1).expand_as(images), rtol=0, atol=0)
     assert scene.clamped_share(Conditions(random_lights(3)), torch.arange(3)).tolist() == [0, 0, 0]
 
 
@@ -203,7 +201,7 @@ def same(a: Operator, b: Operator) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("transfer", "coverage", "pixels"))
 
 
-def built(items: list[ObjectSettings], cameras: list, settings: PictureSettings, *cache: OperatorCache) -> Scene:
+def built(items: list[ObjectSettings], cameras: list, settings: ImageSettings, *cache: OperatorCache) -> Scene:
     """Of all meshes from all cameras over GREYS."""
     objects = [load_object(item) for item in items]
     behind = load_backgrounds(GREYS, settings.size)
@@ -226,7 +224,7 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
         ObjectSettings(str(path), "wall", up="y"),
         ObjectSettings(str(path), "wall", up="y", gain=2.0),
     ]
-    (stack,) = built(walls, [ring(4, 4.0)[1]], PictureSettings(size=32, samples=4)).stacks
+    (stack,) = built(walls, [ring(4, 4.0)[1]], ImageSettings(size=32, samples=4)).stacks
     # From azimuth π/2: as wide as it was and sin π/3 high standing, cos π/3 high lying; half a sample's width of 1/64
     # off along the outline of 6 at the most.
     for coverage, foreshortening in zip(stack.coverage, (0.5, np.sqrt(3) / 2), strict=False):
@@ -286,17 +284,17 @@ def test_a_scene_stores_no_background_pixel_and_no_backgrounds_or_dead_bands_of_
 
 def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterised):
     items = [ObjectSettings("solid:plate", "plate"), ObjectSettings("solid:plate:1", "plate", gain=2.0)]
-    pictures = []
+    images = []
     for calls in ([3, 3], [3, 3]):
         cache = OperatorCache(tmp_path)
-        pictures.append(render(built(items, ring(3, 2), SETTINGS, cache), random_lights(18)))
+        images.append(render(built(items, ring(3, 2), SETTINGS, cache), random_lights(18)))
         assert rasterised == calls
     assert (cache.tally.loaded, cache.tally.built) == (6, 0)
-    assert torch.equal(*pictures)
+    assert torch.equal(*images)
 
 
 def test_under_grace_a_plate_is_brighter_from_above_than_from_below():
-    """The whole way from a spec to a picture."""
+    """The whole way from a spec to an image."""
     scene = built([ObjectSettings("solid:plate", "plate")], ring(1, 2.0), SETTINGS)
     light = probe("grace").expand(3, -1, -1)
     upside_down = light.clone()

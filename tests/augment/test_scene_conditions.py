@@ -26,7 +26,7 @@ def own_lights(scene: Scene, seed: int = 0) -> Tensor:
 
 def composed(scene: Scene, lights: Tensor) -> Tensor:
     """Every example and view by itself, from operators made for this: (E, V, 3, size, size)."""
-    pictures = []
+    images = []
     (item,) = scene.objects
     for light, cameras, behind in zip(lights, scene.cameras, scene.backgrounds, strict=True):
         operators = build_operators(item.mesh, cameras, scene.settings, BACKEND, item.gain, dtype=lights.dtype)
@@ -35,20 +35,20 @@ def composed(scene: Scene, lights: Tensor) -> Tensor:
             canvas[:, operator.pixels] = develop(
                 seen, operator.coverage[None], behind[:, operator.pixels], scene.settings.encoding
             )
-            pictures.append(canvas.unflatten(1, (scene.settings.size, -1)))
-    return torch.stack(pictures).unflatten(0, (len(scene), scene.views))
+            images.append(canvas.unflatten(1, (scene.settings.size, -1)))
+    return torch.stack(images).unflatten(0, (len(scene), scene.views))
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize(("dtype", "rounding"), [(torch.float32, ROUNDING * EPS32 / EPS), (torch.float64, ROUNDING)])
-def test_under_light_alone_pictures_are_those_of_the_views_one_by_one(make_scene, dtype, rounding, encoding):
+def test_under_light_alone_images_are_those_of_the_views_one_by_one(make_scene, dtype, rounding, encoding):
     """In the dtype of the light, whatever the backgrounds have."""
     scene = make_scene(dtype=dtype, encoding=encoding, gain=1.2)
     lights = own_lights(scene)
-    pictures = scene.render(Conditions(lights), EVERY)
-    assert pictures.shape == (3, 2, 3, 6, 6) and pictures.dtype == dtype
-    assert pictures.min() > 0 and pictures.max() < 1  # nothing clamps here
-    torch.testing.assert_close(pictures, composed(scene, lights), rtol=0, atol=rounding)
+    images = scene.render(Conditions(lights), EVERY)
+    assert images.shape == (3, 2, 3, 6, 6) and images.dtype == dtype
+    assert images.min() > 0 and images.max() < 1  # nothing clamps here
+    torch.testing.assert_close(images, composed(scene, lights), rtol=0, atol=rounding)
 
 
 @pytest.mark.parametrize("part", ["light", "vertices", "albedo", "pixels"])
@@ -68,7 +68,7 @@ def test_any_examples_in_any_order_are_rendered_as_all_are(make_scene, part):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_nothing_changes_where_the_other_conditions_are_the_scenes_own(make_scene, encoding):
-    """By operators and by shading, which share no code between the albedo and the picture."""
+    """By operators and by shading, which share no code between the albedo and the image."""
     scene = make_scene(encoding=encoding, gain=1.2)
     light = scene.conditions(EVERY).light
     assert torch.equal(light, scene.lights)
@@ -85,12 +85,12 @@ def test_moved_vertices_are_seen_as_another_mesh_would_be(make_scene, stone):
     """Its outline too: half of the pixels change at least a little."""
     scene, draws = make_scene(), np.random.default_rng(0)
     moved = stone.vertices + 0.1 * draws.normal(size=(3, *stone.vertices.shape))
-    pictures = scene.render(Conditions(own_lights(scene), vertices=torch.from_numpy(moved)), EVERY)
+    images = scene.render(Conditions(own_lights(scene), vertices=torch.from_numpy(moved)), EVERY)
     for row in range(3):
         other = make_scene(mesh=replace(stone, vertices=moved[row]))
         expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
-        torch.testing.assert_close(pictures[row], expected, rtol=0, atol=ROUNDING)
-    assert ((pictures - scene.render(Conditions(own_lights(scene)), EVERY)).abs() > 1e-3).double().mean() > 0.3
+        torch.testing.assert_close(images[row], expected, rtol=0, atol=ROUNDING)
+    assert ((images - scene.render(Conditions(own_lights(scene)), EVERY)).abs() > 1e-3).double().mean() > 0.3
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -98,7 +98,7 @@ def test_a_change_of_albedo_is_seen_as_another_paint_would_be(make_scene, stone,
     """The linear albedo changes, whatever the encoding, and keeps to [0, 1]."""
     scene = make_scene(encoding=encoding)
     offset = torch.rand(3, 20, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
-    pictures = scene.render(Conditions(own_lights(scene), albedo=offset), EVERY)
+    images = scene.render(Conditions(own_lights(scene), albedo=offset), EVERY)
     own = decode(torch.from_numpy(stone.corner_colors).double(), encoding)
     assert ((own + offset[:, :, None]) < 0).any()
     for row in range(3):
@@ -106,7 +106,7 @@ def test_a_change_of_albedo_is_seen_as_another_paint_would_be(make_scene, stone,
         other = make_scene(mesh=replace(stone, corner_colors=paint.float().numpy()), encoding=encoding)
         expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
         # The paint is stored in float32.
-        torch.testing.assert_close(pictures[row], expected, rtol=0, atol=13 * 4 * EPS32)
+        torch.testing.assert_close(images[row], expected, rtol=0, atol=13 * 4 * EPS32)
 
 
 def test_a_gain_may_lift_the_albedo_above_one_and_a_change_lifts_it_no_further(make_scene):
@@ -125,9 +125,9 @@ def test_changes_of_pixels_come_last_and_are_clamped(make_scene):
     scene = make_scene()
     change = 2 * torch.rand(3, 2, 3, 6, 6, generator=torch.Generator().manual_seed(0)).double() - 1
     plain = scene.render(scene.conditions(EVERY), EVERY)
-    pictures = scene.render(replace(scene.conditions(EVERY), pixels=change), EVERY)
-    assert torch.equal(pictures, (plain + change).clamp(0, 1))
-    assert (pictures == 0).any() and (pictures == 1).any()
+    images = scene.render(replace(scene.conditions(EVERY), pixels=change), EVERY)
+    assert torch.equal(images, (plain + change).clamp(0, 1))
+    assert (images == 0).any() and (images == 1).any()
 
 
 def test_black_and_white_pixels_and_paints_have_the_gradients_of_others(make_scene, stone):
@@ -136,17 +136,17 @@ def test_black_and_white_pixels_and_paints_have_the_gradients_of_others(make_sce
     backgrounds[1:] = 1
     scene = make_scene(backgrounds=backgrounds)
     pixels = torch.zeros(3, 2, 3, 6, 6, dtype=torch.float64, requires_grad=True)
-    pictures = scene.render(replace(scene.conditions(EVERY), pixels=pixels), EVERY)
-    assert (pictures == 0).any() and (pictures == 1).any()
-    assert torch.equal(torch.autograd.grad(pictures.sum(), pixels)[0], torch.ones_like(pixels))
+    images = scene.render(replace(scene.conditions(EVERY), pixels=pixels), EVERY)
+    assert (images == 0).any() and (images == 1).any()
+    assert torch.equal(torch.autograd.grad(images.sum(), pixels)[0], torch.ones_like(pixels))
 
     sums = []
     for paint in (0.0, 0.5, 1.0):
         painted = replace(stone, corner_colors=np.full_like(stone.corner_colors, paint))
         scene = make_scene(mesh=painted)
         albedo = torch.zeros(3, 20, 3, dtype=torch.float64, requires_grad=True)
-        pictures = scene.render(replace(scene.conditions(EVERY), albedo=albedo), EVERY)
-        sums.append(torch.autograd.grad(pictures.sum(), albedo)[0])
+        images = scene.render(replace(scene.conditions(EVERY), albedo=albedo), EVERY)
+        sums.append(torch.autograd.grad(images.sum(), albedo)[0])
     torch.testing.assert_close(sums[0], sums[1], rtol=0, atol=ROUNDING)
     torch.testing.assert_close(sums[2], sums[1], rtol=0, atol=ROUNDING)
 
@@ -166,7 +166,7 @@ def test_a_camera_is_rasterised_once_and_moved_vertices_once_per_view(make_scene
         assert rasterised == [3] + [1] * calls
 
 
-def test_a_mesh_outside_the_picture_leaves_the_backgrounds_and_a_gradient_of_zero(make_scene, stone):
+def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(make_scene, stone):
     scene = make_scene(mesh=replace(stone, vertices=stone.vertices + 10))
     for part, value in (
         ("light", scene.lights[0]),
@@ -174,10 +174,10 @@ def test_a_mesh_outside_the_picture_leaves_the_backgrounds_and_a_gradient_of_zer
         ("albedo", torch.zeros(20, 3).double()),
     ):
         values = value.expand(3, -1, -1).clone().requires_grad_(True)
-        pictures = scene.render(replace(scene.conditions(EVERY), **{part: values}), EVERY)
-        behind = scene.backgrounds.view(3, 1, 3, 6, 6).expand_as(pictures)
-        torch.testing.assert_close(pictures.detach(), behind, rtol=0, atol=0)
-        assert not torch.autograd.grad(pictures.sum(), values)[0].any()
+        images = scene.render(replace(scene.conditions(EVERY), **{part: values}), EVERY)
+        behind = scene.backgrounds.view(3, 1, 3, 6, 6).expand_as(images)
+        torch.testing.assert_close(images.detach(), behind, rtol=0, atol=0)
+        assert not torch.autograd.grad(images.sum(), values)[0].any()
 
 
 @pytest.mark.parametrize("part", ["light", "vertices", "albedo"])

@@ -15,7 +15,7 @@ from augment.service import AugmentationService, AugmentationSettings, RandomLig
 from augment.variation import VariationSettings
 from renderer.camera import ring
 from renderer.errors import InputError
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.lights import probe
 from renderer.mesh import normalise
 from renderer.shapes import solid
@@ -31,7 +31,7 @@ SHARES = {"fooled_before", "fooled", "used_all_steps", "zero_gradient", "clamped
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """The paper's 2 meshes × 10 views × 5 backgrounds, small."""
-    settings = PictureSettings(size=8, samples=2)
+    settings = ImageSettings(size=8, samples=2)
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in CLASSES]
     behind = load_backgrounds([0, 0.25, 0.5, 0.75, 1], settings.size)
     return Scene.grid(objects, ring(10, 2.0), behind, LIGHT, settings, choose("software"))
@@ -60,10 +60,10 @@ def model(scene, labels) -> nn.Module:
             nn.Linear(1024, 3),
         )
         optimizer = torch.optim.Adam(network.parameters(), lr=0.003)
-        pictures = render(scene, LIGHT.expand(100, -1, -1))
+        images = render(scene, LIGHT.expand(100, -1, -1))
         for _ in range(60):
             optimizer.zero_grad()
-            nn.functional.cross_entropy(network(pictures), labels).backward()
+            nn.functional.cross_entropy(network(images), labels).backward()
             optimizer.step()
     return network
 
@@ -88,7 +88,7 @@ def test_without_an_arm_or_examples_the_batch_is_empty(serve, model, settings):
 
 
 @pytest.mark.parametrize("arm", ["random", "adversarial"])
-def test_100_pictures_come_with_their_labels_and_plain_diagnostics(serve, model, scene, arm):
+def test_100_images_come_with_their_labels_and_plain_diagnostics(serve, model, scene, arm):
     phases = Phases()
     renders = serve(arm=arm, phases=phases).regenerate(model, 0)
     assert renders.images.shape == (100, 3, 8, 8) and not renders.images.requires_grad
@@ -112,7 +112,7 @@ def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
     assert (serve(seed=2, **settings).regenerate(model, 3).images != images).any()
 
 
-def test_random_diagnostics_are_those_of_the_pictures(serve, model):
+def test_random_diagnostics_are_those_of_the_images(serve, model):
     renders = serve(arm="random").regenerate(model, 0)
     model.eval()
     with torch.no_grad():
@@ -130,7 +130,7 @@ def test_random_lights_of_a_radius_have_that_norm(serve, model):
     assert renders.diagnostics["light_change"] == pytest.approx(1.5, rel=8 * EPS32)
 
 
-def test_random_pictures_leave_the_model_and_the_random_state_as_they_were(serve, model):
+def test_random_images_leave_the_model_and_the_random_state_as_they_were(serve, model):
     model.train()
     before, state = {name: value.clone() for name, value in model.state_dict().items()}, torch.random.get_rng_state()
     serve(arm="random").regenerate(model, 0)
@@ -165,7 +165,7 @@ def attacked_by_hand(model: nn.Module, scene: Scene, labels: Tensor, step: str, 
 
 
 @pytest.mark.parametrize("step", ["unit", "sign"])
-def test_adversarial_pictures_are_those_of_the_papers_loop(serve, model, scene, labels, step):
+def test_adversarial_images_are_those_of_the_papers_loop(serve, model, scene, labels, step):
     renders = serve(attack=TrainingAttackSettings(step=step, max_steps=10, batch_size=32)).regenerate(model, 0)
     expected = attacked_by_hand(model, scene, labels, step, steps=10)
     # Ten steps of products in float32 in another order, through a network that amplifies their rounding.
@@ -257,7 +257,7 @@ SHAPE_AND_PAINT = {
 @pytest.fixture(scope="module")
 def few() -> tuple[Scene, Tensor]:
     """Both meshes from one view over one grey, since shapes are rasterised in every step."""
-    settings = PictureSettings(size=8, samples=2)
+    settings = ImageSettings(size=8, samples=2)
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in CLASSES]
     scene = Scene.grid(objects, ring(1, 2.0), load_backgrounds([0.5], 8), LIGHT, settings, choose("software"))
     return scene, torch.tensor(list(CLASSES.values()))
@@ -303,8 +303,8 @@ def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, mon
     assert renders.labels.tolist() == [0] * 4 + [2] * 4 and len(service) == len(renders) == 8
 
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in ("plate", "table")]
-    picture, behind = PictureSettings(size=8, samples=2), load_backgrounds([0.25, 0.75], 8)
-    scene = Scene.grid(objects, ring(2, 2.0), behind, LIGHT, picture, choose("software"))
+    image, behind = ImageSettings(size=8, samples=2), load_backgrounds([0.25, 0.75], 8)
+    scene = Scene.grid(objects, ring(2, 2.0), behind, LIGHT, image, choose("software"))
     same = AugmentationService(AugmentationSettings(examples=8, attack=attack), scene, renders.labels, 0, Phases())
     assert torch.equal(same.regenerate(model, 0).images, renders.images)
 

@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 from augment.seeding import generator
 from augment.snapshot import Snapshot, SnapshotSettings, draw_snapshot
 from renderer.errors import InputError
-from renderer.image import PictureSettings, decode, encode
+from renderer.image import ImageSettings, decode, encode
 
 SIZE, COUNT = 12, 40
 IMAGES = torch.rand(COUNT, 2, 3, SIZE, SIZE, generator=generator(0), dtype=torch.float64)
@@ -13,8 +13,8 @@ EVERY = torch.arange(COUNT)
 
 
 def taken(images=IMAGES, examples=EVERY, encoding="srgb", **settings) -> torch.Tensor:
-    picture = PictureSettings(SIZE, encoding=encoding)
-    return draw_snapshot(SnapshotSettings(**settings), COUNT, picture, generator(1))(images, examples)
+    image = ImageSettings(SIZE, encoding=encoding)
+    return draw_snapshot(SnapshotSettings(**settings), COUNT, image, generator(1))(images, examples)
 
 
 def test_a_camera_that_changes_nothing_gives_the_render():
@@ -48,7 +48,7 @@ def test_a_blur_is_scipys_gaussian_of_the_linear_light():
         torch.testing.assert_close(light[index], torch.from_numpy(expected), rtol=0, atol=1e-5)
 
 
-def test_noise_has_the_deviation_that_was_drawn_for_the_picture():
+def test_noise_has_the_deviation_that_was_drawn_for_the_image():
     grey = torch.full_like(IMAGES, 0.5)
     deviations = (taken(grey, noise=0.1) - grey).flatten(1).std(1)
     assert deviations.max() < 0.12 and deviations.min() < 0.03 and 0.035 < deviations.mean() < 0.065
@@ -60,7 +60,7 @@ def test_examples_keep_their_own_draws_in_any_order():
     torch.testing.assert_close(taken(IMAGES[some], some, **settings), taken(**settings)[some], rtol=0, atol=1e-12)
 
 
-def test_pictures_are_differentiable_in_the_render():
+def test_images_are_differentiable_in_the_render():
     camera = Snapshot(torch.full((1, 3, 1, 1), 0.5), torch.tensor([0.8]), torch.zeros(1, 3, 4, 4), "srgb")
     images = 0.2 + 0.5 * IMAGES[:1, :1, :, :4, :4]
     assert torch.autograd.gradcheck(lambda values: camera(values, torch.tensor([0])), images.requires_grad_(True))

@@ -19,7 +19,7 @@ from augment.snapshot import SnapshotSettings
 from augment.variation import VariationSettings, vary
 from renderer.camera import ring
 from renderer.errors import InputError
-from renderer.image import PictureSettings, decode
+from renderer.image import ImageSettings, decode
 from renderer.lights import ambient, probe
 from renderer.mesh import Mesh
 from renderer.visibility import choose
@@ -31,7 +31,7 @@ LIGHT = ambient(torch.full((3,), 0.1))
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A plate twelve times, on black."""
-    plate, settings = load_object(ObjectSettings("solid:plate", "plate")), PictureSettings(SIZE, samples=2)
+    plate, settings = load_object(ObjectSettings("solid:plate", "plate")), ImageSettings(SIZE, samples=2)
     return Scene.grid([plate], ring(12, 6.0), load_backgrounds([0.0], SIZE), LIGHT, settings, choose("software"))
 
 
@@ -106,7 +106,7 @@ def test_a_turn_moves_the_camera_at_most_so_far_around_the_mesh(scene):
 def test_individuals_are_drawn_of_solids_without_a_seed_alone(scene):
     kinds = ["solid:plate", "solid:plate:0", "solid:orange"]
     objects = [load_object(ObjectSettings(name, name)) for name in kinds]
-    settings, row = PictureSettings(SIZE, samples=2), scene.examples[0]
+    settings, row = ImageSettings(SIZE, samples=2), scene.examples[0]
     rows = [replace(row, object=index) for index in range(3)]
     mixed = Scene(objects, rows, load_backgrounds([0.0], SIZE), LIGHT, settings, choose("software"))
     first, second = (drawn(mixed, seed, individuals=True).objects for seed in (0, 1))
@@ -126,7 +126,7 @@ def test_lights_are_shared_out_among_the_examples(scene):
 def test_a_lit_background_is_a_wall_that_faces_the_camera():
     """It looks as the middle of a white ball does, and is white or grey in the same light."""
     ball = trimesh.creation.icosphere(subdivisions=4)
-    settings = PictureSettings(SIZE, samples=2, encoding="srgb", normals="smooth")
+    settings = ImageSettings(SIZE, samples=2, encoding="srgb", normals="smooth")
     white = SceneObject("ball", Mesh.plain(ball.vertices, ball.faces, (1.0, 1.0, 1.0)))
     behind = load_backgrounds([1.0, 0.5], SIZE)
     balls = Scene.grid([white], ring(3, 2.5), behind, probe("grace"), settings, choose("software"))

@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import ENCODINGS, PictureSettings
+from renderer.image import ENCODINGS, ImageSettings
 from renderer.mesh import Mesh, concatenate
 from renderer.visibility import choose
 
@@ -24,7 +24,7 @@ HALVES = [[0, 1, 2], [0, 2, 3]]
 
 
 def view(mesh: Mesh, size: int, samples: int = 1, camera: OrthographicCamera = ABOVE) -> Fragments:
-    settings = PictureSettings(size, samples)
+    settings = ImageSettings(size, samples)
     [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("software"))
     return fragments
 
@@ -34,7 +34,7 @@ def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 
 def poster(texture: np.ndarray, uvs=UNIT_UVS, color=(1.0, 1.0, 1.0)) -> Mesh:
-    """The whole picture, one texture on it."""
+    """The whole image, one texture on it."""
     uvs = np.asarray(uvs, dtype=np.float32)[HALVES]
     ids = np.zeros(2, dtype=np.int32)
     return replace(Mesh.plain(ALL_OF_IT, HALVES, color), corner_uvs=uvs, texture_ids=ids, textures=(texture,))
@@ -70,7 +70,7 @@ def linear_of(colors: np.ndarray, encoding: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_a_texture_over_the_picture_at_its_own_resolution_is_the_picture(encoding):
+def test_a_texture_over_the_image_at_its_own_resolution_is_the_image(encoding):
     """Every sample is a texel's centre: v starts at the bottom and texels are decoded."""
     texture = random_texture(16, 16)
     mesh = poster(texture)
@@ -96,7 +96,7 @@ def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repe
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_corner_colours_are_decoded_and_then_interpolated(encoding):
-    """Over a triangle whose corners are the picture's and two beyond it: weights are the coordinates."""
+    """Over a triangle whose corners are the image's and two beyond it: weights are the coordinates."""
     colors = np.array([[0.0, 0.5, 1.0], [1.0, 0.25, 0.5], [0.125, 0.0, 0.75]])
     mesh = Mesh.plain([[-1, -1, 0], [3, -1, 0], [-1, 3, 0]], [[0, 1, 2]], colors)
     fragments = view(mesh, 8)
@@ -149,7 +149,7 @@ def test_albedo_per_texel_has_the_derivative_of_central_differences(mesh, camera
 
 
 def test_texels_that_no_sample_sees_have_a_gradient_of_exactly_zero_and_the_others_share_the_corner_colour():
-    """Bilinear weights add up to one. The left half of the texture is on the picture; samples lie between texels."""
+    """Bilinear weights add up to one. The left half of the texture is on the image; samples lie between texels."""
     mesh = poster(np.zeros((8, 8, 3), dtype=np.uint8), UNIT_UVS * [0.5, 1], color=(0.5, 0.25, 1.0))
     texture = draw(8, 8, 3).requires_grad_(True)
     fragments = view(mesh, 3)
@@ -190,7 +190,7 @@ def test_albedo_per_face_is_that_of_the_face_that_a_sample_sees_and_its_gradient
 
 
 @pytest.mark.parametrize("mesh", [patchwork(), Mesh.plain(ALL_OF_IT, HALVES)])
-def test_outside_of_the_picture_there_is_no_albedo_and_a_gradient_of_zero(mesh):
+def test_outside_of_the_image_there_is_no_albedo_and_a_gradient_of_zero(mesh):
     fragments = view(replace(mesh, vertices=mesh.vertices + 9), 4, 2)
     textures = [draw(*texture.shape).requires_grad_(True) for texture in mesh.textures]
     by_face = draw(len(mesh.faces), 3).requires_grad_(True)

@@ -16,14 +16,14 @@ from renderer import transfer, visibility
 from renderer.basis import Harmonics
 from renderer.cache import OperatorCache, TensorCache, cache_folder, content_key, source_key
 from renderer.camera import OrthographicCamera, ring
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.mesh import Mesh, normalise
 from renderer.shapes import solid
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import Backend, choose
 
 BACKEND = choose("software")
-SETTINGS = PictureSettings(size=8, samples=2)
+SETTINGS = ImageSettings(size=8, samples=2)
 CAMERA = OrthographicCamera(1.0, 0.5, 2.0)
 PLATE = normalise(solid("plate"))
 KEY = "a key"
@@ -48,7 +48,7 @@ MESHES = {
     "open, one colour": Mesh.plain([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], [[0, 1, 2]], color=(0.2, 0.5, 0.7)),
     "closed, many colours": PLATE,
     "textured": TEXTURED,
-    "out of the picture": replace(TEXTURED, vertices=TEXTURED.vertices + np.array([0, 0, 9])),
+    "out of the image": replace(TEXTURED, vertices=TEXTURED.vertices + np.array([0, 0, 9])),
 }
 
 

@@ -27,7 +27,7 @@ def test_right_up_and_back_are_right_handed_and_orthonormal(camera):
 
 
 @pytest.mark.parametrize("camera", ring(7, 2.0))
-def test_world_z_points_straight_up_in_the_picture(camera):
+def test_world_z_points_straight_up_in_the_image(camera):
     (x, y, _) = camera.project(np.array([[0.0, 0.0, 1.0]]))[0]
     assert x == 0
     assert y == pytest.approx(math.sin(math.pi / 3))
@@ -62,12 +62,12 @@ def test_depth_is_smaller_where_nearer_and_fits_every_normalised_mesh(camera):
 
 
 @pytest.mark.parametrize("width", [0.0, -2.0, math.nan])
-def test_a_picture_without_width_is_refused(width):
+def test_a_image_without_width_is_refused(width):
     with pytest.raises(InputError, match="field_of_view"):
         ring(3, width)
 
 
-def test_a_place_moves_the_picture_by_world_units_and_not_the_depth():
+def test_a_place_moves_the_image_by_world_units_and_not_the_depth():
     points, plain = np.random.default_rng(0).normal(size=(20, 3)), OrthographicCamera(1.0, 0.4, 3.0)
     moved = OrthographicCamera(1.0, 0.4, 3.0, right=0.5, up=-0.2).project(points)
     np.testing.assert_allclose(moved - plain.project(points), [[1 / 3, -0.4 / 3, 0]] * 20, rtol=0, atol=4 * EPS)

@@ -355,7 +355,7 @@ def test_a_map_that_is_not_finite_is_refused(tmp_path, suffix, value):
 
 
 @pytest.mark.parametrize("attributes", [{"x": 1, "full_width": 8}, {"Orientation": 4}], ids=["cropped", "turned"])
-def test_an_exr_file_that_is_not_the_whole_upright_picture_is_refused(tmp_path, attributes):
+def test_an_exr_file_that_is_not_the_whole_upright_image_is_refused(tmp_path, attributes):
     write_exr(tmp_path / "map.exr", numbered(3), ("R", "G", "B"), **attributes)
     with pytest.raises(InputError, match="is stored cropped or turned: save it whole, its top row first"):
         read_map(tmp_path / "map.exr")
@@ -367,9 +367,9 @@ def test_a_radiance_file_with_its_bottom_row_first_is_refused(tmp_path):
         read_map(tmp_path / "map.hdr")
 
 
-def test_a_display_picture_under_a_maps_name_is_refused(tmp_path):
+def test_a_display_image_under_a_maps_name_is_refused(tmp_path):
     Image.new("RGB", (4, 2)).save(tmp_path / "map.hdr", format="PNG")
-    with pytest.raises(InputError, match=r"is a png picture: give an \.hdr or \.exr file"):
+    with pytest.raises(InputError, match=r"is a png image: give an \.hdr or \.exr file"):
         read_map(tmp_path / "map.hdr")
 
 
@@ -386,7 +386,7 @@ def test_a_place_that_cannot_be_written_is_refused(tmp_path, suffix):
         write_map(tmp_path / f"map{suffix}", random_map())
 
 
-def test_without_openimageio_arrays_still_work_and_pictures_name_it(tmp_path, monkeypatch):
+def test_without_openimageio_arrays_still_work_and_images_name_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenImageIO", None)
     write_map(tmp_path / "map.npy", random_map())
     assert read_map(tmp_path / "map.npy").shape == (16, 32, 3)

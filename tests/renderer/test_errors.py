@@ -11,7 +11,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError, require_bounded, require_finite
 from renderer.fragments import build_fragments
 from renderer.harmonics import basis, basis_gradient, project, rotate
-from renderer.image import PictureSettings, develop
+from renderer.image import ImageSettings, develop
 from renderer.mesh import Mesh
 from renderer.normals import face_normals, vertex_normals
 from renderer.shading import irradiance, radiance
@@ -19,7 +19,7 @@ from renderer.transfer import build_operators
 from renderer.visibility import choose
 
 MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-CAMERA, SETTINGS, BACKEND = OrthographicCamera(0, 0, 2.0), PictureSettings(2, 2), choose("software")
+CAMERA, SETTINGS, BACKEND = OrthographicCamera(0, 0, 2.0), ImageSettings(2, 2), choose("software")
 [FRAGMENTS] = build_fragments(MESH.vertices, MESH.faces, [CAMERA], SETTINGS, BACKEND)
 [OPERATOR] = build_operators(MESH, [CAMERA], SETTINGS, BACKEND)
 FACES = torch.from_numpy(MESH.faces)

@@ -1,4 +1,4 @@
-"""What a view sees of a mesh, against loops over the rasterised picture."""
+"""What a view sees of a mesh, against loops over the rasterised image."""
 
 from dataclasses import fields, replace
 
@@ -9,7 +9,7 @@ import trimesh
 
 from renderer.camera import OrthographicCamera, ring
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.visibility import choose
 
 EPS = torch.finfo(torch.float64).eps
@@ -30,9 +30,7 @@ def open_shell() -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces[: 2 * len(faces) // 3]
 
 
-def fragments_of(
-    mesh, settings: PictureSettings, camera: OrthographicCamera = CAMERA, closed: bool = False
-) -> Fragments:
+def fragments_of(mesh, settings: ImageSettings, camera: OrthographicCamera = CAMERA, closed: bool = False) -> Fragments:
     [fragments] = build_fragments(*mesh, [camera], settings, BACKEND, closed)
     return fragments
 
@@ -45,9 +43,9 @@ def assert_same(found: Fragments, expected: Fragments) -> None:
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize(("size", "samples"), [(9, 3), (20, 1), (1, 16)])
-def test_the_samples_are_those_of_the_picture_pixel_by_pixel(size, samples, camera):
+def test_the_samples_are_those_of_the_image_pixel_by_pixel(size, samples, camera):
     vertices, faces = open_shell()
-    fragments = fragments_of((vertices, faces), PictureSettings(size, samples), camera)
+    fragments = fragments_of((vertices, faces), ImageSettings(size, samples), camera)
     points, resolution = camera.project(vertices), size * samples
     ids = BACKEND.rasterise(points[None], faces, resolution)[0]
     seen = sorted(set(ids[ids >= 0]))
@@ -73,7 +71,7 @@ def test_the_samples_are_those_of_the_picture_pixel_by_pixel(size, samples, came
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_face_seen_from_behind_is_one_whose_normal_points_away(camera):
     vertices, faces = open_shell()
-    fragments = fragments_of((vertices, faces), PictureSettings(16, 2), camera)
+    fragments = fragments_of((vertices, faces), ImageSettings(16, 2), camera)
     a, b, c = vertices[faces[fragments.faces]].transpose(1, 0, 2)
     towards = np.sign(np.cross(b - a, c - a) @ camera.axes()[2])
     assert set(towards) == {-1, 1}
@@ -83,7 +81,7 @@ def test_a_face_seen_from_behind_is_one_whose_normal_points_away(camera):
 @pytest.mark.parametrize("shift", [0.0, 0.05])
 def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(shift):
     """Corners are snapped when they are drawn, so that a sample may lie just outside; here, some lie well outside."""
-    fragments = fragments_of(open_shell(), PictureSettings(8, 4))
+    fragments = fragments_of(open_shell(), ImageSettings(8, 4))
     fragments = replace(fragments, outlines=fragments.outlines + shift)
     outside = 0
     for weight, face, at in zip(fragments.barycentric(), fragments.face, fragments.positions(), strict=True):
@@ -99,7 +97,7 @@ def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(
     "flatten", [lambda o: 0 * o, lambda o: o[:, :1].expand(-1, 3, -1), lambda o: o[..., :1] * 1e-9]
 )
 def test_an_outline_without_area_has_finite_barycentric_weights(flatten):
-    fragments = fragments_of(open_shell(), PictureSettings(4, 1))
+    fragments = fragments_of(open_shell(), ImageSettings(4, 1))
     weights = replace(fragments, outlines=flatten(fragments.outlines).expand(-1, -1, 2)).barycentric()
     assert (weights >= 0).all()
     torch.testing.assert_close(weights.sum(1), torch.ones(len(weights), dtype=torch.float64), rtol=0, atol=4 * EPS)
@@ -107,7 +105,7 @@ def test_an_outline_without_area_has_finite_barycentric_weights(flatten):
 
 @pytest.mark.parametrize(("size", "samples"), [(5, 4), (20, 1)])
 def test_merging_adds_up_the_albedo_of_a_face_in_a_pixel(size, samples):
-    fragments = fragments_of(open_shell(), PictureSettings(size, samples))
+    fragments = fragments_of(open_shell(), ImageSettings(size, samples))
     albedo = torch.rand(len(fragments.pixel), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     expected = {}
     for pixel, face, value in zip(fragments.pixel.tolist(), fragments.face.tolist(), albedo, strict=True):
@@ -126,14 +124,14 @@ def test_merging_adds_up_the_albedo_of_a_face_in_a_pixel(size, samples):
 
 
 def test_each_view_is_what_it_is_alone():
-    mesh, settings, cameras = open_shell(), PictureSettings(6, 2), ring(3, 2.0)
+    mesh, settings, cameras = open_shell(), ImageSettings(6, 2), ring(3, 2.0)
     for camera, view in zip(cameras, build_fragments(*mesh, cameras, settings, BACKEND), strict=True):
         assert_same(view, fragments_of(mesh, settings, camera))
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(camera):
-    settings = PictureSettings(16, 4)
+    settings = ImageSettings(16, 4)
     whole, culled = (fragments_of(dented_sphere(), settings, camera, closed) for closed in (False, True))
     assert torch.equal(culled.pixels, whole.pixels) and torch.equal(culled.coverage, whole.coverage)
     assert (culled.facing == 1).all()
@@ -143,7 +141,7 @@ def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(camera):
 
 def test_a_closed_mesh_that_the_near_plane_cuts_open_shows_its_inside():
     vertices, faces = dented_sphere()
-    mesh, settings = (3 * vertices, faces), PictureSettings(8, 2)
+    mesh, settings = (3 * vertices, faces), ImageSettings(8, 2)
     camera = OrthographicCamera(1.0, 0.4, 8.0)
     inside = fragments_of(mesh, settings, camera, closed=True)
     assert (inside.facing == -1).any()
@@ -151,9 +149,9 @@ def test_a_closed_mesh_that_the_near_plane_cuts_open_shows_its_inside():
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_mesh_outside_the_picture_has_no_fragments(closed):
+def test_a_mesh_outside_the_image_has_no_fragments(closed):
     vertices, faces = dented_sphere()
-    fragments = fragments_of((9 + vertices, faces), PictureSettings(4, 2), OrthographicCamera(0, 0, 2.0), closed)
+    fragments = fragments_of((9 + vertices, faces), ImageSettings(4, 2), OrthographicCamera(0, 0, 2.0), closed)
     shapes = {name: tuple(value.shape) for name, value in vars(fragments).items() if isinstance(value, torch.Tensor)}
     assert {shape[0] for shape in shapes.values()} == {0}
     assert fragments.barycentric().shape == (0, 3) and fragments.positions().shape == (0, 2)
@@ -162,7 +160,7 @@ def test_a_mesh_outside_the_picture_has_no_fragments(closed):
 
 
 def test_all_of_it_moves_to_another_device():
-    fragments = fragments_of(dented_sphere(), PictureSettings(4, 2))
+    fragments = fragments_of(dented_sphere(), ImageSettings(4, 2))
     moved = fragments.to("meta")
     for name, value in vars(moved).items():
         assert value.is_meta if isinstance(value, torch.Tensor) else value == getattr(fragments, name)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from renderer.errors import InputError
-from renderer.image import ENCODINGS, PictureSettings, behind, clamped, decode, develop, encode
+from renderer.image import ENCODINGS, ImageSettings, behind, clamped, decode, develop, encode
 
 EPS = torch.finfo(torch.float64).eps
 
@@ -36,22 +36,22 @@ def composite(radiance: torch.Tensor, coverage: torch.Tensor, background: torch.
 
 
 def test_the_surface_lies_over_the_background_by_its_coverage():
-    picture = develop(pixel(0.1, 0.2, 0.3), share(0.25), grey(0.4))
-    torch.testing.assert_close(picture, pixel(0.4, 0.5, 0.6), rtol=4 * EPS, atol=0)
+    image = develop(pixel(0.1, 0.2, 0.3), share(0.25), grey(0.4))
+    torch.testing.assert_close(image, pixel(0.4, 0.5, 0.6), rtol=4 * EPS, atol=0)
 
 
 def test_under_srgb_the_compositing_is_linear():
-    picture = develop(pixel(0.1, 0.2, 0.3), share(0.25), grey(0.5), "srgb")
+    image = develop(pixel(0.1, 0.2, 0.3), share(0.25), grey(0.5), "srgb")
     expected = pixel(*(srgb_of(surface + 0.75 * linear_of(0.5)) for surface in (0.1, 0.2, 0.3)))
-    torch.testing.assert_close(picture, expected, rtol=8 * EPS, atol=0)
+    torch.testing.assert_close(image, expected, rtol=8 * EPS, atol=0)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_the_clamp_comes_last(encoding):
     """Half a pixel at radiance 1.5, -0.4 and 2.5: clamped before compositing, the first two would be 0.5 and 0.5."""
-    picture = develop(pixel(0.75, -0.2, 1.25), share(0.5), pixel(0, 1, 1), encoding)
+    image = develop(pixel(0.75, -0.2, 1.25), share(0.5), pixel(0, 1, 1), encoding)
     composite = pixel(0.75, 0.3, 1.0)
-    torch.testing.assert_close(picture, encode(composite, encoding), rtol=4 * EPS, atol=0)
+    torch.testing.assert_close(image, encode(composite, encoding), rtol=4 * EPS, atol=0)
 
 
 def test_colour_backgrounds_and_batches_broadcast():
@@ -59,19 +59,19 @@ def test_colour_backgrounds_and_batches_broadcast():
     radiance = torch.rand(2, 1, 3, 5, generator=draws, dtype=torch.float64) / 2
     coverage = torch.rand(2, 1, 1, 5, generator=draws, dtype=torch.float64)
     background = torch.rand(4, 3, 1, generator=draws, dtype=torch.float64)
-    pictures = develop(radiance, coverage, background, "srgb")
-    assert pictures.shape == (2, 4, 3, 5)
+    images = develop(radiance, coverage, background, "srgb")
+    assert images.shape == (2, 4, 3, 5)
     alone = develop(radiance[1, 0], coverage[1, 0], background[2], "srgb")
-    torch.testing.assert_close(pictures[1, 2], alone, rtol=4 * EPS, atol=0)  # vectorised powers round otherwise
+    torch.testing.assert_close(images[1, 2], alone, rtol=4 * EPS, atol=0)  # vectorised powers round otherwise
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_the_background_comes_back_where_nothing_covers_it(encoding):
     greys = torch.linspace(0, 1, 256).view(256, 1, 1)
-    pictures = develop(torch.zeros(1, 3, 1), torch.zeros(1, 1, 1), greys, encoding)
+    images = develop(torch.zeros(1, 3, 1), torch.zeros(1, 1, 1), greys, encoding)
     # Exactly as it stands; through sRGB and back in float32, powers of some 4 ulps each, multiplied by up to 2.4.
     tolerance = 0 if encoding == "linear" else 16 * torch.finfo(torch.float32).eps
-    torch.testing.assert_close(pictures, greys.expand(-1, 3, 1), rtol=0, atol=tolerance)
+    torch.testing.assert_close(images, greys.expand(-1, 3, 1), rtol=0, atol=tolerance)
 
 
 def test_encoding_and_decoding_are_the_srgb_standards():
@@ -99,8 +99,8 @@ def test_the_gradient_through_srgb_is_its_derivative_and_finite_from_black_to_wh
 
 def test_the_gradient_of_decoding_is_its_derivative_and_finite_outside_of_black_and_white_too():
     values = [-1.0, -0.055, -0.01, 0.0, 0.04, 0.05, 0.5, 1.0, 1.5]
-    picture = torch.tensor(values, dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(decode(picture, "srgb").sum(), picture)
+    image = torch.tensor(values, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(decode(image, "srgb").sum(), image)
     slopes = [1 / 12.92 if value <= 0.04045 else 2.4 / 1.055 * ((value + 0.055) / 1.055) ** 1.4 for value in values]
     np.testing.assert_allclose(gradient, slopes, rtol=8 * EPS)
 
@@ -128,12 +128,12 @@ def test_shorter_dtypes_stay_what_they_are(encoding, dtype):
         torch.full((1, 50), 0.5, dtype=dtype),
         torch.full((1, 1), 0.25, dtype=dtype),
     )
-    picture = develop(*scene, encoding)
-    assert picture.dtype == dtype
+    image = develop(*scene, encoding)
+    assert image.dtype == dtype
     full = develop(*(tensor.double() for tensor in scene), encoding)
     # Decoding, compositing and encoding round a few times; the encoding's slope is up to 12.92.
     slack = 4 * (12.92 if encoding == "srgb" else 1) * torch.finfo(dtype).eps
-    torch.testing.assert_close(picture.double(), full, rtol=0, atol=slack)
+    torch.testing.assert_close(image.double(), full, rtol=0, atol=slack)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -158,13 +158,13 @@ def test_black_and_white_themselves_are_not_clamped(encoding):
     np.testing.assert_allclose(gradient[:, 0], slopes, rtol=8 * EPS)
 
 
-def test_a_background_may_be_a_picture():
+def test_a_background_may_be_a_image():
     draws = torch.Generator().manual_seed(1)
     scene = [torch.rand(*shape, generator=draws, dtype=torch.float64) for shape in ((2, 3, 7), (1, 7), (3, 7))]
-    pictures = develop(*scene, "srgb")
+    images = develop(*scene, "srgb")
     for at in range(7):
         alone = develop(*(part[..., at : at + 1] for part in scene), "srgb")
-        torch.testing.assert_close(pictures[..., at : at + 1], alone, rtol=4 * EPS, atol=0)
+        torch.testing.assert_close(images[..., at : at + 1], alone, rtol=4 * EPS, atol=0)
 
 
 @pytest.mark.parametrize("function", [encode, decode, lambda x, encoding: develop(x, share(1), grey(0), encoding)])
@@ -182,6 +182,6 @@ def test_an_unknown_encoding_is_refused(function):
         (dict(encoding="gamma"), r"renderer\.encoding=gamma: choose one of linear, srgb"),
     ],
 )
-def test_settings_that_make_no_picture_are_refused(settings, message):
+def test_settings_that_make_no_image_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
-        PictureSettings(**settings)
+        ImageSettings(**settings)

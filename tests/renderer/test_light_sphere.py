@@ -1,4 +1,4 @@
-"""The picture of a light: closed forms, and the renderer's picture of a ball."""
+"""The image of a light: closed forms, and the renderer's image of a ball."""
 
 import math
 
@@ -10,7 +10,7 @@ import trimesh
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
-from renderer.image import PictureSettings, encode
+from renderer.image import ImageSettings, encode
 from renderer.light_sphere import light_sphere
 from renderer.lights import ambient, directional, probe
 from renderer.shading import radiance
@@ -28,19 +28,19 @@ def disc(size: int) -> torch.Tensor:
 
 def test_even_light_gives_an_even_disc_on_white():
     color = torch.tensor([0.1, 0.4, 0.9])
-    picture = light_sphere(ambient(color), 64)
-    assert picture.shape == (3, 64, 64) and picture.dtype == torch.float32
+    image = light_sphere(ambient(color), 64)
+    assert image.shape == (3, 64, 64) and image.dtype == torch.float32
     expected = encode(color.double(), "srgb").float()
     torch.testing.assert_close(
-        picture[:, disc(64)], expected[:, None].expand(3, int(disc(64).sum())), rtol=0, atol=8 * EPS32
+        image[:, disc(64)], expected[:, None].expand(3, int(disc(64).sum())), rtol=0, atol=8 * EPS32
     )
-    assert (picture[:, ::63, ::63] == 1).all()
+    assert (image[:, ::63, ::63] == 1).all()
 
 
-def test_the_disc_fills_the_picture_and_its_outline_is_smooth():
+def test_the_disc_fills_the_image_and_its_outline_is_smooth():
     """A black ball on white: what is left of the paper in linear light is the share of 128² samples outside."""
-    picture = light_sphere(torch.zeros(49, 3), 64).double()
-    linear = torch.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
+    image = light_sphere(torch.zeros(49, 3), 64).double()
+    linear = torch.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
     places = torch.arange(-127, 128, 2)
     outside = (places[:, None] ** 2 + places**2 >= 128**2).double().mean()
     torch.testing.assert_close(linear.mean(), outside, rtol=0, atol=4 * EPS32)
@@ -58,7 +58,7 @@ def test_the_disc_fills_the_picture_and_its_outline_is_smooth():
 )
 def test_light_that_grows_linearly_with_direction_shades_the_ball_linearly(camera, right, up, back):
     """Radiance a + b·ω gives the irradiance π a + 2π/3 b·n: the clamped cosine keeps two thirds of band 1. A pixel's
-    four samples of n are symmetric about its centre in the picture and average to it; along the view they do not."""
+    four samples of n are symmetric about its centre in the image and average to it; along the view they do not."""
     b = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
     b = b - (b @ torch.tensor(back).double()) * torch.tensor(back).double()
     light = torch.zeros(49, 3, dtype=torch.float64)
@@ -82,7 +82,7 @@ def test_it_is_what_the_renderer_makes_of_a_white_ball(name):
     normals are off by 1.5e-4. Irradiance / π grows by less than 1 in a radian, and sRGB's slope is 2.5 at 0.02."""
     ball = trimesh.creation.icosphere(subdivisions=6)
     camera, light, size = ring(3, 2.0)[1], probe(name), 48
-    settings = PictureSettings(size, 2)
+    settings = ImageSettings(size, 2)
     vertices, faces = np.array(ball.vertices), np.array(ball.faces)
     [fragments] = build_fragments(vertices, faces, [camera], settings, choose("software"))
     albedo = torch.full((len(fragments.pixel), 3), 1 / math.pi, dtype=torch.float64)
@@ -98,8 +98,8 @@ def test_it_is_what_the_renderer_makes_of_a_white_ball(name):
 
 def test_too_bright_is_white_and_below_zero_is_black():
     light = directional(torch.tensor([1.0, 0.0, 0.0]), torch.full((3,), 100.0))
-    picture = light_sphere(light, 32, FRONT)
-    assert (picture[:, 16, 16] == 1).all()
+    image = light_sphere(light, 32, FRONT)
+    assert (image[:, 16, 16] == 1).all()
     behind = light_sphere(light, 32, OrthographicCamera(math.pi / 2, math.pi, 2.0))
     assert (behind[:, disc(32)] >= 0).all() and (behind[:, disc(32)] == 0).any()
 

@@ -15,7 +15,7 @@ from renderer.albedo import surface_albedo
 from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.mesh import Mesh, concatenate, load_mesh, normalise
 from renderer.visibility import choose
 
@@ -387,7 +387,7 @@ def truncated_glb(path: Path) -> None:
 
 
 def damaged_texture_glb(path: Path) -> None:
-    """The picture's header is whole, so that only decoding it finds the damage."""
+    """The image's header is whole, so that only decoding it finds the damage."""
     scene, _, _ = leaf_and_fruit()
     blob = scene.export(file_type="glb")
     at = blob.index(b"IDAT") + 8
@@ -410,7 +410,7 @@ def text(content: str):
     [
         ("missing.glb", lambda path: None, "does not exist"),
         ("folder.glb", Path.mkdir, "does not exist"),
-        ("picture.jpg", text(""), "no known mesh format: use one of .*glb"),
+        ("image.jpg", text(""), "no known mesh format: use one of .*glb"),
         ("no_suffix", text(""), "no known mesh format"),
         ("empty.glb", text(""), "cannot be read"),
         ("garbage.glb", text("garbage " * 50), "cannot be read"),
@@ -458,7 +458,7 @@ def test_the_shared_oranges_are_closed_around_their_centre_and_orange(name, face
     outward = (corner_positions(mesh).mean(axis=1) * mesh.face_normals()).sum(axis=1)
     fruit = np.arange(faces)[-960:] if name == "orange_leaf" else np.arange(faces)
     assert np.average(outward[fruit] > 0, weights=mesh.face_areas()[fruit]) > 0.95
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, ring(1, 2.0), PictureSettings(32, 1), choose("software"))
+    [fragments] = build_fragments(mesh.vertices, mesh.faces, ring(1, 2.0), ImageSettings(32, 1), choose("software"))
     albedo = surface_albedo(mesh, fragments, "linear").numpy()
     red, green, blue = albedo[np.isin(fragments.faces[fragments.face], fruit)].mean(axis=0)
     assert red > 1.4 * green > 1.4 * 2 * blue

@@ -15,7 +15,7 @@ from renderer.albedo import surface_albedo
 from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.mesh import Mesh, concatenate, load_mesh, normalise
 from renderer.mesh_export import export_mesh
 from renderer.shading import radiance
@@ -98,10 +98,10 @@ def assert_same_surface(found: Mesh, mesh: Mesh) -> None:
         assert_array_equal(texture, expected)
 
 
-def picture(mesh: Mesh) -> torch.Tensor:
+def image_of(mesh: Mesh) -> torch.Tensor:
     """Radiance of a view, smooth vertex normals and all."""
     [fragments] = build_fragments(
-        mesh.vertices, mesh.faces, ring(1, 4.0)[0:1], PictureSettings(24, 2), choose("software"), mesh.closed
+        mesh.vertices, mesh.faces, ring(1, 4.0)[0:1], ImageSettings(24, 2), choose("software"), mesh.closed
     )
     light = torch.randn(49, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     albedo = surface_albedo(mesh, fragments, "linear")
@@ -120,17 +120,17 @@ def test_a_glb_gives_back_the_same_surface(tmp_path, mesh):
 
 
 @every_mesh
-def test_a_glb_gives_back_the_same_picture(tmp_path, mesh):
+def test_a_glb_gives_back_the_same_image(tmp_path, mesh):
     """Of the mesh whose positions are float32 already, so that the same samples see the same faces. Texture
     coordinates are off by 2 EPS32, which is 64 of it in texels."""
     mesh = replace(mesh, vertices=mesh.vertices.astype(np.float32).astype(np.float64))
     export_mesh(mesh, tmp_path / "mesh.glb")
-    before, after = picture(mesh), picture(load_mesh(tmp_path / "mesh.glb"))
+    before, after = image_of(mesh), image_of(load_mesh(tmp_path / "mesh.glb"))
     torch.testing.assert_close(after, before, rtol=0, atol=2 * 64 * EPS32 * float(before.abs().max()))
 
 
 def read_glb(path: Path) -> list[dict]:
-    """The primitives of a .glb: their attributes and indices as arrays, the material and the picture's bytes."""
+    """The primitives of a .glb: their attributes and indices as arrays, the material and the image's bytes."""
     blob = path.read_bytes()
     magic, version, length, size, kind = struct.unpack("<4sII I4s", blob[:20])
     assert (magic, version, length, kind) == (b"glTF", 2, len(blob), b"JSON")
@@ -218,7 +218,7 @@ def test_dark_colours_are_kept(tmp_path):
     assert_allclose(found, levels[faces][..., None].repeat(3, -1), rtol=2 * EPS32, atol=1e-7)
 
 
-def test_pictures_of_the_same_bytes_and_other_sizes_are_kept_apart(tmp_path):
+def test_images_of_the_same_bytes_and_other_sizes_are_kept_apart(tmp_path):
     mesh = painted(box(), 2)
     texture = mesh.textures[0]
     mesh = replace(mesh, textures=(texture, texture.reshape(texture.shape[1], texture.shape[0], 3)))

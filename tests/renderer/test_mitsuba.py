@@ -1,6 +1,6 @@
-"""Pictures of convex meshes against Mitsuba 3, which traces rays from the surface into a map of the same light.
+"""Images of convex meshes against Mitsuba 3, which traces rays from the surface into a map of the same light.
 
-A diffuse face reflects albedo / π of its irradiance and our radiance leaves the 1/π out, so a picture of Mitsuba's
+A diffuse face reflects albedo / π of its irradiance and our radiance leaves the 1/π out, so an image of Mitsuba's
 times π is one of ours. It draws directions by the cosine: its noise is then the light's variation alone.
 """
 
@@ -16,13 +16,13 @@ from scipy.special import sph_harm_y
 
 from renderer.camera import OrthographicCamera
 from renderer.mesh import Mesh
-from renderer.transfer import PictureSettings, build_operators
+from renderer.transfer import ImageSettings, build_operators
 from renderer.visibility import choose
 
 mi = pytest.importorskip("mitsuba")
 
-SEEDS = 32  # independent pictures of Mitsuba's, which tell its noise
-SIGMAS = 5  # a right picture fails a bound once in a million times
+SEEDS = 32  # independent images of Mitsuba's, which tell its noise
+SIGMAS = 5  # a right image fails a bound once in a million times
 FEW = 0.02  # of a pixel: less surface is hit too seldom for a normal distribution
 MAP_ROWS = 192  # linear interpolation dims band l by l(l + 1) (π / 191)² / 12: 5e-5 of band 1, 1e-3 of the faint band 6
 BAND_WEIGHTS = [0, 1, 1, 0.3, 1, 0.3, 1]  # bands 3 and 5 reach no diffuse surface and only add noise
@@ -110,12 +110,12 @@ each_case = pytest.mark.parametrize(
     ],
 )
 
-# ---------------------------------------------------------------------------- pictures
+# ---------------------------------------------------------------------------- images
 
 
-def our_picture(mesh: Mesh, camera: OrthographicCamera, size: int, samples: int) -> np.ndarray:
+def our_image(mesh: Mesh, camera: OrthographicCamera, size: int, samples: int) -> np.ndarray:
     """(size, size, 4): radiance and coverage."""
-    [operator] = build_operators(mesh, [camera], PictureSettings(size, samples), choose("software"))
+    [operator] = build_operators(mesh, [camera], ImageSettings(size, samples), choose("software"))
     canvas = np.zeros((size * size, 4))
     canvas[operator.pixels, :3] = operator.radiance(torch.from_numpy(LIGHT)).T
     canvas[operator.pixels, 3] = operator.coverage
@@ -123,8 +123,8 @@ def our_picture(mesh: Mesh, camera: OrthographicCamera, size: int, samples: int)
 
 
 @functools.cache
-def mitsuba_picture(solid, view: str, size: int, rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """The mean (size, size, 4) of SEEDS pictures of so many rays per pixel, and its standard error."""
+def mitsuba_image(solid, view: str, size: int, rays: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mean (size, size, 4) of SEEDS images of so many rays per pixel, and its standard error."""
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -134,9 +134,9 @@ def mitsuba_picture(solid, view: str, size: int, rays: int) -> tuple[np.ndarray,
             "sensor": mitsuba_sensor(VIEWS[view], size),
         }
     )
-    pictures = np.stack([np.array(mi.render(scene, spp=rays, seed=seed)) for seed in range(SEEDS)]).astype(float)
-    pictures[..., :3] *= math.pi
-    return pictures.mean(axis=0), pictures.std(axis=0, ddof=1) / math.sqrt(SEEDS)
+    images = np.stack([np.array(mi.render(scene, spp=rays, seed=seed)) for seed in range(SEEDS)]).astype(float)
+    images[..., :3] *= math.pi
+    return images.mean(axis=0), images.std(axis=0, ddof=1) / math.sqrt(SEEDS)
 
 
 def mitsuba_light() -> dict:
@@ -148,7 +148,7 @@ def mitsuba_light() -> dict:
 def mitsuba_sensor(camera: OrthographicCamera, size: int) -> dict:
     _, up, back = camera.axes()
     look = mi.ScalarTransform4f().look_at(origin=list(4 * back), target=[0, 0, 0], up=list(up))
-    half = camera.field_of_view / 2  # Mitsuba's picture spans [-1, 1]
+    half = camera.field_of_view / 2  # Mitsuba's image spans [-1, 1]
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "rfilter": {"type": "box"}}
     return {"type": "orthographic", "to_world": look @ mi.ScalarTransform4f().scale([half, half, 1]), "film": film}
 
@@ -187,14 +187,14 @@ def mitsuba_albedo(mesh: Mesh) -> dict:
 def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(solid, view, size, samples, rays):
     """Our error, in Mitsuba's standard errors: its root mean square is one and its mean is zero.
 
-    A standard error from n pictures makes a Student's t of n - 1 degrees of freedom: the mean and the variance of its
+    A standard error from n images makes a Student's t of n - 1 degrees of freedom: the mean and the variance of its
     square follow. The three channels share their rays, so a pixel counts once.
 
     s² samples misjudge the coverage at the outline by 1 / √(12 s³), as each of s rows rounds to its samples: 0.2 % of
     a pixel, against Mitsuba's noise of up to 0.8 % there (0.06 and 0.4 % in the slow runs), too little to show.
     """
-    ours = our_picture(solid(), VIEWS[view], size, samples)
-    theirs, noise = mitsuba_picture(solid, view, size, rays)
+    ours = our_image(solid(), VIEWS[view], size, samples)
+    theirs, noise = mitsuba_image(solid, view, size, rays)
     seen = np.maximum(ours, theirs)[..., 3] > FEW
     errors = (ours - theirs)[seen, :3] / noise[seen, :3]
     freedom = SEEDS - 1
@@ -213,8 +213,8 @@ def test_the_outline_is_mitsubas_to_a_sixteenth_of_a_pixel(solid, view):
 
     Only an edge along the rows or columns is off so far, so the few pixels where two edges meet stay below it too.
     """
-    ours = our_picture(solid(), VIEWS[view], 32, 8)
-    theirs, noise = mitsuba_picture(solid, view, 32, 128)
+    ours = our_image(solid(), VIEWS[view], 32, 8)
+    theirs, noise = mitsuba_image(solid, view, 32, 128)
     outline = (np.maximum(ours, theirs)[..., 3] > 0) & (np.minimum(ours, theirs)[..., 3] < 1)
     brightest = theirs.max(axis=(0, 1))
     error, noise = ((values[outline] / brightest) ** 2 for values in (ours - theirs, noise))

@@ -1,6 +1,6 @@
-"""Irradiance against scipy, and derivatives of whole pictures against central differences with visibility held fixed.
+"""Irradiance against scipy, and derivatives of whole images against central differences with visibility held fixed.
 
-A picture is everything from vertices, light and albedo to what a classifier sees: shading, box filter, background,
+An image is everything from vertices, light and albedo to what a classifier sees: shading, box filter, background,
 clamp and encoding, and the pixels around the mesh.
 """
 
@@ -23,7 +23,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import MAX_DEGREE, irradiance_basis, lambertian_factors, live_coefficients, rotate
-from renderer.image import PictureSettings, behind, clamped, develop
+from renderer.image import ImageSettings, behind, clamped, develop
 from renderer.mesh import Mesh
 from renderer.shading import irradiance, radiance
 from renderer.transfer import build_operators
@@ -227,7 +227,7 @@ class Scene:
 
     @cached_property
     def fragments(self) -> Fragments:
-        settings = PictureSettings(self.size, self.samples)
+        settings = ImageSettings(self.size, self.samples)
         [fragments] = build_fragments(self.mesh.vertices, self.mesh.faces, [self.camera], settings, BACKEND)
         return fragments
 
@@ -266,12 +266,12 @@ def test_the_scenes_are_what_they_are_called():
     assert len(OUTSIDE.fragments.pixels) == 0
 
 
-# ---------------------------------------------------------------------------- pictures
+# ---------------------------------------------------------------------------- images
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A scene as a function of vertices (V, 3), light (49, 3) and textures: (3, size²) picture values."""
+class Image:
+    """A scene as a function of vertices (V, 3), light (49, 3) and textures: (3, size²) image values."""
 
     scene: Scene
     encoding: str
@@ -315,30 +315,30 @@ def slope(function, inputs, steps, length: float = 1e-5) -> torch.Tensor:
 @each_scene
 @flat_and_smooth
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
-def test_derivatives_of_pictures_are_central_differences(scene, smooth, encoding):
+def test_derivatives_of_images_are_central_differences(scene, smooth, encoding):
     """By vertices, light and texels each alone, and by all of them at once."""
-    picture = Picture(scene, encoding, smooth)
-    inputs = picture.inputs()
+    image = Image(scene, encoding, smooth)
+    inputs = image.inputs()
     upstream = draw(3, scene.size**2, seed=2)
-    gradients = torch.autograd.grad(picture(*inputs), inputs, upstream)
+    gradients = torch.autograd.grad(image(*inputs), inputs, upstream)
     directions = [draw(*tensor.shape, seed=3 + index) for index, tensor in enumerate(inputs)]
     for moved in ([0], [1], [2], [3], range(4)):
         steps = [direction * (index in moved) for index, direction in enumerate(directions)]
         for distance in (2e-5, -2e-5):  # no value comes to the clamp on the way
             nudged = [tensor.detach() + distance * step for tensor, step in zip(inputs, steps, strict=True)]
-            assert torch.equal(picture.clamped(*nudged), picture.clamped(*inputs))
-        expected = (slope(picture, inputs, steps) * upstream).sum()
+            assert torch.equal(image.clamped(*nudged), image.clamped(*inputs))
+        expected = (slope(image, inputs, steps) * upstream).sum()
         found = sum((gradient * step).sum() for gradient, step in zip(gradients, steps, strict=True))
         # What is left out is of the order of length⁴; a few hundred values round by 1e-16 / length.
         assert found.item() == pytest.approx(expected.item(), rel=1e-8, abs=1e-8)
 
 
 @flat_and_smooth
-def test_each_entry_of_a_pictures_jacobian_is_a_central_difference(smooth):
-    picture = Picture(replace(SCENES["open, from behind"], size=3, samples=2), "linear", smooth)
-    inputs = picture.inputs()
-    assert torch.autograd.gradcheck(picture, inputs)
-    share = picture.clamped(*inputs).double().mean()
+def test_each_entry_of_a_images_jacobian_is_a_central_difference(smooth):
+    image = Image(replace(SCENES["open, from behind"], size=3, samples=2), "linear", smooth)
+    inputs = image.inputs()
+    assert torch.autograd.gradcheck(image, inputs)
+    share = image.clamped(*inputs).double().mean()
     assert 0 < share < 0.5
 
 
@@ -364,10 +364,10 @@ def test_albedo_per_face_has_the_derivative_of_central_differences(smooth):
 @flat_and_smooth
 def test_what_no_sample_sees_has_a_gradient_of_exactly_zero(scene, smooth):
     """Coefficients of the dead bands, vertices of no seen face (nor of a neighbour's, where normals are smooth)."""
-    picture = Picture(scene, "linear", smooth)
-    inputs = picture.inputs()
+    image = Image(scene, "linear", smooth)
+    inputs = image.inputs()
     fragments = scene.fragments
-    by_vertex, by_light, *_ = torch.autograd.grad(picture(*inputs), inputs, draw(3, scene.size**2))
+    by_vertex, by_light, *_ = torch.autograd.grad(image(*inputs), inputs, draw(3, scene.size**2))
     dead = torch.ones(49, dtype=torch.bool).index_fill(0, live_coefficients(6), False)
     assert not by_light[dead].any() and by_light[~dead].all()
     moving = np.unique(fragments.corners)
@@ -380,12 +380,12 @@ def test_what_no_sample_sees_has_a_gradient_of_exactly_zero(scene, smooth):
 @each_scene
 @flat_and_smooth
 def test_background_and_clamped_pixels_have_a_gradient_of_exactly_zero(scene, smooth):
-    picture = Picture(scene, "srgb", smooth)
-    inputs = picture.inputs()
-    values = picture(*inputs)
+    image = Image(scene, "srgb", smooth)
+    inputs = image.inputs()
+    values = image(*inputs)
     fragments = scene.fragments
     around = torch.ones(3, scene.size**2).index_fill(1, fragments.pixels, 0)
-    at_an_end = torch.zeros_like(around).index_copy(1, fragments.pixels, picture.clamped(*inputs).float())
+    at_an_end = torch.zeros_like(around).index_copy(1, fragments.pixels, image.clamped(*inputs).float())
     assert at_an_end.any()
     for upstream in (around, at_an_end):
         gradients = torch.autograd.grad(values, inputs, upstream.double(), retain_graph=True)
@@ -394,11 +394,11 @@ def test_background_and_clamped_pixels_have_a_gradient_of_exactly_zero(scene, sm
 
 @flat_and_smooth
 def test_an_empty_view_has_gradients_and_they_are_zero(smooth):
-    picture = Picture(OUTSIDE, "srgb", smooth)
-    inputs = picture.inputs()
-    values = picture(*inputs)
+    image = Image(OUTSIDE, "srgb", smooth)
+    inputs = image.inputs()
+    values = image(*inputs)
     assert torch.equal(values[:, 0], torch.tensor([0.3, 0.6, 0.1], dtype=torch.float64)) and values.shape == (3, 25)
-    lit = picture.parts(*inputs)[1][0]
+    lit = image.parts(*inputs)[1][0]
     assert lit.shape == (3, 0)
     for output in (values, lit):
         gradients = torch.autograd.grad(output.sum(), inputs, retain_graph=True)
@@ -423,7 +423,7 @@ def lit_and_gradients(scene: Scene, smooth: bool, dtype=torch.float64) -> tuple[
 def test_flat_radiance_is_the_operators(scene, color):
     mesh = scene.mesh if color is None else Mesh.plain(scene.mesh.vertices, scene.mesh.faces, color)
     scene = replace(scene, mesh=mesh)
-    settings = PictureSettings(scene.size, scene.samples)
+    settings = ImageSettings(scene.size, scene.samples)
     [operator] = build_operators(mesh, [scene.camera], settings, BACKEND, dtype=torch.float64)
     assert len(operator.transfer) == (3 if color is None and scene.samples > 1 else 1)
     lit, _, by_light, _ = lit_and_gradients(scene, smooth=False)

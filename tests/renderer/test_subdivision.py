@@ -1,4 +1,4 @@
-"""Subdivision: closed forms, trimesh's own, and the renderer's pictures before and after."""
+"""Subdivision: closed forms, trimesh's own, and the renderer's images before and after."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera, ring
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.mesh import Mesh, concatenate
 from renderer.shading import radiance
 from renderer.shapes import solid
@@ -151,11 +151,11 @@ def test_the_fields_keep_their_types():
 
 
 def fragments_of(mesh: Mesh, camera: OrthographicCamera, size: int) -> Fragments:
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], PictureSettings(size, 4), choose("software"))
+    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], ImageSettings(size, 4), choose("software"))
     return fragments
 
 
-def test_a_picture_is_unchanged_where_the_new_corners_lie_on_the_rasterisers_grid():
+def test_a_image_is_unchanged_where_the_new_corners_lie_on_the_rasterisers_grid():
     """Corners at whole samples before and after. In two rounds, uvs are off by EPS32, which is 8 of that in texels; so
     is then the albedo, whose texels and colours differ by up to 1, and so are the radiances in their proportion."""
     mesh, camera = height_field(), OrthographicCamera(0.0, 0.0, 2.0)
@@ -164,12 +164,12 @@ def test_a_picture_is_unchanged_where_the_new_corners_lie_on_the_rasterisers_gri
     assert torch.equal(after.sample, before.sample)
     assert torch.equal(after.faces[after.face] // 16, before.faces[before.face])
     light = torch.randn(49, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    pictures = [
+    images = [
         radiance(fragments, torch.from_numpy(each.vertices), light, surface_albedo(each, fragments, "linear"))
         for each, fragments in ((mesh, before), (finer, after))
     ]
-    assert pictures[0].std() > 0.1
-    torch.testing.assert_close(pictures[1], pictures[0], rtol=0, atol=16 * EPS32 * float(pictures[0].abs().max()))
+    assert images[0].std() > 0.1
+    torch.testing.assert_close(images[1], images[0], rtol=0, atol=16 * EPS32 * float(images[0].abs().max()))
 
 
 def edge_distance(outlines: torch.Tensor, points: torch.Tensor) -> torch.Tensor:

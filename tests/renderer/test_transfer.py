@@ -15,7 +15,7 @@ from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
 from renderer.harmonics import MAX_DEGREE, lambertian_factors, live_coefficients
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.lights import ambient, directional
 from renderer.mesh import Mesh, concatenate
 from renderer.shading import radiance as shade
@@ -35,7 +35,7 @@ def radiance(operator: Operator, light: torch.Tensor) -> np.ndarray:
     return torch.einsum("kc,ckp->cp", live, (operator.transfer * operator.albedo[:, None]).double()).numpy()
 
 
-def picture(operator: Operator, light: torch.Tensor, size: int) -> np.ndarray:
+def image_of(operator: Operator, light: torch.Tensor, size: int) -> np.ndarray:
     """(size, size, 3), black where nothing covers."""
     canvas = np.zeros((size * size, 3))
     canvas[operator.pixels] = radiance(operator, light).T
@@ -123,7 +123,7 @@ def albedo_at(mesh: Mesh, face: int, weights: np.ndarray, encoding: str) -> np.n
     return color
 
 
-def shade_slowly(mesh: Mesh, camera: OrthographicCamera, light: torch.Tensor, settings: PictureSettings) -> tuple:
+def shade_slowly(mesh: Mesh, camera: OrthographicCamera, light: torch.Tensor, settings: ImageSettings) -> tuple:
     """(size, size, 3) radiance and (size, size) coverage, sample by sample."""
     projected = camera.project(mesh.vertices)
     resolution = settings.size * settings.samples
@@ -148,19 +148,19 @@ def shade_slowly(mesh: Mesh, camera: OrthographicCamera, light: torch.Tensor, se
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 def test_operators_are_what_shading_every_sample_gives(encoding):
-    mesh, settings = patchwork(), PictureSettings(size=9, samples=3, encoding=encoding)
+    mesh, settings = patchwork(), ImageSettings(size=9, samples=3, encoding=encoding)
     cameras = [OrthographicCamera(0.4, 5.0, 1.7), OrthographicCamera(math.pi / 3, 0.0, 2.0)]
     for camera, operator in zip(cameras, build_operators(mesh, cameras, settings, BACKEND), strict=True):
         for light in (random_light(0), random_light(1)):
-            image, coverage = shade_slowly(mesh, camera, light, settings)
+            expected, coverage = shade_slowly(mesh, camera, light, settings)
             # The transfer is stored in float32, and 31 terms are summed.
-            tolerance = 8 * EPS32 * np.abs(image).max()
-            np.testing.assert_allclose(picture(operator, light, settings.size), image, rtol=0, atol=tolerance)
+            tolerance = 8 * EPS32 * np.abs(expected).max()
+            np.testing.assert_allclose(image_of(operator, light, settings.size), expected, rtol=0, atol=tolerance)
             np.testing.assert_allclose(coverage_map(operator, settings.size), coverage, rtol=EPS32)
 
 
 def test_pixels_are_in_order_and_coverage_is_positive_up_to_1():
-    (operator,) = build_operators(sphere(2), ring(1, 1.5), PictureSettings(size=8, samples=3), BACKEND)
+    (operator,) = build_operators(sphere(2), ring(1, 1.5), ImageSettings(size=8, samples=3), BACKEND)
     assert operator.transfer.shape == (1, 31, len(operator.pixels))
     assert (operator.transfer.dtype, operator.coverage.dtype) == (torch.float32, torch.float32)
     assert (operator.pixels.diff() > 0).all()
@@ -169,7 +169,7 @@ def test_pixels_are_in_order_and_coverage_is_positive_up_to_1():
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 def test_white_under_white_ambient_light_is_pi_times_coverage(encoding):
-    settings = PictureSettings(size=12, samples=4, encoding=encoding)
+    settings = ImageSettings(size=12, samples=4, encoding=encoding)
     for operator in build_operators(sphere(2), ring(3, 2.0), settings, BACKEND):
         expected = math.pi * operator.coverage.double().numpy() * np.array([[0.5], [1.0], [2.0]])
         lit = radiance(operator, ambient(torch.tensor([0.5, 1.0, 2.0])))
@@ -181,8 +181,8 @@ def test_a_sphere_under_directional_light_has_the_truncated_cosines_shading(ligh
     """Facets reach an angle ρ from their centre, so normals are off by at most ρ + ρ²; the series' slope is 1.02."""
     camera, size, samples = OrthographicCamera(1.1, 0.7, 2.0), 16, 4
     mesh = sphere(5)
-    (operator,) = build_operators(mesh, [camera], PictureSettings(size, samples), BACKEND)
-    lit = picture(operator, directional(torch.tensor(light_from), torch.ones(3)), size)
+    (operator,) = build_operators(mesh, [camera], ImageSettings(size, samples), BACKEND)
+    lit = image_of(operator, directional(torch.tensor(light_from), torch.ones(3)), size)
 
     steps = (np.arange(size * samples) + 0.5) / (size * samples) * 2 - 1
     x, y = np.meshgrid(steps, -steps)
@@ -202,7 +202,7 @@ def test_a_sphere_under_directional_light_has_the_truncated_cosines_shading(ligh
 
 def test_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
     """Half-width 5/8 at 8 pixels of 1/4: two pixels' worth and a half on either side of the centre."""
-    (operator,) = build_operators(square(0.625), [ABOVE], PictureSettings(size=8, samples=4), BACKEND)
+    (operator,) = build_operators(square(0.625), [ABOVE], ImageSettings(size=8, samples=4), BACKEND)
     along = [0, 0.5, 1, 1, 1, 1, 0.5, 0]
     np.testing.assert_array_equal(coverage_map(operator, 8), np.outer(along, along))
 
@@ -210,21 +210,21 @@ def test_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
 @pytest.mark.parametrize("turn", [0.1, 0.5, 1.2])
 def test_coverage_of_a_turned_square_adds_up_to_its_area(turn):
     """Each side, of length 1, is off by at most half a sample's width, 1/128, along its length."""
-    (operator,) = build_operators(square(0.5, turn), [ABOVE], PictureSettings(size=16, samples=8), BACKEND)
+    (operator,) = build_operators(square(0.5, turn), [ABOVE], ImageSettings(size=16, samples=8), BACKEND)
     area = float(operator.coverage.sum()) * (2 / 16) ** 2
     assert area == pytest.approx(1.0, abs=4 / 128)
 
 
-def test_the_picture_is_upright():
+def test_the_image_is_upright():
     """From θ = π/2 on the +x side, up is up and right is +y."""
     corners = [[0, 0.5, 0.5], [0, 1, 0.5], [0, 1, 1], [0, 0.5, 1]]
     mesh = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
-    (operator,) = build_operators(mesh, [OrthographicCamera(math.pi / 2, 0, 2.0)], PictureSettings(4, 2), BACKEND)
+    (operator,) = build_operators(mesh, [OrthographicCamera(math.pi / 2, 0, 2.0)], ImageSettings(4, 2), BACKEND)
     assert operator.pixels.tolist() == [3]
 
 
 def test_each_view_is_what_it_is_alone():
-    mesh, cameras, settings = patchwork(), ring(3, 2.0), PictureSettings(size=6, samples=2)
+    mesh, cameras, settings = patchwork(), ring(3, 2.0), ImageSettings(size=6, samples=2)
     together = build_operators(mesh, cameras, settings, BACKEND)
     for camera, operator in zip(cameras, together, strict=True):
         (alone,) = build_operators(mesh, [camera], settings, BACKEND)
@@ -233,7 +233,7 @@ def test_each_view_is_what_it_is_alone():
 
 
 def test_winding_does_not_matter():
-    mesh, settings = patchwork(), PictureSettings(size=8, samples=3)
+    mesh, settings = patchwork(), ImageSettings(size=8, samples=3)
     flipped = replace(
         mesh,
         faces=mesh.faces[:, ::-1],
@@ -253,7 +253,7 @@ def test_winding_does_not_matter():
 
 def test_faces_turned_away_do_not_shade():
     box = trimesh.convex.convex_hull(CUBE)
-    camera, settings = OrthographicCamera(math.pi / 3, 0.4, 2.0), PictureSettings(size=8, samples=4)
+    camera, settings = OrthographicCamera(math.pi / 3, 0.4, 2.0), ImageSettings(size=8, samples=4)
     white = Mesh.plain(box.vertices, box.faces)
     away = white.face_normals() @ camera.axes()[2] < 0
     assert 0 < away.sum() < len(away)
@@ -265,20 +265,20 @@ def test_faces_turned_away_do_not_shade():
 def test_hidden_faces_do_not_shade():
     """A red square just below a white one, listed first."""
     below = replace(square(0.5, color=(1.0, 0.0, 0.0)), vertices=square(0.5).vertices - [0, 0, 0.1])
-    settings = PictureSettings(size=8, samples=2)
+    settings = ImageSettings(size=8, samples=2)
     (both,) = build_operators(concatenate([below, square(0.5)]), [ABOVE], settings, BACKEND)
     (alone,) = build_operators(square(0.5), [ABOVE], settings, BACKEND)
     torch.testing.assert_close(both.transfer, alone.transfer, rtol=0, atol=0)
 
 
 def test_gain_multiplies_the_radiance_and_leaves_the_coverage():
-    mesh, settings = patchwork(), PictureSettings(size=6, samples=2, encoding="srgb")
+    mesh, settings = patchwork(), ImageSettings(size=6, samples=2, encoding="srgb")
     (plain,), (bright,) = (build_operators(mesh, ring(1, 2.0), settings, BACKEND, gain) for gain in (1.0, 2.5))
     torch.testing.assert_close(bright.transfer, 2.5 * plain.transfer, rtol=2 * EPS32, atol=0)
     torch.testing.assert_close(bright.coverage, plain.coverage, rtol=0, atol=0)
 
 
-def test_a_mesh_outside_the_picture_leaves_an_empty_operator():
+def test_a_mesh_outside_the_image_leaves_an_empty_operator():
     operator = empty_operator()
     assert operator.transfer.shape == (1, 31, 0)
     assert len(operator.coverage) == len(operator.pixels) == 0
@@ -286,14 +286,14 @@ def test_a_mesh_outside_the_picture_leaves_an_empty_operator():
 
 def test_an_unknown_encoding_is_refused():
     with pytest.raises(InputError, match=r"renderer\.encoding=gamma"):
-        build_operators(square(0.5), [ABOVE], PictureSettings(size=4, samples=1, encoding="gamma"), BACKEND)
+        build_operators(square(0.5), [ABOVE], ImageSettings(size=4, samples=1, encoding="gamma"), BACKEND)
 
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 @pytest.mark.parametrize("shape", [patchwork, lambda: sphere(2, (0.8, 0.4, 0.1))], ids=["patchwork", "one colour"])
 def test_smooth_operators_are_what_shading_with_vertex_normals_gives(shape, encoding):
     mesh, light, cameras = shape(), draw(49, 3), ring(2, 2.2)
-    settings = PictureSettings(12, samples=3, encoding=encoding, normals="smooth")
+    settings = ImageSettings(12, samples=3, encoding=encoding, normals="smooth")
     operators = build_operators(mesh, cameras, settings, BACKEND, dtype=torch.float64)
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, BACKEND, closed=mesh.closed)
     vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
@@ -308,7 +308,7 @@ def test_smooth_operators_are_what_shading_with_vertex_normals_gives(shape, enco
 
 def test_unknown_normals_are_refused():
     with pytest.raises(InputError, match=r"renderer\.normals=round: choose one of flat, smooth"):
-        PictureSettings(normals="round")
+        ImageSettings(normals="round")
 
 
 # ---------------------------------------------------------------------------- light to pixels and back
@@ -322,14 +322,14 @@ LAYOUTS = {  # mesh, samples, channels of the transfer
 
 def operator_of(layout: str, dtype=torch.float64) -> Operator:
     mesh, samples, channels = LAYOUTS[layout]
-    [operator] = build_operators(mesh, ring(1, 2.2), PictureSettings(6, samples), BACKEND, dtype=dtype)
+    [operator] = build_operators(mesh, ring(1, 2.2), ImageSettings(6, samples), BACKEND, dtype=dtype)
     assert operator.transfer.shape == (channels, 31, len(operator.pixels)) and operator.transfer.dtype == dtype
     return operator
 
 
 def empty_operator() -> Operator:
     mesh = replace(square(0.1), vertices=square(0.1).vertices + np.array([0.8, 0, 0]))
-    [operator] = build_operators(mesh, [OrthographicCamera(0, 0, 0.5)], PictureSettings(size=4, samples=2), BACKEND)
+    [operator] = build_operators(mesh, [OrthographicCamera(0, 0, 0.5)], ImageSettings(size=4, samples=2), BACKEND)
     return operator
 
 
@@ -337,7 +337,7 @@ def empty_operator() -> Operator:
 def test_operators_of_any_degree_are_scipys_harmonics(degree):
     box = trimesh.convex.convex_hull(CUBE)
     mesh = Mesh.plain(Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).apply(box.vertices), box.faces, (0.5, 1.0, 0.25))
-    settings, camera = PictureSettings(size=4, samples=1), OrthographicCamera(1.0, 0.4, 1.5)
+    settings, camera = ImageSettings(size=4, samples=1), OrthographicCamera(1.0, 0.4, 1.5)
     [operator] = build_operators(mesh, [camera], settings, BACKEND, basis=Harmonics(degree), dtype=torch.float64)
     light = draw((degree + 1) ** 2, 3)
     image, coverage = shade_slowly(mesh, camera, light, settings)
@@ -433,7 +433,7 @@ def test_both_layouts_give_the_same_radiance():
     plain = concatenate([at(0.6, 0.6, (1, 0.2, 0.1)), at(-0.6, -0.6, (0.1, 1, 0.3))])
     mixed = at(0.6, -0.6, (1, 1, 1))
     mixed.corner_colors[0] = (0, 0, 1)
-    settings = PictureSettings(8, 4)
+    settings = ImageSettings(8, 4)
     [one], [three] = (
         build_operators(mesh, [ABOVE], settings, BACKEND, dtype=torch.float64)
         for mesh in (plain, concatenate([plain, mixed]))
@@ -455,9 +455,9 @@ def test_one_channel_is_taken_for_albedos_that_are_the_same_to_float32s_rounding
     colors = np.full((2, 3, 3), 0.75, dtype=np.float32)
     colors[1] += step * np.spacing(colors[1])
     mesh = replace(square(0.5), corner_colors=colors)
-    [operator] = build_operators(mesh, [ABOVE], PictureSettings(4, 4), BACKEND)
+    [operator] = build_operators(mesh, [ABOVE], ImageSettings(4, 4), BACKEND)
     assert len(operator.transfer) == channels
-    [exact] = build_operators(mesh, [ABOVE], PictureSettings(4, 4), BACKEND, dtype=torch.float64)
+    [exact] = build_operators(mesh, [ABOVE], ImageSettings(4, 4), BACKEND, dtype=torch.float64)
     light = random_light(0)
     torch.testing.assert_close(operator.radiance(light), exact.radiance(light), rtol=0, atol=16 * EPS32)
 

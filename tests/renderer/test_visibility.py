@@ -270,19 +270,19 @@ def test_a_face_across_the_depth_range_is_clipped_to_it(backend):
 
 
 @pytest.mark.parametrize("shift", [(2.5, 0, 0), (-2.5, 0, 0), (0, 2.5, 0), (0, -2.5, 0), (1e12, 1e300, 0)])
-def test_faces_beside_the_picture_leave_it_empty(backend, shift):
+def test_faces_beside_the_image_leave_it_empty(backend, shift):
     points, faces = rotated_spheres(views=1)
     assert (backend.rasterise(points * 0.5 + shift, faces, 16) == -1).all()
 
 
 @pytest.mark.parametrize("size", [2, 100, 1e4])
-def test_a_face_larger_than_the_picture_covers_it_all(backend, size):
+def test_a_face_larger_than_the_image_covers_it_all(backend, size):
     points, faces = triangle([-size, -size, 0], [3 * size, -size, 0], [-size, 3 * size, 0])
     assert (backend.rasterise(points, faces, 16) == 0).all()
 
 
 def test_zero_area_faces_are_not_drawn(backend):
-    """A point and a segment on sample centres of a 4×4 picture."""
+    """A point and a segment on sample centres of a 4×4 image."""
     centre = [0.25, 0.25, 0]
     ids = backend.rasterise(*triangle(centre, centre, centre, [-0.75, 0.25, 0], centre, [0.75, 0.25, 0]), 4)
     assert (ids == -1).all()
@@ -304,7 +304,7 @@ def test_points_that_are_not_finite_are_refused(backend, value):
 BOX = trimesh.creation.box(bounds=[[-0.6, -0.4, -0.2], [0.4, 0.6, 0.2]])
 BUMP = trimesh.creation.box(bounds=[[0.4, 0.0, 0.0], [0.8, 0.4, 0.4]])  # on the +x side, higher than the box
 # Rows of 10×10 samples, 0.2 apart from -0.9 to 0.9. X is the side towards +x, x the one towards -x, B the bump.
-PICTURES = {
+IMAGES = {
     "+x, right +y, up +z": (90, 0, {3: ".....BB...", 4: "...XXBBX..", 5: "...XXXXX.."}),
     "-x, right -y, up +z": (90, 180, {3: "...BB.....", 4: "..xxxxx...", 5: "..xxxxx..."}),
     "+y, right -x, up +z": (90, 90, {3: ".BB.......", 4: ".BBYYYYY..", 5: "...YYYYY.."}),
@@ -318,15 +318,15 @@ PICTURES = {
 
 
 @pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
-@pytest.mark.parametrize(("polar", "azimuth", "rows"), PICTURES.values(), ids=PICTURES)
+@pytest.mark.parametrize(("polar", "azimuth", "rows"), IMAGES.values(), ids=IMAGES)
 def test_a_labelled_box_with_a_bump_looks_from_each_side_as_drawn_by_hand(backend, closed, polar, azimuth, rows):
     labels = ["xyzXYZ"[axis] for axis in np.argmax(np.hstack([-BOX.face_normals, BOX.face_normals]), axis=1)]
     labels = np.array([*labels, *"B" * len(BUMP.faces), "."])  # an id of -1 takes the last
     mesh = trimesh.util.concatenate([BOX, BUMP])
     camera = OrthographicCamera(math.radians(polar), math.radians(azimuth), field_of_view=2.0)
     ids = backend.rasterise(camera.project(mesh.vertices)[None], mesh.faces, 10, closed)[0]
-    picture = ["".join(row) for row in labels[ids]]
-    assert picture == [rows.get(row, "." * 10) for row in range(10)]
+    image = ["".join(row) for row in labels[ids]]
+    assert image == [rows.get(row, "." * 10) for row in range(10)]
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
@@ -399,7 +399,7 @@ def test_culling_a_closed_mesh_changes_ids_only_within_rounding_of_an_outline(ba
 
 
 def test_culling_a_closed_mesh_changes_ids_where_front_and_back_meet_on_a_sample(backend):
-    """A convex solid whose vertices, and some points of its outline, are sample centres of a picture of 17×17."""
+    """A convex solid whose vertices, and some points of its outline, are sample centres of an image of 17×17."""
     mesh = trimesh.convex.convex_hull(np.random.default_rng(6).integers(-3, 4, (40, 3)) * 4 / 17)
     distances = distances_of_changed_ids(backend, mesh, mesh.vertices[None] * [1, 1, -1], 17)
     assert len(distances) > 0
@@ -429,7 +429,7 @@ def test_the_back_ends_agree_on_spheres(resolution, closed):
 def test_the_back_ends_agree_on_any_triangles(seed, count, resolution, lattice, closed):
     """Coverage exactly; ids wherever the two faces' depths are not equal within rounding.
 
-    Inside the picture, since Mesa's rasteriser cuts triangles at its border and snaps the new corners.
+    Inside the image, since Mesa's rasteriser cuts triangles at its border and snaps the new corners.
     """
     points, faces = random_triangles(seed, count)
     if lattice:

@@ -58,7 +58,7 @@ EXPORT = ["export_light", "light=grace", "height=4"]
 
 def test_folders_whose_names_look_like_numbers_or_have_no_utf_8_are_scored(call, here, capsys):
     assert call(*EVALUATE, "out=1e3") == 0
-    assert "1 pictures of orange, 1 of other things" in capsys.readouterr().out
+    assert "1 images of orange, 1 of other things" in capsys.readouterr().out
     assert {path.name for path in (here / "1e3").iterdir()} == {
         *("photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK)
     }

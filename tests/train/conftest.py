@@ -37,7 +37,7 @@ TINY = [
 
 
 def coloured_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
-    """Pictures (N, 3, 16, 16) uint8 whose channel `label` is somewhat brighter."""
+    """Images (N, 3, 16, 16) uint8 whose channel `label` is somewhat brighter."""
     images = rng.integers(0, 200, (len(labels), 3, 16, 16))
     images[np.arange(len(labels)), labels] += 30
     return images.astype(np.uint8)
@@ -62,7 +62,7 @@ def cache_home(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tiny_npz(tmp_path_factory) -> Path:
-    """60 training and 30 test pictures of three classes, 16 × 16."""
+    """60 training and 30 test images of three classes, 16 × 16."""
     path = tmp_path_factory.mktemp("data") / "tiny.npz"
     rng = np.random.default_rng(0)
     train, test = np.repeat(np.arange(3), 20), np.repeat(np.arange(3), 10)
@@ -79,7 +79,7 @@ def tiny_npz(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory) -> Path:
-    """Seven pictures: of two classes, and of a thing that the data has no class for."""
+    """Seven images: of two classes, and of a thing that the data has no class for."""
     folder = tmp_path_factory.mktemp("photos")
     rng = np.random.default_rng(1)
     for name, count in [("orange", 3), ("apple", 2), ("other_tomato", 2)]:

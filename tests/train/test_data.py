@@ -38,12 +38,12 @@ def arrays(**changes) -> dict[str, np.ndarray]:
 
 
 def numbered(count: int, classes: int = 1) -> Split:
-    """Pictures (N, 3, 1, 1) that show their row's number, with labels in turn."""
+    """Images (N, 3, 1, 1) that show their row's number, with labels in turn."""
     rows = torch.arange(count)
     return Split(rows.view(-1, 1, 1, 1).expand(-1, 3, 1, 1).to(torch.uint8), rows % classes)
 
 
-def save_picture(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
+def save_image(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.new("RGB", size, (value, value, value)).save(path)
 
@@ -146,10 +146,10 @@ def test_cifar100_has_its_published_classes_and_statistics():
 # ---------------------------------------------------------------------------------------- folders
 
 
-def test_class_folders_become_classes_and_pictures_of_any_size_are_reduced(tmp_path):
+def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_path):
     for label, name in enumerate(["lime", "fig"]):
         for number in range(10):
-            save_picture(tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30))
+            save_image(tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30))
     (tmp_path / ".thumbnails").mkdir()
     data = load_folder(str(tmp_path), size=8, test_share=0.2)
     assert data.classes == ("fig", "lime")
@@ -164,7 +164,7 @@ def test_class_folders_become_classes_and_pictures_of_any_size_are_reduced(tmp_p
 
 def test_train_and_test_folders_are_the_splits(tmp_path):
     for part, name, value in [("train", "fig", 1), ("train", "lime", 2), ("test", "lime", 3)]:
-        save_picture(tmp_path / part / name / "a.png", value)
+        save_image(tmp_path / part / name / "a.png", value)
     data = load_folder(str(tmp_path), size=8, test_share=0.1)
     assert data.train.images[:, 0, 0, 0].tolist() == [1, 2] and data.train.labels.tolist() == [0, 1]
     assert data.test.images[:, 0, 0, 0].tolist() == [3] and data.test.labels.tolist() == [1]
@@ -172,32 +172,32 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
 
 def test_a_class_of_the_test_folder_alone_is_an_error(tmp_path):
     for name in ("train/fig", "train/lime", "test/fig", "test/other_limes"):
-        save_picture(tmp_path / name / "a.png", 0)
+        save_image(tmp_path / name / "a.png", 0)
     with pytest.raises(InputError, match="'other_limes' is not a class of the model"):
         load_folder(str(tmp_path), size=8, test_share=0.1)
 
 
 @pytest.mark.parametrize(
-    "pictures, test, fault",
+    "images, test, fault",
     [
         (None, 0.1, "is not a folder"),
         (["fig/a.png"], 0.1, "holds 1 class folders: it needs two or more"),
-        (["fig/a.png", "lime/.a.png"], 0.1, "data/lime holds no picture: put some there or remove the folder"),
-        (["fig/a.png", "lime/a.png"], 0.1, "data.test_share=0.1 of the 1 pictures of class 0"),
+        (["fig/a.png", "lime/.a.png"], 0.1, "data/lime holds no image: put some there or remove the folder"),
+        (["fig/a.png", "lime/a.png"], 0.1, "data.test_share=0.1 of the 1 images of class 0"),
         (["fig/a.png", "lime/a.png"], 60, "data.test_share=60 must lie between 0 and 1"),
     ],
 )
-def test_a_fault_in_a_folder_is_named(tmp_path, pictures, test, fault):
-    for name in pictures or []:
-        save_picture(tmp_path / "data" / name, 0)
+def test_a_fault_in_a_folder_is_named(tmp_path, images, test, fault):
+    for name in images or []:
+        save_image(tmp_path / "data" / name, 0)
     with pytest.raises(InputError, match=fault):
         load_folder(str(tmp_path / "data"), 8, test)
 
 
-def test_a_broken_picture_of_a_class_folder_is_named_without_advice_that_would_not_help(tmp_path):
+def test_a_broken_image_of_a_class_folder_is_named_without_advice_that_would_not_help(tmp_path):
     for name in ("fig", "lime"):
-        save_picture(tmp_path / name / "a.png", 0)
-    (tmp_path / "fig" / "b.png").write_bytes(b"no picture")
+        save_image(tmp_path / name / "a.png", 0)
+    (tmp_path / "fig" / "b.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"1 of 3 photographs cannot be read, .*fig/b\.png .*: replace them$"):
         load_folder(str(tmp_path), 8, 0.1)
 
@@ -205,21 +205,19 @@ def test_a_broken_picture_of_a_class_folder_is_named_without_advice_that_would_n
 def test_files_of_other_kinds_are_counted_and_named_before_training(tmp_path, caplog):
     for name in ("fig", "lime"):
         for number in range(4):
-            save_picture(tmp_path / name / f"{number}.png", 0)
+            save_image(tmp_path / name / f"{number}.png", 0)
         for number in range(3):
             (tmp_path / name / f"{number}.heic").touch()
     with caplog.at_level("WARNING", "train"):
         load_folder(str(tmp_path), 8, 0.25)
-    assert (
-        f"6 files in {tmp_path} are no pictures that are read: fig/0.heic, fig/1.heic, fig/2.heic, ..." in caplog.text
-    )
+    assert f"6 files in {tmp_path} are no images that are read: fig/0.heic, fig/1.heic, fig/2.heic, ..." in caplog.text
 
 
 # ---------------------------------------------------------------------------------------- CIFAR-100
 
 
 def write_cifar100(root: Path, monkeypatch) -> dict[str, np.ndarray]:
-    """torchvision's own layout, with few pictures, and the checksums that torchvision then expects."""
+    """torchvision's own layout, with few images, and the checksums that torchvision then expects."""
     rng = np.random.default_rng(0)
     cifar100, folder = torchvision.datasets.CIFAR100, root / torchvision.datasets.CIFAR100.base_folder
     folder.mkdir(parents=True)

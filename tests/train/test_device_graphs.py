@@ -18,7 +18,7 @@ def network() -> WideResNet:
 
 
 class Recorded:
-    """A back end of torch.compile that notes the shape of each graph's pictures and runs it as it is."""
+    """A back end of torch.compile that notes the shape of each graph's images and runs it as it is."""
 
     def __init__(self):
         self.shapes = []
@@ -74,14 +74,14 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
 
 def test_no_run_of_a_sweep_is_compiled_less_than_the_first(network):
     """Torch would stop at a number of graphs, of all the runs of a process together."""
-    found, picture = [], torch.zeros(1, 3, 8, 8, dtype=torch.float64)
+    found, image = [], torch.zeros(1, 3, 8, 8, dtype=torch.float64)
     for _ in range(RECOMPILE_LIMIT // len(SIZES) + 1):
         backend = Recorded()
         training_pass(network, 0.1, compiled=True)  # as each run begins
         fixed = FixedSizes(network, backend).eval()
         with torch.no_grad():
             for size in SIZES:
-                fixed(picture.expand(size, -1, -1, -1))
+                fixed(image.expand(size, -1, -1, -1))
         found.append([shape[0] for shape in backend.shapes])
     assert found == [list(SIZES)] * len(found)
 

@@ -16,7 +16,7 @@ def whole_epoch(images: torch.Tensor, epoch: int) -> Round:
 
 
 def epoch_of(count: int, seed: int = 0, epoch: int = 0, batch_size: int = 7) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Batches of plain pictures, each of its own value, which is its label too."""
+    """Batches of plain images, each of its own value, which is its label too."""
     rows = torch.arange(count)
     images = rows.view(-1, 1, 1, 1).expand(-1, 3, 8, 8).to(torch.uint8)
     return list(training_batches(images, rows, batch_size, seed, whole_epoch(images, epoch)))
@@ -24,7 +24,7 @@ def epoch_of(count: int, seed: int = 0, epoch: int = 0, batch_size: int = 7) -> 
 
 @pytest.mark.parametrize("shape", [(8, 8), (5, 5), (6, 11)])
 @pytest.mark.parametrize("flipped", [False, True])
-def test_crops_are_those_of_a_reflect_padded_picture_for_every_shift(shape, flipped):
+def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flipped):
     height, width = shape
     images = noise(3, 3, height, width)
     steps = range(-PADDING, PADDING + 1)
@@ -32,13 +32,13 @@ def test_crops_are_those_of_a_reflect_padded_picture_for_every_shift(shape, flip
     chosen = torch.arange(shifts.shape[1]) % len(images)
     cropped = crop_and_flip(images, chosen, shifts, torch.full((len(chosen),), flipped))
     padded = F.pad(images.double(), (PADDING,) * 4, mode="reflect").to(torch.uint8)
-    for picture, row, (down, right) in zip(cropped, chosen, shifts.T, strict=True):
+    for image, row, (down, right) in zip(cropped, chosen, shifts.T, strict=True):
         top, left = PADDING + down, PADDING + right
         expected = padded[row, :, top : top + height, left : left + width]
-        assert torch.equal(picture, expected.flip(2) if flipped else expected)
+        assert torch.equal(image, expected.flip(2) if flipped else expected)
 
 
-def test_each_epoch_shows_every_picture_once_with_its_own_label_and_fills_the_last_batch_with_the_first():
+def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last_batch_with_the_first():
     shown = epoch_of(100)
     assert [len(labels) for _, labels in shown] == [7] * 15
     order = torch.cat([labels for _, labels in shown]).tolist()
@@ -48,17 +48,17 @@ def test_each_epoch_shows_every_picture_once_with_its_own_label_and_fills_the_la
         assert torch.equal(images, labels.to(torch.uint8).view(-1, 1, 1, 1).expand_as(images))
 
 
-def test_fewer_pictures_than_a_batch_fill_it_several_times():
+def test_fewer_images_than_a_batch_fill_it_several_times():
     ((_, labels),) = epoch_of(3)
     assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
 
 
 @pytest.mark.parametrize("flips", ["random", "alternating"])
-@pytest.mark.parametrize("pictures_at_once", [1, 20, 10**6])
-def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, pictures_at_once):
+@pytest.mark.parametrize("images_at_once", [1, 20, 10**6])
+def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, images_at_once):
     images, labels = noise(50, 3, 8, 8), torch.arange(50)
     whole = list(training_batches(images, labels, 8, 0, whole_epoch(images, 1), flips))
-    monkeypatch.setattr(epochs, "CHUNK_BYTES", pictures_at_once * 3 * 8 * 8)
+    monkeypatch.setattr(epochs, "CHUNK_BYTES", images_at_once * 3 * 8 * 8)
     for first in range(len(whole) + 1):
         rest = list(training_batches(images, labels, 8, 0, whole_epoch(images, 1), flips, first))
         assert len(rest) == len(whole) - first
@@ -66,11 +66,11 @@ def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch,
             assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
 
 
-def test_alternating_flips_show_each_picture_mirrored_in_every_other_epoch():
+def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
     ramp = torch.arange(11, dtype=torch.uint8).expand(40, 3, 11, 11)
 
     def mirrored(epoch: int) -> torch.Tensor:
-        """By picture."""
+        """By image."""
         ((images, labels),) = training_batches(ramp, torch.arange(40), 40, 0, whole_epoch(ramp, epoch), "alternating")
         flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
         return flipped[labels.argsort()]

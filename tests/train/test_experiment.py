@@ -516,7 +516,7 @@ def test_the_test_set_is_looked_at_once_after_the_last_epoch(tiny, tmp_path):
     assert data.looks == 1
 
 
-def test_training_and_validation_pictures_are_apart(tiny, tmp_path, monkeypatch):
+def test_training_and_validation_images_are_apart(tiny, tmp_path, monkeypatch):
     seen = {}
 
     def record(self, train, validation, log):
@@ -548,7 +548,7 @@ def log_of_a_scene(config, folder: Path, caplog) -> dict[str, str]:
 def test_the_log_says_what_is_shared_and_what_is_skipped(tiny, tmp_path, caplog, rasterised):
     """A wall that hides another, both open, and a closed box, seen from the front and above; 1 view, 2 backgrounds.
 
-    The wall covers 15 of the picture's 16 rows, and the box no other. Unseen are 2 of the walls' 4 faces and 8 of the
+    The wall covers 15 of the image's 16 rows, and the box no other. Unseen are 2 of the walls' 4 faces and 8 of the
     box's 12.
     """
     wall, box = np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]]), trimesh.creation.box((1, 2, 1))
@@ -681,10 +681,10 @@ def test_another_class_takes_a_label_meshes_and_look_alikes_alone(tiny, tmp_path
     assert len(torch.cat([first.images, second.images]).unique(dim=0)) == 16
 
 
-def test_the_demonstration_is_scored_on_the_pictures_that_it_renders():
+def test_the_demonstration_is_scored_on_the_images_that_it_renders():
     with initialize_config_module("conf", version_base="1.3"):
         settings = read_settings(ExperimentSettings, compose("train", ["run=here"]))
-    assert settings.evaluate.photos == settings.data.pictures == "here/rendered_pictures"
+    assert settings.evaluate.photos == settings.data.images == "here/rendered_images"
 
 
 def test_training_takes_the_attacks_of_scripts_attack_and_the_papers_where_none_is_named():

@@ -145,7 +145,7 @@ def test_an_epochs_images_are_drawn_anew_and_are_never_more_than_there_are():
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_evaluation_is_the_mean_over_all_pictures_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
+def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
     monkeypatch.setattr(fit, "BATCH", 7)
     torch.manual_seed(0)
     model = WideResNet(3, 10, 1, dropout=0.5).train(training)
@@ -165,9 +165,9 @@ def test_evaluation_is_the_mean_over_all_pictures_in_eval_mode_and_leaves_the_mo
 def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tmp_path, monkeypatch):
     """Two steps of a linear network against the update written down."""
     images, labels = torch.rand(2, 4, 3, 2, 2), torch.tensor([[0, 1, 2, 0], [1, 1, 2, 0]])
-    pictures = (images * 255).round().to(torch.uint8)
-    images = pictures / 255
-    monkeypatch.setattr(fit, "training_batches", lambda *arguments, first: zip(pictures, labels, strict=True))
+    as_bytes = (images * 255).round().to(torch.uint8)
+    images = as_bytes / 255
+    monkeypatch.setattr(fit, "training_batches", lambda *arguments, first: zip(as_bytes, labels, strict=True))
     monkeypatch.setattr(fit, "evaluate", lambda *arguments: {"loss": 1.0, "accuracy": 0.0})
     torch.manual_seed(0)
     network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
@@ -176,7 +176,7 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
         epochs=1, batch_size=4, learning_rate=0.5, momentum=0.9, weight_decay=0.1, schedule="cosine"
     )
     trainer = Trainer(settings, MixedPrecision(network, "float32"), {}, NoRenders(), Phases(), tmp_path, seed=0)
-    trainer.fit(Split(pictures.flatten(0, 1), labels.flatten()), noise(1), RunLog(tmp_path))
+    trainer.fit(Split(as_bytes.flatten(0, 1), labels.flatten()), noise(1), RunLog(tmp_path))
 
     velocities = [torch.zeros_like(weight), torch.zeros_like(bias)]
     losses = []

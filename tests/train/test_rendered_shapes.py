@@ -18,9 +18,9 @@ FEW = ("apple", "orange", "plate")
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    """Few classes and pictures, one sample per pixel: the tests look at what is rendered, not at how well."""
+    """Few classes and images, one sample per pixel: the tests look at what is rendered, not at how well."""
     monkeypatch.setattr(rendered_shapes, "CLASSES", FEW)
-    monkeypatch.setattr(rendered_shapes, "SETTINGS", rendered_shapes.PictureSettings(samples=1))
+    monkeypatch.setattr(rendered_shapes, "SETTINGS", rendered_shapes.ImageSettings(samples=1))
     monkeypatch.setattr(rendered_shapes, "HELD_OUT_PER_CLASS", 3)
 
 
@@ -42,7 +42,7 @@ def test_the_classes_are_ten_solids_the_orange_among_them():
     assert len(set(CLASSES)) == len(CLASSES) == 10 and "orange" in CLASSES
 
 
-def test_every_class_has_the_pictures_asked_for_of_as_many_individuals_as_that_takes(individuals):
+def test_every_class_has_the_images_asked_for_of_as_many_individuals_as_that_takes(individuals):
     data = load_shapes(train=21, test=2, size=SIZE, seed=0)
     assert data.classes == FEW
     assert data.train.images.shape == (63, 3, SIZE, SIZE) and data.train.images.dtype == torch.uint8
@@ -52,13 +52,13 @@ def test_every_class_has_the_pictures_asked_for_of_as_many_individuals_as_that_t
     assert len(data.train.images.unique(dim=0)) == 63
 
 
-def test_no_individual_is_in_two_of_training_test_and_held_out_pictures(individuals, tmp_path):
+def test_no_individual_is_in_two_of_training_test_and_held_out_images(individuals, tmp_path):
     load_shapes(train=1, test=1, size=SIZE, seed=0)
     write_held_out(tmp_path, SIZE, seed=0)
     assert len(individuals) == len(set(individuals)) == 9
 
 
-def test_pictures_are_a_function_of_the_seed():
+def test_images_are_a_function_of_the_seed():
     torch.manual_seed(1)
     first, again, other = (load_shapes(1, 1, SIZE, seed) for seed in (0, 0, 1))
     for part in ("train", "test"):
@@ -66,7 +66,7 @@ def test_pictures_are_a_function_of_the_seed():
         assert not torch.equal(getattr(first, part).images, getattr(other, part).images)
 
 
-def test_pictures_that_are_on_disk_are_not_rendered_again(tmp_path, individuals):
+def test_images_that_are_on_disk_are_not_rendered_again(tmp_path, individuals):
     cache = TensorCache(tmp_path / "kept")
     for folder, made in (("first", 9), ("second", 9)):
         data = load_shapes(1, 2, SIZE, 0, cache)
@@ -84,7 +84,7 @@ def test_pictures_that_are_on_disk_are_not_rendered_again(tmp_path, individuals)
     ("change", "splits"),
     [({"train": 2}, 1), ({"test": 3}, 1), ({"size": 9}, 2), ({"seed": 1}, 2), ({"code": "other"}, 2), ({}, 0)],
 )
-def test_pictures_of_other_settings_or_other_code_are_rendered(change, splits, tmp_path, individuals, monkeypatch):
+def test_images_of_other_settings_or_other_code_are_rendered(change, splits, tmp_path, individuals, monkeypatch):
     def load(code=rendered_shapes.CODE, **settings):
         monkeypatch.setattr(rendered_shapes, "CODE", code)
         load_shapes(**{"train": 1, "test": 2, "size": SIZE, "seed": 0} | settings, cache=TensorCache(tmp_path))
@@ -95,7 +95,7 @@ def test_pictures_of_other_settings_or_other_code_are_rendered(change, splits, t
     assert len(individuals) == 3 * splits
 
 
-def test_held_out_pictures_are_a_folder_of_photographs_that_says_they_are_rendered(tmp_path):
+def test_held_out_images_are_a_folder_of_photographs_that_says_they_are_rendered(tmp_path):
     write_held_out(tmp_path, SIZE, seed=0)
     found = find_photographs(tmp_path, FEW, "orange")
     assert [item.label for item in found] == [name for name in FEW for _ in range(3)]
@@ -107,7 +107,7 @@ def test_held_out_pictures_are_a_folder_of_photographs_that_says_they_are_render
 
 
 def test_every_class_is_held_out_under_the_same_lights_before_the_same_cameras(tmp_path, monkeypatch):
-    """With one and the same solid in every class's place, the classes' pictures are the same, byte for byte."""
+    """With one and the same solid in every class's place, the classes' images are the same, byte for byte."""
     solid = rendered_shapes.solid
     monkeypatch.setattr(rendered_shapes, "HELD_OUT_PER_CLASS", 21)
     monkeypatch.setattr(rendered_shapes, "solid", lambda name, seed: solid("pear", 0))
@@ -117,9 +117,9 @@ def test_every_class_is_held_out_under_the_same_lights_before_the_same_cameras(t
     lights = {}
     for row in rows:
         lights.setdefault(row["light"], []).append((tmp_path / row["path"]).read_bytes())
-    assert {len(pictures) for pictures in lights.values()} == {len(FEW)}
-    assert {len(set(pictures)) for pictures in lights.values()} == {1}
-    assert len({pictures[0] for pictures in lights.values()}) == 21
+    assert {len(images) for images in lights.values()} == {len(FEW)}
+    assert {len(set(images)) for images in lights.values()} == {1}
+    assert len({images[0] for images in lights.values()}) == 21
 
 
 def test_training_light_leaves_no_side_dark_and_held_out_light_does():
@@ -136,7 +136,7 @@ def test_training_light_leaves_no_side_dark_and_held_out_light_does():
 
 
 @pytest.mark.parametrize("train, test", [(0, 1), (1, 0)])
-def test_no_pictures_of_a_class_is_an_error(train, test):
+def test_no_images_of_a_class_is_an_error(train, test):
     with pytest.raises(
         InputError, match=f"data.train_per_class={train} and data.test_per_class={test} must be at least 1"
     ):

@@ -46,7 +46,7 @@ def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
         summarise(tmp_path)
 
 
-def test_the_headline_tables_have_a_row_per_run_and_name_the_pictures(tmp_path, made_up_run, read_markdown):
+def test_the_headline_tables_have_a_row_per_run_and_name_the_images(tmp_path, made_up_run, read_markdown):
     photographs = {"photographs": scored(3, 4, 0.75), "lab": scored(1, 4)}
     with_photographs = made_up_run(tmp_path / "a", "adversarial", photographs)
     text = format_table([summarise(made_up_run(tmp_path / "b")), summarise(with_photographs)])
@@ -68,8 +68,8 @@ def test_the_headline_tables_have_a_row_per_run_and_name_the_pictures(tmp_path, 
             ["adversarial", "0", interval(3, 4), interval(1, 10), ranked, ranked, ranked, "-"],
         ],
     }
-    pictures = [line for line in text.splitlines() if line.startswith("picture")]
-    assert pictures == [f"picture: {with_photographs}/{name}/contact_sheet.png" for name in ("lab", "photographs")]
+    images = [line for line in text.splitlines() if line.startswith("image")]
+    assert images == [f"image: {with_photographs}/{name}/contact_sheet.png" for name in ("lab", "photographs")]
 
 
 def test_a_run_without_photographs_has_one_table(tmp_path, made_up_run, read_markdown):

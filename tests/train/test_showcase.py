@@ -54,7 +54,7 @@ def page(finished, made_up_run, tmp_path_factory) -> Path:
     return write_report([folder], folder / "out")
 
 
-def test_a_page_loads_nothing_escapes_what_files_say_and_tells_pictures_in_words(page):
+def test_a_page_loads_nothing_escapes_what_files_say_and_tells_images_in_words(page):
     text = page.read_text()
     found = Sources(text)
     assert {address.partition(":")[0] for address in found.addresses if address[0] != "#"} == {"data"}
@@ -71,12 +71,12 @@ def test_runs_in_every_state_are_shown_or_named(page):
     assert "1 attacks" in text and "in 1 of 2, 1 more being wrong before any step" in text
 
 
-def test_markdown_says_the_same_and_its_pictures_are_there(page):
+def test_markdown_says_the_same_and_its_images_are_there(page):
     text = (page.parent / "report.md").read_text()
-    pictures = re.findall(r"!\[.*\]\((.*)\)", text)
+    images = re.findall(r"!\[.*\]\((.*)\)", text)
     found = Sources(page.read_text())
-    assert len(pictures) == len(found.alts) and "<script>" not in text
-    for name, address in zip(pictures, [each for each in found.addresses if each.startswith("data:")], strict=True):
+    assert len(images) == len(found.alts) and "<script>" not in text
+    for name, address in zip(images, [each for each in found.addresses if each.startswith("data:")], strict=True):
         assert (page.parent / name).read_bytes() == base64.b64decode(address.partition(",")[2])
     assert re.findall(r"^## (.*)$", text, re.M)[:2] == ["In short", "Arms"]
 
@@ -93,7 +93,7 @@ def test_the_command_makes_the_same_settings_again(tmp_path, made_up_run, overri
     words = shlex.split(training_command(config))[3:]
     with initialize_config_module("conf", version_base="1.3"):
         again = compose("train", words)
-    expected, found = ({**decisive_settings(each), "data.pictures": None} for each in (config, again))
+    expected, found = ({**decisive_settings(each), "data.images": None} for each in (config, again))
     assert {key: value for key, value in found.items() if key in expected} == expected
 
 

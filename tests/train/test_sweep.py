@@ -312,10 +312,10 @@ def test_a_sweep_that_cannot_be_meant_is_one_sentence(run_sweep, cell, tmp_path,
 
 def test_what_decides_a_result_is_all_but_its_folder_and_circumstances(tiny):
     def settings(*overrides):
-        return decisive_settings(tiny("+data.pictures=${run}/pictures", *overrides))
+        return decisive_settings(tiny("+data.images=${run}/images", *overrides))
 
     here = settings("run=here")
-    assert here["data.pictures"] == "${run}/pictures" and here["augment.attack.max_steps"] == 3
+    assert here["data.images"] == "${run}/images" and here["augment.attack.max_steps"] == 3
     assert settings("run=there/a", "sweep=x", "train.resume=true", "renderer.cache=null", "compare=[none]") == here
     changed = settings("run=here", "train.epochs=4")
     assert {key for key in here if here[key] != changed[key]} == {"train.epochs"} and changed.keys() == here.keys()

@@ -47,7 +47,7 @@ def test_convolutions_start_with_he_initialisation():
             assert abs(weight.mean()) < 5 * expected / math.sqrt(weight.numel()), name
 
 
-def test_pictures_are_normalised_inside():
+def test_images_are_normalised_inside():
     torch.manual_seed(0)
     mean, std = (0.2, 0.5, 0.7), (0.1, 0.2, 0.4)
     network = WideResNet(5, 10, 1, 0.0, mean, std).double().eval()
@@ -96,7 +96,7 @@ def test_dropout_acts_in_training_alone():
 
 
 @pytest.mark.parametrize("size", [(8, 8), (33, 17), (64, 64)])
-def test_pictures_of_other_sizes_give_logits_too(size):
+def test_images_of_other_sizes_give_logits_too(size):
     assert WideResNet(7, 10, 1).eval()(torch.rand(2, 3, *size)).shape == (2, 7)
 
 

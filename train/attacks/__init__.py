@@ -1,1 +1,1 @@
-"""Attacks on one picture or several views of it, and what they leave behind: pictures, shapes, lights, numbers."""
+"""Attacks on one image or several views of it, and what they leave behind: images, shapes, lights, numbers."""

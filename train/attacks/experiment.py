@@ -39,7 +39,7 @@ def build_scene(item: ObjectSettings, settings: AttackExperimentSettings, size: 
         ring(scene.views, scene.field_of_view, math.radians(scene.polar), math.radians(scene.azimuth)),
         load_backgrounds(scene.backgrounds, size),
         (load_light(scene.light) * scene.exposure).to(device),
-        renderer.pictures(size),
+        renderer.images(size),
         choose(renderer.visibility),
         OperatorCache(cache_folder(renderer.cache)),
         shared=settings.attack.shared,

@@ -64,7 +64,7 @@ def _write(sittings: Iterator[tuple[int, Shot, Subject]], settings: LabSettings,
     for light, shot, subject in tqdm(sittings, "photographs", 2 * settings.lights, leave=False, disable=hidden):
         path = Path(subject.label) / f"{light:04d}_{shot.family}.png"
         (out / path).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(_picture(subject, shot, light, settings)).save(out / path)
+        Image.fromarray(_image(subject, shot, light, settings)).save(out / path)
         rows.append((path.as_posix(), shot.family, light, subject.mesh, f"{shot.brightness:.4f}"))
     with open(out / TABLE, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([COLUMNS, *sorted(rows)])
@@ -105,7 +105,7 @@ def _sittings(sides: list[list[Subject]], settings: LabSettings) -> Iterator[tup
             yield light, shot, side[light % len(side)]
 
 
-def _picture(subject: Subject, shot: Shot, light: int, settings: LabSettings) -> np.ndarray:
+def _image(subject: Subject, shot: Shot, light: int, settings: LabSettings) -> np.ndarray:
     """(size, size, 3) uint8 sRGB. The seed of the samples is the light's, too."""
     seed = stream_seed(settings.seed, "samples", light) % 2**32
     radiance = photograph(subject.parts, shot, settings.size, settings.samples, settings.bounces, seed)

@@ -1,4 +1,4 @@
-"""Ask a model about pictures: its probabilities, and where it ranks the classes that matter."""
+"""Ask a model about images: its probabilities, and where it ranks the classes that matter."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext

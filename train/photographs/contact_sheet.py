@@ -1,4 +1,4 @@
-"""A sheet of small pictures with captions, in titled sections: what to show of the answers, and its drawing."""
+"""A sheet of small images with captions, in titled sections: what to show of the answers, and its drawing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ from train.photographs.answers import Answer
 
 TILES_PER_SECTION = 40
 COLUMNS = 10
-PICTURE = 96  # px, the side of an enlarged picture
+IMAGE = 96  # px, the side of an enlarged image
 FRAME = 4
 
-CELL = PICTURE + 2 * FRAME
+CELL = IMAGE + 2 * FRAME
 CAPTION_WIDTH = CELL + GAP - 4
 SHEET_WIDTH = 2 * MARGIN + COLUMNS * CELL + (COLUMNS - 1) * GAP
 
@@ -51,7 +51,7 @@ class Section:
 
 
 def choose_sections(answers: Sequence[Answer], images: torch.Tensor, label: str) -> list[Section]:
-    """Hits, misses and false alarms; `images` are the answers' pictures, (N, 3, H, W) uint8 sRGB."""
+    """Hits, misses and false alarms; `images` are the answers' images, (N, 3, H, W) uint8 sRGB."""
     asked = list(zip(answers, images.permute(0, 2, 3, 1).numpy(), strict=True))
     mine = [pair for pair in asked if pair[0].photograph.label == label]
     others = [pair for pair in asked if pair[0].photograph.label != label]
@@ -71,7 +71,7 @@ def _section(title: str, colour: str, asked: Sequence[tuple[Answer, np.ndarray]]
     if len(ordered) > TILES_PER_SECTION:
         title += f" ({TILES_PER_SECTION} drawn evenly from the surest to the least sure)"
         ordered = evenly(ordered, TILES_PER_SECTION)
-    return Section(title, colour, [Tile(picture, caption(answer)) for answer, picture in ordered])
+    return Section(title, colour, [Tile(image, caption(answer)) for answer, image in ordered])
 
 
 def evenly(ordered: Sequence, count: int) -> list:
@@ -93,7 +93,7 @@ def caption(answer: Answer) -> tuple[str, ...]:
 def draw_contact_sheet(sections: Sequence[Section]) -> Image.Image:
     """Draw the sections from top to bottom, each row by row.
 
-    Pictures are enlarged without smoothing, so that one sees the pixels that the classifier saw.
+    Images are enlarged without smoothing, so that one sees the pixels that the classifier saw.
     A section without tiles keeps its title.
     """
     height = 2 * MARGIN + sum(section.height for section in sections)
@@ -117,8 +117,8 @@ def _draw_section(sheet: Image.Image, section: Section, top: int) -> None:
 def _draw_tile(sheet: Image.Image, tile: Tile, colour: str, left: int, top: int) -> None:
     draw = ImageDraw.Draw(sheet)
     draw.rectangle((left, top, left + CELL - 1, top + CELL - 1), fill=colour)
-    picture = Image.fromarray(tile.picture).resize((PICTURE, PICTURE), Image.Resampling.NEAREST)
-    sheet.paste(picture, (left + FRAME, top + FRAME))
+    image = Image.fromarray(tile.image).resize((IMAGE, IMAGE), Image.Resampling.NEAREST)
+    sheet.paste(image, (left + FRAME, top + FRAME))
     font = ImageFont.load_default(CAPTION_SIZE)
     for line, text in enumerate(tile.caption):
         position = (left, top + CELL + 2 + line * LINE_HEIGHT)

@@ -1,4 +1,4 @@
-"""Find the pictures of a folder, tell their classes, and reduce them to the classifier's size."""
+"""Find the images of a folder, tell their classes, and reduce them to the classifier's size."""
 
 import csv
 import os
@@ -25,7 +25,7 @@ SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training
 
 @dataclass(frozen=True)
 class Photograph:
-    """A picture: its path relative to the folder, its class (or `other_*`) and, where known, its source.
+    """An image: its path relative to the folder, its class (or `other_*`) and, where known, its source.
 
     look_alikes: the sources of the other things that it is ranked against, besides its own.
     """
@@ -37,21 +37,21 @@ class Photograph:
 
 
 def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[Photograph]:
-    """The pictures of a folder, sorted by path, each with its class.
+    """The images of a folder, sorted by path, each with its class.
 
     The folder either holds one sub-folder per class, named exactly as in `classes` (or `other_NAME` for a
-    class the model lacks), or holds pictures only, which are then all of class `label`. Sub-folders are
+    class the model lacks), or holds images only, which are then all of class `label`. Sub-folders are
     searched to any depth, also where they are symbolic links; hidden files are passed over, and so are other kinds of
     file, which `left_out` tells. `photos.csv` in the folder, if there, gives sources by its columns `path` and
-    `source_tag`, and by `look_alikes`, if it has that, the other sources, separated by `;`, whose pictures of other
-    things a picture is ranked against.
+    `source_tag`, and by `look_alikes`, if it has that, the other sources, separated by `;`, whose images of other
+    things an image is ranked against.
 
     Raises InputError for a folder that is missing, unreadable, empty or mixes both layouts, for a sub-folder or `label`
-    that is no class, for a `photos.csv` without those columns or that names none of the pictures, and for look-alikes
+    that is no class, for a `photos.csv` without those columns or that names none of the images, and for look-alikes
     of a source that is nowhere.
     """
     class_index(classes, label, "label")
-    paths = _picture_paths(folder)
+    paths = _image_paths(folder)
     has_class_folders = _check_layout(folder, paths, classes)
     rows = _read_table(folder / TABLE)
     if rows and rows.keys().isdisjoint(paths):
@@ -66,16 +66,16 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
 def left_out(folder: Path) -> list[PurePosixPath]:
     """The files of a folder, as `find_photographs` searches it, that are of no kind that is read; sorted."""
     return sorted(
-        path for path in _files(folder) if not _is_picture(folder, path) and str(path) not in (TABLE, DESCRIPTION)
+        path for path in _files(folder) if not _is_image(folder, path) and str(path) not in (TABLE, DESCRIPTION)
     )
 
 
-def _picture_paths(folder: Path) -> list[PurePosixPath]:
+def _image_paths(folder: Path) -> list[PurePosixPath]:
     if not folder.is_dir():
         fault = "is not a folder" if folder.exists() else "does not exist"
         raise InputError(f"{folder} {fault}: name a folder of photographs")
     files = list(_files(folder))
-    paths = sorted(path for path in files if _is_picture(folder, path))
+    paths = sorted(path for path in files if _is_image(folder, path))
     if not paths:
         others = f" among its {len(files)} files" if files else ""
         raise InputError(f"{folder} holds no photographs{others}: put some there ({', '.join(SUFFIXES)})")
@@ -99,8 +99,8 @@ def _files(folder: Path) -> Iterator[PurePosixPath]:
         yield from (at / name for name in files if not _is_hidden(name))
 
 
-def _is_picture(folder: Path, path: PurePosixPath) -> bool:
-    """Also of a link to nothing, which is a picture that cannot be read; but not of a pipe, whose end never comes."""
+def _is_image(folder: Path, path: PurePosixPath) -> bool:
+    """Also of a link to nothing, which is an image that cannot be read; but not of a pipe, whose end never comes."""
     return path.suffix.lower() in SUFFIXES and ((folder / path).is_file() or not (folder / path).exists())
 
 
@@ -154,7 +154,7 @@ def _check_look_alikes(table: Path, photographs: Sequence[Photograph]) -> None:
         if unknown := set(photograph.look_alikes) - sources:
             raise InputError(
                 f"{table} pairs {photograph.path} with look_alikes of source {min(unknown)!r}, of which there is no "
-                f"picture: name one of {', '.join(sorted(sources))}"
+                f"image: name one of {', '.join(sorted(sources))}"
             )
 
 
@@ -167,13 +167,13 @@ def load_photographs(
 ) -> tuple[list[Photograph], torch.Tensor, list[str]]:
     """Read photographs as the classifier sees them.
 
-    Returns the photographs that could be read, their pictures as (N, 3, size, size) uint8 sRGB, and the paths
-    of those that could not. Each picture is turned as its EXIF orientation says, brought to RGB (alpha over
+    Returns the photographs that could be read, their images as (N, 3, size, size) uint8 sRGB, and the paths
+    of those that could not. Each image is turned as its EXIF orientation says, brought to RGB (alpha over
     white, 16 bits to 8), cropped to its central square and reduced with Pillow's Lanczos filter, which widens
     with the reduction: detail too fine for `size` averages out rather than turning into false patterns, and
     of what fits the most is kept, which counts at 32 pixels.
 
-    Raises InputError at broken or oversized pictures unless `skip_unreadable`, and if no picture can be read.
+    Raises InputError at broken or oversized images unless `skip_unreadable`, and if no image can be read.
     advice: how they could be skipped, in the words of whoever calls.
     """
     with ThreadPoolExecutor() as pool:  # Pillow releases the interpreter while it decodes and resizes

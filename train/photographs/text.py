@@ -36,7 +36,7 @@ def format_summary(summary: dict) -> str:
         ),
     ]
     paragraphs = [
-        f"{n['label']} pictures of {label}, {n['others']} of other things",
+        f"{n['label']} images of {label}, {n['others']} of other things",
         _table(share_rows, "<>>>"),
         _table(ranked_rows, "<>>>>"),
         _table(class_rows, "<>>>><"),

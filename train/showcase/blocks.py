@@ -1,4 +1,4 @@
-"""What a page is made of: sections of sentences, tables, pictures, galleries and code, whatever the format."""
+"""What a page is made of: sections of sentences, tables, images, galleries and code, whatever the format."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from train.tables import Table
 
 
 @dataclass(frozen=True)
-class Picture:
+class Illustration:
     """A file's bytes. alt: what it shows, in words. kind: svg, png or jpeg. width: CSS pixels to show it at."""
 
     data: bytes
@@ -19,10 +19,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pictures side by side, as many as there is room for, under a title."""
+    """Images side by side, as many as there is room for, under a title."""
 
     title: str
-    pictures: Sequence[Picture]
+    images: Sequence[Illustration]
 
 
 @dataclass(frozen=True)

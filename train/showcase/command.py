@@ -14,7 +14,7 @@ from augment.parameters import KINDS
 from train.cli import quoted
 from train.settings import dotted
 
-CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "out", "train.resume", "data.pictures")
+CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "out", "train.resume", "data.images")
 DATA = ("cifar100", "npz", "folder")  # besides the default
 PLAIN = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_/][\w./:-]*", re.ASCII | re.IGNORECASE)
 
@@ -36,7 +36,7 @@ def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapp
     with _no_other_hydra(), initialize_config_module("conf", version_base="1.3"):
         defaults = dict(dotted(OmegaConf.to_container(compose(name, chosen))))
     own = dict(dotted(OmegaConf.to_container(config)))
-    if own.get("evaluate.photos") and own.get("evaluate.photos") == own.get("data.pictures"):
+    if own.get("evaluate.photos") and own.get("evaluate.photos") == own.get("data.images"):
         del own["evaluate.photos"]  # the run's own renders, which it makes again
     changed = {key: value for key, value in own.items() if key in defaults and value != defaults[key]}
     overrides = [f"{key}={_value(value)}" for key, value in changed.items() if not _is_circumstance(key)]

@@ -1,19 +1,19 @@
-"""One picture for the first minute: what fooled, the network's answers, and how the arms fare."""
+"""One image for the first minute: what fooled, the network's answers, and how the arms fare."""
 
 import io
 from collections.abc import Sequence
 
 from train.photographs import find_figure
 from train.report import RunSummary
-from train.showcase.blocks import Picture
-from train.showcase.pictures import headline_tiles
+from train.showcase.blocks import Illustration
+from train.showcase.images import headline_tiles
 from train.showcase.plots import COLOURS
 
 EXAMPLES = 3
 FIGURES = {"recall": "recognised", "false_alarms": "false alarms", "auc": "AUC"}
 
 
-def headline(runs: dict[str, RunSummary], photographs: str) -> Picture | None:
+def headline(runs: dict[str, RunSummary], photographs: str) -> Illustration | None:
     """One run of each arm, by name; None where none keeps an example that was right before and wrong after."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -34,7 +34,7 @@ def headline(runs: dict[str, RunSummary], photographs: str) -> Picture | None:
         figure.savefig(file, format="png")
     told = "; ".join(f"{name}: {_told(run, photographs)}" for name, run in arms)
     alt = f"Renders before and after the light changed, with the network's answers; {told}"
-    return Picture(file.getvalue(), "png", alt, 1032)
+    return Illustration(file.getvalue(), "png", alt, 1032)
 
 
 def _draw_tiles(figure, tiles: Sequence, label: str) -> None:

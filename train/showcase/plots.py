@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from train.photographs.ranking import RATES, Ranking
-from train.showcase.blocks import Picture
+from train.showcase.blocks import Illustration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +39,7 @@ def style(index: int) -> dict:
     return {"color": COLOURS[index % len(COLOURS)], "linestyle": LINES[index % len(LINES)]}
 
 
-def curves(series: Series, title: str, xlabel: str, limits: tuple[float, float] | None = (0, 1)) -> Picture | None:
+def curves(series: Series, title: str, xlabel: str, limits: tuple[float, float] | None = (0, 1)) -> Illustration | None:
     """A line per seed, in the colour of its arm; None where there is nothing to draw."""
     drawn = {arm: [line for line in lines if len(line[0])] for arm, lines in series.items()}
     if not any(drawn.values()):
@@ -54,10 +54,10 @@ def curves(series: Series, title: str, xlabel: str, limits: tuple[float, float] 
         axes.locator_params(axis="x", integer=True)
 
     ends = [f"{arm} {np.mean([y[-1] for _, y in lines]):.2f}" for arm, lines in drawn.items() if lines]
-    return _picture(draw, title, f"{title} over {xlabel}s, at the end: {', '.join(ends)}")
+    return _figure(draw, title, f"{title} over {xlabel}s, at the end: {', '.join(ends)}")
 
 
-def roc(rankings: Mapping[str, Sequence[Ranking]], label: str, title: str) -> Picture | None:
+def roc(rankings: Mapping[str, Sequence[Ranking]], label: str, title: str) -> Illustration | None:
     """ROC curves, one per seed, with the arm's mean AUC in the legend and lines at RATES."""
     if not any(rankings.values()):
         return None
@@ -73,10 +73,10 @@ def roc(rankings: Mapping[str, Sequence[Ranking]], label: str, title: str) -> Pi
                 axes.plot(alarms, recall, label=None if number else f"{arm}: AUC {told[arm]:.3f}", **style(index))
         axes.set(xlabel=f"others called {label}", ylabel=f"{label} recognised", xlim=(-0.01, 1), ylim=(0, 1.01))
 
-    return _picture(draw, title, f"{title}; AUC: {', '.join(f'{arm} {auc:.3f}' for arm, auc in told.items())}")
+    return _figure(draw, title, f"{title}; AUC: {', '.join(f'{arm} {auc:.3f}' for arm, auc in told.items())}")
 
 
-def bars(values: Mapping[str, Sequence[Mapping]], names: Sequence[str], title: str) -> Picture | None:
+def bars(values: Mapping[str, Sequence[Mapping]], names: Sequence[str], title: str) -> Illustration | None:
     """A row of bars per name, one for each arm, with its interval: {value, low, high}, of which value may be None."""
     if not any(figure.get("value") is not None for figures in values.values() for figure in figures):
         return None
@@ -102,14 +102,14 @@ def bars(values: Mapping[str, Sequence[Mapping]], names: Sequence[str], title: s
         for row, name in enumerate(names)
     ]
     height = max(SIZE[1], 0.9 + 0.24 * len(names) * len(values))
-    return _picture(draw, title, f"{title}. {'; '.join(told)}", height)
+    return _figure(draw, title, f"{title}. {'; '.join(told)}", height)
 
 
 def _known(figure: Mapping) -> bool:
     return figure.get("value") is not None
 
 
-def _picture(draw, title: str, alt: str, height: float = SIZE[1]) -> Picture:
+def _figure(draw, title: str, alt: str, height: float = SIZE[1]) -> Illustration:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -120,7 +120,7 @@ def _picture(draw, title: str, alt: str, height: float = SIZE[1]) -> Picture:
         handles, labels = axes.get_legend_handles_labels()
         if handles:
             figure.legend(handles, labels, loc="outside lower center", ncols=1 if len(max(labels, key=len)) > 16 else 3)
-        return Picture(svg(figure), "svg", alt, WIDTH, title)
+        return Illustration(svg(figure), "svg", alt, WIDTH, title)
 
 
 def svg(figure) -> bytes:

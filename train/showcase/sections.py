@@ -17,8 +17,8 @@ from train.photographs.ranking import Ranking
 from train.photographs.roc import rank_pools
 from train.report import RunSummary, group_by_settings, headline_tables, name_among, spread_tables
 from train.run_folder import CONFIG, read_config
-from train.showcase import pictures, plots
-from train.showcase.blocks import Block, Code, Gallery, Picture, Section
+from train.showcase import images, plots
+from train.showcase.blocks import Block, Code, Gallery, Illustration, Section
 from train.showcase.command import attack_command, training_command
 from train.showcase.folders import Attack, Run
 from train.tables import Table
@@ -48,7 +48,7 @@ def _short_names(heads: Sequence[RunSummary]) -> list[str]:
 
 
 def of_runs(runs: Sequence[Run]) -> Iterator[Section]:
-    """Tables first, then plots, then pictures."""
+    """Tables first, then plots, then images."""
     finished, arms = [run.summary for run in runs if run.summary], arms_of(runs)
     if finished:
         yield _tables(finished)
@@ -57,7 +57,7 @@ def of_runs(runs: Sequence[Run]) -> Iterator[Section]:
     names = sorted({name for run in finished for name in run.photographs})
     for name in names:
         yield from _photographs(name, arms)
-    yield Section("Renders", [pictures.renders(group[0].folder, arm) for arm, group in arms.items()])
+    yield Section("Renders", [images.renders(group[0].folder, arm) for arm, group in arms.items()])
     yield _fooled(arms)
     yield _reproduction(arms)
 
@@ -96,7 +96,7 @@ def _training(runs: Sequence[Run], arms: Arms) -> Section:
         for arm, group in arms.items()
     ]
     table = Table("Seconds per epoch, and once for the operators", ["arm", *PHASES, "operators"], seconds)
-    gallery = Gallery("", [picture for picture in drawn if picture])
+    gallery = Gallery("", [image for image in drawn if image])
     return Section("Over the epochs", [gallery, *([table] if seconds else [])])
 
 
@@ -146,7 +146,7 @@ def _rankings(group: Sequence[RunSummary], name: str, label: str) -> list[Rankin
     return [ranking for each in pools if (ranking := rank_pools({OVERALL: each[OVERALL]}).get(OVERALL))]
 
 
-def _plots(scored: Mapping[str, Sequence[RunSummary]], rankings: Mapping, name: str, label: str) -> list[Picture]:
+def _plots(scored: Mapping[str, Sequence[RunSummary]], rankings: Mapping, name: str, label: str) -> list[Illustration]:
     first = {arm: group[0].photographs[name] for arm, group in scored.items()}
     sources = sorted({source for summary in first.values() for source in summary.get("by_source", {})})[:MOST_ROWS]
     drawn = [plots.roc(rankings, label, "ROC")]
@@ -156,13 +156,13 @@ def _plots(scored: Mapping[str, Sequence[RunSummary]], rankings: Mapping, name: 
             for arm, summary in first.items()
         }
         drawn.append(plots.bars(values, sources, f"{figure_title(figure, label)}, by source or pattern"))
-    return [picture for picture in drawn if picture]
+    return [image for image in drawn if image]
 
 
 def _tiles(arm: str, run: RunSummary, name: str) -> Iterator[Block]:
     folder = photographs_folder(run, name)
     if folder is None or not folder.is_dir():
-        sheet = pictures.from_file(run.folder / name / "contact_sheet.png", f"Answers of {arm} on {name}", 1100)
+        sheet = images.from_file(run.folder / name / "contact_sheet.png", f"Answers of {arm} on {name}", 1100)
         yield Gallery(arm, sheet)
         return
     try:
@@ -170,18 +170,18 @@ def _tiles(arm: str, run: RunSummary, name: str) -> Iterator[Block]:
     except InputError as error:
         yield str(error)
         return
-    yield from pictures.photographs(answers, folder, run.config.label, arm)
+    yield from images.photographs(answers, folder, run.config.label, arm)
 
 
 def photographs_folder(run: RunSummary, name: str) -> Path | None:
-    """Where the pictures were that a run was scored on, as its configuration has it."""
+    """Where the images were that a run was scored on, as its configuration has it."""
     photos = OmegaConf.to_container(run.config).get("evaluate", {}).get("photos")
     found = photos.get(name) if isinstance(photos, dict) else photos
     return Path(found) if isinstance(found, str) else None
 
 
 def _fooled(arms: Arms) -> Section:
-    blocks = [gallery for arm, group in arms.items() for gallery in pictures.specimens(group[0].folder, arm)]
+    blocks = [gallery for arm, group in arms.items() for gallery in images.specimens(group[0].folder, arm)]
     return Section("Light that fooled", blocks)
 
 
@@ -208,7 +208,7 @@ def of_attacks(attacks: Sequence[Attack]) -> Iterator[Section]:
         ]
         checks = [[name, value] for name, value in attack.checks.items() if not isinstance(value, dict)]
         tables = [Table("", header, rows), *([Table("Checks", ["what", "value"], checks)] if checks else [])]
-        blocks = [pictures.attack_pictures(attack), *tables, *_attack_reproduction(attack)]
+        blocks = [images.attack_images(attack), *tables, *_attack_reproduction(attack)]
         yield Section(f"Attack {attack.folder.parent.name}/{attack.folder.name}", blocks)
     if others := attacks[MOST_ATTACKS:]:
         told = "\n".join(f"{each.folder}: {count_fooled(each)} of {len(each.examples)} fooled" for each in others)

@@ -1,4 +1,4 @@
-"""One report as HTML that loads nothing, and as Markdown with its pictures beside it."""
+"""One report as HTML that loads nothing, and as Markdown with its images beside it."""
 
 import base64
 import html
@@ -9,12 +9,12 @@ from pathlib import Path
 
 from train.settings import PHOTOGRAPHS
 from train.showcase import answer, sections
-from train.showcase.blocks import Block, Code, Gallery, Picture, Section
+from train.showcase.blocks import Block, Code, Gallery, Illustration, Section
 from train.showcase.folders import find
 from train.showcase.headline import headline
 from train.tables import Table, shown
 
-PAGE, MARKDOWN, PICTURES, HEADLINE = "report.html", "report.md", "report_files", "report.png"
+PAGE, MARKDOWN, IMAGES, HEADLINE = "report.html", "report.md", "report_files", "report.png"
 MIME = {"svg": "image/svg+xml", "png": "image/png", "jpeg": "image/jpeg"}
 
 
@@ -40,16 +40,14 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     if top:
         (out / HEADLINE).write_bytes(top.data)
     (out / PAGE).write_text(_rendered("page.html.jinja", parts, about, _data_uri), encoding="utf-8", errors="replace")
-    shutil.rmtree(out / PICTURES, ignore_errors=True)
-    text = _rendered("page.md.jinja", parts, about, lambda picture: _beside(picture, out))
+    shutil.rmtree(out / IMAGES, ignore_errors=True)
+    text = _rendered("page.md.jinja", parts, about, lambda image: _beside(image, out))
     (out / MARKDOWN).write_text(re.sub(r"\n{3,}", "\n\n", text), encoding="utf-8", errors="replace")
     return out / PAGE
 
 
 def _without_empty(section: Section) -> Section:
-    return Section(
-        section.title, [block for block in section.blocks if not isinstance(block, Gallery) or block.pictures]
-    )
+    return Section(section.title, [block for block in section.blocks if not isinstance(block, Gallery) or block.images])
 
 
 def _rendered(template: str, parts: Sequence[Section], about: str, source) -> str:
@@ -70,16 +68,16 @@ def _kind(block: Block) -> str:
     return {Table: "table", Gallery: "gallery", Code: "code"}.get(type(block), "text")
 
 
-def _data_uri(picture: Picture) -> str:
-    return f"data:{MIME[picture.kind]};base64,{base64.b64encode(picture.data).decode()}"
+def _data_uri(image: Illustration) -> str:
+    return f"data:{MIME[image.kind]};base64,{base64.b64encode(image.data).decode()}"
 
 
-def _beside(picture: Picture, out: Path) -> str:
-    folder = out / PICTURES
+def _beside(image: Illustration, out: Path) -> str:
+    folder = out / IMAGES
     folder.mkdir(exist_ok=True)
-    path = folder / f"{len(list(folder.iterdir())):03d}.{picture.kind}"
-    path.write_bytes(picture.data)
-    return f"{PICTURES}/{path.name}"
+    path = folder / f"{len(list(folder.iterdir())):03d}.{image.kind}"
+    path.write_bytes(image.data)
+    return f"{IMAGES}/{path.name}"
 
 
 def _escaped(text: object) -> str:
@@ -98,5 +96,5 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
     """What the end of a training says of the report: its path, or why there is none; it never fails the run."""
     try:
         return f"report: {write_report(folders, out)}"
-    except Exception as error:  # what was trained is whole, whatever its pictures look like
+    except Exception as error:  # what was trained is whole, whatever its images look like
         return f"no report: {error}"

@@ -62,7 +62,7 @@ def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifi
 
 def test_what_is_not_recognised_or_no_class_is_refused_in_one_sentence(classifier):
     scene = augment.build_scene([("solid:orange", "lime")], 8, **SMALL)
-    with pytest.raises(InputError, match="1 of 1 pictures of solid:orange are not recognised as 'lime'"):
+    with pytest.raises(InputError, match="1 of 1 images of solid:orange are not recognised as 'lime'"):
         augment.attack(classifier, scene)
     assert augment.attack(classifier, scene, force=True).result.fooled_before.all()
     with pytest.raises(InputError, match="has no class 'mango'"):

@@ -57,8 +57,8 @@ def attacked(*overrides: str, classifier: Classifier | None = None, device: torc
 
 
 @pytest.mark.parametrize("kinds", [*KINDS, "lighting,geometry,pixels"])
-def test_every_kind_alone_and_with_others_lowers_the_cost_of_its_own_pictures(kinds):
-    """The numbers are those of the pictures: the cost and the answers follow from the logits."""
+def test_every_kind_alone_and_with_others_lowers_the_cost_of_its_own_images(kinds):
+    """The numbers are those of the images: the cost and the answers follow from the logits."""
     done = attacked(f"attack=[{kinds}]", "attack.max_steps=3", "scene.backgrounds=[0.4,0.5]")
     assert [kind.name for kind in done.problem.kinds] == kinds.split(",")
     assert done.result.images.shape == (2, 1, 3, SIZE, SIZE)
@@ -244,7 +244,7 @@ def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_f
     with pytest.raises(InputError) as refused:
         attacked("scene.views=2", classifier=deaf)
     assert str(refused.value) == (
-        f"2 of 2 pictures of solid:orange:0 are not recognised as 'orange' before any attack (the first: {best}): "
+        f"2 of 2 images of solid:orange:0 are not recognised as 'orange' before any attack (the first: {best}): "
         "change the scene, or set attack.force=true"
     )
     done = attacked("scene.views=2", "attack.force=true", classifier=deaf)
@@ -256,7 +256,7 @@ def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_f
 
 
 def test_success_is_counted_among_what_was_recognised_before():
-    """Before the dark background the picture is not recognised; wrong as it is, it is nothing that the attack did."""
+    """Before the dark background the image is not recognised; wrong as it is, it is nothing that the attack did."""
     dark = Classifier(sky_in_the_dark, SIZE, CLASSES[:3])
     done = attacked("scene.backgrounds=[0.5,0.0]", "attack.force=true", "attack.max_steps=30", classifier=dark)
     assert done.recognised.tolist() == [True, False] and done.success.tolist() == [True, True]
@@ -266,7 +266,7 @@ def test_success_is_counted_among_what_was_recognised_before():
 
 
 def test_views_that_share_a_light_are_counted_one_by_one_too():
-    """No light makes the picture before it both green and blue, so that of two views with a target each one remains."""
+    """No light makes the image before it both green and blue, so that of two views with a target each one remains."""
     done = attacked("target=[lime,sky]", "scene.views=2", "attack.shared=true", "attack.max_steps=30")
     assert done.success_in_views.shape == (1, 2)
     views = int(done.success_in_views.sum())
@@ -297,7 +297,7 @@ def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
 
 
 def test_random_search_that_does_as_well_is_a_warning():
-    """Any change fools a classifier that knows no picture but one of almost exactly this brightness."""
+    """Any change fools a classifier that knows no image but one of almost exactly this brightness."""
     brightness, width = attacked("attack.max_steps=0").images_before.mean(), 1e-4
 
     def narrow(images: Tensor) -> Tensor:

@@ -53,7 +53,7 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
     """Beyond an object too small to see. A projector lights the planes that face it evenly: by 1 / z² at depth z."""
     [shot] = draw_shots(1, ["solid"], (1.5, 1.5), seed)
     shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
-    picture = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 8, 4096, bounces=1, seed=0)
+    image = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 8, 4096, bounces=1, seed=0)
 
     rays = directions(shot, 8)
     places = shot.camera - rays * (shot.camera[2] / rays[..., 2:])
@@ -63,14 +63,14 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
     lit = evenly[..., None] * shot.brightness * shot.pattern[0, 0] + shot.ambient
     inside = np.linalg.norm(places, axis=-1) < 1.5  # of what the projector reaches
     assert inside.mean() > 0.3
-    np.testing.assert_allclose(picture[inside], (shot.table * lit)[inside], rtol=0.03)
+    np.testing.assert_allclose(image[inside], (shot.table * lit)[inside], rtol=0.03)
 
 
 def test_a_texture_lies_upright_on_its_faces():
     red, green, blue, white = [220, 0, 0], [0, 220, 0], [0, 0, 220], [220, 220, 220]
     texture = np.array([[red, green], [blue, white]], dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
-    picture = photograph(split_parts(card(texture), 1.0, "card"), frontal(), 16, 16, bounces=1, seed=0)
-    strong = picture > picture.max() / 2
+    image = photograph(split_parts(card(texture), 1.0, "card"), frontal(), 16, 16, bounces=1, seed=0)
+    strong = image > image.max() / 2
     for row, column, expected in [(5, 5, red), (5, 10, green), (10, 5, blue), (10, 10, white)]:
         np.testing.assert_array_equal(strong[row, column], np.array(expected) > 0)
 
@@ -81,19 +81,19 @@ def test_a_card_reflects_its_linear_albedo_times_the_gain_and_the_brightness():
     gloss = 0.04 / (4 * ROUGHNESS**4)  # α is the roughness's square
     for gain, brightness in [(1, 1), (2, 1), (1, 0.5)]:
         shot = frontal(brightness=brightness)
-        picture = photograph(split_parts(card(grey), gain, "card"), shot, 8, 16, bounces=1, seed=0)
-        assert picture[3:5, 3:5].mean() == pytest.approx((0.216 * gain + gloss) * brightness, rel=0.05)
+        image = photograph(split_parts(card(grey), gain, "card"), shot, 8, 16, bounces=1, seed=0)
+        assert image[3:5, 3:5].mean() == pytest.approx((0.216 * gain + gloss) * brightness, rel=0.05)
 
 
 def test_an_object_stands_on_the_table():
     """A cube's front, lit by its surroundings, reaches from the table up to its height."""
     cube = trimesh.creation.box((2, 2, 2))
     shot = frontal(ambient=np.ones(3), brightness=1e-9)
-    picture = photograph(split_parts(Mesh.plain(cube.vertices, cube.faces), 1, "cube"), shot, 32, 64, bounces=1, seed=0)
+    image = photograph(split_parts(Mesh.plain(cube.vertices, cube.faces), 1, "cube"), shot, 32, 64, bounces=1, seed=0)
     ray = directions(shot, 32)[:, 15]
     height = shot.camera[2] + ray[:, 2] * (5 / ray[:, 1])  # where it meets the plane of the front, y = -1
     clear = (height < 2) & (np.abs(height) > 0.04)  # not the row that the lower edge runs through
-    np.testing.assert_array_equal((picture[:, 15] > 0.1).all(axis=1)[clear], (height > 0)[clear])
+    np.testing.assert_array_equal((image[:, 15] > 0.1).all(axis=1)[clear], (height > 0)[clear])
 
 
 @pytest.mark.parametrize("divisions", [0, 1, 3])

@@ -7,7 +7,7 @@ from PIL import Image
 
 
 class Oracle(torch.nn.Module):
-    """Answers row i of a table of logits for a picture whose red is i."""
+    """Answers row i of a table of logits for an image whose red is i."""
 
     def __init__(self, table):
         super().__init__()
@@ -20,7 +20,7 @@ class Oracle(torch.nn.Module):
 
 @pytest.fixture
 def known_model(tmp_path) -> Callable[..., tuple[Oracle, list[str], Path]]:
-    """Makes a folder of the named pictures and a model that gives the i-th of them the i-th row of logits.
+    """Makes a folder of the named images and a model that gives the i-th of them the i-th row of logits.
 
     Returns the model, its classes and the folder, in the order in which `evaluate_photographs` takes them.
     """

@@ -33,7 +33,7 @@ def touch(folder: Path, *names: str) -> Path:
 
 
 def load_one(path: Path, size: int = 32) -> np.ndarray:
-    """The picture as (size, size, 3) integers."""
+    """The image as (size, size, 3) integers."""
     photograph = Photograph(PurePosixPath(path.name), "orange", None)
     _, images, _ = load_photographs(path.parent, [photograph], size)
     return images[0].permute(1, 2, 0).numpy().astype(int)
@@ -54,7 +54,7 @@ def test_class_folders_give_the_class_at_any_depth_in_sorted_order(tmp_path):
     assert {photograph.source for photograph in found} == {None}
 
 
-def test_pictures_without_class_folders_are_all_of_the_given_class(tmp_path):
+def test_images_without_class_folders_are_all_of_the_given_class(tmp_path):
     touch(tmp_path, "b.jpg", "a.gif")
     assert find_photographs(tmp_path, CLASSES, "pear") == [
         Photograph(PurePosixPath("a.gif"), "pear", None),
@@ -107,7 +107,7 @@ def test_what_is_of_no_kind_that_is_read_is_told(tmp_path):
     assert [*map(str, left_out(tmp_path))] == ["notes.txt", "orange/b.HEIC", "orange/c.avif", "orange/pipe.jpg"]
 
 
-def test_a_link_to_nothing_is_a_picture_that_cannot_be_read(tmp_path):
+def test_a_link_to_nothing_is_a_image_that_cannot_be_read(tmp_path):
     save(tmp_path / "good.png", plain())
     (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
     _, _, unreadable = load_photographs(tmp_path, find_photographs(tmp_path, CLASSES, "orange"), skip_unreadable=True)
@@ -148,7 +148,7 @@ def test_look_alikes_are_the_sources_named_in_photos_csv(tmp_path):
     assert [photograph.look_alikes for photograph in found] == [("lab", "web"), (), (), (), ()]
 
 
-def test_look_alikes_of_a_source_without_pictures_are_refused_by_name(tmp_path):
+def test_look_alikes_of_a_source_without_images_are_refused_by_name(tmp_path):
     touch(tmp_path, "orange/a.jpg", "other_lemon/b.jpg")
     rows = [
         "path,source_tag,look_alikes",
@@ -195,7 +195,7 @@ def test_what_cannot_be_labelled_is_refused_in_one_sentence(tmp_path, files, fol
 # ---------------------------------------------------------------------------------------- loading
 
 
-# EXIF 2.3, tag 274: which sides of the upright picture the stored first row and first column are.
+# EXIF 2.3, tag 274: which sides of the upright image the stored first row and first column are.
 ORIENTATIONS = {
     1: ("top", "left"),
     2: ("top", "right"),
@@ -231,7 +231,7 @@ def test_only_the_central_square_is_kept(tmp_path, axis):
     np.testing.assert_array_equal(load_one(path), thirds[1])
 
 
-def test_the_square_is_exactly_central_so_that_a_turned_picture_loads_turned(tmp_path):
+def test_the_square_is_exactly_central_so_that_a_turned_image_loads_turned(tmp_path):
     pixels = np.random.default_rng(0).integers(64, 192, (67, 90, 3), dtype=np.uint8)  # no clipping
     loaded = load_one(save(tmp_path / "a.png", pixels))
     turned = load_one(save(tmp_path / "b.png", np.ascontiguousarray(np.rot90(pixels))))
@@ -295,7 +295,7 @@ def test_any_mode_becomes_rgb_over_white(tmp_path, name, image, options, expecte
     assert np.abs(loaded - expected).max() <= (2 if name.endswith("jpg") else 0)
 
 
-def test_pictures_come_as_bytes_in_the_order_asked_for(tmp_path):
+def test_images_come_as_bytes_in_the_order_asked_for(tmp_path):
     colours = {"c.png": (255, 0, 0), "a.png": (0, 255, 0), "b.png": (0, 0, 255)}
     for name, colour in colours.items():
         save(tmp_path / name, plain(colour, (50, 40)))
@@ -316,7 +316,7 @@ BROKEN = {
     "truncated.jpg": truncated,
     "truncated.png": truncated,
     "empty.jpg": Path.touch,
-    "text.png": lambda path: path.write_text("not a picture"),
+    "text.png": lambda path: path.write_text("not an image"),
     "huge.png": lambda path: save(path, plain(size=(100, 100))),
     "float.tif": lambda path: save(path, np.ones((40, 40), np.float32)),
 }
@@ -327,9 +327,9 @@ def small_bomb_limit(monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4096)  # Pillow refuses what has over twice as many
 
 
-@pytest.mark.parametrize(("name", "break_picture"), BROKEN.items())
-def test_an_unreadable_picture_is_named_or_skipped(tmp_path, small_bomb_limit, name, break_picture):
-    break_picture(tmp_path / name)
+@pytest.mark.parametrize(("name", "break_image"), BROKEN.items())
+def test_an_unreadable_image_is_named_or_skipped(tmp_path, small_bomb_limit, name, break_image):
+    break_image(tmp_path / name)
     save(tmp_path / "good.png", plain())
     found = find_photographs(tmp_path, CLASSES, "orange")
     with pytest.raises(
@@ -341,9 +341,9 @@ def test_an_unreadable_picture_is_named_or_skipped(tmp_path, small_bomb_limit, n
     assert images.shape == (1, 3, 32, 32) and unreadable == [name]
 
 
-def test_many_unreadable_pictures_are_counted_and_the_first_is_named(tmp_path, small_bomb_limit):
-    for name, break_picture in BROKEN.items():
-        break_picture(tmp_path / name)
+def test_many_unreadable_images_are_counted_and_the_first_is_named(tmp_path, small_bomb_limit):
+    for name, break_image in BROKEN.items():
+        break_image(tmp_path / name)
     found = find_photographs(tmp_path, CLASSES, "orange")
     for skip_unreadable in (False, True):  # there is nothing to go on with
         with pytest.raises(InputError, match=r"6 of 6 .*empty\.jpg .*replace them$"):

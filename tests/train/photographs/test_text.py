@@ -5,7 +5,7 @@ def test_the_terminal_table_is_aligned_and_complete(story, tmp_path):
     assert (
         format_summary(evaluate_photographs(*story, "orange", tmp_path))
         == """\
-5 pictures of orange, 5 of other things
+5 images of orange, 5 of other things
 
                              recall                       top-5                false alarms
 overall  1/5 = 0.200 [0.036, 0.624]  4/5 = 0.800 [0.376, 0.964]  2/5 = 0.400 [0.118, 0.769]

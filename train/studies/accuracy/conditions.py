@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from renderer.camera import OrthographicCamera
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.lights import ambient
 from renderer.mesh import Mesh, normalise
 from train.studies.accuracy import shapes
@@ -129,7 +129,7 @@ def meshes(subdivisions: int) -> Iterator[Row]:
         "each face by itself",
     )
     yield Row("a single triangle", by_both(Setup(shapes.TRIANGLE, light())), "each face by itself")
-    many, settings = shapes.sphere(subdivisions), PictureSettings(size=256, samples=1)
+    many, settings = shapes.sphere(subdivisions), ImageSettings(size=256, samples=1)
     yield Row(
         f"{len(many.faces):,} faces, thin ones, at 256²", by_both(Setup(many, light(), settings=settings)), SUMMED
     )
@@ -165,7 +165,7 @@ def merged(mesh: Mesh) -> np.ndarray:
 
 def thin_faces(count: int) -> Iterator[Row]:
     def measured(mesh: Mesh, dtype: torch.dtype) -> Errors:
-        settings = PictureSettings(size=ceil(sqrt(len(mesh.faces))), samples=1)
+        settings = ImageSettings(size=ceil(sqrt(len(mesh.faces))), samples=1)
         return by_both(Setup(mesh, light(), settings=settings, backend=shapes.Chart(), lift=exact, dtype=dtype))
 
     for power in (2, 4, 6, 8, 10, 12):
@@ -215,13 +215,13 @@ def number_types() -> Iterator[Row]:
 def images(size: int) -> Iterator[Row]:
     ball = shapes.sphere()
     for samples in (1, 16):
-        settings = PictureSettings(size=1, samples=samples)
+        settings = ImageSettings(size=1, samples=samples)
         yield Row(
             f"1 × 1, {samples**2} sample{'s' * (samples > 1)}",
             by_both(Setup(ball, light(), settings=settings)),
             "one pixel",
         )
-    settings = PictureSettings(size=size, samples=1)
+    settings = ImageSettings(size=size, samples=1)
     yield Row(f"{size} × {size}", by_both(Setup(ball, light(), settings=settings, camera=framing(6.0))), SUMMED)
     around = replace(ball, vertices=1.5 * ball.vertices + 1.2 * TOWARDS)
     yield Row(

@@ -13,7 +13,7 @@ from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import basis, basis_gradient
-from renderer.image import PictureSettings, develop
+from renderer.image import ImageSettings, develop
 from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.transfer import build_operators
@@ -23,7 +23,7 @@ from train.studies.accuracy.reference import exact, extended
 
 BACKEND = choose("software")
 CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, field_of_view=2.2)
-SETTINGS = PictureSettings(size=16, samples=2)
+SETTINGS = ImageSettings(size=16, samples=2)
 IMAGE, LIGHT_GRADIENT = "image", "light gradient"  # of an operator
 GEOMETRY, VERTEX_GRADIENT = "image by geometry", "vertex gradient"  # of `renderer.shading`
 
@@ -76,7 +76,7 @@ class Setup:
     light: Tensor
     vertices: np.ndarray | None = None
     camera: OrthographicCamera = CAMERA
-    settings: PictureSettings = SETTINGS
+    settings: ImageSettings = SETTINGS
     backend: Backend = BACKEND
     dtype: torch.dtype = torch.float64
     lift: Callable = extended

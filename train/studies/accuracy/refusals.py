@@ -11,7 +11,7 @@ from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import build_fragments
 from renderer.harmonics import MAX_DEGREE, basis, rotate
-from renderer.image import PictureSettings, develop
+from renderer.image import ImageSettings, develop
 from renderer.mesh import Mesh
 from renderer.shading import irradiance, radiance
 from renderer.transfer import build_operators
@@ -73,7 +73,7 @@ def _degenerate_settings() -> dict[str, Callable[[], object]]:
         "a gain of NaN": lambda: _build(gain=nan),
         "a camera at NaN": lambda: _build(camera=OrthographicCamera(nan, 0, 2)),
         "a frame of no width": lambda: OrthographicCamera(0, 0, 0),
-        "an image of no pixels": lambda: PictureSettings(size=0),
+        "an image of no pixels": lambda: ImageSettings(size=0),
     }
 
 

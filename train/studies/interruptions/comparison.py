@@ -13,7 +13,7 @@ from torch import Tensor
 from renderer.errors import InputError
 from train import checkpoint
 from train.logs import METRICS, read_metrics
-from train.showcase.write import PICTURES
+from train.showcase.write import IMAGES
 
 SECONDS = "seconds/"
 logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it says of every resumed run that it was
@@ -96,13 +96,13 @@ def board(run: Path) -> dict[str, list[tuple[int, float | bytes]]]:
 def file_differences(run: Path, reference: Path) -> Iterator[str]:
     """Images of renders, and files of the photographs' scores, that are missing, too many or of other bytes.
 
-    The report's pictures are left out: they show the seconds.
+    The report's images are left out: they show the seconds.
     """
     found, expected = (
         {
             path.relative_to(folder).as_posix(): path.read_bytes()
             for path in folder.glob("*/*")
-            if path.parent.name != PICTURES
+            if path.parent.name != IMAGES
         }
         for folder in (run, reference)
     )

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.attacks.report_picture import Exhibit, answer_caption, report_picture
+from augment.attacks.figure import Exhibit, answer_caption, save_figure
 from augment.attacks.run import Attacked
 from augment.attacks.settings import SkylightSettings
 from augment.objects import ObjectSettings
@@ -174,7 +174,7 @@ def exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Cond
 
 def save_small(attacked: Attacked, path: Path) -> None:
     """The image of an attack, in 256 colours where it would be large."""
-    report_picture(*exhibits(attacked), path)
+    save_figure(*exhibits(attacked), path)
     if path.stat().st_size > LIMIT:
         with Image.open(path) as image:
             reduced = image.quantize(256)

@@ -18,7 +18,7 @@ from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.scene import Scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from renderer.camera import ring
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.visibility import choose
 from train.photographs.shares import share
@@ -206,7 +206,7 @@ def training_step(study: Study, settings: RunTimeSettings) -> Iteration:
     classifier = load_classifier(PRETRAINED)
     label, views = classifier.label(study.label), EXAMPLES // len(study.subjects) // len(GREYS)
     objects = [SceneObject(item.label, item.mesh, item.gain) for item in study.subjects]
-    behind, drawn = load_backgrounds(GREYS, classifier.size), PictureSettings(classifier.size)
+    behind, drawn = load_backgrounds(GREYS, classifier.size), ImageSettings(classifier.size)
     scene = Scene.grid(objects, ring(views, 2.0), behind, load_light(study.light), drawn, choose())
     with torch.no_grad():
         classifier.function.head.bias[label] += 100

@@ -15,7 +15,7 @@ from augment.scene import Scene
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh
 from renderer.subdivision import subdivide
@@ -74,7 +74,7 @@ def scene_of(
         cameras,
         greys.view(-1, 1, 1, 1).expand(-1, 3, size, size),
         load_light(light),
-        PictureSettings(size, samples, normals=normals),
+        ImageSettings(size, samples, normals=normals),
         choose(),
         subject.gain,
     )

@@ -22,7 +22,7 @@ def write_corpus(folder: Path) -> None:
     """Fill an empty folder: data, photographs, meshes, lights, a background. A run and its network come later."""
     write_inputs(folder, epochs=1)
     _write_photographs(folder / "photographs")
-    _write_class_folders(folder / "pictures")
+    _write_class_folders(folder / "images")
     _write_meshes(folder)
     light = probe("grace")
     for name in LIGHTS[:3]:

@@ -63,7 +63,7 @@ DOORS = [
         "train data=folder",
         "train",
         ("run=out", "data=folder", "data.size=16", "data.test_share=0.3", "augment=none", *TRAINING),
-        {"data.path={}": ("pictures/apple/0.png",)},
+        {"data.path={}": ("images/apple/0.png",)},
     ),
     Door(
         "train train.resume=true",

@@ -141,12 +141,12 @@ def zip_bomb(path: Path) -> None:
             archive.writestr(f"{name}.npy", header.getvalue() + bytes(10**6))
 
 
-def picture(mode: str, size: tuple[int, int], kind: str = "PNG") -> Edit:
+def image(mode: str, size: tuple[int, int], kind: str = "PNG") -> Edit:
     return lambda path: Image.new(mode, size).save(path, format=kind)
 
 
 def png_header(width: int, height: int) -> Edit:
-    """A small file that says it is a huge picture."""
+    """A small file that says it is a huge image."""
 
     def chunk(name: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))

@@ -8,7 +8,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.transfer import DEGREE
 from renderer.visibility import Backend
 from train.studies.renderer_speed.descent import bend, lit_from_opposite
@@ -18,7 +18,7 @@ from train.studies.renderer_speed.results import Row
 from train.studies.renderer_speed.scenes import View, coefficients, ellipsoid
 from train.studies.renderer_speed.steps import LAYOUTS, laid_out, light_step, vertex_step
 
-SAMPLES = PictureSettings().samples
+SAMPLES = ImageSettings().samples
 DTYPES = (torch.float32, torch.bfloat16, torch.float64)  # the default first
 
 Entries = Iterator[tuple[Row, Callable[[], object]]]

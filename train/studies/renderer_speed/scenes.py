@@ -13,7 +13,7 @@ from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import basis
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.lights import probe
 from renderer.mesh import Mesh
 from renderer.transfer import Operator, build_operators
@@ -77,8 +77,8 @@ class View:
     backend: Backend
     device: torch.device
 
-    def settings(self, samples: int) -> PictureSettings:
-        return PictureSettings(self.size, samples)
+    def settings(self, samples: int) -> ImageSettings:
+        return ImageSettings(self.size, samples)
 
     def operator(self, samples: int, degree: int = 6, dtype: torch.dtype = torch.float32) -> Operator:
         (operator,) = build_operators(

@@ -11,7 +11,7 @@ from renderer import shading
 from renderer.cache import OperatorCache
 from renderer.camera import ring
 from renderer.fragments import Fragments
-from renderer.image import PictureSettings
+from renderer.image import ImageSettings
 from renderer.mesh import Mesh
 from renderer.transfer import COEFFICIENTS, Operator
 from train.studies.renderer_speed.panels import SAMPLES, Bench
@@ -49,7 +49,7 @@ def measure(bench: Bench, meshes: Sequence[Mesh]) -> list[Saving]:
 
 def build_operators(bench: Bench, meshes: Sequence[Mesh], cache: OperatorCache) -> list[Operator]:
     """Of all meshes from all views at the small size, as the paper's scene has them."""
-    cameras, settings = ring(bench.plan.views, FIELD_OF_VIEW), PictureSettings(bench.plan.small, SAMPLES)
+    cameras, settings = ring(bench.plan.views, FIELD_OF_VIEW), ImageSettings(bench.plan.small, SAMPLES)
     return [operator for mesh in meshes for operator in cache.operators(mesh, cameras, settings, bench.backends[0])]
 
 

@@ -1,4 +1,4 @@
-"""One picture of an attack: what the classifier saw before and after, their difference, and the light of either."""
+"""One image of an attack: what the classifier saw before and after, their difference, and the light of either."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from renderer.tiles import (
     Tile,
 )
 
-SIDE = 192  # px: smaller pictures are enlarged by a whole factor to at least this width
+SIDE = 192  # px: smaller images are enlarged by a whole factor to at least this width
 
 Column = tuple[str, Sequence[Tile]]  # a title, and a tile per view
 
@@ -29,11 +29,11 @@ Column = tuple[str, Sequence[Tile]]  # a title, and a tile per view
 class Exhibit:
     """What one side of an attack, initial or adversarial, shows in V views.
 
-    pictures: (V, 3, H, W) RGB in [0, 1]. captions: V times lines of text, as `answer_caption` gives them, the first in
+    images: (V, 3, H, W) RGB in [0, 1]. captions: V times lines of text, as `answer_caption` gives them, the first in
     ink and the others faint. spheres: (V, 3, S, S) in [0, 1], each view's light (`renderer.light_sphere`), or None.
     """
 
-    pictures: Tensor
+    images: Tensor
     captions: Sequence[tuple[str, ...]]
     spheres: Tensor | None = None
 
@@ -44,16 +44,16 @@ def answer_caption(probabilities: Tensor, classes: Sequence[str], label: str) ->
     return tuple(f"{probabilities[index]:.1%} {classes[index]}" for index in shown)
 
 
-def report_picture(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
-    """Write the picture, a row per view, to a file whose suffix Pillow knows.
+def save_figure(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
+    """Write the image, a row per view, to a file whose suffix Pillow knows.
 
     The differences are grey where there is none, and scaled alike so that the largest reaches black or white.
-    Pictures are enlarged without smoothing, so that one sees the pixels that the classifier saw.
+    Images are enlarged without smoothing, so that one sees the pixels that the classifier saw.
     """
     columns = [
-        ("initial", _tiles(initial.pictures, initial.captions)),
-        ("adversarial", _tiles(adversarial.pictures, adversarial.captions)),
-        ("difference", _difference_tiles(adversarial.pictures - initial.pictures)),
+        ("initial", _tiles(initial.images, initial.captions)),
+        ("adversarial", _tiles(adversarial.images, adversarial.captions)),
+        ("difference", _difference_tiles(adversarial.images - initial.images)),
     ]
     for title, exhibit in (("initial light", initial), ("adversarial light", adversarial)):
         if exhibit.spheres is not None:
@@ -61,9 +61,9 @@ def report_picture(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
     _draw(columns).save(path)
 
 
-def _tiles(pictures: Tensor, captions: Sequence[tuple[str, ...]]) -> list[Tile]:
-    """Tiles of pictures (V, 3, H, W) in [0, 1]."""
-    return [Tile.of(picture, caption) for picture, caption in zip(pictures, captions, strict=True)]
+def _tiles(images: Tensor, captions: Sequence[tuple[str, ...]]) -> list[Tile]:
+    """Tiles of images (V, 3, H, W) in [0, 1]."""
+    return [Tile.of(image, caption) for image, caption in zip(images, captions, strict=True)]
 
 
 def _difference_tiles(differences: Tensor) -> list[Tile]:
@@ -97,12 +97,12 @@ def _draw(columns: Sequence[Column]) -> Image.Image:
 
 
 def _enlarged(tile: Tile) -> Image.Image:
-    """The tile's picture over its caption, as wide as the wider of them."""
-    font, picture = ImageFont.load_default(CAPTION_SIZE), Image.fromarray(tile.picture)
-    picture = picture.resize([side * -(-SIDE // picture.width) for side in picture.size], Image.Resampling.NEAREST)
-    width = max([picture.width, *(round(font.getlength(line) + 0.5) for line in tile.caption)])
-    image = Image.new("RGB", (width, picture.height + 2 + LINE_HEIGHT * len(tile.caption)), PAPER)
-    image.paste(picture)
+    """The tile's image over its caption, as wide as the wider of them."""
+    font, image = ImageFont.load_default(CAPTION_SIZE), Image.fromarray(tile.image)
+    image = image.resize([side * -(-SIDE // image.width) for side in image.size], Image.Resampling.NEAREST)
+    width = max([image.width, *(round(font.getlength(line) + 0.5) for line in tile.caption)])
+    captioned = Image.new("RGB", (width, image.height + 2 + LINE_HEIGHT * len(tile.caption)), PAPER)
+    captioned.paste(image)
     for line, text in enumerate(tile.caption):
-        ImageDraw.Draw(image).text((0, picture.height + 2 + line * LINE_HEIGHT), text, FAINT if line else INK, font)
-    return image
+        ImageDraw.Draw(captioned).text((0, image.height + 2 + line * LINE_HEIGHT), text, FAINT if line else INK, font)
+    return captioned

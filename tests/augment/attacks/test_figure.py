@@ -5,31 +5,31 @@ import pytest
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from augment.attacks.report_picture import SIDE, Exhibit, answer_caption, report_picture
+from augment.attacks.figure import SIDE, Exhibit, answer_caption, save_figure
 from renderer.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 
 PAPER = 255
 
 
-def pictures(views: int, size: int, seed: int) -> torch.Tensor:
+def random_images(views: int, size: int, seed: int) -> torch.Tensor:
     """Values of eight bits, and no pixel as white as the paper."""
     draws = torch.Generator().manual_seed(seed)
     return torch.randint(0, 250, (views, 3, size, size), generator=draws).float() / 255
 
 
 def exhibit(views: int = 2, size: int = 32, seed: int = 0, caption: tuple[str, ...] = ("orange",), **more) -> Exhibit:
-    return Exhibit(pictures(views, size, seed), [caption] * views, **more)
+    return Exhibit(random_images(views, size, seed), [caption] * views, **more)
 
 
 def draw(path: Path, *exhibits: Exhibit) -> np.ndarray:
-    report_picture(*exhibits, path)
+    save_figure(*exhibits, path)
     with Image.open(path) as sheet:
         return np.asarray(sheet)
 
 
-def place(sheet: np.ndarray, picture: torch.Tensor) -> list[tuple[int, int]]:
-    """(row, column) of everywhere that a picture (3, H, W), enlarged to at least SIDE, stands on the sheet."""
-    pixels = (picture * 255).round().byte().permute(1, 2, 0).numpy()
+def place(sheet: np.ndarray, image: torch.Tensor) -> list[tuple[int, int]]:
+    """(row, column) of everywhere that an image (3, H, W), enlarged to at least SIDE, stands on the sheet."""
+    pixels = (image * 255).round().byte().permute(1, 2, 0).numpy()
     scale = -(-SIDE // pixels.shape[1])
     pixels = pixels.repeat(scale, axis=0).repeat(scale, axis=1)
     height, width = pixels.shape[:2]
@@ -44,9 +44,9 @@ def test_each_view_has_a_row_and_each_side_a_column_in_which_pixels_stay_as_they
     side = -(-SIDE // size) * size
     row_height = side + 2 + 2 * LINE_HEIGHT + GAP  # the captions of the differences have two lines
     for column, shown in enumerate((before, after)):
-        for view, picture in enumerate(shown.pictures):
+        for view, image in enumerate(shown.images):
             top, left = MARGIN + TITLE_HEIGHT + view * row_height, MARGIN + column * (side + GAP)
-            assert place(sheet, picture) == [(top, left)]
+            assert place(sheet, image) == [(top, left)]
 
 
 def test_the_difference_is_grey_where_there_is_none_and_reaches_white_or_black(tmp_path):
@@ -56,12 +56,12 @@ def test_the_difference_is_grey_where_there_is_none_and_reaches_white_or_black(t
     after[0, 0, 1, 2] += 0.2
     after[1, :, 3, 0] -= 0.1
     after[:, 1, 0, 0] += 0.05
-    sheet = draw(tmp_path / "report.png", *(Exhibit(pictures, [()] * 2) for pictures in (before, after)))
+    sheet = draw(tmp_path / "report.png", *(Exhibit(images, [()] * 2) for images in (before, after)))
     expected = torch.full((2, 3, 4, 4), 128.0)
     expected[0, 0, 1, 2] = 255
     expected[1, :, 3, 0] = 64
     expected[:, 1, 0, 0] = 159
-    places = [place(sheet, picture / 255) for picture in expected]
+    places = [place(sheet, image / 255) for image in expected]
     assert [len(found) for found in places] == [1, 1]
     assert places[0][0][1] == places[1][0][1] == MARGIN + 2 * (SIDE + GAP)
 
@@ -73,12 +73,12 @@ def test_without_a_difference_all_of_it_is_grey(tmp_path):
 
 
 def test_the_light_of_either_side_is_shown_where_it_is_given(tmp_path):
-    spheres = [pictures(2, 48, seed) for seed in (2, 3)]
+    spheres = [random_images(2, 48, seed) for seed in (2, 3)]
     both = draw(tmp_path / "both.png", exhibit(seed=0, spheres=spheres[0]), exhibit(seed=1, spheres=spheres[1]))
     column = SIDE + GAP
     for number, sphere in enumerate(spheres, start=3):
-        for picture in sphere:
-            [(_, left)] = place(both, picture)
+        for image in sphere:
+            [(_, left)] = place(both, image)
             assert left == MARGIN + number * column
     one = draw(tmp_path / "one.png", exhibit(seed=0), exhibit(seed=1, spheres=spheres[1]))
     none = draw(tmp_path / "none.png", exhibit(seed=0), exhibit(seed=1))
@@ -99,7 +99,7 @@ def contains(sheet: np.ndarray, part: np.ndarray) -> bool:
     return bool((windows == part).all(axis=(-3, -2, -1)).any())
 
 
-def test_captions_stand_below_their_pictures_uncut_however_long(tmp_path):
+def test_captions_stand_below_their_images_uncut_however_long(tmp_path):
     long = "97.0% a jumpy quagga, grazing beside a long paddock's edge"
     sheet = draw(tmp_path / "report.png", exhibit(1, caption=("orange", "by jug")), exhibit(1, seed=1, caption=(long,)))
     below = sheet[MARGIN + TITLE_HEIGHT + SIDE :]
@@ -131,5 +131,5 @@ def test_an_answer_is_told_with_its_confidence_and_the_true_classs_where_it_is_w
 
 def test_views_without_a_caption_of_their_own_are_refused(tmp_path):
     with pytest.raises(ValueError):
-        report_picture(Exhibit(pictures(2, 8, 0), [()]), exhibit(2, 8), tmp_path / "report.png")
+        save_figure(Exhibit(random_images(2, 8, 0), [()]), exhibit(2, 8), tmp_path / "report.png")
     assert not list(tmp_path.iterdir())

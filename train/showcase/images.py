@@ -1,4 +1,4 @@
-"""Small pictures from the files of runs and attacks; what cannot be read is left out."""
+"""Small images from the files of runs and attacks; what cannot be read is left out."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -13,25 +13,25 @@ from renderer.light_sphere import light_sphere
 from renderer.tiles import Tile
 from train.photographs.answers import Answer
 from train.photographs.contact_sheet import caption, evenly
-from train.showcase.blocks import Gallery, Picture
+from train.showcase.blocks import Gallery, Illustration
 from train.showcase.folders import Attack
 from train.specimens import SUFFIX, Side, read_specimens
 
 TILE, SPHERE = 96, 64  # pixels
 TILES = 8  # photographs of each kind
-WIDEST = 720  # pixels of a grid of renders, 1100 of an attack's picture
+WIDEST = 720  # pixels of a grid of renders, 1100 of an attack's image
 EXAMPLES = 6  # of an attack
 
 
-def encoded(image: Image.Image, alt: str, width: int, text: str = "") -> Picture:
+def encoded(image: Image.Image, alt: str, width: int, text: str = "") -> Illustration:
     """As PNG where few pixels are to be seen as they are, else as JPEG."""
     file, small = io.BytesIO(), max(image.size) <= 2 * TILE
     image.convert("RGB").save(file, "PNG" if small else "JPEG", optimize=True, quality=82)
-    return Picture(file.getvalue(), "png" if small else "jpeg", alt, width, text)
+    return Illustration(file.getvalue(), "png" if small else "jpeg", alt, width, text)
 
 
-def from_file(path: Path, alt: str, widest: int, text: str = "") -> list[Picture]:
-    """The picture of a file, reduced to a width; [] where there is none that can be read."""
+def from_file(path: Path, alt: str, widest: int, text: str = "") -> list[Illustration]:
+    """The image of a file, reduced to a width; [] where there is none that can be read."""
     try:
         with Image.open(path) as image:
             shown = image.convert("RGB")
@@ -52,9 +52,9 @@ def renders(folder: Path, arm: str) -> Gallery:
     return Gallery(
         arm,
         [
-            picture
+            image
             for epoch, path in first_middle_last([*(folder / "renders").glob("epoch_*.png")])
-            for picture in from_file(path, f"Renders of epoch {epoch}, {arm}", WIDEST, f"epoch {epoch}")
+            for image in from_file(path, f"Renders of epoch {epoch}, {arm}", WIDEST, f"epoch {epoch}")
         ],
     )
 
@@ -66,14 +66,14 @@ def specimens(folder: Path, arm: str) -> Iterator[Gallery]:
             rows = read_specimens(path)
         except InputError:
             continue
-        shown = [picture for label, *sides in rows for picture in _sides(label, sides)]
+        shown = [image for label, *sides in rows for image in _sides(label, sides)]
         yield Gallery(f"{arm}, epoch {epoch}", shown)
 
 
-def _sides(label: str, sides: Sequence[Side]) -> Iterator[Picture]:
+def _sides(label: str, sides: Sequence[Side]) -> Iterator[Illustration]:
     for when, side in zip(("before", "after"), sides, strict=True):
         image = Image.fromarray(side.image.permute(1, 2, 0).numpy()).resize((TILE, TILE), Image.Resampling.NEAREST)
-        sphere = Image.fromarray(Tile.of(light_sphere(side.light, SPHERE), ()).picture)
+        sphere = Image.fromarray(Tile.of(light_sphere(side.light, SPHERE), ()).image)
         pair = Image.new("RGB", (TILE + SPHERE, TILE), "white")
         pair.paste(image)
         pair.paste(sphere, (TILE, (TILE - SPHERE) // 2))
@@ -93,12 +93,12 @@ def photographs(answers: Sequence[Answer], folder: Path, label: str, arm: str) -
     }
     for kind, group in kinds.items():
         chosen = evenly(sorted(group, key=lambda answer: -answer.probability), TILES) if group else []
-        tiles = [picture for answer in chosen for picture in _photograph(answer, folder)]
+        tiles = [image for answer in chosen for image in _photograph(answer, folder)]
         if tiles:
             yield Gallery(f"{arm}: {kind}, {len(tiles)} of {len(group)}", tiles)
 
 
-def _photograph(answer: Answer, folder: Path) -> list[Picture]:
+def _photograph(answer: Answer, folder: Path) -> list[Illustration]:
     path = answer.photograph.path
     if path.is_absolute() or ".." in path.parts or not (folder / path).is_file():
         return []
@@ -110,7 +110,7 @@ def _photograph(answer: Answer, folder: Path) -> list[Picture]:
     return [encoded(Image.fromarray(square), f"{answer.photograph.label}, called {said}", TILE, said)]
 
 
-def attack_pictures(attack: Attack) -> Gallery:
+def attack_images(attack: Attack) -> Gallery:
     """Before, after, their difference and the lights, of examples drawn evenly."""
     shown = []
     for line in evenly(attack.examples, EXAMPLES) if attack.examples else []:
