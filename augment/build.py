@@ -16,13 +16,14 @@ from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, normalise
 from renderer.subdivision import subdivide
-from renderer.visibility import choose
+from renderer.visibility import Backend, choose
 
 Shown = str | Path | Mesh
+Member = ObjectSettings | tuple[Shown, str]
 
 
 def build_scene(
-    meshes: Sequence[tuple[Shown, str]],
+    meshes: Sequence[Member],
     size: int,
     views: int = 1,
     *,
@@ -37,32 +38,35 @@ def build_scene(
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
-    visibility: str = "auto",
+    visibility: str | Backend = "auto",
     operators: OperatorCache | None = None,
     device: torch.device | str = "cpu",
 ) -> Scene:
     """Every mesh from a ring of views over every background, at `size` pixels per side.
 
-    meshes: (file, solid:NAME or `Mesh`; the name of its class) each. shared: the views of an example share one light,
-    shape or colour; otherwise each is an example. backgrounds: grey values or image files. light: coefficients or what
-    `renderer.load_light` takes; exposure multiplies it. polar: degrees off +z; azimuth: of the first view,
-    off +x. vertices: subdivide until there are
-    more. samples, encoding, normals, visibility: as for `renderer.render`. operators: where rendered views are kept.
+    meshes: (file, solid:NAME or `Mesh`; the name of its class) each, or `ObjectSettings`. shared: the views of an
+    example share one light, shape or colour; otherwise each is an example. backgrounds: grey values or image files.
+    light: coefficients or what `renderer.load_light` takes; exposure multiplies it. polar: degrees off +z; azimuth: of
+    the first view, off +x. vertices: subdivide until there are more. samples, encoding, normals, visibility: as for
+    `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
     coefficients = load_light(light) if isinstance(light, str) else light
     return Scene.grid(
-        [_object(mesh, label, vertices) for mesh, label in meshes],
+        [_object(member, vertices) for member in meshes],
         ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
         load_backgrounds(backgrounds, size),
         (coefficients * exposure).to(device),
         ImageSettings(size, samples, encoding, normals),
-        choose(visibility),
+        choose(visibility) if isinstance(visibility, str) else visibility,
         operators,
         shared=shared,
     )
 
 
-def _object(mesh: Shown, label: str, vertices: int) -> SceneObject:
+def _object(member: Member, vertices: int) -> SceneObject:
+    if isinstance(member, ObjectSettings):
+        return load_object(member, vertices)
+    mesh, label = member
     if isinstance(mesh, Mesh):
         return SceneObject(label, subdivide(normalise(mesh), vertices))
     return load_object(ObjectSettings(str(mesh), label), vertices)

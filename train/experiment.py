@@ -14,20 +14,16 @@ import torchvision
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
-from augment.backgrounds import load_backgrounds
+from augment.build import build_scene
 from augment.labels import anything_but
-from augment.objects import load_object
 from augment.phases import Phases
 from augment.scene import Scene
 from augment.seeding import stream_seed
 from augment.service import AugmentationService
 from renderer.cache import OperatorCache, TensorCache, cache_folder
-from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
-from renderer.lights import load_light
 from renderer.transfer import COEFFICIENTS, DEGREE
-from renderer.visibility import choose
 from train import checkpoint
 from train.classes import class_index
 from train.cli import NO_ROOM
@@ -203,24 +199,15 @@ def _build_service(
 
 
 def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
-    scene, renderer = settings.scene, settings.renderer
     for key, item in settings.objects.items():
         if item.label != OTHER:
             class_index(data.classes, item.label, f"label of {key}")
-    backend = choose(renderer.visibility)
-    console.info("visibility: %s", backend.description)
-    cache, start = OperatorCache(cache_folder(renderer.cache)), time.perf_counter()
-    built = Scene.grid(
-        [load_object(item) for item in settings.objects.values()],
-        ring(settings.views, scene.field_of_view),
-        load_backgrounds(scene.backgrounds, data.size),
-        (load_light(scene.light) * scene.exposure).to(device),
-        renderer.images(data.size),
-        backend,
-        cache,
-    )
+    choices, start = settings.renderer.choices, time.perf_counter()
+    console.info("visibility: %s", choices["visibility"].description)
+    objects = list(settings.objects.values())
+    built = build_scene(objects, data.size, settings.views, **settings.scene.choices, **choices, device=device)
     if settings.augment.relights:
-        _log_skipped(built, cache, start)
+        _log_skipped(built, choices["operators"], start)
     else:
         console.info("operators: none are kept, since views are rasterised in every epoch")
     return built

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ from omegaconf.errors import OmegaConfBaseException
 from augment.objects import ObjectSettings
 from augment.scene import count_views
 from augment.service import AugmentationSettings
+from renderer.cache import OperatorCache, cache_folder
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.image import ImageSettings
+from renderer.visibility import choose
 from train.recipe import TrainSettings
 from train.run_folder import CONFIG, read_config
 
@@ -27,6 +28,8 @@ PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a fold
 RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
 SMALLEST_SIZE, LARGEST_SIZE = 5, 4096  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
+MOST_VERTICES = 10**7  # some 5 GB
+COUNTED = ("meshes", "views")  # what a scene shows and how often; the rest says how
 
 
 @dataclass
@@ -52,21 +55,36 @@ class DataSettings:
 
 @dataclass
 class SceneSettings:
-    """What is rendered. meshes: each a file, a `solid:NAME`, or a mapping with ObjectSettings' keys. look_alikes: the
-    same, of what `label` is to be told from; of no class, unless a mapping names one.
+    """What is rendered, as `augment.build_scene` takes it. meshes: each a file, a `solid:NAME`, or a mapping with
+    ObjectSettings' keys.
     """
 
     meshes: list = field(default_factory=list)
-    look_alikes: list = field(default_factory=list)
-    backgrounds: list[float] = field(default_factory=list)
+    backgrounds: list = field(default_factory=list)
     views: int | None = None
+    polar: float = 60.0
+    azimuth: float = 0.0
     field_of_view: float = 2.0
+    vertices: int = 0
     light: str = "grace"
     exposure: float = 1.0
 
     def __post_init__(self):
         require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
         require_range("scene.views", self.views, 1, MOST_VIEWS)
+        require_range("scene.vertices", self.vertices, 0, MOST_VERTICES)
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """Arguments of `augment.build_scene`: all but the meshes and the number of views."""
+        return {each.name: getattr(self, each.name) for each in fields(SceneSettings) if each.name not in COUNTED}
+
+
+@dataclass
+class TrainingSceneSettings(SceneSettings):
+    """look_alikes: like meshes, of what `label` is to be told from; of no class, unless a mapping names one."""
+
+    look_alikes: list = field(default_factory=list)
 
 
 @dataclass
@@ -82,9 +100,11 @@ class RendererSettings:
     normals: str = "flat"
     cache: str | None = "auto"
 
-    def images(self, size: int) -> ImageSettings:
-        """Of images with `size` pixels per side."""
-        return ImageSettings(size, self.samples, self.encoding, self.normals)
+    @property
+    def choices(self) -> dict[str, Any]:
+        """Arguments of `augment.build_scene`."""
+        drawn = {name: getattr(self, name) for name in ("samples", "encoding", "normals")}
+        return {**drawn, "visibility": choose(self.visibility), "operators": OperatorCache(cache_folder(self.cache))}
 
 
 @dataclass
@@ -135,7 +155,7 @@ class ExperimentSettings:
     compare: list[str] = field(default_factory=list)
     data: DataSettings = field(default_factory=DataSettings)
     augment: AugmentationSettings = field(default_factory=AugmentationSettings)
-    scene: SceneSettings = field(default_factory=SceneSettings)
+    scene: TrainingSceneSettings = field(default_factory=TrainingSceneSettings)
     renderer: RendererSettings = field(default_factory=RendererSettings)
     model: ModelSettings = field(default_factory=ModelSettings)
     train: TrainSettings = field(default_factory=TrainSettings)

@@ -1,19 +1,12 @@
 """An attack from its configuration: scene, criterion, and what is changed."""
 
-import math
-
 import torch
 
 from augment.attacks.criteria import Criterion, LeastLikely, Misclassification, Targeted
 from augment.attacks.run import Attacked, attack
-from augment.backgrounds import load_backgrounds
+from augment.build import build_scene
 from augment.classifiers import Classifier
-from augment.objects import ObjectSettings, load_object
-from augment.scene import Scene
-from renderer.cache import OperatorCache, cache_folder
-from renderer.camera import ring
-from renderer.lights import load_light
-from renderer.visibility import choose
+from augment.objects import ObjectSettings
 from train.attacks.settings import AttackExperimentSettings
 
 LEAST_LIKELY = "least_likely"
@@ -26,24 +19,17 @@ def attack_mesh(
 
     InputError also where the classifier does not recognise it to begin with.
     """
-    scene = build_scene(item, settings, classifier.size, device)
+    scene = build_scene(
+        [item],
+        classifier.size,
+        settings.scene.views,
+        shared=settings.attack.shared,
+        **settings.scene.choices,
+        **settings.renderer.choices,
+        device=device,
+    )
     wanted, force = criterion(settings.target), settings.attack.force
     return attack(classifier, scene, wanted, settings.attack, seed=settings.seed, force=force)
-
-
-def build_scene(item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device) -> Scene:
-    """Views × backgrounds, as an example each or, where the views share what is attacked, an example per background."""
-    scene, renderer = settings.scene, settings.renderer
-    return Scene.grid(
-        [load_object(item, scene.vertices)],
-        ring(scene.views, scene.field_of_view, math.radians(scene.polar), math.radians(scene.azimuth)),
-        load_backgrounds(scene.backgrounds, size),
-        (load_light(scene.light) * scene.exposure).to(device),
-        renderer.images(size),
-        choose(renderer.visibility),
-        OperatorCache(cache_folder(renderer.cache)),
-        shared=settings.attack.shared,
-    )
 
 
 def criterion(target: object) -> Criterion:

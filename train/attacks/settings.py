@@ -4,10 +4,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from augment.attacks.settings import AttackSettings
-from renderer.errors import FACTOR, InputError, require_range
-from train.settings import LARGEST_SEED, MOST_VIEWS, RendererSettings
-
-MOST_VERTICES = 10**7  # some 5 GB
+from renderer.errors import InputError, require_range
+from train.settings import LARGEST_SEED, RendererSettings, SceneSettings
 
 
 @dataclass
@@ -20,26 +18,17 @@ class AttackCommandSettings(AttackSettings):
 
 
 @dataclass
-class AttackSceneSettings:
-    """What is rendered. meshes: as in training. polar, azimuth: degrees, of the first
-    view. vertices: subdivide until there are more."""
+class AttackSceneSettings(SceneSettings):
+    """One view of a solid orange before grey, unless told otherwise."""
 
     meshes: list = field(default_factory=lambda: ["solid:orange:0"])
     backgrounds: list = field(default_factory=lambda: [0.5])
     views: int = 1
-    polar: float = 60.0
-    azimuth: float = 0.0
-    field_of_view: float = 2.0
-    vertices: int = 0
-    light: str = "grace"
-    exposure: float = 1.0
 
     def __post_init__(self):
         if not self.meshes or not self.backgrounds:
             raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
-        require_range("scene.views", self.views, 1, MOST_VIEWS)
-        require_range("scene.vertices", self.vertices, 0, MOST_VERTICES)
-        require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
+        super().__post_init__()
 
 
 @dataclass
