@@ -1,5 +1,7 @@
-"""Meshes as files: .glb with colours and textures, .ply with colours."""
+"""Meshes as files: .glb with colours, textures, normals and cameras, .ply with colours and normals."""
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,42 +12,63 @@ from torch.nn.functional import grid_sample
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.image import decode, encode
+from renderer.image import NORMALS, decode, encode
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh
+from renderer.normals import vertex_normals
 
-_COLOR = "_COLOR_0"  # glTF's name for colours after an underscore, under which trimesh writes any attribute
+# glTF's names for colours and normals after an underscore, under which trimesh writes any attribute.
+_COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
+_DISTANCE = 4.0  # of a file's cameras from the origin, in world units: that of an orthographic one shows nowhere
 
 
-def export_mesh(mesh: Mesh, path: str | Path) -> None:
-    """Write a mesh to a .glb or .ply file. A vertex whose corners differ in colour or uv is written once for each.
+def export_mesh(
+    mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[OrthographicCamera] = ()
+) -> None:
+    """Write a mesh to a .glb or .ply file. A vertex whose corners differ in colour, uv or normal is written for each.
 
     .glb: `load_mesh` gives back the same surface, to float32: y up, linear colours, one part per texture; a diffuse
     material that is seen from both sides. A mesh of several textures has its faces ordered by texture.
+    normals: those that the renderer shades with, "smooth" or "flat". cameras: as nodes of a .glb, in order.
     .ply: z up, colours of 8 bits. The format has no standard texture, so that vertices get their texel's colour, times
     their own in linear light: between them the texture is lost, unless the mesh is subdivided.
     InputError where the suffix is another or the file cannot be written.
     """
-    path, writers = Path(path), {".glb": _glb, ".ply": _ply}
+    path, writers = Path(path), {".glb": partial(_glb, cameras=cameras), ".ply": _ply}
     if path.suffix.lower() not in writers:
         raise InputError(f"{path} is no name for a mesh to write: give one that ends in {', '.join(writers)}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(writers[path.suffix.lower()](mesh))
+        path.write_bytes(writers[path.suffix.lower()](mesh, corner_normals(mesh, normals)))
     except OSError as error:
         raise InputError(f"mesh {path} cannot be written: {error}") from error
 
 
-def _glb(mesh: Mesh) -> bytes:
-    parts = [_textured_part(mesh, texture_id) for texture_id in np.unique(mesh.texture_ids)]
-    return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=_as_one_mesh)
+def corner_normals(mesh: Mesh, normals: str) -> np.ndarray:
+    """(F, 3, 3) float64 unit normals that the corners of faces are shaded with, "smooth" or "flat"; up where there is
+    none. InputError: another choice."""
+    if normals not in NORMALS:
+        raise InputError(f"normals={normals}: choose one of {', '.join(NORMALS)}")
+    flat = np.broadcast_to(mesh.face_normals()[:, None], (len(mesh.faces), 3, 3))
+    if normals == "smooth":
+        smooth = vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)).numpy()[mesh.faces]
+        flat = np.where(smooth.any(axis=-1, keepdims=True), smooth, flat)
+    return np.where(flat.any(axis=-1, keepdims=True), flat, [0.0, 0.0, 1.0])
 
 
-def _textured_part(mesh: Mesh, texture_id: int) -> trimesh.Trimesh:
+def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[OrthographicCamera]) -> bytes:
+    parts = [_textured_part(mesh, normals, texture_id) for texture_id in np.unique(mesh.texture_ids)]
+    finish = partial(_as_one_mesh, cameras=cameras)
+    return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=finish)
+
+
+def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int) -> trimesh.Trimesh:
     """The faces of one texture, or of none, y up."""
     here = mesh.texture_ids == texture_id
-    corners = np.concatenate([mesh.corner_colors[here], mesh.corner_uvs[here]], axis=-1)
+    corners = np.concatenate([mesh.corner_colors[here], mesh.corner_uvs[here], normals[here]], axis=-1)
     ids, values, faces = _split(mesh.faces[here], corners)
+    colors, uvs, normals = values[:, :3], values[:, 3:5], values[:, 5:]
     material = PBRMaterial(
         name=f"texture {texture_id}",  # trimesh would take images of the same bytes and other sizes for one
         baseColorTexture=Image.fromarray(mesh.textures[texture_id]) if texture_id >= 0 else None,
@@ -56,27 +79,50 @@ def _textured_part(mesh: Mesh, texture_id: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(
         mesh.vertices[ids] @ Y_UP_TO_Z_UP[:3, :3],  # the inverse, since it multiplies rows
         faces,
-        visual=TextureVisuals(uv=values[:, 3:], material=material),
-        vertex_attributes={_COLOR: decode(torch.from_numpy(values[:, :3]), "srgb").float().numpy()},
+        visual=TextureVisuals(uv=uvs, material=material),
+        vertex_attributes={
+            _COLOR: decode(torch.from_numpy(colors), "srgb").float().numpy(),
+            _NORMAL: (normals @ Y_UP_TO_Z_UP[:3, :3]).astype(np.float32),
+        },
         process=False,
     )
 
 
-def _as_one_mesh(tree: dict) -> None:
+def _as_one_mesh(tree: dict, cameras: Sequence[OrthographicCamera]) -> None:
     """One node with the parts as primitives, in order, and colours of full precision: trimesh's own have 8 bits, too
-    few for dark linear ones."""
+    few for dark linear ones. A node for each camera."""
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
     for primitive in primitives:
         primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_COLOR)
+        primitive["attributes"]["NORMAL"] = primitive["attributes"].pop(_NORMAL)
     tree["meshes"], tree["nodes"] = [{"primitives": primitives}], [{"mesh": 0}]
-    tree["scenes"] = [{"nodes": [0]}]
+    if cameras:
+        tree["cameras"] = [_gltf_camera(camera) for camera in cameras]
+        tree["nodes"] += [_camera_node(camera, index) for index, camera in enumerate(cameras)]
+    tree["scenes"] = [{"nodes": list(range(len(tree["nodes"])))}]
 
 
-def _ply(mesh: Mesh) -> bytes:
-    ids, colors, faces = _split(mesh.faces, _baked_colors(mesh))
-    colors = colors.astype(np.uint8)
-    part = trimesh.Trimesh(mesh.vertices[ids], faces, vertex_colors=colors, process=False)
-    return part.export(file_type="ply", vertex_normal=False)
+def _gltf_camera(camera: OrthographicCamera) -> dict:
+    half = camera.field_of_view / 2
+    return {
+        "type": "orthographic",
+        "orthographic": {"xmag": half, "ymag": half, "znear": _DISTANCE - 2, "zfar": _DISTANCE + 2},
+    }
+
+
+def _camera_node(camera: OrthographicCamera, index: int) -> dict:
+    """Where a camera stands, y up; it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
+    pose = np.eye(4)
+    pose[:3, :3] = camera.axes().T
+    pose[:3, 3] = camera.axes().T @ [-camera.right, -camera.up, _DISTANCE]
+    return {"camera": index, "name": f"view {index}", "matrix": (Y_UP_TO_Z_UP.T @ pose).T.ravel().tolist()}
+
+
+def _ply(mesh: Mesh, normals: np.ndarray) -> bytes:
+    ids, values, faces = _split(mesh.faces, np.concatenate([_baked_colors(mesh), normals], axis=-1))
+    colors, normals = values[:, :3].astype(np.uint8), values[:, 3:]
+    part = trimesh.Trimesh(mesh.vertices[ids], faces, vertex_normals=normals, vertex_colors=colors, process=False)
+    return part.export(file_type="ply", vertex_normal=True)
 
 
 def _baked_colors(mesh: Mesh) -> np.ndarray:

@@ -96,5 +96,6 @@ def _write_conditions(attacked: Attacked, after: Conditions, example: int, stem:
     if after.vertices is not None:
         vertices = after.vertices[example, : len(mesh.vertices)].detach().cpu().double().numpy()
         for suffix in (".glb", ".ply"):
-            export_mesh(replace(mesh, vertices=vertices), stem.with_name(stem.name + "_shape" + suffix))
+            path, shape = stem.with_name(stem.name + "_shape" + suffix), replace(mesh, vertices=vertices)
+            export_mesh(shape, path, scene.settings.normals, scene.cameras[example])
         yield "shape", asdict(mesh_damage(mesh.vertices, vertices, mesh.faces))

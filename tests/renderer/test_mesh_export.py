@@ -12,7 +12,7 @@ import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 
 from renderer.albedo import surface_albedo
-from renderer.camera import ring
+from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
@@ -166,7 +166,7 @@ def test_a_glb_holds_y_up_positions_linear_colours_and_uvs_from_the_top(tmp_path
     plain = mesh.texture_ids < 0
     assert len(parts) == 2 and plain.any() and not plain.all()
     for part, here in zip(parts, (plain, ~plain), strict=True):
-        assert set(part) == {"POSITION", "COLOR_0", "TEXCOORD_0", "indices", "material"}
+        assert set(part) == {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0", "indices", "material"}
         x, y, z = np.moveaxis(corners(mesh)[here], -1, 0)
         assert_array_equal(part["POSITION"][part["indices"]], np.stack([x, z, -y], axis=-1).astype(np.float32))
         colors = linear(mesh.corner_colors[here].astype(np.float64))
@@ -183,6 +183,42 @@ def test_a_glb_holds_y_up_positions_linear_colours_and_uvs_from_the_top(tmp_path
         assert part["material"]["doubleSided"] is True
         assert part["material"]["pbrMetallicRoughness"]["metallicFactor"] == 0
         assert part["material"]["pbrMetallicRoughness"]["roughnessFactor"] == 1
+
+
+@pytest.mark.parametrize("normals", ["smooth", "flat"])
+def test_a_glb_has_the_normals_that_the_renderer_shades_with(tmp_path, normals):
+    """Flat ones by the cross product; smooth ones the area-weighted sum of those around the vertex."""
+    mesh = solid("pear")
+    export_mesh(mesh, tmp_path / "mesh.glb", normals)
+    [part] = read_glb(tmp_path / "mesh.glb")
+    a, b, c = np.moveaxis(corners(mesh), 1, 0)
+    expected = np.cross(b - a, c - a)[:, None].repeat(3, axis=1)
+    if normals == "smooth":
+        sums = np.zeros_like(mesh.vertices)
+        np.add.at(sums, mesh.faces, expected)
+        expected = sums[mesh.faces]
+    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+    x, y, z = np.moveaxis(part["NORMAL"][part["indices"]], -1, 0)
+    assert_allclose(np.stack([x, -z, y], axis=-1), expected, rtol=0, atol=4 * EPS32)
+
+
+def test_a_glbs_cameras_see_what_ours_see(tmp_path):
+    """A point through the node's matrix, turned from y up, lands where `project` puts it."""
+    cameras = [*ring(2, 3.0, 1.0, 0.4), OrthographicCamera(2.0, 1.0, 2.5, right=0.3, up=-0.2)]
+    export_mesh(box(), tmp_path / "mesh.glb", cameras=cameras)
+    blob = (tmp_path / "mesh.glb").read_bytes()
+    tree = json.loads(blob[20 : 20 + struct.unpack("<I", blob[12:16])[0]])
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    x, y, z = points.T
+    nodes = [tree["nodes"][index] for index in tree["scenes"][0]["nodes"][1:]]
+    assert len(nodes) == len(cameras)
+    for camera, node in zip(cameras, nodes, strict=True):
+        pose, lens = np.reshape(node["matrix"], (4, 4)).T, tree["cameras"][node["camera"]]["orthographic"]
+        seen = np.linalg.inv(pose) @ np.stack([x, z, -y, np.ones(20)])
+        expected = camera.project(points)
+        assert_allclose(seen[0] / lens["xmag"], expected[:, 0], atol=1e-12)
+        assert_allclose(seen[1] / lens["ymag"], expected[:, 1], atol=1e-12)
+        assert_allclose((-seen[2] - lens["znear"]) / (lens["zfar"] - lens["znear"]) * 2 - 1, expected[:, 2], atol=1e-12)
 
 
 @every_mesh

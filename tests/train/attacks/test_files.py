@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hydra import compose, initialize_config_module
 from PIL import Image
 
@@ -94,3 +95,16 @@ def test_the_shape_is_read_back_where_the_attack_left_it(tmp_path, suffix, up):
         "displacement": [pytest.approx(each, abs=2**-23) for each in damage.displacement],
     }
     assert 0 < max(line["shape"]["displacement"]) <= 0.002 + 2**-23
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_the_shapes_file_has_the_normals_that_the_renderer_shades_with_and_the_view(tmp_path, normals):
+    done = attacked("attack=[geometry]", f"renderer.normals={normals}")
+    written(done, tmp_path)
+    scene = trimesh.load(tmp_path / "example_000_shape.glb", process=False)
+    (part,) = scene.geometry.values()
+    turns = np.linalg.norm(part.vertex_normals[part.faces] - part.face_normals[:, None], axis=2)
+    assert (turns.max() < 1e-4) == (normals == "flat")  # float32 positions of faces a thousandth wide
+    blob = (tmp_path / "example_000_shape.glb").read_bytes()
+    tree = json.loads(blob[20 : 20 + int.from_bytes(blob[12:16], "little")])
+    assert [node["name"] for node in tree["nodes"] if "camera" in node] == ["view 0"]
