@@ -144,6 +144,7 @@ class SweepReport(Callback):
 
     def __init__(self):
         self.folders: list[Path] = []
+        self._handler = signal.SIG_DFL
 
     @_one_outcome
     def on_multirun_start(self, config: DictConfig, **_) -> None:
@@ -158,13 +159,14 @@ class SweepReport(Callback):
                 raise InputError(f"the sweep asks twice for {folder}: give each value once")
             _check_same_settings(folder, cell)
         atexit.register(self._print)  # where the launcher raises, or a signal stops the sweep:
-        signal.signal(signal.SIGTERM, _stop)
+        self._handler = signal.signal(signal.SIGTERM, _stop)
 
     @_one_outcome
     def on_multirun_end(self, config: DictConfig, **_) -> None:
-        atexit.unregister(self._print)
         print(report_of([folder for folder in self.folders if folder.exists()], Path(config.hydra.sweep.dir)))
+        atexit.unregister(self._print)
         self._print()
+        signal.signal(signal.SIGTERM, self._handler)
         if not all(map(is_finished, self.folders)):
             sys.exit(1)
 

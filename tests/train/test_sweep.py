@@ -33,7 +33,7 @@ SMALL = [
 
 @pytest.fixture(autouse=True)
 def undone(monkeypatch) -> list:
-    """What a sweep leaves in its process: a handler, which is put back, and calls to come at exit, which are listed."""
+    """What a sweep that does not end leaves in its process: a handler, put back, and calls to come at exit, listed."""
     calls = []
     monkeypatch.setattr(sweep, "report_of", lambda folders, out: f"report: {len(folders)} in {out}")
     monkeypatch.setattr(sweep.atexit, "register", calls.append)
@@ -188,6 +188,12 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
         found, expected = (weights(cell(folder, f"seed={seed}") / LAST) for folder in (tmp_path, swept))
         assert all(torch.equal(found[name], expected[name]) for name in expected)
         assert len(read_metrics(cell(tmp_path, f"seed={seed}"))) == 3
+
+
+def test_a_sweep_that_ends_leaves_no_handler_and_no_call_to_come(run_sweep, swept, undone):
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    assert run_sweep(swept, "seed=0,1") == 0
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN and not undone
 
 
 def test_a_failed_cell_is_told_with_its_reason_and_tried_again_and_stops_no_other(
