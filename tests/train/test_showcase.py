@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_module
 from renderer.errors import InputError
 from train.report import summarise
 from train.settings import decisive_settings
-from train.showcase import report_of, write_report
+from train.showcase import plots, report_of, write_report
 from train.showcase.command import training_command
 
 HOSTILE = "<script>alert(1)</script>|*x*"
@@ -101,6 +101,13 @@ def test_where_there_is_nothing_one_sentence_says_so(tmp_path):
     with pytest.raises(InputError, match="holds no run and no attack"):
         write_report([tmp_path], tmp_path)
     assert report_of([tmp_path / "no"], tmp_path).startswith("no report: runs: ")
+
+
+def test_a_fault_of_the_report_is_told_with_its_place_and_raises_nothing(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(plots, "curves", lambda *_: 1 / 0)
+    first, *frames, last = report_of([finished], tmp_path).strip().splitlines()
+    assert first.startswith("no report: Traceback") and last == "ZeroDivisionError: division by zero"
+    assert any(frame.endswith(", in _training") for frame in frames)
 
 
 def test_a_browser_shows_it_without_overflow_wide_and_narrow_light_and_dark(page):

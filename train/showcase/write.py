@@ -4,9 +4,11 @@ import base64
 import html
 import re
 import shutil
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
+from train.cli import one_sentence
 from train.settings import PHOTOGRAPHS
 from train.showcase import answer, sections
 from train.showcase.blocks import Block, Code, Gallery, Illustration, Section
@@ -93,8 +95,11 @@ def _fenced(text: str) -> str:
 
 
 def report_of(folders: Sequence[Path], out: Path) -> str:
-    """What the end of a training says of the report: its path, or why there is none; it never fails the run."""
+    """What the end of a training says of the report: its path, or why there is none; it never fails the run.
+
+    The reason is one sentence, or the traceback of what is no fault of the user's.
+    """
     try:
         return f"report: {write_report(folders, out)}"
-    except Exception as error:  # what was trained is whole, whatever its images look like
-        return f"no report: {error}"
+    except Exception as error:  # what was trained is whole, whatever became of its report
+        return f"no report: {one_sentence(error) or traceback.format_exc()}"
