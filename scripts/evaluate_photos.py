@@ -22,6 +22,7 @@ class Settings:
     """conf/evaluate_photos.yaml."""
 
     run: str | None
+    model: str | None
     classifier: str | None
     weights: str | None
     photos: str
@@ -36,8 +37,9 @@ class Settings:
         require_range("size", self.size, 1, LARGEST_SIZE)
         if (self.run is None) == (self.classifier is None):
             raise InputError("give one network: run=FOLDER, or classifier=NAME")
-        if self.classifier and self.size:
-            raise InputError(f"size={self.size} is for run=FOLDER: a classifier has a size of its own, leave it out")
+        for key in ("size", "model"):
+            if self.classifier and (given := getattr(self, key)):
+                raise InputError(f"{key}={given} is for run=FOLDER: a classifier has its own, leave it out")
 
 
 def main(settings: Settings) -> None:
@@ -63,7 +65,7 @@ def main(settings: Settings) -> None:
 def _load(settings: Settings) -> Classifier:
     if settings.run is None:
         return load_classifier(settings.classifier, settings.weights)
-    return load_run(settings.run, settings.weights, settings.size)
+    return load_run(settings.run, settings.weights, settings.size, settings.model)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """`python -m train`: train an arm, score it, and print the table. See conf/train.yaml for every setting."""
 
+import re
 import shlex
 import sys
 from collections.abc import Mapping
@@ -22,6 +23,8 @@ from train.report import format_table, summarise
 from train.run_folder import sole_writer
 from train.showcase import report_of
 from train.sweep import check_launcher, run_cell
+
+NAMED_MODEL = re.compile(r"^model=(?!\{)")  # by its name alone
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="train")
@@ -81,6 +84,7 @@ def start() -> None:
         if processes.index() > 0:
             console.setLevel("WARNING")
             sys.argv.append(f"run={quoted(announced())}")
+        sys.argv[1:] = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
         with_suggestions(main, "train")
 
 

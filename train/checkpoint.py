@@ -16,8 +16,8 @@ from torch import Tensor, cuda, get_rng_state, nn, set_rng_state
 
 from renderer.errors import InputError
 from renderer.image import ENCODINGS
+from train.networks import PYTHON, WIDERESNET, build_network
 from train.settings import LARGEST_SIZE
-from train.wideresnet import WideResNet
 
 LAST, PREVIOUS, BEST, PUBLISHED = "last.pt", "previous.pt", "best.pt", "model.safetensors"
 HASH = "sha256"
@@ -33,7 +33,7 @@ class TrainedNetwork:
     architecture: all that is stored beside the weights.
     """
 
-    module: WideResNet
+    module: nn.Module
     classes: tuple[str, ...]
     size: int
     encoding: str
@@ -153,12 +153,12 @@ def load_weights(network: nn.Module, weights: Mapping[str, torch.Tensor], path: 
     network.load_state_dict(weights)
 
 
-def describe(network: WideResNet, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
+def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
     """What is stored with the weights, so that a network can be used without its run's configuration.
 
-    shape: the network's own settings. Its normalisation is a part of it.
+    shape: the network's own settings. Its normalisation, unless it is its own affair, is a part of it.
     """
-    statistics = {name: getattr(network, name).flatten().tolist() for name in ("mean", "std")}
+    statistics = {name: getattr(network, name).flatten().tolist() for name in ("mean", "std") if hasattr(network, name)}
     return {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding, **shape, **statistics}
 
 
@@ -171,38 +171,51 @@ def contradiction(stored: Mapping[str, Any], own: Mapping[str, Any], keys: Seque
     return next((key for key in common if stored[key] != own[key]), None)
 
 
-def start_from(network: WideResNet, own: Mapping[str, Any], run: Path) -> None:
+def start_from(network: nn.Module, own: Mapping[str, Any], run: Path) -> None:
     """Give the network the weights and the normalisation of another run's, which `load_network` finds.
 
     own: what is known of the network (see `describe`). InputError where the other has other classes, another size or
     shape.
     """
-    other = load_network(run)
-    stored = {**other.architecture, "size": other.size}
-    if key := contradiction(stored, own, ("classes", "size", "depth", "width")):
+    path, state = _selected(run)
+    stored, own = ({"name": WIDERESNET, "size": SIZE, **each} for each in (state["architecture"], own))
+    if key := contradiction(stored, own, ("classes", "size", "name", "depth", "width")):
         shown = "other classes" if key == "classes" else f"{key} {stored[key]}, not {own[key]}"
         raise InputError(f"train.init_from={run} was trained with {shown}: give this run the same")
-    load_weights(network, other.module.state_dict(), run)
+    load_weights(network, state["model"], path)
 
 
-def load_network(run: Path, size: int | None = None) -> TrainedNetwork:
-    """The selected network of a run folder (best.pt or model.safetensors) or of such a file.
-
-    size: of images, for a network of version 1, whose file does not say; None: 32. InputError where it does say.
-    """
+def _selected(run: Path) -> tuple[Path, dict[str, Any]]:
+    """The file of a run's selected network, and what it holds."""
     path = run if run.is_file() else next((run / name for name in (BEST, PUBLISHED) if (run / name).is_file()), None)
     if path is None:
         raise InputError(
             f"run={run} holds neither {BEST} nor {PUBLISHED}: give a run folder that `python -m train` wrote"
         )
-    state = _load_published(path) if path.suffix == ".safetensors" else load(path)
+    return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
+
+
+def load_network(run: Path, size: int | None = None, model: str | None = None) -> TrainedNetwork:
+    """The selected network of a run folder (best.pt or model.safetensors) or of such a file.
+
+    size: of images, for a network of version 1, whose file does not say; None: 32. InputError where it does say.
+    model: the python:package.module:function that makes it, where one does: code runs because the user names it, never
+    because a file does.
+    """
+    path, state = _selected(run)
     shape = dict(state["architecture"])
     stored_size, encoding = _pop_images(shape, path)
+    name = str(shape.get("name", WIDERESNET))
+    if name.startswith(PYTHON) and name != model:
+        raise InputError(
+            f"the network in {path} is made by {name}: give model={name} to run that code, which a file alone must not "
+            "do; an attack takes it as classifier=python: with a function that loads its weights"
+        )
     try:
         classes = tuple(map(str, shape.pop("classes")))
-        network = WideResNet(len(classes), **shape)
+        network = build_network(classes, stored_size or size or SIZE, **shape)
     except (TypeError, ValueError, KeyError, AttributeError, RuntimeError) as error:
-        raise InputError(f"checkpoint {path} is from another architecture than this WideResNet: {error}") from error
+        raise InputError(f"checkpoint {path} is from another architecture than can be built: {error}") from error
     if size and stored_size and size != stored_size:
         raise InputError(f"size={size}: {path} was trained on images of {stored_size} pixels per side; leave size out")
     load_weights(network, state["model"], path)

@@ -5,7 +5,6 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +38,7 @@ from train.device import MixedPrecision, choose_device, choose_precision, set_de
 from train.distributed import first_process_first
 from train.fit import Trainer, evaluate
 from train.logs import NoLog, RunLog, console
+from train.networks import build_network
 from train.photographs import FIGURES, evaluate_photographs, find_figure, find_photographs, format_summary
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
@@ -50,7 +50,6 @@ from train.settings import (
     read_settings,
     require_same_settings,
 )
-from train.wideresnet import WideResNet
 
 
 def load_data(config: DictConfig) -> DataSet:
@@ -139,9 +138,9 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
     phases = Phases(device)
     precision = choose_precision(settings.train.precision, device)
     mean, std = channel_statistics(data.train.images)
-    shape = asdict(settings.model)
+    shape = settings.model.shape
     torch.manual_seed(stream_seed(settings.seed, "weights"))
-    network = WideResNet(len(data.classes), **shape, mean=mean, std=std)
+    network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
     facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
     if settings.train.init_from:
         checkpoint.start_from(network, facts, Path(settings.train.init_from))

@@ -14,6 +14,7 @@ from renderer.errors import InputError
 from train import checkpoint
 from train.epoch import PHASES
 from train.logs import METRICS, read_metrics
+from train.networks import model_title
 from train.photographs import FIGURES, SUMMARY, figure_title, find_figure, format_interval
 from train.run_folder import CONFIG, read_config, read_json
 from train.settings import decisive_settings
@@ -206,7 +207,7 @@ def _spread(values: Sequence[float | None]) -> str:
 
 def _card(run: RunSummary, name: str) -> str:
     config, scores = run.config, run.scores
-    architecture = f"WideResNet-{config.model.depth}-{config.model.width}, dropout {config.model.dropout}"
+    architecture = model_title(**config.model)
     data = Path(config.data.path).name if config.data.name in ("npz", "folder") else config.data.name
     meshes = [Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in config.scene.meshes]
     often = f"every {config.augment.every} training images" if config.augment.get("every") else "each epoch"

@@ -15,6 +15,7 @@ from augment.service import AugmentationSettings
 from renderer.cache import OperatorCache, cache_folder
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.visibility import choose
+from train.networks import WIDERESNET
 from train.recipe import TrainSettings
 from train.run_folder import CONFIG, read_config
 
@@ -109,11 +110,21 @@ class RendererSettings:
 
 @dataclass
 class ModelSettings:
-    """The WideResNet; its dropout acts between the two convolutions of a block."""
+    """name: as `train.networks.build_network` takes it. The rest is the WideResNet's; its dropout acts between the two
+    convolutions of a block.
+    """
 
+    name: str = WIDERESNET
     depth: int = 16
     width: int = 4
     dropout: float = 0.3
+
+    @property
+    def shape(self) -> dict[str, Any]:
+        """What a network of this name is built from, and what is stored beside its weights."""
+        if self.name == WIDERESNET:
+            return {"depth": self.depth, "width": self.width, "dropout": self.dropout}
+        return {"name": self.name}
 
 
 @dataclass

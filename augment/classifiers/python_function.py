@@ -2,7 +2,9 @@
 
 import importlib
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
@@ -21,23 +23,28 @@ def load_python(name: str, weights: str | Path | None = None) -> Classifier:
     """
     if weights is not None:
         raise InputError(f"weights={weights} is not for classifier=python:{name}, which loads its own: leave it out")
+    return Classifier(*call_python(name, f"classifier=python:{name}"), f"python:{name}")
+
+
+def call_python(name: str, setting: str) -> tuple[nn.Module, int, Sequence[str]]:
+    """What `package.module:function` returns; the setting that names it is named in errors."""
     place, _, attribute = name.partition(":")
     if not place or not attribute:
-        raise InputError(f"classifier=python:{name} names no function: give {FORM}")
-    made = _function(place, attribute)()
+        raise InputError(f"{setting} names no function: give {FORM}")
+    made = _function(place, attribute, setting)()
     if not (isinstance(made, tuple | list) and len(made) == 3):
-        raise InputError(f"classifier=python:{name} returns {type(made).__name__}: return (module, size, classes)")
+        raise InputError(f"{setting} returns {type(made).__name__}: return (module, size, classes)")
     network, size, classes = made
     if not isinstance(network, nn.Module):
-        raise InputError(f"classifier=python:{name} returns {type(network).__name__} first: return a torch.nn.Module")
+        raise InputError(f"{setting} returns {type(network).__name__} first: return a torch.nn.Module")
     if not isinstance(size, int) or size < 1:
-        raise InputError(f"classifier=python:{name} returns the size {size!r}: return its images' pixels per side")
+        raise InputError(f"{setting} returns the size {size!r}: return its images' pixels per side")
     if isinstance(classes, str) or not all(isinstance(each, str) for each in classes):
-        raise InputError(f"classifier=python:{name} returns no list of class names: return one name per logit")
-    return Classifier(network, size, classes, f"python:{name}")
+        raise InputError(f"{setting} returns no list of class names: return one name per logit")
+    return network, size, classes
 
 
-def _function(place: str, attribute: str):
+def _function(place: str, attribute: str, setting: str) -> Callable[[], Any]:
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
@@ -45,10 +52,8 @@ def _function(place: str, attribute: str):
     except ModuleNotFoundError as error:
         if error.name is None or not f"{place}.".startswith(f"{error.name}."):
             raise  # the module is there and lacks something that it imports itself
-        raise InputError(
-            f"classifier=python:{place}:{attribute}: there is no module {error.name} in the current folder or installed"
-        ) from error
+        raise InputError(f"{setting}: there is no module {error.name} in the current folder or installed") from error
     function = getattr(module, attribute, None)
     if not callable(function):
-        raise InputError(f"classifier=python:{place}:{attribute}: {place} has no function {attribute}: name one")
+        raise InputError(f"{setting}: {place} has no function {attribute}: name one")
     return function

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -69,7 +69,7 @@ def measure(settings: BenchmarkSettings, config: DictConfig, data: DataSet, devi
     work = Workload(len(train), len(validation), plain.augment.examples, recipe.batch_size, settings.steps or None)
     validation = validation[: work.validated].to(device)
     mean, std = channel_statistics(data.train.images)
-    network = WideResNet(len(data.classes), **asdict(plain.model), mean=(0, 0, 0), std=(1, 1, 1))
+    network = WideResNet(len(data.classes), **plain.model.shape, mean=(0, 0, 0), std=(1, 1, 1))
     multiply_adds = forward_multiply_adds(network, data.size)
     loader = build_loader(train[: work.trained], recipe.batch_size, mean, std, settings.workers, device)
     with TemporaryDirectory() as folder:

@@ -6,6 +6,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from train.cli import command_line
 from train.device import choose_device, compiles, set_deterministic, set_threads
+from train.networks import model_title
 from train.outputs import writable_file
 from train.settings import ExperimentSettings, read_settings
 from train.studies.figures import pyplot
@@ -31,7 +32,7 @@ def run(config: DictConfig) -> None:
     facts = {
         "command": command_line(),
         "machine": description,
-        "network": f"WideResNet-{config.model.depth}-{config.model.width} with dropout {config.model.dropout:g}",
+        "network": model_title(**config.model),
         "data": f"`data={config.data.name}`" if config.data.path else "random images like CIFAR-100's",
         "compiled": "compiled" if compiles(config.train.compile, device) else "not compiled",
         "workers": settings.workers,
