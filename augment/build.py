@@ -68,5 +68,5 @@ def _object(member: Member, vertices: int) -> SceneObject:
         return load_object(member, vertices)
     mesh, label = member
     if isinstance(mesh, Mesh):
-        return SceneObject(label, subdivide(normalise(mesh), vertices))
+        return SceneObject(label, normalise(subdivide(mesh, vertices)))
     return load_object(ObjectSettings(str(mesh), label), vertices)

@@ -36,11 +36,11 @@ class SceneObject:
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
-    """The mesh, normalised, and subdivided until it has more than so many vertices.
+    """The mesh, subdivided until it has more than so many vertices, and normalised.
 
     InputError: as `load_mesh` and `solid`.
     """
-    return SceneObject(item.label, subdivide(_load(item), vertices), item.gain, item.mesh)
+    return SceneObject(item.label, normalise(subdivide(_load(item), vertices)), item.gain, item.mesh)
 
 
 def another_individual(item: SceneObject, seed: int) -> SceneObject:
@@ -54,8 +54,8 @@ def another_individual(item: SceneObject, seed: int) -> SceneObject:
 def _load(item: ObjectSettings) -> Mesh:
     kind, _, name = item.mesh.partition(":")
     if kind != "solid":
-        return normalise(load_mesh(item.mesh, up=item.up))
+        return load_mesh(item.mesh, up=item.up)
     name, _, seed = name.partition(":")
     if seed and not seed.isdecimal():
         raise InputError(f"scene.meshes: the seed in {item.mesh!r} must be a whole number, as in solid:orange:3")
-    return normalise(solid(name, int(seed or 0)))
+    return solid(name, int(seed or 0))

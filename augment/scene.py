@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
-from renderer.albedo import face_albedo, surface_albedo
+from renderer.albedo import painted_albedo, surface_albedo
 from renderer.basis import HARMONICS, Basis
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera
@@ -271,8 +271,8 @@ class Scene:
             vertices = conditions.vertices[row, : len(mesh.vertices)]
             fragments, albedo = self._fragments(number, camera, vertices.detach().cpu().double().numpy())
         if conditions.albedo is not None:
-            offset = face_albedo(conditions.albedo[row, : len(mesh.faces)], fragments)
-            albedo = clamp(albedo + offset, albedo.clamp(min=1))
+            added, gain = conditions.albedo[row, : len(mesh.faces)], self.objects[number].gain
+            albedo = painted_albedo(mesh, fragments, self.settings.encoding, gain, added)
         smooth_faces = self._faces[number] if self.settings.normals == "smooth" else None
         return fragments, radiance(fragments, vertices, light, albedo, smooth_faces)
 

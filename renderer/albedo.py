@@ -10,7 +10,7 @@ from torch import Tensor
 
 from renderer.errors import require_bounded
 from renderer.fragments import BLOCK, Fragments
-from renderer.image import decode
+from renderer.image import clamp, decode
 from renderer.mesh import Mesh
 
 
@@ -59,6 +59,35 @@ def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
     return _of_faces(albedo.index_select(0, fragments.faces), fragments)
 
 
+def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, gain: float, added: Tensor) -> Tensor:
+    """(S, 3) at the samples: the albedo times the gain plus what is `added` to each face (F, 3), within [0, 1] or up to
+    what it was beyond; differentiable in what is added. InputError: NaN.
+
+    It is kept within where it is stored, at corners and texels, and then interpolated, so that colours and textures can
+    hold it: see `renderer.albedo_bake`.
+    """
+    there, faces = face_albedo(added, fragments), fragments.faces.cpu().numpy()
+    corners = decode(torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(added), encoding) * gain
+    albedo = fragments.interpolate(_within(corners + added.index_select(0, fragments.faces)[:, None], corners))
+    if not mesh.textures:
+        return albedo
+    colors = (_colors(mesh, faces, fragments, encoding) * gain).to(added)
+    uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(fragments.coverage)).T
+    texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)[fragments.face]
+    for index, texture in enumerate(_packed_textures(mesh, encoding, added)):
+        here = torch.nonzero(texture_ids == index).squeeze(1)
+        texels = [
+            (weight.to(added), colors[here] * texture.texels(at).T) for weight, at in _taps(texture, uvs[:, here])
+        ]
+        value = sum(weight[:, None] * _within(texel + there[here], texel) for weight, texel in texels)
+        albedo = albedo.index_copy(0, here, value)
+    return albedo
+
+
+def _within(changed: Tensor, albedo: Tensor) -> Tensor:
+    return clamp(changed, albedo.clamp(min=1))
+
+
 def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[_Texture], encoding: str) -> Tensor:
     """Corner colour × texture at the samples."""
     faces = fragments.faces.cpu().numpy()
@@ -101,11 +130,15 @@ def _bilinear(texture: _Texture, uvs: Tensor) -> Tensor:
     Texel centres are at half-integers, v = 0 is the bottom row's lower edge.
     """
     blocks = []
-    for u, v in (block.unbind() for block in uvs.split(BLOCK, dim=1)):
-        columns, rows = _neighbours(u, texture.width), _neighbours(1 - v, texture.height)
-        taps = [(down * across, row * texture.width + column) for row, down in rows for column, across in columns]
-        blocks.append(sum(weight * texture.texels(index.long()) for weight, index in taps))
+    for block in uvs.split(BLOCK, dim=1):
+        blocks.append(sum(weight * texture.texels(index) for weight, index in _taps(texture, block)))
     return torch.cat(blocks, dim=1)
+
+
+def _taps(texture: _Texture, uvs: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """(weight, row-major index) of the four texels around places (2, S)."""
+    columns, rows = _neighbours(uvs[0], texture.width), _neighbours(1 - uvs[1], texture.height)
+    return [(down * across, (row * texture.width + column).long()) for row, down in rows for column, across in columns]
 
 
 def _neighbours(along: Tensor, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:

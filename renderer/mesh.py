@@ -153,14 +153,16 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
 
 
 def normalise(mesh: Mesh) -> Mesh:
-    """Move the area-weighted centroid of the faces to the origin and scale the largest |coordinate| to 1.
+    """Move the area-weighted centroid of the faces to the origin and scale the largest |coordinate| to 1, rounded to
+    float32: so files hold the vertices exactly, and what is read back covers the same pixels.
 
     The same point is the average of the vertices weighted with the areas around them (the paper's appendix).
     Needs a positive area, as `load_mesh` ensures.
     """
     centroids = mesh.vertices[mesh.faces].mean(axis=1)
     centred = mesh.vertices - np.average(centroids, axis=0, weights=mesh.face_areas())
-    return replace(mesh, vertices=centred / np.abs(centred).max())
+    scaled = centred / np.abs(centred).max()
+    return replace(mesh, vertices=scaled.astype(np.float32).astype(np.float64))
 
 
 def _read(path: Path, linear: bool) -> list[Mesh]:

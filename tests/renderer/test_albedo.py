@@ -9,7 +9,8 @@ import torch
 import trimesh
 from scipy.ndimage import map_coordinates
 
-from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.albedo import face_albedo, painted_albedo, surface_albedo, textured_albedo
+from renderer.albedo_bake import with_added_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ENCODINGS, ImageSettings
@@ -202,3 +203,72 @@ def test_outside_of_the_image_there_is_no_albedo_and_a_gradient_of_zero(mesh):
         assert albedo.shape == (0, 3)
         if inputs:
             assert not any(gradient.any() for gradient in torch.autograd.grad(albedo.sum(), inputs))
+
+
+# ---------------------------------------------------------------------------- what is added to faces
+
+
+def middling(colors_differ: bool) -> Mesh:
+    """`patchwork` between 0.2 and 0.8 in linear light, so that adding up to 0.15 clamps nothing."""
+    mesh = patchwork()
+    colors = mesh.corner_colors if colors_differ else mesh.corner_colors[:, :1].repeat(3, axis=1)
+    colors = np.where((mesh.texture_ids >= 0)[:, None, None], 1.0, 0.2 + 0.6 * colors).astype(np.float32)
+    textures = tuple((51 + 0.6 * each).astype(np.uint8) for each in mesh.textures)
+    return replace(mesh, corner_colors=colors, textures=textures)
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.5, 1.2])
+def test_what_is_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped(gain):
+    mesh = middling(True)
+    fragments, added = view(mesh, 16, 2), 0.1 * (draw(len(mesh.faces), 3) - 0.5)
+    expected = surface_albedo(mesh, fragments, "linear") * gain + face_albedo(added, fragments)
+    torch.testing.assert_close(painted_albedo(mesh, fragments, "linear", gain, added), expected, rtol=0, atol=8 * EPS)
+
+
+@pytest.mark.parametrize("gain", [1.0, 3.0])
+def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(gain):
+    mesh = patchwork()
+    fragments = view(mesh, 16, 2)
+    much = torch.full((len(mesh.faces), 3), 9.0, dtype=torch.float64)
+    assert (painted_albedo(mesh, fragments, "srgb", gain, -much) == 0).all()
+    most = painted_albedo(mesh, fragments, "srgb", gain, much)
+    assert most.min() >= 1 - 4 * EPS and most.max() <= gain * (1 + 4 * EPS)
+
+
+def test_the_derivative_by_what_is_added_is_that_of_finite_differences():
+    mesh = patchwork()
+    fragments = view(mesh, 6)
+    added = (0.3 * (draw(len(mesh.faces), 3) - 0.5)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda each: painted_albedo(mesh, fragments, "srgb", 1.5, each), [added])
+
+
+@pytest.mark.parametrize(("encoding", "gain"), [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)])
+def test_colours_and_textures_hold_what_was_added(encoding, gain):
+    """Colours at corners to float32; texels, in which no colours vary, to half of a step of 8 bits, encoded."""
+    mesh = patchwork()
+    even = mesh.corner_colors[:, :1].repeat(3, axis=1)
+    mesh = replace(mesh, corner_colors=np.where((mesh.texture_ids >= 0)[:, None, None], even, mesh.corner_colors))
+    added = 0.6 * (draw(len(mesh.faces), 3) - 0.5)
+    painted, new_gain = with_added_albedo(mesh, added.numpy(), encoding, gain)
+    assert new_gain == max(1, gain)
+    bare = torch.from_numpy(mesh.texture_ids < 0)
+    step = {"linear": 0.5 / 255, "srgb": 0.5 / 255 * 2.4 / 1.055}[encoding] * new_gain  # the curve's steepest, at 1
+    for polar in (0.3, 1.5, 2.8):
+        fragments = view(mesh, 24, 2, OrthographicCamera(polar, polar, 2.0))
+        expected = painted_albedo(mesh, fragments, encoding, gain, added)
+        off = (surface_albedo(painted, fragments, encoding) * new_gain - expected).abs().amax(1)
+        without = bare[fragments.faces][fragments.face]
+        assert without.any() and not without.all()
+        assert off[without].max() < 1e-6 and off[~without].max() < step + 1e-5
+
+
+def test_corners_of_different_colours_are_painted_into_the_texels_between_them():
+    """A texture of one colour, under a blend of four: the blend, to what texels can tell."""
+    mesh = poster(
+        np.full((64, 64, 3), 255, np.uint8), color=np.array([[0.2] * 3, [0.9, 0.2, 0.2], [0.8] * 3, [0.4] * 3])
+    )
+    fragments, nothing = view(mesh, 32), np.zeros((2, 3))
+    painted, _ = with_added_albedo(mesh, nothing, "linear")
+    assert (painted.corner_colors == 1).all()
+    expected = surface_albedo(mesh, fragments, "linear")
+    torch.testing.assert_close(surface_albedo(painted, fragments, "linear"), expected, rtol=0, atol=1.1 / 255)

@@ -189,10 +189,11 @@ def test_normalise_centres_on_the_centroid_of_the_surface_and_fits_the_unit_cube
     cone = trimesh.creation.cone(radius=0.3, height=2)
     cone.apply_translation([7, -3, 11])
     mesh = normalise(Mesh.plain(cone.vertices, cone.faces))
-    assert_allclose(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).centroid, 0, atol=1e-12)
+    assert_allclose(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).centroid, 0, atol=2**-25)
     assert np.abs(mesh.vertices).max() == 1
     centred = cone.vertices - cone.centroid
-    assert_allclose(mesh.vertices, centred / np.abs(centred).max(), atol=1e-12)
+    assert_allclose(mesh.vertices, centred / np.abs(centred).max(), atol=2**-25)  # half of float32's step below 1
+    assert_array_equal(mesh.vertices, mesh.vertices.astype(np.float32))
 
 
 def test_normalise_weights_by_area_not_by_vertex():
