@@ -38,6 +38,7 @@ def build_scene(
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
+    transport: str = "direct",
     visibility: str | Backend = "auto",
     operators: OperatorCache | None = None,
     device: torch.device | str = "cpu",
@@ -47,8 +48,8 @@ def build_scene(
     meshes: (file, solid:NAME or `Mesh`; the name of its class) each, or `ObjectSettings`. shared: the views of an
     example share one light, shape or colour; otherwise each is an example. backgrounds: grey values or image files.
     light: coefficients or what `renderer.load_light` takes; exposure multiplies it. polar: degrees off +z; azimuth: of
-    the first view, off +x. vertices: subdivide until there are more. samples, encoding, normals, visibility: as for
-    `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
+    the first view, off +x. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility:
+    as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
     coefficients = load_light(light) if isinstance(light, str) else light
     return Scene.grid(
@@ -56,7 +57,7 @@ def build_scene(
         ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
         load_backgrounds(backgrounds, size),
         (coefficients * exposure).to(device),
-        ImageSettings(size, samples, encoding, normals),
+        ImageSettings(size, samples, encoding, normals, transport),
         choose(visibility) if isinstance(visibility, str) else visibility,
         operators,
         shared=shared,

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from renderer.basis import Basis
 from renderer.transfer import Operator, apply_transfer
 
 
@@ -13,15 +13,18 @@ class OperatorStack:
     """O operators, and N images that each show one of them in a light of its own.
 
     Operators share nothing but the index of pixels that any of them covers; the other pixels are neither stored nor
-    shaded. pixels: (P,) int64. transfer: (O, 3 or 1, K, P), K = 32 for 31 live harmonics. albedo: (O, 3, P).
-    coverage: (O, 1, P).
+    shaded. pixels: (P,) int64. transfer: (O, 3 or 1, K, P), of the K coefficients that reach a pixel of any of them,
+    and a row of zeros where their number is odd: for 32 rows instead of 31 the gradient's product is twice as fast.
+    albedo: (O, 3, P). coverage: (O, 1, P).
     """
 
     def __init__(self, operators: Sequence[Operator], shown: Tensor, device: torch.device | str = "cpu"):
         """shown: (N,) int64, the operator of each image. The operators are of one dtype and basis, on the CPU."""
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         slots, self._slots = _rank_among_equals(shown)
-        parts = (pixels, *_stack(operators, pixels), shown, slots, _kept_coefficients(operators[0].basis))
+        kept = torch.cat([operator.kept for operator in operators]).unique()
+        padded = F.pad(kept, (0, len(kept) % 2))  # with any coefficient
+        parts = (pixels, *_stack(operators, pixels, kept), shown, slots, padded)
         self.pixels, self.transfer, self.albedo, self.coverage, self.shown, self._slot, self._coefficients = (
             part.to(device) for part in parts
         )
@@ -55,28 +58,17 @@ def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:
     return ranks, int(counts.max())
 
 
-def _kept_coefficients(basis: Basis) -> Tensor:
-    """The live coefficients and, where their number is odd, another, whose row is zero: for 32 rows instead of 31 the
-    gradient's product is twice as fast."""
-    live = basis.live
-    if len(live) % 2 == 0:
-        return live
-    dead = next((index for index in range(basis.size) if index not in live), 0)
-    return torch.cat([live, torch.tensor([dead])])
-
-
-def _stack(operators: Sequence[Operator], pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Operators over a common set of pixels: transfer (O, 3 or 1, K, P), albedo (O, 3, P) and coverage (O, 1, P)."""
+def _stack(operators: Sequence[Operator], pixels: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Operators over common pixels and coefficients: transfer (O, C, K, P), albedo (O, 3, P), coverage (O, 1, P)."""
     channels, like = max(len(operator.transfer) for operator in operators), operators[0].transfer
-    live, rows = like.shape[1], len(_kept_coefficients(operators[0].basis))
-    transfer = like.new_zeros(len(operators), channels, rows, len(pixels))
+    transfer = like.new_zeros(len(operators), channels, len(kept) + len(kept) % 2, len(pixels))
     albedo = like.new_ones(len(operators), 3, len(pixels))
     coverage = like.new_zeros(len(operators), 1, len(pixels))
     for row, operator in enumerate(operators):
-        columns = torch.searchsorted(pixels, operator.pixels)
+        rows, columns = torch.searchsorted(kept, operator.kept)[:, None], torch.searchsorted(pixels, operator.pixels)
         if channels == 1:
-            transfer[row][:, :live, columns], albedo[row][:, columns] = operator.transfer, operator.albedo
+            transfer[row][:, rows, columns], albedo[row][:, columns] = operator.transfer, operator.albedo
         else:
-            transfer[row][:, :live, columns] = operator.transfer * operator.albedo[:, None]
+            transfer[row][:, rows, columns] = operator.transfer * operator.albedo[:, None]
         coverage[row, 0, columns] = operator.coverage
     return transfer, albedo, coverage

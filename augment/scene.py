@@ -225,8 +225,14 @@ class Scene:
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[_Layer]:
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
-        only_light = conditions.vertices is None and conditions.albedo is None
-        return self._relit(light, examples) if only_light else self._reshaded(light, conditions, examples)
+        if conditions.vertices is None and conditions.albedo is None:
+            return self._relit(light, examples)
+        if self.settings.transport != "direct":
+            raise InputError(
+                f"renderer.transport={self.settings.transport} holds for one shape in its colours: attack the light or "
+                "set renderer.transport=direct"
+            )
+        return self._reshaded(light, conditions, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[_Layer]:
         """By one product per stack of operators."""

@@ -5,7 +5,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from renderer.harmonics import irradiance_basis, live_coefficients
+from renderer.harmonics import basis, irradiance_basis, live_coefficients
 
 
 class Basis(Protocol):
@@ -21,10 +21,13 @@ class Basis(Protocol):
 
     @property
     def live(self) -> Tensor:
-        """(K,) ascending indices of those that can reach a diffuse surface; images and gradients ignore the others."""
+        """(K,) ascending indices of those that reach a diffuse surface under an open sky; see `Operator.kept`."""
 
     def irradiance(self, normals: Tensor) -> Tensor:
         """(N, K) at unit normals (N, 3), per unit of each live coefficient."""
+
+    def radiance(self, directions: Tensor) -> Tensor:
+        """(N, size) that comes from unit directions (N, 3), per unit of each coefficient."""
 
     def within_domain(self, coefficients: Tensor) -> Tensor:
         """Coefficients (..., size, 3) clamped to a box, or as they are where any light is allowed."""
@@ -51,6 +54,9 @@ class Harmonics:
 
     def irradiance(self, normals: Tensor) -> Tensor:
         return irradiance_basis(normals, self.degree)
+
+    def radiance(self, directions: Tensor) -> Tensor:
+        return basis(directions, self.degree)
 
     def within_domain(self, coefficients: Tensor) -> Tensor:
         return coefficients

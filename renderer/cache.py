@@ -22,6 +22,7 @@ from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
 from renderer.transfer import TENSORS, Operator, build_operator
+from renderer.transport import build_transport
 from renderer.visibility import Backend
 
 
@@ -165,8 +166,10 @@ class OperatorCache(TensorCache):
         missing = [camera for camera in keys if camera not in views]
         if missing:
             fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, backend, closed=mesh.closed)
+            transport = build_transport(mesh, settings)
             for camera, seen in zip(missing, fragments, strict=True):
-                views[camera] = _pack(mesh, seen, build_operator(mesh, seen, settings, gain, basis, dtype))
+                operator = build_operator(mesh, seen, settings, gain, basis, dtype, transport)
+                views[camera] = _pack(mesh, seen, operator)
                 self.write(keys[camera], views[camera])
         self.tally.add(built=len(missing), views=views.values())
         return [_unpack(views[camera], settings, basis) for camera in cameras]

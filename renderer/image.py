@@ -10,12 +10,14 @@ from renderer.errors import InputError, require_bounded
 
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
+TRANSPORTS = ("direct", "shadows")
 MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
 
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """Image size in pixels, samples per pixel side, encoding, and a normal per face or interpolated vertex normals.
+    """Image size in pixels, samples per pixel side, encoding, a normal per face or interpolated vertex normals, and
+    what the mesh does to its own light: nothing, or shadows.
 
     InputError: none of the first two, an unknown choice.
     """
@@ -24,6 +26,7 @@ class ImageSettings:
     samples: int = 8
     encoding: str = "linear"
     normals: str = "flat"
+    transport: str = "direct"
 
     def __post_init__(self):
         if self.size < 1 or self.samples < 1:
@@ -36,6 +39,8 @@ class ImageSettings:
         check_encoding(self.encoding)
         if self.normals not in NORMALS:
             raise InputError(f"renderer.normals={self.normals}: choose one of {', '.join(NORMALS)}")
+        if self.transport not in TRANSPORTS:
+            raise InputError(f"renderer.transport={self.transport}: choose one of {', '.join(TRANSPORTS)}")
 
 
 def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:

@@ -1,6 +1,7 @@
 """Meshes to images in one call: `render` by all that can be differentiated, `operators` for many lights."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import torch
@@ -14,6 +15,7 @@ from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.transfer import Operator, build_operators
+from renderer.transport import build_transport
 from renderer.visibility import choose
 
 _choose = cache(choose)  # "auto" asks the driver, which takes longer than an image
@@ -32,6 +34,7 @@ def render(
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
+    transport: str = "direct",
     visibility: str = "auto",
 ) -> Tensor:
     """Images (V, 3, size, size) in [0, 1] of a mesh from V cameras; differentiable in light, vertices and albedo.
@@ -40,20 +43,24 @@ def render(
     `renderer.image.as_background`; an image per view with (V, 3, size, size). vertices: (N, 3) in place of the mesh's;
     the gradient holds fixed which face covers each sample. albedo: linear, in place of the mesh's colours, (F, 3) per
     face, or (H, W, 3) in place of the texture of a mesh that has one. gain multiplies the albedo. samples: per pixel
-    side. encoding: linear or srgb. normals: flat or smooth. visibility: auto, opengl or software.
+    side. encoding: linear or srgb. normals: flat or smooth. transport: direct, or shadows that a mesh casts on itself,
+    which the gradient by vertices and albedo holds fixed. visibility: auto, opengl or software.
     InputError: NaN, shapes that do not fit, unknown choices.
     """
-    settings = ImageSettings(size, samples, encoding, normals)
+    settings = ImageSettings(size, samples, encoding, normals, transport)
     vertices = _matching(vertices, mesh.vertices.shape, "vertices", torch.from_numpy(mesh.vertices)).to(light)
     positions = vertices.detach().cpu().double().numpy()
     views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(visibility), closed=mesh.closed)
     backgrounds = as_background(background, size, light).expand(len(views), -1, -1, -1)
     smooth_faces = torch.from_numpy(mesh.faces).to(light.device) if normals == "smooth" else None
+    shaping = build_transport(replace(mesh, vertices=positions), settings)
     images = []
     for view, behind in zip(views, backgrounds, strict=True):
         seen = view.to(light.device)
         surface = _albedo(mesh, seen, albedo, encoding).to(light) * gain
         shade = radiance(seen, vertices, light, surface, smooth_faces)
+        if shaping is not None:
+            shade = shade + shaping.radiance(view, surface.detach().cpu().double(), light)
         images.append(compose(shade, seen.coverage.to(light), seen.pixels, behind, encoding))
     return torch.stack(images)
 
@@ -67,13 +74,14 @@ def operators(
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
+    transport: str = "direct",
     visibility: str = "auto",
 ) -> list[Operator]:
     """One operator per camera: images and gradients under any number of lights without another look at the mesh.
 
     `operator.image(light, background)` is the image that `render` makes, to rounding. Keywords as there.
     """
-    settings = ImageSettings(size, samples, encoding, normals)
+    settings = ImageSettings(size, samples, encoding, normals, transport)
     return build_operators(mesh, _listed(cameras), settings, _choose(visibility), gain)
 
 

@@ -1,7 +1,8 @@
 """A scene as a linear operator on its light: (mesh, camera) → T, rasterised once and multiplied ever after.
 
 Before clamping, every pixel of a diffuse mesh is linear in the lighting coefficients U (the paper's appendix B.2):
-radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly.
+radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do shadows
+(`renderer.transport`).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,11 +23,12 @@ from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.shading import smooth_normals
+from renderer.transport import Transport, build_transport
 from renderer.visibility import Backend
 
 DEGREE = HARMONICS.degree
 COEFFICIENTS = HARMONICS.size
-TENSORS = ("transfer", "albedo", "coverage", "pixels")  # of an operator
+TENSORS = ("transfer", "albedo", "coverage", "pixels", "kept")  # of an operator
 BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 
 
@@ -34,11 +36,13 @@ BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 class Operator:
     """What is kept of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
 
-    transfer: (3, K, P), K live coefficients (31 for harmonics of degree 6) and P covered pixels; or (1, K, P), a third
-    of the size and the time, where no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
+    transfer: (3, K, P), K kept coefficients and P covered pixels; or (1, K, P), a third of the size and the time, where
+    no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
     albedo: (3, P), what the one channel is multiplied with; ones where there are three.
     coverage: (P,) in (0, 1], the share of a pixel's samples that the mesh covers.
     pixels: (P,) int64, row-major indices of the covered pixels; row 0 is the top of the image.
+    kept: (K,) int64, ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
+    under an open sky (`Basis.live`), and all in a view with shadows.
     settings: of the image that they are pixels of. basis: of the lights.
     """
 
@@ -46,6 +50,7 @@ class Operator:
     albedo: Tensor
     coverage: Tensor
     pixels: Tensor
+    kept: Tensor
     settings: ImageSettings
     basis: Basis = HARMONICS
 
@@ -76,7 +81,7 @@ class Operator:
     def light_gradient(self, radiance_gradient: Tensor) -> Tensor:
         """∂C/∂U (..., size, 3) = T ∂C/∂radiance (..., 3, P), without a graph.
 
-        Exactly zero for the coefficients of bands that cannot reach a diffuse surface. InputError: NaN.
+        Exactly zero for the coefficients that reach no pixel. InputError: NaN.
         """
         require_bounded(radiance_gradient=radiance_gradient)
         upstream = radiance_gradient.to(self.transfer.dtype)
@@ -98,14 +103,9 @@ class Operator:
         return self.transfer[0] if len(self.transfer) == 1 else None
 
     @cached_property
-    def _live(self) -> Tensor:
-        """(K,) indices of the coefficients that reach a surface."""
-        return self.basis.live.to(self.transfer.device)
-
-    @cached_property
     def _places(self) -> Tensor:
-        """(size, K): puts the live coefficients in their places, with exact zeros in the others."""
-        return torch.eye(self.basis.size).to(self.transfer)[:, self._live]
+        """(size, K): puts the kept coefficients in their places, with exact zeros in the others."""
+        return torch.eye(self.basis.size).to(self.transfer)[:, self.kept]
 
 
 class _Radiance(torch.autograd.Function):
@@ -121,7 +121,7 @@ class _Radiance(torch.autograd.Function):
 
 
 def _radiance(operator: Operator, lights: Tensor) -> Tensor:
-    kept = lights.index_select(-2, operator._live).to(operator.transfer.dtype)
+    kept = lights.index_select(-2, operator.kept).to(operator.transfer.dtype)
     if operator._shared is not None:
         product = (kept.mT @ operator._shared).mul_(operator.albedo)
     else:
@@ -150,16 +150,23 @@ def build_operators(
     """One operator per camera, for lights of one basis; computed in float64 and stored in `dtype`.
 
     gain multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side that the
-    camera sees, with normals as the settings say.
+    camera sees, with normals as the settings say. InputError: `renderer.transport`.
     """
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, backend, closed=mesh.closed)
-    return [build_operator(mesh, view, settings, gain, basis, dtype) for view in views]
+    transport = build_transport(mesh, settings)
+    return [build_operator(mesh, view, settings, gain, basis, dtype, transport) for view in views]
 
 
 def build_operator(
-    mesh: Mesh, fragments: Fragments, settings: ImageSettings, gain: float, basis: Basis, dtype: torch.dtype
+    mesh: Mesh,
+    fragments: Fragments,
+    settings: ImageSettings,
+    gain: float,
+    basis: Basis,
+    dtype: torch.dtype,
+    transport: Transport | None,
 ) -> Operator:
-    """The operator of one view that has been rasterised; see `build_operators`."""
+    """The operator of one view that has been rasterised; see `build_operators`. transport: `build_transport`'s."""
     require_bounded(gain=torch.tensor(gain))
     albedo = surface_albedo(mesh, fragments, settings.encoding) * gain
     factor = _pixel_albedo(fragments, albedo, dtype)
@@ -167,11 +174,17 @@ def build_operator(
         factor = torch.ones(len(fragments.pixels), 3)
     else:
         albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
+    transfer = _box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype)
+    kept = basis.live
+    change = transport.change(fragments, albedo, basis) if transport else None
+    if change is not None:
+        transfer, kept = change.index_add_(1, kept, transfer.double()).to(dtype), torch.arange(basis.size)
     return Operator(
-        transfer=_box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype),
+        transfer=transfer,
         albedo=factor.T.to(dtype).contiguous(),
         coverage=fragments.coverage.to(dtype),
         pixels=fragments.pixels,
+        kept=kept,
         settings=settings,
         basis=basis,
     )

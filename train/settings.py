@@ -92,19 +92,21 @@ class TrainingSceneSettings(SceneSettings):
 class RendererSettings:
     """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb. normals: flat or smooth.
 
-    cache: the folder of what is rendered once, auto or None; see `renderer.cache.cache_folder`.
+    transport: direct, or with shadows that a mesh casts on itself. cache: the folder of what is rendered once, auto or
+    None; see `renderer.cache.cache_folder`.
     """
 
     visibility: str = "auto"
     samples: int = 8
     encoding: str = "linear"
     normals: str = "flat"
+    transport: str = "direct"
     cache: str | None = "auto"
 
     @property
     def choices(self) -> dict[str, Any]:
         """Arguments of `augment.build_scene`."""
-        drawn = {name: getattr(self, name) for name in ("samples", "encoding", "normals")}
+        drawn = {name: getattr(self, name) for name in ("samples", "encoding", "normals", "transport")}
         return {**drawn, "visibility": choose(self.visibility), "operators": OperatorCache(cache_folder(self.cache))}
 
 

@@ -45,6 +45,7 @@ def random_operator(seed: int, count: int) -> Operator:
         albedo=torch.ones(3, count),
         coverage=coverage,
         pixels=torch.randperm(SIZE**2, generator=draws)[:count].sort().values,
+        kept=LIVE,
         settings=ImageSettings(size=SIZE),
     )
 
@@ -154,8 +155,8 @@ def test_the_clamped_share_counts_covered_values_alone():
     unit, settings = torch.zeros(3, 31, 3), ImageSettings(size=2)
     unit[:, 0] = torch.tensor([1.0, 0.5, -1.0])
     views = [
-        Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2]), settings),
-        Operator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3]), settings),
+        Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2]), LIVE, settings),
+        Operator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3]), LIVE, settings),
     ]
     scene = scene_of(["orange"], views, [0.0, 1.0], settings)
     lights = torch.zeros(4, 49, 3)
@@ -415,3 +416,28 @@ def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its
 def test_a_light_of_another_basis_is_refused():
     with pytest.raises(InputError, match=r"light of shape \(9, 3\) is not of harmonics of degree 6: give 49 rows"):
         Scene.of_mesh(solid("plate"), [ring(1, 2.0)], load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, BACKEND)
+
+
+def test_a_scene_of_shadowed_and_open_meshes_shows_each_as_its_operator_does():
+    """The one has 49 coefficients and the other 31."""
+    items = [ObjectSettings("solid:cup", "cup"), ObjectSettings("solid:ball", "ball")]
+    settings, cameras = replace(SETTINGS, transport="shadows"), ring(2, 2)
+    scene, lights = built(items, cameras, settings), random_lights(12)
+    images = render(scene, lights)
+    expected, kept = [], set()
+    for item in items:
+        for operator in build_operators(load_object(item).mesh, cameras, settings, BACKEND):
+            kept.add(len(operator.kept))
+            for grey in GREYS:
+                expected.append(operator.image(lights[len(expected)], grey))
+    assert kept == {49, 31}
+    torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=100 * EPS32)
+
+
+@pytest.mark.parametrize("changed", ["vertices", "albedo"])
+def test_a_scene_with_shadows_refuses_other_shapes_and_colours(changed):
+    scene = built([ObjectSettings("solid:cup", "cup")], ring(1, 2), replace(SETTINGS, transport="shadows"))
+    examples = torch.arange(len(scene))
+    conditions = replace(scene.conditions(examples), **{changed: torch.zeros(len(scene), 4, 3)})
+    with pytest.raises(InputError, match=r"set renderer\.transport=direct"):
+        scene.render(conditions, examples)

@@ -14,8 +14,9 @@ import torch
 import trimesh
 from scipy.special import sph_harm_y
 
+from renderer import transport
 from renderer.camera import OrthographicCamera
-from renderer.mesh import Mesh
+from renderer.mesh import Mesh, concatenate
 from renderer.transfer import ImageSettings, build_operators
 from renderer.visibility import choose
 
@@ -98,6 +99,28 @@ def textured_hull() -> Mesh:
     )
 
 
+def pocked() -> Mesh:
+    """A ball with dents, whose sides shadow each other."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    rng = np.random.default_rng(3)
+    return Mesh.plain(ball.vertices * rng.uniform(0.5, 1, (len(ball.vertices), 1)), ball.faces, (0.9, 0.5, 0.2))
+
+
+def heap() -> Mesh:
+    """Open, thin, touching itself and of several parts: a ball on a plate, before a wall that is seen from behind."""
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
+    plate = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
+    wall = Mesh.plain([[-0.7, -0.8, 0], [-0.7, 0.8, 0], [-0.6, 0.7, 0.9]], [[0, 1, 2]], (0.8, 0.3, 0.1))
+    return concatenate([Mesh.plain(ball.vertices + np.array([0, 0, 0.4]), ball.faces), plate, wall])
+
+
+def bowl() -> Mesh:
+    """The lower half of a ball, seen from within."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.9)
+    lower = ball.vertices[ball.faces].mean(axis=1)[:, 2] < 0
+    return Mesh.plain(ball.vertices, ball.faces[lower], (0.8, 0.8, 0.3))
+
+
 each_case = pytest.mark.parametrize(
     ("solid", "view"),
     [
@@ -113,9 +136,10 @@ each_case = pytest.mark.parametrize(
 # ---------------------------------------------------------------------------- images
 
 
-def our_image(mesh: Mesh, camera: OrthographicCamera, size: int, samples: int) -> np.ndarray:
+def our_image(mesh: Mesh, camera: OrthographicCamera, size: int, samples: int, transport="direct") -> np.ndarray:
     """(size, size, 4): radiance and coverage."""
-    [operator] = build_operators(mesh, [camera], ImageSettings(size, samples), choose("software"))
+    settings = ImageSettings(size, samples, transport=transport)
+    [operator] = build_operators(mesh, [camera], settings, choose("software"))
     canvas = np.zeros((size * size, 4))
     canvas[operator.pixels, :3] = operator.radiance(torch.from_numpy(LIGHT)).T
     canvas[operator.pixels, 3] = operator.coverage
@@ -157,7 +181,8 @@ def mitsuba_mesh(mesh: Mesh):
     """Every face gets corners of its own, as our colours are kept."""
     properties = mi.Properties()
     properties["face_normals"] = True
-    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": mitsuba_albedo(mesh)})
+    diffuse = {"type": "diffuse", "reflectance": mitsuba_albedo(mesh)}
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "material": diffuse})
     corners = 3 * len(mesh.faces)
     result = mi.Mesh("mesh", corners, len(mesh.faces), props=properties, has_vertex_texcoords=True)
     result.add_attribute("vertex_color", 3, mesh.corner_colors.ravel())
@@ -219,3 +244,18 @@ def test_the_outline_is_mitsubas_to_a_sixteenth_of_a_pixel(solid, view):
     brightest = theirs.max(axis=(0, 1))
     error, noise = ((values[outline] / brightest) ** 2 for values in (ours - theirs, noise))
     np.testing.assert_array_less(np.sqrt(error.mean(axis=0)), np.sqrt((1 / 16) ** 2 + noise.mean(axis=0)))
+
+
+@pytest.mark.parametrize(("solid", "view"), [(pocked, "from above"), (heap, "from above"), (bowl, "near the pole")])
+def test_shadows_are_mitsubas_within_its_noise(solid, view, monkeypatch):
+    """With rays enough for a quadrature of 0.5 % of the brightest, root mean square, and 0.1 % on average."""
+    monkeypatch.setattr(transport, "DIRECTIONS", 2**12)
+    theirs, noise = mitsuba_image(solid, view, 32, 128)
+    inside, brightest = theirs[..., 3] == 1, theirs[..., :3].max()
+    shadowed, unshadowed = (our_image(solid(), VIEWS[view], 32, 8, chosen) for chosen in ("shadows", "direct"))
+    error, without, noise = (
+        values[inside, :3] / brightest for values in (shadowed - theirs, unshadowed - theirs, noise)
+    )
+    assert (error**2).mean() < 0.005**2 + (noise**2).mean()
+    assert abs(error.mean()) < 0.001
+    assert (without**2).mean() > 0.1**2

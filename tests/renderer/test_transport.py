@@ -1,0 +1,212 @@
+"""Shadows that a mesh casts on itself, against closed forms and a ray caster in float64. See also test_mitsuba."""
+
+import math
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from renderer import reference
+from renderer.camera import OrthographicCamera, ring
+from renderer.errors import InputError
+from renderer.fragments import build_fragments
+from renderer.harmonics import basis, live_coefficients, rotate
+from renderer.image import ImageSettings
+from renderer.lights import ambient, load_light
+from renderer.mesh import Mesh, concatenate
+from renderer.rendering import operators, render
+from renderer.transfer import Operator, build_operators
+from renderer.transport import DIRECTIONS, sphere
+from renderer.visibility import choose
+
+BACKEND = choose("software")
+ABOVE = OrthographicCamera(0, 0, 2.0)
+FLOAT32 = torch.finfo(torch.float32).eps
+QUADRATURE = 0.015  # of the brightest: what 512 directions misjudge of a shadowed pixel, root mean square
+
+
+def operator_of(mesh: Mesh, camera=ABOVE, transport="shadows", dtype=torch.float64, **settings) -> Operator:
+    chosen = ImageSettings(**{"size": 6, "samples": 1} | settings, transport=transport)
+    [operator] = build_operators(mesh, [camera], chosen, BACKEND, dtype=dtype)
+    return operator
+
+
+def all_rows(operator: Operator) -> torch.Tensor:
+    """(C, 49, P) float64."""
+    transfer = (operator.transfer * operator.albedo[:, None]).double()
+    return transfer.new_zeros(3, 49, transfer.shape[2]).index_copy(1, operator.kept, transfer)
+
+
+def sky_share(operator: Operator) -> torch.Tensor:
+    """(3, P), the radiance of white pixels under a white sky, over that under an open one."""
+    return operator.radiance(ambient(torch.ones(3, dtype=torch.float64))) / operator.coverage / math.pi
+
+
+def plain(shape: trimesh.Trimesh) -> Mesh:
+    return Mesh.plain(shape.vertices, shape.faces)
+
+
+def dented(seed=0) -> Mesh:
+    """A closed, lumpy ball: dents that see their own other side."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    depth = np.random.default_rng(seed).uniform(0.5, 1.0, (len(ball.vertices), 1))
+    return Mesh.plain(ball.vertices * depth, ball.faces, np.random.default_rng(seed).uniform(0.1, 1, (len(depth), 3)))
+
+
+def parts() -> Mesh:
+    """A ball over a plate that it touches, beside a thin wall seen from behind: open, thin and of several parts."""
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
+    plate = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
+    wall = Mesh.plain([[-0.7, -0.8, 0], [-0.7, 0.8, 0], [-0.6, 0.7, 0.9]], [[0, 1, 2]], (0.8, 0.3, 0.1))
+    return concatenate([Mesh.plain(ball.vertices + np.array([0, 0, 0.4]), ball.faces), plate, wall])
+
+
+def pit(depth: float) -> Mesh:
+    """A square hole of width 1, seen from above: floor and four walls, facing inward."""
+    corners = [[x, y, z] for z in (0, depth) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
+    sides = ((0, 1), (1, 2), (2, 3), (3, 0))
+    walls = [face for a, b in sides for face in ([a, 4 + a, b], [b, 4 + a, 4 + b])]
+    return Mesh.plain(corners, [[0, 1, 2], [0, 2, 3], *walls])
+
+
+CONVEX = {
+    "a ball": plain(trimesh.creation.icosphere(subdivisions=3)),
+    "a cube": plain(trimesh.creation.box()),
+    "an open square": Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]),
+}
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+@pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
+def test_a_convex_mesh_keeps_the_operator_of_direct_light_to_the_bit(mesh, normals):
+    camera = OrthographicCamera(1.0, 0.3, 2.2)
+    direct, shadowed = (operator_of(mesh, camera, transport, normals=normals) for transport in ("direct", "shadows"))
+    assert torch.equal(shadowed.transfer, direct.transfer)
+    assert torch.equal(shadowed.kept, live_coefficients(6))
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+@pytest.mark.parametrize("mesh", [dented(), parts(), pit(1.0)], ids=["dented", "parts", "pit"])
+def test_each_coefficient_is_that_of_the_slow_ray_caster(mesh, normals):
+    """One sample per pixel looks in all directions, so that both add up the same rays."""
+    camera = OrthographicCamera(0.8, 0.4, 2.1)
+    settings = ImageSettings(6, 1, normals=normals)
+    [seen] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, BACKEND, mesh.closed)
+    corners, directions = torch.from_numpy(mesh.vertices[mesh.faces]), sphere(DIRECTIONS)
+    own = corners[seen.faces]
+    planes = reference.unit(reference.doubled_area_vectors(own)) * seen.facing
+    at_corners = planes[:, None].expand(-1, 3, -1)
+    if normals == "smooth":
+        smooth = reference.vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces))
+        at_corners = smooth[seen.corners] * seen.facing[:, None]
+    weights = seen.barycentric()[..., None]
+    at = (weights * own[seen.face]).sum(1) + 1e-5 * planes[seen.face] * np.abs(mesh.vertices).max()
+    cosine = (reference.unit((weights * at_corners[seen.face]).sum(1)) @ directions.T).clamp(min=0)
+    cosine[planes[seen.face] @ directions.T <= 0] = 0
+    lost = torch.where(reference.blocked(at, directions, corners), cosine, 0) @ basis(directions, 6)
+
+    direct, shadowed = (operator_of(mesh, camera, t, normals=normals) for t in ("direct", "shadows"))
+    expected = all_rows(direct) - direct.albedo[:, None] * lost.T * 4 * math.pi / DIRECTIONS
+    assert lost.any()
+    torch.testing.assert_close(all_rows(shadowed), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("depth", [0.25, 0.5, 1.0])
+def test_the_middle_of_a_pit_sees_the_share_of_the_sky_that_a_square_has(depth):
+    """The configuration factor of a square parallel to a surface, over its middle (Howell's catalogue, B-3)."""
+    side = 0.5 / depth
+    far = math.hypot(1, side)
+    share = 4 * side / (math.pi * far) * math.atan(side / far)
+    [middle] = sky_share(operator_of(pit(depth), OrthographicCamera(0, 0, 0.01), size=1))[0].tolist()
+    assert middle == pytest.approx(share, abs=QUADRATURE)
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_no_pixel_is_brighter_than_under_an_open_sky_or_darker_than_none(samples):
+    """A white furnace. What is lost is added up from directions, and what is there in closed form."""
+    for mesh in (dented(1), parts(), pit(3.0)):
+        shares = sky_share(operator_of(mesh, size=16, samples=samples)).amax(0)
+        assert shares.max() <= 1 + 1e-9
+        assert shares.min() >= -QUADRATURE
+        assert shares.min() < 0.9
+
+
+def test_samples_share_the_directions_of_their_pixel():
+    """A pixel of 8 × 8 samples has their mean, as if each of them had looked in all directions."""
+    shared, apart = operator_of(parts(), size=8, samples=8), operator_of(parts(), size=64, samples=1)
+    mean, light = torch.zeros(64, dtype=torch.float64), ambient(torch.ones(3, dtype=torch.float64))
+    mean.index_add_(0, apart.pixels // 512 * 8 + apart.pixels % 64 // 8, apart.radiance(light)[0] / 64)
+    difference = shared.radiance(light)[0] - mean[shared.pixels]
+    assert difference.square().mean().sqrt() < QUADRATURE * mean.max()
+
+
+def test_a_turned_mesh_in_a_turned_light_looks_the_same():
+    """But for what the directions, which do not turn along, misjudge."""
+    light, angle = load_light("grace").double(), 2.0
+    turn = Rotation.from_euler("z", angle).as_matrix()
+    still, turned = dented(2), replace(dented(2), vertices=dented(2).vertices @ turn.T)
+    here = operator_of(still, OrthographicCamera(1.0, 0.5, 2.2), size=12, samples=4)
+    there = operator_of(turned, OrthographicCamera(1.0, 0.5 + angle, 2.2), size=12, samples=4)
+    assert torch.equal(here.pixels, there.pixels)
+    seen = here.radiance(light)
+    difference = seen - there.radiance(rotate(light, torch.from_numpy(turn)))
+    assert difference.square().mean().sqrt() < math.sqrt(2) * QUADRATURE * seen.max()  # of two such errors
+
+
+def test_the_gradient_of_light_is_the_transposed_of_all_49_rows():
+    operator = operator_of(dented(), dtype=torch.float64, samples=2)
+    light = torch.randn(49, 3, dtype=torch.float64, requires_grad=True)
+    upstream = torch.randn(3, len(operator.pixels), dtype=torch.float64)
+    [gradient] = torch.autograd.grad(operator.radiance(light), light, upstream)
+    torch.testing.assert_close(gradient, torch.einsum("ckp,cp->kc", all_rows(operator), upstream))
+    assert (gradient != 0).all()
+
+
+def test_missing_embree_is_told_in_a_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
+    with pytest.raises(InputError, match="pip install embreex"):
+        operator_of(dented())
+
+
+def test_an_unknown_transport_is_refused():
+    with pytest.raises(InputError, match=r"renderer\.transport=caustics: choose one of direct, shadows"):
+        ImageSettings(transport="caustics")
+
+
+@pytest.mark.parametrize("degree", [2, 6])
+def test_render_shows_the_operators_shadows_also_of_moved_vertices(degree):
+    cameras, light = ring(2, 2.2), load_light("grace").double()[: (degree + 1) ** 2]
+    shown = {"size": 12, "normals": "flat", "transport": "shadows", "visibility": "software"}
+    stretched = replace(dented(), vertices=dented().vertices * [1.0, 0.5, 1.0])
+    images = render(dented(), cameras, light, vertices=torch.from_numpy(stretched.vertices), **shown)
+    expected = [
+        operator.image(F.pad(light, (0, 0, 0, 49 - len(light)))) for operator in operators(stretched, cameras, **shown)
+    ]
+    torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=10 * FLOAT32)
+
+
+def test_render_differentiates_shadows_by_the_light_and_holds_them_by_the_vertices():
+    def shade(transport, light, vertices):
+        image = render(
+            dented(),
+            ABOVE,
+            light,
+            size=6,
+            vertices=vertices,
+            normals="flat",
+            transport=transport,
+            visibility="software",
+        )
+        return torch.autograd.grad(image.sum(), (light, vertices))
+
+    light, vertices = ambient(torch.full((3,), 0.1).double()), torch.from_numpy(dented().vertices)
+    light.requires_grad_(), vertices.requires_grad_()
+    (by_light, by_vertices), (_, direct_by_vertices) = (shade(t, light, vertices) for t in ("shadows", "direct"))
+    rows = all_rows(operator_of(dented(), samples=2)).sum(2).T
+    torch.testing.assert_close(by_light, rows)
+    assert torch.equal(by_vertices, direct_by_vertices)
