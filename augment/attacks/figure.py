@@ -1,10 +1,14 @@
 """One image of an attack: what the classifier saw before and after, their difference, and the light of either."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from renderer.tiles import (
@@ -21,6 +25,7 @@ from renderer.tiles import (
 )
 
 SIDE = 192  # px: smaller images are enlarged by a whole factor to at least this width
+COLUMNS = "columns"  # the text in a .png that says where its tiles are
 
 Column = tuple[str, Sequence[Tile]]  # a title, and a tile per view
 
@@ -45,7 +50,7 @@ def answer_caption(probabilities: Tensor, classes: Sequence[str], label: str) ->
 
 
 def save_figure(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
-    """Write the image, a row per view, to a file whose suffix Pillow knows.
+    """Write the image, a row per view, as a .png, whose tiles `read_figure` returns.
 
     The differences are grey where there is none, and scaled alike so that the largest reaches black or white.
     Images are enlarged without smoothing, so that one sees the pixels that the classifier saw.
@@ -58,7 +63,39 @@ def save_figure(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
     for title, exhibit in (("initial light", initial), ("adversarial light", adversarial)):
         if exhibit.spheres is not None:
             columns.append((title, _tiles(exhibit.spheres, [()] * len(exhibit.spheres))))
-    _draw(columns).save(path)
+    columns = [(title, [*map(_enlarged, tiles)]) for title, tiles in columns]
+    sheet, corners = _draw(columns)
+    told = [
+        {"title": title, "tiles": [_told(*each) for each in zip(tiles, places, strict=True)]}
+        for (title, tiles), places in zip(columns, corners, strict=True)
+    ]
+    info = PngInfo()
+    info.add_text(COLUMNS, json.dumps(told), zip=True)
+    sheet.save(path, pnginfo=info)
+
+
+def read_figure(path: Path) -> list[Column]:
+    """The columns of an image of `save_figure`, with tiles as they were drawn; ValueError for another file."""
+    try:
+        with Image.open(path, formats=["PNG"]) as sheet:
+            told = json.loads(sheet.text[COLUMNS])
+            pixels = np.asarray(sheet.convert("RGB"))
+        return [(str(column["title"]), [_cut(tile, pixels) for tile in column["tiles"]]) for column in told]
+    except Exception as error:  # Pillow raises almost anything at a broken file
+        raise ValueError(f"{path} is no image of an attack") from error
+
+
+def _told(tile: Tile, corner: tuple[int, int]) -> dict:
+    height, width, _ = tile.image.shape
+    return {"left": corner[0], "top": corner[1], "width": width, "height": height, "caption": tile.caption}
+
+
+def _cut(tile: dict, pixels: np.ndarray) -> Tile:
+    left, top, width, height = (tile[key] for key in ("left", "top", "width", "height"))
+    image = pixels[top : top + height, left : left + width]
+    if image.shape != (height, width, 3) or not image.size:
+        raise ValueError("a tile is not on the sheet")
+    return Tile(image, tuple(map(str, tile["caption"])))
 
 
 def _tiles(images: Tensor, captions: Sequence[tuple[str, ...]]) -> list[Tile]:
@@ -73,33 +110,37 @@ def _difference_tiles(differences: Tensor) -> list[Tile]:
     return _tiles((1 + gain * differences) / 2, captions)
 
 
-def _draw(columns: Sequence[Column]) -> Image.Image:
+def _draw(columns: Sequence[Column]) -> tuple[Image.Image, list[list[tuple[int, int]]]]:
+    """The sheet, and where each column's tiles have their left upper corner on it."""
     title_font = ImageFont.load_default(TITLE_SIZE)
-    images = [[_enlarged(tile) for tile in tiles] for _, tiles in columns]
+    images = [[_captioned(tile) for tile in tiles] for _, tiles in columns]
     widths = [
         max(round(title_font.getlength(title) + 0.5), *(image.width for image in column))
         for (title, _), column in zip(columns, images, strict=True)
     ]
     heights = [max(image.height for image in row) for row in zip(*images, strict=True)]
-    size = (
-        2 * MARGIN + sum(widths) + GAP * (len(widths) - 1),
-        2 * MARGIN + TITLE_HEIGHT + sum(heights) + GAP * (len(heights) - 1),
-    )
-    sheet, left = Image.new("RGB", size, PAPER), MARGIN
-    for (title, _), column, width in zip(columns, images, widths, strict=True):
+    lefts, tops = _starts(MARGIN, widths), _starts(MARGIN + TITLE_HEIGHT, heights)
+    sheet = Image.new("RGB", (lefts[-1] + widths[-1] + MARGIN, tops[-1] + heights[-1] + MARGIN), PAPER)
+    for (title, _), column, left in zip(columns, images, lefts, strict=True):
         ImageDraw.Draw(sheet).text((left, MARGIN), title, INK, title_font)
-        top = MARGIN + TITLE_HEIGHT
-        for image, height in zip(column, heights, strict=True):
+        for image, top in zip(column, tops, strict=True):
             sheet.paste(image, (left, top))
-            top += height + GAP
-        left += width + GAP
-    return sheet
+    return sheet, [[(left, top) for top in tops] for left in lefts]
 
 
-def _enlarged(tile: Tile) -> Image.Image:
+def _starts(first: int, sizes: Sequence[int]) -> list[int]:
+    """Where things of these sizes begin, GAP apart."""
+    return [*accumulate((size + GAP for size in sizes[:-1]), initial=first)]
+
+
+def _enlarged(tile: Tile) -> Tile:
+    scale = -(-SIDE // tile.image.shape[1])
+    return Tile(tile.image.repeat(scale, 0).repeat(scale, 1), tile.caption)
+
+
+def _captioned(tile: Tile) -> Image.Image:
     """The tile's image over its caption, as wide as the wider of them."""
     font, image = ImageFont.load_default(CAPTION_SIZE), Image.fromarray(tile.image)
-    image = image.resize([side * -(-SIDE // image.width) for side in image.size], Image.Resampling.NEAREST)
     width = max([image.width, *(round(font.getlength(line) + 0.5) for line in tile.caption)])
     captioned = Image.new("RGB", (width, image.height + 2 + LINE_HEIGHT * len(tile.caption)), PAPER)
     captioned.paste(image)
