@@ -7,7 +7,7 @@ from train.comparison import difference, read_evaluations
 from train.photographs import figure_title, find_figure
 from train.photographs.figures import OVERALL
 from train.showcase.folders import Attack, Run
-from train.showcase.sections import count_fooled
+from train.showcase.sections import count_fooled, scored_on
 
 RATE = "recall_at/0.10"  # what tells discernment: recall at equal false alarms
 
@@ -20,10 +20,11 @@ def of_runs(arms: Mapping[str, Sequence[Run]], name: str) -> str:
     if not scored:
         accuracy = ", ".join(f"{arm} {group[0].summary.scores['test/accuracy']:.3f}" for arm, group in arms.items())
         return f"Asked: what do {len(arms)} ways of training reach on the test set? Answered: accuracy {accuracy}."
-    label = next(iter(scored.values()))[0].config.label
+    first = next(iter(scored.values()))[0]
+    label, where = first.config.label, scored_on(first, name)
     told = "; ".join(f"{arm} {_told(group[0].photographs[name])}" for arm, group in scored.items())
     return (
-        f"Asked: does a network trained in another way tell {label} from other things on {name}, and not only call "
+        f"Asked: does a network trained in another way tell {label} from other things on {where}, and not only call "
         f"more of them {label}? Answered, of the first seed of each arm: {told}{_difference(scored, name)}."
     )
 

@@ -1,74 +1,139 @@
 """One image for the first minute: what fooled, the network's answers, and how the arms fare."""
 
 import io
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
 
 from train.photographs import find_figure
 from train.report import RunSummary
 from train.showcase.blocks import Illustration
-from train.showcase.images import headline_tiles
+from train.showcase.images import turned
 from train.showcase.plots import COLOURS
+from train.showcase.sections import scored_on
+from train.specimens import Side
 
 EXAMPLES = 3
-FIGURES = {"recall": "recognised", "false_alarms": "false alarms", "auc": "AUC"}
+FIGURES = {"recall": "Recall", "false_alarms": "False alarms", "auc": "AUC"}
+WIDTH, DPI = 7.2, 200  # inches; a phone shows them in 360 CSS pixels, letters at half their size
+TOP, LINE = 1.4, 0.22  # inches: of titles and margins, and of a line of an arm's name beside its bar
+LONGEST_LINE, LONGEST_ANSWER, LONGEST_TITLE = 14, 9, 25  # characters; more are wrapped, or set smaller
+FONT = 14  # points
+LOOK = {"axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False, "font.size": FONT}
 
 
-def headline(runs: dict[str, RunSummary], photographs: str) -> Illustration | None:
-    """One run of each arm, by name; None where none keeps an example that was right before and wrong after."""
+@dataclass(frozen=True)
+class Score:
+    """A figure of an arm: the mean of its seeds and, of a single one, its interval."""
+
+    seeds: Sequence[float]
+    interval: tuple[float, float] | None
+
+    @property
+    def mean(self) -> float:
+        return fmean(self.seeds)
+
+
+Pairs = Sequence[tuple[Side, Side]]  # before and after
+Scores = Mapping[str, Mapping[str, Score]]  # by the figure's title and the arm's name
+
+
+def headline(arms: Mapping[str, Sequence[RunSummary]], photographs: str) -> Illustration | None:
+    """Of the runs of each arm by its name, with their scores in the sub-folder `photographs`.
+
+    None where no arm's first run keeps an example that was right before and wrong after.
+    """
+    pairs = next((found for group in reversed(arms.values()) if (found := turned(group[0].folder, EXAMPLES))), [])
+    if not pairs:
+        return None
+    first = next(iter(arms.values()))[0]
+    label, where = first.config.label, f"on {scored_on(first, photographs)}"
+    scores = {title: _scores(arms, photographs, name) for name, title in FIGURES.items()}
+    scores = {title: found for title, found in scores.items() if found}
+    answers = "; ".join(f"{_said(before)}, then {_said(after)}" for before, after in pairs)
+    alt = f"{label.capitalize()} before and after its light changed, called {answers}."
+    told = [f" {title} {where}: {_told(found)}." for title, found in scores.items()]
+    return Illustration(_drawn(pairs, scores, label, where), "png", "".join([alt, *told]), int(100 * WIDTH))
+
+
+def _scores(arms: Mapping[str, Sequence[RunSummary]], photographs: str, name: str) -> dict[str, Score]:
+    """Of the arms that have the figure."""
+    scores = {}
+    for arm, runs in arms.items():
+        found = [find_figure(run.photographs.get(photographs, {}), name) for run in runs]
+        if known := [figure for figure in found if figure.get("value") is not None]:
+            interval = (known[0]["low"], known[0]["high"]) if len(known) == 1 else None
+            scores[arm] = Score([figure["value"] for figure in known], interval)
+    return scores
+
+
+def _drawn(
+    pairs: Sequence[tuple[Side, Side]], scores: Mapping[str, Mapping[str, Score]], label: str, where: str
+) -> bytes:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    arms = list(runs.items())
-    tiles = next((found for _, run in reversed(arms) if (found := headline_tiles(run.folder, EXAMPLES))), [])
-    if not tiles:
-        return None
-    look = {"axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False}
-    with mpl.rc_context(look):
-        figure = Figure(figsize=(8.6, 3.6), layout="constrained", dpi=120)
-        left, right = figure.subfigures(1, 2, width_ratios=(1.1, 1))
-        _draw_tiles(left, tiles, arms[0][1].config.label)
-        axes = right.subplots()
-        _draw_bars(axes, arms, photographs)
-        right.legend(loc="outside lower center", ncols=3, frameon=False)
-        file = io.BytesIO()
+    lines = sum(len(textwrap.wrap(arm, LONGEST_LINE)) for found in scores.values() for arm in found)
+    file = io.BytesIO()
+    with mpl.rc_context(LOOK):
+        figure = Figure(figsize=(WIDTH, max(4.0, TOP + lines * LINE)), layout="constrained", dpi=DPI)
+        left, right = figure.subfigures(1, 2, width_ratios=(1.05, 1))
+        _draw_pairs(left, pairs, label)
+        if scores:
+            _draw_scores(right, scores, where)
         figure.savefig(file, format="png")
-    told = "; ".join(f"{name}: {_told(run, photographs)}" for name, run in arms)
-    alt = f"Renders before and after the light changed, with the network's answers; {told}"
-    return Illustration(file.getvalue(), "png", alt, 1032)
+    return file.getvalue()
 
 
-def _draw_tiles(figure, tiles: Sequence, label: str) -> None:
-    grid = figure.subplots(2, len(tiles), squeeze=False)
-    figure.suptitle(f"the same {label} before and after", fontsize=10)
-    for column, (before, said_before, after, said_after) in zip(grid.T, tiles, strict=True):
-        for axes, image, said, colour in (
-            (column[0], before, said_before, COLOURS[2]),
-            (column[1], after, said_after, COLOURS[1]),
-        ):
-            axes.imshow(image, interpolation="nearest")
+def _draw_pairs(figure, pairs: Pairs, label: str) -> None:
+    _draw_title(figure, f"One {label}, another light")
+    grid = figure.subplots(2, len(pairs), squeeze=False)
+    grid[0, 0].set_ylabel("before")
+    grid[1, 0].set_ylabel("after")
+    for column, pair in zip(grid.T, pairs, strict=True):
+        for axes, side, mark in zip(column, pair, "✓✗", strict=True):
+            axes.imshow(side.image.permute(1, 2, 0).numpy(), interpolation="nearest")
+            size = FONT * min(1, LONGEST_ANSWER / len(side.answer))
+            axes.set_xlabel(f"{side.answer}\n{mark} {side.confidence:.0%}", fontsize=size)
             axes.set(xticks=[], yticks=[])
-            axes.set_xlabel(said, color=colour)
-            for spine in axes.spines.values():
-                spine.set(visible=True, color=colour, linewidth=2)
+            axes.spines[:].set(visible=True, color="0.8")
 
 
-def _draw_bars(axes, arms: Sequence[tuple[str, RunSummary]], photographs: str) -> None:
-    thickness = 0.8 / len(arms)
-    for index, (name, run) in enumerate(arms):
-        figures = [find_figure(run.photographs.get(photographs, {}), figure) for figure in FIGURES]
-        for row, figure in enumerate(figures):
-            if figure.get("value") is None:
-                continue
-            at, value = row + (index - (len(arms) - 1) / 2) * thickness, figure["value"]
-            error = [[max(0, value - figure["low"])], [max(0, figure["high"] - value)]]
-            label = name if row == 0 else None
-            axes.barh(at, value, thickness * 0.9, xerr=error, color=COLOURS[index % len(COLOURS)], label=label)
-            axes.annotate(f"{value:.2f}", (min(1, figure["high"]) + 0.02, at), va="center", fontsize=9)
-    axes.set(xlim=(0, 1.15), xticks=(0, 0.5, 1), yticks=range(len(FIGURES)), yticklabels=FIGURES.values())
-    axes.invert_yaxis()
-    axes.set_title(f"{photographs}: one seed an arm, 95 % intervals", fontsize=9)
+def _draw_scores(figure, scores: Scores, where: str) -> None:
+    _draw_title(figure, where.capitalize())
+    most = max(len(score.seeds) for found in scores.values() for score in found.values())
+    note = "one seed, 95 % intervals" if most == 1 else f"means of up to {most} seeds, each a dot"
+    figure.supxlabel(note, color="0.35", fontsize=11)
+    grid = figure.subplots(len(scores), 1, sharex=True, squeeze=False)
+    for axes, (name, found) in zip(grid.flat, scores.items(), strict=True):
+        for row, score in enumerate(found.values()):
+            _draw_bar(axes, row, score)
+        axes.set(xlim=(0, 1.25), xticks=[], yticks=range(len(found)))
+        axes.set_yticklabels([textwrap.fill(arm, LONGEST_LINE) for arm in found])
+        axes.set_title(name, loc="left", fontsize=FONT)
+        axes.invert_yaxis()
+        axes.spines["bottom"].set_visible(False)
+        axes.tick_params(left=False)
 
 
-def _told(run: RunSummary, photographs: str) -> str:
-    found = {title: find_figure(run.photographs.get(photographs, {}), name) for name, title in FIGURES.items()}
-    return ", ".join(f"{title} {each['value']:.2f}" for title, each in found.items() if each.get("value") is not None)
+def _draw_title(figure, text: str) -> None:
+    size = (FONT + 1) * min(1, LONGEST_TITLE / len(text))
+    figure.suptitle(text, x=0.02, ha="left", weight="bold", fontsize=size)
+
+
+def _draw_bar(axes, row: int, score: Score) -> None:
+    axes.barh(row, score.mean, 0.75, color=COLOURS[row % len(COLOURS)])
+    if score.interval:
+        axes.hlines(row, *score.interval, color="0.1", linewidth=2)
+    else:
+        axes.plot(score.seeds, [row] * len(score.seeds), "o", ms=4, mfc="white", mec="0.1")
+    axes.annotate(f" {score.mean:.2f}", (max(*score.seeds, *(score.interval or [0])), row), va="center")
+
+
+def _said(side: Side) -> str:
+    return f"{side.answer} {side.confidence:.0%}"
+
+
+def _told(found: Mapping[str, Score]) -> str:
+    return ", ".join(f"{arm} {score.mean:.2f}" for arm, score in found.items())

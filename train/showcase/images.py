@@ -4,7 +4,6 @@ import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 from PIL import Image
 
 from renderer.errors import InputError
@@ -122,21 +121,13 @@ def attack_images(attack: Attack) -> Gallery:
     return Gallery("", shown)
 
 
-def headline_tiles(folder: Path, count: int) -> list[tuple[np.ndarray, str, np.ndarray, str]]:
-    """Images (H, W, 3) uint8 and answers, before and after, of a run's newest specimens that were right before."""
+def turned(folder: Path, count: int) -> list[tuple[Side, Side]]:
+    """Before and after, of the newest of a run's specimens that were called by their label before, and not after."""
     for _, path in reversed(first_middle_last([*(folder / "renders").glob(f"epoch_*{SUFFIX}")])):
         try:
             rows = read_specimens(path)
         except InputError:
             continue
-        turned = [(before, after) for label, before, after in rows if before.answer == label != after.answer]
-        if turned:
-            return [
-                tuple(part for side in sides for part in (side.image.permute(1, 2, 0).numpy(), _said(side)))
-                for sides in turned[:count]
-            ]
+        if found := [(before, after) for label, before, after in rows if before.answer == label != after.answer]:
+            return found[:count]
     return []
-
-
-def _said(side: Side) -> str:
-    return f"{side.answer}\n{side.confidence:.0%}"

@@ -180,6 +180,12 @@ def photographs_folder(run: RunSummary, name: str) -> Path | None:
     return Path(found) if isinstance(found, str) else None
 
 
+def scored_on(run: RunSummary, name: str) -> str:
+    """What the images are that a run was scored on, in the sub-folder `name`."""
+    own = OmegaConf.to_container(run.config).get("data", {}).get("images")
+    return "held-out renders" if own and photographs_folder(run, name) == Path(own) else name
+
+
 def _fooled(arms: Arms) -> Section:
     blocks = [gallery for arm, group in arms.items() for gallery in images.specimens(group[0].folder, arm)]
     return Section("Light that fooled", blocks)

@@ -31,7 +31,8 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     name = PHOTOGRAPHS if PHOTOGRAPHS in scored or not scored else scored[0]
     told = [answer.of_runs(arms, name)] if arms else []
     told += [answer.of_attacks(attacks)] if attacks else []
-    top = headline({arm: group[0].summary for arm, group in arms.items()}, name) if arms else None
+    summaries = {arm: [run.summary for run in group] for arm, group in arms.items()}
+    top = headline(summaries, name) if arms else None
     first = [*told, *([Gallery("", [top])] if top else []), *problems]
     parts = [Section("In short", first), *(sections.of_runs(runs) if runs else ()), *sections.of_attacks(attacks)]
     parts = [part for part in map(_without_empty, parts) if part.blocks]
