@@ -30,7 +30,7 @@ class DescentSettings:
     shorten: bool = False
     batch_size: int = 128
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range("attack: max_steps", self.max_steps, 0, 10**6)
         require_range("attack: batch_size", self.batch_size, 1, 10**6)
 

@@ -23,7 +23,7 @@ class NormBall:
     norm: str = "linf"
     radius: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.norm not in NORMS:
             raise InputError(f"attack: norm={self.norm}: choose one of {', '.join(NORMS)}")
         require_range("attack: radius", self.radius, 0, FACTOR)  # no limit: null

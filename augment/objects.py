@@ -21,7 +21,7 @@ class ObjectSettings:
     up: str = "auto"
     gain: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
 
 

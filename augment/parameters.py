@@ -34,7 +34,7 @@ class StepSettings:
     step: str = "unit"
     step_size: float = 0.05
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         NormBall(self.norm, self.radius)
         check_step(self.step, self.step_size, "attack: ")
 

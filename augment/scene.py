@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 import torch
@@ -334,7 +335,9 @@ class _Placed(torch.autograd.Function):
     """Covered pixels (B, 3, P) in their places on canvases (N, 3, size²), which are overwritten."""
 
     @staticmethod
-    def forward(ctx, canvas: Tensor, places: Sequence[tuple[list[int] | None, Tensor]], *covered: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, canvas: Tensor, places: Sequence[tuple[list[int] | None, Tensor]], *covered: Tensor
+    ) -> Tensor:
         ctx.places = places
         for (rows, pixels), values in zip(places, covered, strict=True):
             if rows is None:
@@ -346,7 +349,7 @@ class _Placed(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         return None, None, *(_taken(upstream, *place) for place in ctx.places)
 
 

@@ -39,7 +39,7 @@ class RandomLights:
     amplitude: float = 0.5
     radius: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("amplitude", "radius"):  # no radius: null
             require_range(f"augment.random.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
 
@@ -55,7 +55,7 @@ class TrainingAttackSettings(AttackSettings):
     step_size: float = 0.05
     batch_size: int = 128
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_step(self.step, self.step_size, "augment.attack.")
         self._light = StepSettings(step=self.step, step_size=self.step_size)
         super().__post_init__()
@@ -84,7 +84,7 @@ class AugmentationSettings:
     random: RandomLights = field(default_factory=RandomLights)
     attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, value, choices in [
             ("arm", self.arm, ARMS),
             ("start", self.start, STARTS),

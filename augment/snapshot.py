@@ -27,7 +27,7 @@ class SnapshotSettings:
     blur: float = 0.0
     noise: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, most in (("patterns", 1), ("white_balance", 5), ("blur", REACH / 2), ("noise", 1)):
             require_range(f"augment.vary.snapshot.{name}", getattr(self, name), 0, most)
         if len(self.ambient) != 2 or not 0 <= self.ambient[0] <= self.ambient[1] <= 1:

@@ -45,7 +45,7 @@ class VariationSettings:
     lit: bool = False
     snapshot: SnapshotSettings = field(default_factory=SnapshotSettings)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not 0 <= self.place <= 1:
             raise InputError(f"augment.vary.place={self.place} must be a share of the frame's width, from 0 to 1")
         require_range("augment.vary.turn", self.turn, 0, 180)

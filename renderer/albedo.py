@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ def _packed_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[_Texture]:
         return decoded.index_select(0, channels.long().flatten()).view(3, -1)
 
     packed = [torch.from_numpy(each).to(like.device) for each in mesh.packed_textures]
-    return [_Texture(*each.shape, partial(texels, each.flatten())) for each in packed]
+    return [_Texture(each.shape[0], each.shape[1], partial(texels, each.flatten())) for each in packed]
 
 
 def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], encoding: str) -> Tensor:
@@ -49,7 +49,10 @@ def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor]
     """
     for texture in textures:
         require_bounded(texture=texture)
-    rows = [_Texture(*each.shape[:2], partial(torch.index_select, each.flatten(0, 1).T, 1)) for each in textures]
+    rows = [
+        _Texture(each.shape[0], each.shape[1], partial(torch.index_select, each.flatten(0, 1).T, 1))
+        for each in textures
+    ]
     return _albedo(mesh, fragments, rows, encoding)
 
 
@@ -79,7 +82,7 @@ def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, gain: float,
         texels = [
             (weight.to(added), colors[here] * texture.texels(at).T) for weight, at in _taps(texture, uvs[:, here])
         ]
-        value = sum(weight[:, None] * _within(texel + there[here], texel) for weight, texel in texels)
+        value = reduce(torch.add, (weight[:, None] * _within(texel + there[here], texel) for weight, texel in texels))
         albedo = albedo.index_copy(0, here, value)
     return albedo
 
@@ -131,7 +134,7 @@ def _bilinear(texture: _Texture, uvs: Tensor) -> Tensor:
     """
     blocks = []
     for block in uvs.split(BLOCK, dim=1):
-        blocks.append(sum(weight * texture.texels(index) for weight, index in _taps(texture, block)))
+        blocks.append(reduce(torch.add, (weight * texture.texels(index) for weight, index in _taps(texture, block))))
     return torch.cat(blocks, dim=1)
 
 

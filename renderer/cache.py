@@ -4,6 +4,8 @@ A file is a checksum and then the tensors in the safetensors format. It is parse
 of any kind means that it is made anew, as does any change to the renderer's code.
 """
 
+from __future__ import annotations
+
 import hashlib
 import os
 import tempfile
@@ -47,12 +49,12 @@ def content_key(*parts: object) -> str:
     return digest.hexdigest()
 
 
-def _feed(digest, part: object) -> None:
+def _feed(digest: hashlib._Hash, part: object) -> None:
     if is_dataclass(part):
         part = (type(part).__name__, *(getattr(part, field.name) for field in fields(part)))
     if isinstance(part, np.ndarray):
         digest.update(f"{part.dtype.str}{part.shape};".encode())
-        digest.update(np.ascontiguousarray(part))
+        digest.update(np.ascontiguousarray(part).data)
     elif isinstance(part, tuple | list):
         digest.update(f"{len(part)} parts;".encode())
         for item in part:

@@ -23,7 +23,7 @@ class OrthographicCamera:
     right: float = 0.0
     up: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")

@@ -10,6 +10,7 @@ shade with albedo / π where this project leaves out the π: a strength of π gi
 
 import math
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -85,7 +86,9 @@ def write_map(path: Path, radiance: Tensor) -> None:
 
 def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     try:
-        array = np.lib.format.open_memmap(path, mode="r")  # so that no header makes room for more than the file holds
+        array: np.ndarray = np.lib.format.open_memmap(
+            path, mode="r"
+        )  # so that no header makes room for more than the file holds
         if array.dtype.kind not in "fiu" or not array.size:
             raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
         with np.errstate(over="ignore"):  # beyond float32 is infinite, and refused as such
@@ -149,7 +152,7 @@ def _color_channels(path: Path, names: tuple[str, ...]) -> list[int]:
     )
 
 
-def _openimageio(path: Path):
+def _openimageio(path: Path) -> ModuleType:
     try:
         import OpenImageIO
     except ImportError as error:

@@ -6,6 +6,7 @@ Rasterised once and then held fixed, while light, albedo or the positions of the
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -93,15 +94,16 @@ class Fragments:
 
     def to(self, device: torch.device | str) -> "Fragments":
         """The same on another device."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return replace(self, **{name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)})
+        values = ((field.name, getattr(self, field.name)) for field in fields(self))
+        moved: dict[str, Any] = {name: value.to(device) for name, value in values if isinstance(value, Tensor)}
+        return replace(self, **moved)
 
 
 class _Interpolation(torch.autograd.Function):
     """Values (D, S) of corners' (3 D, G), all of a corner together, by blocks of samples that stay in the cache."""
 
     @staticmethod
-    def forward(ctx, corners: Tensor, face: Tensor, weights: Tensor) -> Tensor:
+    def forward(ctx: Any, corners: Tensor, face: Tensor, weights: Tensor) -> Tensor:
         ctx.save_for_backward(face, weights)
         ctx.corners = corners.shape
         values = corners.new_empty(len(corners) // 3, len(face))
@@ -112,7 +114,7 @@ class _Interpolation(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:
         face, weights = ctx.saved_tensors
         by_corners = upstream.new_zeros(ctx.corners)
         for above, index, weight in _blocks(upstream, face, weights.to(upstream)):
@@ -147,7 +149,7 @@ def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settin
     hits = np.flatnonzero(by_pixel >= 0)
     seen, face = _compact(by_pixel[hits], len(faces))
     if samples == 1:  # a sample is a pixel
-        pixels, pixel, counts = hits, np.arange(len(hits)), np.ones(len(hits))
+        pixels, pixel, counts = hits, np.arange(len(hits)), np.ones(len(hits), dtype=np.int64)
     else:
         pixels, pixel = _compact(hits // samples**2, size**2)
         counts = np.bincount(pixel, minlength=len(pixels))

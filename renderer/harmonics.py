@@ -7,7 +7,7 @@ angles, so it stays exact at the poles, where the paper's (appendix B.1) derivat
 import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -69,14 +69,14 @@ def _over(gradient: Tensor, length: Tensor, dtype: torch.dtype) -> Tensor:
 
 class _Basis(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, directions: Tensor, degree: int) -> Tensor:
+    def forward(ctx: Any, directions: Tensor, degree: int) -> Tensor:
         ctx.save_for_backward(directions)
         ctx.degree = degree
         unit, _ = unit_vectors(directions.double().movedim(-1, 0))
         return torch.stack(select_rows(unit, range((degree + 1) ** 2)), dim=-1).to(directions.dtype)
 
     @staticmethod
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         (directions,) = ctx.saved_tensors
         tangential, length = _tangential_gradient(directions, ctx.degree)
         summed = torch.einsum("...k,...kd->...d", upstream.double(), tangential)
@@ -86,13 +86,13 @@ class _Basis(torch.autograd.Function):
 def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
     """The harmonics with these indices, (...) each, of unit vectors (3, ...): `basis` for inner loops, unchecked."""
     x, y, z = unit
-    rows = dict.fromkeys(indices)
-    degree = math.isqrt(max(rows, default=0))
+    wanted, rows = dict.fromkeys(indices), {}
+    degree = math.isqrt(max(wanted, default=0))
     cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # Re and Im of (x + iy)^m, times √2 where m > 0
     for m in range(degree + 1):
         for l, legendre in zip(range(m, degree + 1), _legendre(z, m, degree), strict=True):
             for index, circular in ((l * l + l - m, sine), (l * l + l + m, cosine)):
-                if index in rows:
+                if index in wanted:
                     rows[index] = circular * legendre
         if m == 0:
             cosine = cosine * math.sqrt(2)
@@ -100,7 +100,7 @@ def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
             torch.addcmul(x * cosine, y, sine, value=-1),
             torch.addcmul(x * sine, y, cosine),
         )
-    return list(rows.values())
+    return [rows[index] for index in wanted]
 
 
 def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:

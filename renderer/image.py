@@ -1,6 +1,7 @@
 """Radiance to image: background, clamp and encoding, in one place and last, since clamping is not linear."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,7 +29,7 @@ class ImageSettings:
     normals: str = "flat"
     transport: str = "direct"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.size < 1 or self.samples < 1:
             raise InputError(f"renderer.samples={self.samples} and the size {self.size} must be at least 1")
         if self.size * self.samples > MOST_SAMPLES:
@@ -110,7 +111,7 @@ def clamp(values: Tensor, ceiling: Tensor | float = 1.0) -> Tensor:
 
 class _Clamp(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, values: Tensor, ceiling: Tensor | float) -> Tensor:
+    def forward(ctx: Any, values: Tensor, ceiling: Tensor | float) -> Tensor:
         clamped = values.clamp(min=0).clamp_(max=ceiling)
         # As numbers: with booleans, comparison and product take several times as long.
         ctx.save_for_backward(torch.eq(values, clamped, out=torch.empty_like(values)))
@@ -118,7 +119,7 @@ class _Clamp(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         (passing,) = ctx.saved_tensors
         return upstream * passing, None
 

@@ -30,5 +30,5 @@ def light_sphere(light: Tensor, size: int, camera: OrthographicCamera = _OBLIQUE
     normals = torch.stack([right, up, back.sqrt()], dim=-1)[inside] @ torch.from_numpy(camera.axes())
     radiance = torch.zeros(3, side, side, dtype=torch.float64)
     radiance[:, inside] = irradiance(normals, light.detach().cpu()) / math.pi
-    layers = [avg_pool2d(layer, _SAMPLES).flatten(1) for layer in (radiance, inside[None].double())]
-    return develop(*layers, background=torch.ones(1, 1), encoding="srgb").unflatten(1, (size, size)).float()
+    radiance, coverage = (avg_pool2d(layer, _SAMPLES).flatten(1) for layer in (radiance, inside[None].double()))
+    return develop(radiance, coverage, background=torch.ones(1, 1), encoding="srgb").unflatten(1, (size, size)).float()

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+from numpy.typing import ArrayLike
 from PIL import Image
 from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
@@ -46,7 +47,7 @@ class Mesh:
     textures: tuple[np.ndarray, ...] = ()
 
     @staticmethod
-    def plain(vertices, faces, color=(1.0, 1.0, 1.0)) -> Mesh:
+    def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
         """An untextured mesh. `color` is one RGB (3,) or one per vertex (V, 3), sRGB-encoded in [0, 1]."""
         vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
         vertex_colors = np.broadcast_to(np.asarray(color, dtype=np.float32), vertices.shape)

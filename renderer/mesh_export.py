@@ -1,8 +1,9 @@
 """Meshes as files: .glb with colours, textures, normals and cameras, .ply with colours and normals."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +36,8 @@ def export_mesh(
     their own in linear light: between them the texture is lost, unless the mesh is subdivided.
     InputError where the suffix is another or the file cannot be written.
     """
-    path, writers = Path(path), {".glb": partial(_glb, cameras=cameras), ".ply": _ply}
+    path = Path(path)
+    writers: dict[str, Callable[[Mesh, np.ndarray], bytes]] = {".glb": partial(_glb, cameras=cameras), ".ply": _ply}
     if path.suffix.lower() not in writers:
         raise InputError(f"{path} is no name for a mesh to write: give one that ends in {', '.join(writers)}")
     try:
@@ -88,7 +90,7 @@ def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int) -> trimesh.
     )
 
 
-def _as_one_mesh(tree: dict, cameras: Sequence[OrthographicCamera]) -> None:
+def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[OrthographicCamera]) -> None:
     """One node with the parts as primitives, in order, and colours of full precision: trimesh's own have 8 bits, too
     few for dark linear ones. A node for each camera."""
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
@@ -102,7 +104,7 @@ def _as_one_mesh(tree: dict, cameras: Sequence[OrthographicCamera]) -> None:
     tree["scenes"] = [{"nodes": list(range(len(tree["nodes"])))}]
 
 
-def _gltf_camera(camera: OrthographicCamera) -> dict:
+def _gltf_camera(camera: OrthographicCamera) -> dict[str, Any]:
     half = camera.field_of_view / 2
     return {
         "type": "orthographic",
@@ -110,7 +112,7 @@ def _gltf_camera(camera: OrthographicCamera) -> dict:
     }
 
 
-def _camera_node(camera: OrthographicCamera, index: int) -> dict:
+def _camera_node(camera: OrthographicCamera, index: int) -> dict[str, Any]:
     """Where a camera stands, y up; it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
     pose = np.eye(4)
     pose[:3, :3] = camera.axes().T

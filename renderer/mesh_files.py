@@ -8,8 +8,9 @@ import io
 import json
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 from PIL import Image
@@ -22,7 +23,7 @@ LIBRARY, USED = (re.compile(rf"^[ \t]*{key}[ \t]+(.*?)[ \t\r]*$", re.MULTILINE) 
 IMAGE = re.compile(r"^comment[ \t]+TextureFile[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
 
 
-class Companions(Resolver):
+class Companions(Resolver):  # type: ignore[misc]  # trimesh counts as untyped, see pyproject.toml
     """What lies beside a mesh, by the names that its file has for it. Regular files alone: a pipe would never end."""
 
     def __init__(self, path: Path):
@@ -38,7 +39,7 @@ class Companions(Resolver):
         names = [name for line in LIBRARY.findall(text) for name in ([line] if self._find(line) else line.split())]
         for name in names:
             self.materials += decoded(self.read(name)) + "\n"
-            self._folders.append(self._find(name).parent)
+            self._folders.append(self._locate(name).parent)
         return f"mtllib {MATERIALS}\n{text}" if names else text
 
     def get(self, name: str) -> bytes | str:
@@ -46,13 +47,17 @@ class Companions(Resolver):
 
     def read(self, name: str) -> bytes:
         """A file's content. InputError where it is not there or cannot be read."""
-        file = self._find(name)
-        if file is None:
-            raise InputError(f"{self.path} names {name}, which is not there: put it beside, or take its name out")
+        file = self._locate(name)
         try:
             return file.read_bytes()
         except OSError as error:
             raise InputError(f"{self.path} names {file}, which cannot be read: {error.strerror}") from error
+
+    def _locate(self, name: str) -> Path:
+        file = self._find(name)
+        if file is None:
+            raise InputError(f"{self.path} names {name}, which is not there: put it beside, or take its name out")
+        return file
 
     def _find(self, name: str) -> Path | None:
         """By a name that another system may have written: \\ for /, %20 for a blank, or in a folder of its own.
@@ -88,7 +93,8 @@ def open_mesh(path: Path) -> tuple[io.BytesIO, Companions]:
 
     InputError otherwise; KeyError, ValueError and the like for a damaged glTF file.
     """
-    content, companions, images = path.read_bytes(), Companions(path), ()
+    content, companions = path.read_bytes(), Companions(path)
+    images: Iterable[tuple[str, bytes]] = ()
     match path.suffix.lower():
         case ".obj":
             text = companions.add_materials(decoded(content))
@@ -142,7 +148,7 @@ def _gltf_images(content: bytes, read: Callable[[str], bytes]) -> Iterator[tuple
         content, binary = content[20 : 20 + length], content[28 + length :]
     tree = json.loads(content)
 
-    def data(source: dict) -> bytes:
+    def data(source: dict[str, Any]) -> bytes:
         if "bufferView" in source:
             view = tree["bufferViews"][source["bufferView"]]
             start = view.get("byteOffset", 0)

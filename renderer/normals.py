@@ -4,6 +4,8 @@ Computed in float64 and, for slivers, with the rounding errors of differences an
 normal of a face of height 1e-6 is off by 0.01 rad, and a plain float64 one of height 1e-12 by 1e-4.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -49,7 +51,7 @@ def area_vectors(vertices: Tensor, faces: Tensor) -> Tensor:
 
 class _AreaVectors(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, vertices: Tensor, faces: Tensor) -> Tensor:
+    def forward(ctx: Any, vertices: Tensor, faces: Tensor) -> Tensor:
         corners = vertices.index_select(0, faces.T.flatten()).T.contiguous().double().unflatten(1, (3, -1))
         edges = corners[:, 1:] - corners[:, :1]
         scale = _power_of_two(edges) if vertices.dtype == torch.float64 else edges.new_ones(())  # room enough
@@ -64,7 +66,7 @@ class _AreaVectors(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         faces, first, second, scale = ctx.saved_tensors
         shape, dtype = ctx.vertices
         by_second, by_third = _cross(second, upstream), _cross(upstream, first)
@@ -77,14 +79,14 @@ class _Unit(torch.autograd.Function):
     """Vectors (3, N) at unit length, with a gradient of zero where the vector is zero."""
 
     @staticmethod
-    def forward(ctx, vectors: Tensor) -> Tensor:
+    def forward(ctx: Any, vectors: Tensor) -> Tensor:
         unit, length = unit_vectors(vectors)
         ctx.save_for_backward(unit, length)
         return unit
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> Tensor:
+    def backward(ctx: Any, upstream: Tensor) -> Tensor:
         unit, length = ctx.saved_tensors
         tangential = upstream - unit * (unit * upstream).sum(0)
         return tangential / length.masked_fill(length == 0, torch.inf)

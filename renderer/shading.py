@@ -6,6 +6,7 @@ sees how normals turn and not how outlines move. For the light alone, `renderer.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -81,7 +82,7 @@ class _Irradiance(torch.autograd.Function):
     """Finds value and slope together, and keeps the slope for the backward pass: three numbers a channel."""
 
     @staticmethod
-    def forward(ctx, normals: Tensor, light: Tensor) -> Tensor:
+    def forward(ctx: Any, normals: Tensor, light: Tensor) -> Tensor:
         unit, length = unit_vectors(normals)
         unit, polynomial = unit.to(light.dtype), _Polynomial.of(light)
         blocks = zip(*map(polynomial, unit.split(BLOCK, dim=1)), strict=True)
@@ -96,7 +97,7 @@ class _Irradiance(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
         unit, length, slope = ctx.saved_tensors
         by_normal = by_light = None
         if ctx.needs_input_grad[0]:

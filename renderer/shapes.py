@@ -10,12 +10,13 @@ back to the axis, counter-clockwise around the solid's half section.
 """
 
 import colorsys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
 from renderer.errors import InputError
 from renderer.mesh import Mesh, concatenate
@@ -253,7 +254,8 @@ def fruit(rng: np.random.Generator) -> Mesh:
         for turn in (0, rng.uniform(-0.1, 0.1))
     ]
     weight = 0.5 + 0.3 * _ripples(rng, directions, rng.uniform(0.3, 2.0)) + 0.1 * pores
-    return Mesh.plain(0.95 * vertices / np.abs(vertices).max(), sphere.faces, _mix(*map(np.array, shades), weight))
+    first, second = map(np.array, shades)
+    return Mesh.plain(0.95 * vertices / np.abs(vertices).max(), sphere.faces, _mix(first, second, weight))
 
 
 SOLIDS: dict[str, Callable[[np.random.Generator], Mesh]] = {
@@ -266,7 +268,7 @@ LOOK_ALIKES: dict[str, Callable[[np.random.Generator], Mesh]] = {
 }
 
 
-def _revolve(*strokes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _revolve(*strokes: np.ndarray | Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3), faces (F, 3) and the stroke (F,) of each face, around the profile drawn in strokes."""
     corners = np.concatenate(strokes)
     stroke_of_corner = np.repeat(np.arange(len(strokes)), [len(stroke) for stroke in strokes])
@@ -332,13 +334,13 @@ def _surface_of_cells(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices, corners.reshape(-1, 4)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
 
 
-def _paint(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, *paints) -> Mesh:
+def _paint(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, *paints: ArrayLike) -> Mesh:
     """A mesh whose faces of part i have the colour paints[i]: one RGB (3,) or one per vertex (V, 3)."""
     colors = np.stack([np.broadcast_to(paint, vertices.shape) for paint in paints]).astype(np.float32)
     return replace(Mesh.plain(vertices, faces), corner_colors=colors[part[:, None], faces])
 
 
-def _arc(centre, radii, start: float, stop: float) -> np.ndarray:
+def _arc(centre: ArrayLike, radii: ArrayLike, start: float, stop: float) -> np.ndarray:
     """Profile rows (13, 2) along an ellipse, from and to an angle in degrees above the horizontal."""
     angle = np.radians(np.linspace(start, stop, 13))[:, None]
     return np.array(centre) + radii * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
@@ -357,11 +359,11 @@ def _ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) ->
     return np.cos(points @ directions + phases).sum(axis=1) / 4
 
 
-def _choose(rng: np.random.Generator, *colors) -> np.ndarray:
+def _choose(rng: np.random.Generator, *colors: tuple[float, float, float]) -> np.ndarray:
     """One of the RGB colours, a little off."""
     return np.clip(rng.choice(colors) + rng.uniform(-0.04, 0.04, 3), 0, 1)
 
 
-def _mix(from_color, to_color, weight) -> np.ndarray:
+def _mix(from_color: np.ndarray, to_color: ArrayLike, weight: np.ndarray) -> np.ndarray:
     """(V, 3) colours between two, RGB (3,) or (V, 3) each; weight (V,) or a number is clipped to [0, 1]."""
     return from_color + np.clip(weight, 0, 1)[..., None] * (np.asarray(to_color) - from_color)

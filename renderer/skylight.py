@@ -12,6 +12,7 @@ after Habel et al. 2008).
 import math
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -143,7 +144,7 @@ class _FittedSky(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, zenith: Tensor, azimuth: Tensor, turbidity: Tensor, fit: Tensor) -> Tensor:
+    def forward(ctx: Any, zenith: Tensor, azimuth: Tensor, turbidity: Tensor, fit: Tensor) -> Tensor:
         in_zenith, by_zenith = _chebyshev(4 / math.pi * zenith - 1, 4 / math.pi, len(fit))
         in_turbidity, by_turbidity = _chebyshev(5 / turbidity - 1.5, -5 / turbidity**2, fit.shape[1])
         left = torch.stack([in_zenith, by_zenith, in_zenith])
@@ -160,7 +161,7 @@ class _FittedSky(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         return *((upstream * partial).sum((-2, -1)) for partial in ctx.saved_tensors), None
 
 

@@ -8,6 +8,7 @@ radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactl
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -110,13 +111,13 @@ class Operator:
 
 class _Radiance(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, lights: Tensor, operator: Operator) -> Tensor:
+    def forward(ctx: Any, lights: Tensor, operator: Operator) -> Tensor:
         ctx.operator = operator
         return _radiance(operator, lights)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         return ctx.operator.light_gradient(upstream), None
 
 

@@ -24,7 +24,7 @@ class Interruption:
     ignored, and they reach its main thread alone: in another one, none is noted.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._number: int | None = None
         self._before = {}
 

@@ -93,7 +93,7 @@ class TrainSettings:
     checkpoint_every: int = 1
     resume: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         choices_of = {"schedule": SCHEDULES, "flips": FLIPS, "distortion": DISTORTIONS, "compile": COMPILE}
         for name, choices in choices_of.items():
             if getattr(self, name) not in choices:

@@ -47,7 +47,7 @@ class DataSettings:
     seed: int = 0
     images: str | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range("data.size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
         require_range("data.seed", self.seed, 0, LARGEST_SEED)
         for name in ("train_per_class", "test_per_class"):
@@ -70,7 +70,7 @@ class SceneSettings:
     light: str = "grace"
     exposure: float = 1.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
         require_range("scene.views", self.views, 1, MOST_VIEWS)
         require_range("scene.vertices", self.vertices, 0, MOST_VERTICES)
@@ -138,7 +138,7 @@ class EvaluationSettings:
     photos: Any = None  # str | dict[str, str] | None, a union that OmegaConf has no type for
     skip_unreadable: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         given = self.photos
         named = isinstance(given, dict) and all(isinstance(folder, str) for folder in given.values())
         if not (given is None or isinstance(given, str) or named):
@@ -174,7 +174,7 @@ class ExperimentSettings:
     train: TrainSettings = field(default_factory=TrainSettings)
     evaluate: EvaluationSettings = field(default_factory=EvaluationSettings)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)
         if self.augment.renders:
             _ = self.views  # fails on an inconsistent product before any data is read

@@ -142,7 +142,7 @@ def _one_outcome(callback: Callable) -> Callable:
 class SweepReport(Callback):
     """Checks a sweep before its first cell, and ends it with a table; exit status 1 where a cell is not finished."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.folders: list[Path] = []
         self._handler = signal.SIG_DFL
 

@@ -36,7 +36,7 @@ class AttackSettings:
     restarts: int = 0
     batch_size: int = 32
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.lighting and self.skylight:
             raise InputError("attack: lighting and skylight both set the light: choose one of them")
         require_range("attack.restarts", self.restarts, 0, 10**6)

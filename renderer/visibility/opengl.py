@@ -61,7 +61,7 @@ def _context() -> Iterator[moderngl.Context]:
     import moderngl
 
     try:
-        context = moderngl.create_context(standalone=True, backend="egl")
+        context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]  # annotated as though a dict
     except Exception as error:  # moderngl raises no narrower class
         raise InputError("no EGL device: apt install libegl1 libgl1, or renderer.visibility=software") from error
     try:

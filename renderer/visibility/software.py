@@ -136,7 +136,7 @@ def _parts(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     ends = np.cumsum(counts)
     starts, begin, done = ends - counts, 0, 0
     while begin < len(counts):
-        end = max(begin + 1, np.searchsorted(ends, done + PARTS, side="right"))
+        end = max(begin + 1, int(np.searchsorted(ends, done + PARTS, side="right")))
         whole = np.repeat(np.arange(begin, end), counts[begin:end])
         yield whole, np.arange(done, done + len(whole)) - starts.take(whole)
-        begin, done = end, ends[end - 1]
+        begin, done = end, int(ends[end - 1])

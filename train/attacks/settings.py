@@ -25,7 +25,7 @@ class AttackSceneSettings(SceneSettings):
     backgrounds: list = field(default_factory=lambda: [0.5])
     views: int = 1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.meshes or not self.backgrounds:
             raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
         super().__post_init__()
@@ -46,5 +46,5 @@ class AttackExperimentSettings:
     scene: AttackSceneSettings = field(default_factory=AttackSceneSettings)
     renderer: RendererSettings = field(default_factory=RendererSettings)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)

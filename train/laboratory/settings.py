@@ -30,7 +30,7 @@ class LabSettings:
     bounces: int = 4
     seed: int = 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if unknown := [name for name in self.patterns if name not in FAMILIES]:
             raise InputError(f"patterns: {unknown[0]!r} is not known: choose from {', '.join(FAMILIES)}")
         if not self.patterns or self.lights < 1 or self.lights % len(self.patterns):

@@ -23,7 +23,7 @@ class AccuracySettings:
     size: int
     slivers: int
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, least, most in [("degree", 1, 20), ("subdivisions", 0, 9), ("size", 1, 16384), ("slivers", 1, 10**4)]:
             require_range(name, getattr(self, name), least, most)
 

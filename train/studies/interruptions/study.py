@@ -39,7 +39,7 @@ class InterruptionSettings:
     jobs: int
     keep: str | None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, least in [("kills", 0), ("signals", 0), ("draws", 0), ("epochs", 1), ("seed", 0), ("jobs", 1)]:
             require_range(name, getattr(self, name), least, 10**6)
 

@@ -144,7 +144,7 @@ class Attack:
 class Stopwatch:
     """Adds up the process time of a descent's passes through the classifier; see `augment.phases.Phases`."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.seconds = 0.0
 
     @contextmanager

@@ -30,7 +30,7 @@ class ReliabilitySettings:
     seed: int
     doors: list[str]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range("draws", self.draws, 1, 10**6)
         require_range("seed", self.seed, 0, 10**6)
         if unknown := set(self.doors) - BY_NAME.keys():

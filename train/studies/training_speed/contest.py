@@ -38,7 +38,7 @@ class BenchmarkSettings:
     steps: int | None = None
     workers: int | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, least, most in (("epochs", 1, 10**6), ("steps", 0, 10**6), ("workers", 0, 1024)):
             require_range(name, getattr(self, name), least, most)
 
