@@ -6,8 +6,9 @@ from renderer.errors import InputError
 from train.comparison import difference, read_evaluations
 from train.photographs import figure_title, find_figure
 from train.photographs.figures import OVERALL
-from train.showcase.folders import Attack, Run
-from train.showcase.sections import count_fooled, scored_on
+from train.showcase.attacks import Attack
+from train.showcase.folders import Run
+from train.showcase.sections import scored_on
 
 RATE = "recall_at/0.10"  # what tells discernment: recall at equal false alarms
 
@@ -55,8 +56,8 @@ def _difference(scored: Mapping[str, Sequence], name: str) -> str:
 
 
 def of_attacks(attacks: Sequence[Attack]) -> str:
-    fooled, total = sum(map(count_fooled, attacks)), sum(len(attack.examples) for attack in attacks)
-    before = sum(bool(line.get("fooled_before")) for attack in attacks for line in attack.examples)
+    fooled, total = sum(attack.fooled for attack in attacks), sum(len(attack.examples) for attack in attacks)
+    before = sum(attack.fooled_before for attack in attacks)
     wrong = f", {before} more being wrong before any step" if before else ""
     draws = [share for attack in attacks if isinstance(share := attack.checks.get("random_search"), int | float)]
     random = f"; random search with as many tries fools {sum(draws) / len(draws):.0%}" if draws else ""

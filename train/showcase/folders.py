@@ -1,6 +1,5 @@
 """What lies in folders: runs, whatever became of them, and attacks. Nothing in them breaks a report."""
 
-import json
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -13,9 +12,9 @@ from train import checkpoint
 from train.logs import METRICS, read_metrics
 from train.report import RunSummary, is_finished, summarise
 from train.run_folder import CONFIG, FAILURE, state
+from train.showcase.attacks import Attack, read_attack
 
 DEPTH = 4  # folders below the one that is named
-LARGEST_ATTACK = 2**24  # bytes of attack.jsonl
 
 
 @dataclass(frozen=True)
@@ -26,15 +25,6 @@ class Run:
     state: str
     summary: RunSummary | None = None
     epochs: list[dict[str, float]] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Attack:
-    """An attack's folder: a dictionary for each example and, last, the checks where they were made."""
-
-    folder: Path
-    examples: list[dict]
-    checks: dict
 
 
 def find(folders: Sequence[Path]) -> tuple[list[Run], list[Attack], list[str]]:
@@ -51,7 +41,7 @@ def find(folders: Sequence[Path]) -> tuple[list[Run], list[Attack], list[str]]:
     for path in found:
         if (path / LINES).is_file():
             try:
-                attacks.append(_read_attack(path))
+                attacks.append(read_attack(path))
             except InputError as error:
                 problems.append(str(error))
     if not (runs or attacks or problems):
@@ -86,22 +76,3 @@ def _read_run(folder: Path) -> Run:
         return Run(folder, f"cannot be read: {error}")
     except OSError as error:  # the lock, in a folder that others own
         return Run(folder, f"not finished ({error.strerror})")
-
-
-def _read_attack(folder: Path) -> Attack:
-    path = folder / LINES
-    try:
-        if path.stat().st_size > LARGEST_ATTACK:
-            raise ValueError("it is too large")
-        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        examples = [line for line in lines if "example" in line]
-        for line in examples:
-            if not all(isinstance(line[key], list) for key in ("label", "answer", "confidence")):
-                raise ValueError("an answer is no list")
-            float(sum(line["confidence"])), int(line["example"]), int(line["steps"]), bool(line["fooled"])
-        checks = next((line["checks"] for line in lines if "checks" in line), {})
-        if not isinstance(checks, dict):
-            raise ValueError("the checks are no object")
-        return Attack(folder, examples, checks)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-        raise InputError(f"{path} is damaged or no file of an attack ({' '.join(str(error).split())})") from error

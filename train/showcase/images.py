@@ -1,4 +1,4 @@
-"""Small images from the files of runs and attacks; what cannot be read is left out."""
+"""Small images from the files of runs; what cannot be read is left out."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -13,13 +13,11 @@ from renderer.tiles import Tile
 from train.photographs.answers import Answer
 from train.photographs.contact_sheet import caption, evenly
 from train.showcase.blocks import Gallery, Illustration
-from train.showcase.folders import Attack
 from train.specimens import SUFFIX, Side, read_specimens
 
 TILE, SPHERE = 96, 64  # pixels
 TILES = 8  # photographs of each kind
-WIDEST = 720  # pixels of a grid of renders, 1100 of an attack's image
-EXAMPLES = 6  # of an attack
+WIDEST = 720  # pixels of a grid of renders
 
 
 def encoded(image: Image.Image, alt: str, width: int, text: str = "") -> Illustration:
@@ -107,18 +105,6 @@ def _photograph(answer: Answer, folder: Path) -> list[Illustration]:
         return []
     said = " / ".join(caption(answer))
     return [encoded(Image.fromarray(square), f"{answer.photograph.label}, called {said}", TILE, said)]
-
-
-def attack_images(attack: Attack) -> Gallery:
-    """Before, after, their difference and the lights, of examples drawn evenly."""
-    shown = []
-    for line in evenly(attack.examples, EXAMPLES) if attack.examples else []:
-        example, answer = int(line["example"]), ", ".join(map(str, line["answer"]))
-        alt = f"Example {example}: before, after, their difference and the lights; called {answer} in the end"
-        fooled = "wrong before any step" if line.get("fooled_before") else "fooled" if line["fooled"] else "not fooled"
-        outcome = f"example {example}: {fooled}, {int(line['steps'])} steps"
-        shown += from_file(attack.folder / f"example_{example:03d}.png", alt, 1100, outcome)
-    return Gallery("", shown)
 
 
 def turned(folder: Path, count: int) -> list[tuple[Side, Side]]:

@@ -1,10 +1,9 @@
-"""What is told of runs and attacks, in order."""
+"""What is told of runs, in order."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
-import yaml
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
@@ -16,15 +15,14 @@ from train.photographs.figures import OVERALL, pool_answers
 from train.photographs.ranking import Ranking
 from train.photographs.roc import rank_pools
 from train.report import RunSummary, group_by_settings, headline_tables, name_among, spread_tables
-from train.run_folder import CONFIG, read_config
 from train.showcase import images, plots
 from train.showcase.blocks import Block, Code, Gallery, Illustration, Section
-from train.showcase.command import attack_command, training_command
-from train.showcase.folders import Attack, Run
+from train.showcase.command import training_command
+from train.showcase.folders import Run
 from train.tables import Table
 
 MOST_ARMS, MOST_SEEDS = 6, 5  # that are drawn and compared; all are in the tables of means
-MOST_ROWS, MOST_ATTACKS = 30, 12
+MOST_ROWS = 30
 LONGEST_NAME = 36  # characters
 Arms = Mapping[str, Sequence[Run]]
 
@@ -196,40 +194,3 @@ def _reproduction(arms: Arms) -> Section:
     commands = "\n\n".join(f"# {arm}\n{training_command(run.config)}" for arm, run in heads.items())
     configs = [Code(f"configuration: {arm}", OmegaConf.to_yaml(run.config)) for arm, run in heads.items()]
     return Section("To reproduce", [Code("commands", commands), *configs] if heads else [])
-
-
-def of_attacks(attacks: Sequence[Attack]) -> Iterator[Section]:
-    for attack in attacks[:MOST_ATTACKS]:
-        header = ["example", "label", "answer", "confidence", "fooled", "steps"]
-        rows = [
-            [
-                line["example"],
-                ", ".join(map(str, line["label"])),
-                ", ".join(map(str, line["answer"])),
-                ", ".join(f"{share:.1%}" for share in line["confidence"]),
-                bool(line["fooled"]),
-                line["steps"],
-            ]
-            for line in attack.examples[:MOST_ROWS]
-        ]
-        checks = [[name, value] for name, value in attack.checks.items() if not isinstance(value, dict)]
-        tables = [Table("", header, rows), *([Table("Checks", ["what", "value"], checks)] if checks else [])]
-        blocks = [images.attack_images(attack), *tables, *_attack_reproduction(attack)]
-        yield Section(f"Attack {attack.folder.parent.name}/{attack.folder.name}", blocks)
-    if others := attacks[MOST_ATTACKS:]:
-        told = "\n".join(f"{each.folder}: {count_fooled(each)} of {len(each.examples)} fooled" for each in others)
-        yield Section("Further attacks", [Code(f"{len(others)} more", told)])
-
-
-def count_fooled(attack: Attack) -> int:
-    """Without those that were wrong before any step."""
-    return sum(bool(line["fooled"]) and not line.get("fooled_before") for line in attack.examples)
-
-
-def _attack_reproduction(attack: Attack) -> list[Block]:
-    try:
-        config = read_config(attack.folder.parent / CONFIG)
-        command = attack_command(config)
-    except (InputError, AttributeError, yaml.YAMLError):
-        return []
-    return [Code("command", command), Code("configuration", OmegaConf.to_yaml(config))]

@@ -11,6 +11,7 @@ from pathlib import Path
 from train.cli import one_sentence
 from train.settings import PHOTOGRAPHS
 from train.showcase import answer, sections
+from train.showcase.attacks import sections as attack_sections
 from train.showcase.blocks import Block, Code, Gallery, Illustration, Section
 from train.showcase.folders import find
 from train.showcase.headline import headline
@@ -34,7 +35,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     summaries = {arm: [run.summary for run in group] for arm, group in arms.items()}
     top = headline(summaries, name) if arms else None
     first = [*told, *([Gallery("", [top])] if top else []), *problems]
-    parts = [Section("In short", first), *(sections.of_runs(runs) if runs else ()), *sections.of_attacks(attacks)]
+    parts = [Section("In short", first), *(sections.of_runs(runs) if runs else ()), *attack_sections(attacks)]
     parts = [part for part in map(_without_empty, parts) if part.blocks]
     done = sum(run.summary is not None for run in runs)
     about = f"{done} of {len(runs)} runs finished, {len(attacks)} attacks"
