@@ -21,7 +21,7 @@ from renderer.normals import vertex_normals
 
 # glTF's names for colours and normals after an underscore, under which trimesh writes any attribute.
 _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
-_DISTANCE = 4.0  # of a file's cameras from the origin, in world units: that of an orthographic one shows nowhere
+DISTANCE = 4.0  # of a file's cameras from the origin, in world units: that of an orthographic one shows nowhere
 
 
 def export_mesh(
@@ -108,7 +108,7 @@ def _gltf_camera(camera: OrthographicCamera) -> dict[str, Any]:
     half = camera.field_of_view / 2
     return {
         "type": "orthographic",
-        "orthographic": {"xmag": half, "ymag": half, "znear": _DISTANCE - 2, "zfar": _DISTANCE + 2},
+        "orthographic": {"xmag": half, "ymag": half, "znear": DISTANCE - 2, "zfar": DISTANCE + 2},
     }
 
 
@@ -116,7 +116,7 @@ def _camera_node(camera: OrthographicCamera, index: int) -> dict[str, Any]:
     """Where a camera stands, y up; it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
     pose = np.eye(4)
     pose[:3, :3] = camera.axes().T
-    pose[:3, 3] = camera.axes().T @ [-camera.right, -camera.up, _DISTANCE]
+    pose[:3, 3] = camera.axes().T @ [-camera.right, -camera.up, DISTANCE]
     return {"camera": index, "name": f"view {index}", "matrix": (Y_UP_TO_Z_UP.T @ pose).T.ravel().tolist()}
 
 

@@ -6,35 +6,42 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from augment.attacks.adversary_folder import read_adversary
 from augment.parameters import KINDS
 from renderer.errors import InputError
-from train.attacks.experiment import attack_mesh
+from renderer.visibility import choose
+from train.attacks.experiment import attacks
 from train.attacks.settings import AttackExperimentSettings
-from train.attacks.text import format_attack
+from train.attacks.text import format_attack, format_reloaded
 from train.cli import one_sentence_errors, script
 from train.device import choose_device
 from train.outputs import writable_folder
 from train.run_classifier import load_classifier
 from train.run_folder import sole_writer
-from train.settings import read_object, read_settings
+from train.settings import read_settings
 
 
 def main(config: DictConfig) -> None:
     config = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     settings = read_settings(AttackExperimentSettings, config)
-    settings.attack.require_kinds()
+    adversary = read_adversary(Path(settings.reload)) if settings.reload else None
+    if adversary is None:
+        settings.attack.require_kinds()
     device = choose_device(settings.device)
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
+    if adversary is not None:
+        images = adversary.render(choose(settings.renderer.visibility)).to(device)
+        print(format_reloaded(adversary, images, classifier))
+        if not settings.attack.kinds:
+            return
     out = writable_folder(settings.out, "out")
     with sole_writer("out", out):
-        for index, item in enumerate(settings.scene.meshes):
-            named = read_object(item, settings.label, index)
-            attacked = attack_mesh(named, settings, classifier, device)
+        for index, (name, attacked) in enumerate(attacks(settings, classifier, device, adversary)):
             checks = attacked.check() if settings.attack.checks else None
-            folder = out / f"{index}_{Path(named.mesh.replace(':', '_')).stem}"
-            attacked.save(folder, checks)
-            print(format_attack(named.mesh, attacked, checks))
-            print(f"images, lights, shapes and numbers: {folder}\n")
+            folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
+            verdicts = attacked.save(folder, checks, settings.attack.renderers)
+            print(format_attack(name, attacked, checks, verdicts))
+            print(f"images, adversaries and numbers: {folder}\n")
         OmegaConf.save(config, out / "config.yaml")
 
 
@@ -50,6 +57,12 @@ def _several_kinds(argument: str) -> str:
     return f"attack=[{','.join(names)}]"
 
 
+def _arguments(given: list[str]) -> list[str]:
+    """As Hydra reads them; what is reloaded is not attacked, unless that is asked for."""
+    keys = {argument.partition("=")[0] for argument in given}
+    return [*map(_several_kinds, given), *(["attack=[]"] if "reload" in keys and "attack" not in keys else [])]
+
+
 if __name__ == "__main__":
-    sys.argv[1:] = [_several_kinds(argument) for argument in sys.argv[1:]]
+    sys.argv[1:] = _arguments(sys.argv[1:])
     script(main)

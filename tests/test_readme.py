@@ -59,7 +59,9 @@ def test_attack_a_classifier(folder, capsys):
     assert 0 < float((names["lights"] - attacked.problem.scene.lights).norm()) <= 1 + 1e-5
     assert attacked.result.cost < attacked.result.cost_before
     (line,) = [json.loads(line) for line in (folder / "adversaries" / "attack.jsonl").read_text().splitlines()]
-    assert line["fooled"] == bool(attacked.success) and (folder / "adversaries" / "example_000_light.hdr").is_file()
+    assert (
+        line["fooled"] == bool(attacked.success) and (folder / "adversaries" / "example_000" / "light.json").is_file()
+    )
 
 
 class Photographs(Dataset):

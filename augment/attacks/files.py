@@ -1,42 +1,53 @@
-"""What an attack leaves behind: images, lights, shapes, and all numbers as JSON lines."""
+"""What an attack leaves behind: an image and a folder for each example, and all numbers as JSON lines."""
 
 import json
-from collections.abc import Iterator
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from augment.attacks.adversary import Adversary
+from augment.attacks.adversary_folder import write_adversary
 from augment.attacks.checks import Checks
 from augment.attacks.figure import Exhibit, answer_caption, save_figure
 from augment.attacks.run import Attacked
+from augment.attacks.verification import Verdict, verify
 from augment.scene import Conditions
-from renderer.environment import to_map, write_map
 from renderer.light_sphere import light_sphere
-from renderer.lights import save_light
 from renderer.mesh_damage import mesh_damage
-from renderer.mesh_export import export_mesh
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
-MAP_HEIGHT = 256
 SPHERE = 192
 
 
-def write_files(attacked: Attacked, checks: Checks | None, folder: Path) -> None:
-    """Write a folder: attack.jsonl, and for each example an image and the light and shape that it ended with."""
+def write_files(
+    attacked: Attacked, checks: Checks | None, folder: Path, renderers: Sequence[str] = ("reload",)
+) -> list[Verdict]:
+    """Write a folder: attack.jsonl and, for each example, an image and the adversary as a folder of its own.
+
+    renderers: what is to render the adversaries anew from these; see `verify`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     everything = attacked.problem.everything
     before = attacked.problem.conditions(attacked.problem.start, everything)
     after = attacked.problem.conditions(attacked.result.values, everything)
+    stems = [folder / f"example_{example:03d}" for example in everything.tolist()]
+    lines = []
+    for example, stem in enumerate(stems):
+        _write_image(attacked, before, after, example, stem.with_suffix(".png"))
+        images = attacked.images_before[example], attacked.images[example]
+        light = write_adversary(Adversary.of(attacked.problem.scene, example, after, *images), stem)
+        lines.append({"example": example, **_numbers(attacked, example), **light, **_damage(attacked, after, example)})
+    verdicts = verify(attacked, stems, renderers)
     with open(folder / LINES, "w", encoding="utf-8") as file:
-        for example in range(len(everything)):
-            stem = folder / f"example_{example:03d}"
-            _write_image(attacked, before, after, example, stem.with_suffix(".png"))
-            numbers = _numbers(attacked, example) | dict(_write_conditions(attacked, after, example, stem))
-            file.write(json.dumps({"example": example, **numbers}) + "\n")
+        for example, line in enumerate(lines):
+            survives = {each.version: each.of(example, attacked.classifier.classes) for each in verdicts}
+            file.write(json.dumps({**line, "versions": survives}) + "\n")
         if checks is not None:
             file.write(json.dumps({"checks": asdict(checks), "warnings": checks.warnings}) + "\n")
+    return verdicts
 
 
 def _write_image(attacked: Attacked, before: Conditions, after: Conditions, example: int, path: Path) -> None:
@@ -86,16 +97,10 @@ def _numbers(attacked: Attacked, example: int) -> dict:
     }
 
 
-def _write_conditions(attacked: Attacked, after: Conditions, example: int, stem: Path) -> Iterator[tuple[str, object]]:
-    """What can be used elsewhere: the light, if it was attacked, and the shape."""
-    scene, light = attacked.problem.scene, after.light[example].detach().cpu()
-    mesh = scene.mesh(example)
-    if not torch.equal(light, scene.lights[example].cpu()):
-        save_light(stem.with_name(stem.name + "_light.json"), light)
-        write_map(stem.with_name(stem.name + "_light.hdr"), to_map(light, MAP_HEIGHT))
-    if after.vertices is not None:
-        vertices = after.vertices[example, : len(mesh.vertices)].detach().cpu().double().numpy()
-        for suffix in (".glb", ".ply"):
-            path, shape = stem.with_name(stem.name + "_shape" + suffix), replace(mesh, vertices=vertices)
-            export_mesh(shape, path, scene.settings.normals, scene.cameras[example])
-        yield "shape", asdict(mesh_damage(mesh.vertices, vertices, mesh.faces))
+def _damage(attacked: Attacked, after: Conditions, example: int) -> dict[str, dict]:
+    """What became of the shape, where it was attacked."""
+    mesh = attacked.problem.scene.mesh(example)
+    if after.vertices is None:
+        return {}
+    vertices = after.vertices[example, : len(mesh.vertices)].detach().cpu().double().numpy()
+    return {"shape": asdict(mesh_damage(mesh.vertices, vertices, mesh.faces))}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +24,7 @@ from renderer.errors import InputError
 
 if TYPE_CHECKING:
     from augment.attacks.checks import Checks
+    from augment.attacks.verification import Verdict
 
 
 @dataclass(frozen=True)
@@ -80,11 +82,16 @@ class Attacked:
 
         return check(self, self.settings.descent(), self.seed)
 
-    def save(self, folder: str | Path, checks: Checks | None = None) -> None:
-        """Write a folder: attack.jsonl and, for each example, an image of before and after, its light and its shape."""
+    def save(
+        self, folder: str | Path, checks: Checks | None = None, verify: Sequence[str] = ("reload",)
+    ) -> list[Verdict]:
+        """Write a folder: attack.jsonl and, for each example, an image of before and after and a folder with all of it.
+
+        verify: "reload", "mitsuba" or both render these anew; what became of the adversaries is returned.
+        """
         from augment.attacks.files import write_files
 
-        write_files(self, checks, Path(folder))
+        return write_files(self, checks, Path(folder), verify)
 
 
 def attack(

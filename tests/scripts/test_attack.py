@@ -44,46 +44,66 @@ def run(monkeypatch, tmp_path) -> Callable[..., int]:
     return command
 
 
-LIGHT, SHAPE = ["_light.hdr", "_light.json"], ["_shape.glb", "_shape.ply"]
-KINDS = {
-    "lighting": LIGHT,
-    "skylight": LIGHT,
-    "geometry": SHAPE,
-    "albedo": [],
-    "pixels": [],
-    "lighting+geometry": LIGHT + SHAPE,
-    "[albedo,pixels]": [],
-}
+ALWAYS = {
+    "adversary.json", "mesh.glb", "light.json", "before_0.png", "after_0.png", "before.npy", "after.npy",
+    "mitsuba/scene.xml", "mitsuba/part_0.ply", "mitsuba/light.exr",
+}  # fmt: skip
+KINDS = ["lighting", "skylight", "geometry", "albedo", "pixels", "lighting+geometry", "[albedo,pixels]"]
 
 
-@pytest.mark.parametrize(("kinds", "endings"), KINDS.items(), ids=KINDS)
-def test_every_kind_and_several_at_once_run_and_write_what_they_promise(run, tmp_path, capsys, kinds, endings):
+@pytest.mark.parametrize("kinds", KINDS)
+def test_every_kind_and_several_at_once_run_and_write_what_they_promise(run, tmp_path, capsys, kinds):
     assert run(f"attack={kinds}") == 0
     printed = capsys.readouterr()
     names = kinds.strip("[]").replace(",", "+")
     assert printed.err == "" and printed.out.startswith(f"solid:orange:0: {names} against run:")
     folder = tmp_path / "out" / "0_solid_orange_0"
-    expected = ["attack.jsonl", *(f"example_000{ending}" for ending in [".png", *endings])]
-    assert sorted(path.name for path in folder.iterdir()) == sorted(expected)
+    assert {path.name for path in folder.iterdir()} == {"attack.jsonl", "example_000.png", "example_000"}
+    files = {str(path.relative_to(folder / "example_000")) for path in (folder / "example_000").rglob("*.*")}
+    maps = {"light.hdr", "light.exr"} if example_is_physical(folder) else set()
+    assert files == ALWAYS | maps | ({"pixels.npy"} if "pixels" in kinds else set())
     example, last = map(json.loads, (folder / "attack.jsonl").read_text().splitlines())
     assert list(example["largest_change"]) == names.split("+")
     assert all(example["largest_change"].values()) and ("shape" in example) == ("geometry" in names)
     assert example["cost"] < example["cost_before"]
+    assert example["versions"]["reload"]["largest_difference"] <= 1 / 255
     assert 0 <= last["checks"]["random_search"] <= 1 and last["checks"]["cost_fell"] == 1
     assert set(OmegaConf.load(tmp_path / "out" / "config.yaml").attack) >= set(names.split("+"))
 
 
+def example_is_physical(folder: Path) -> bool:
+    line, *_ = (folder / "attack.jsonl").read_text().splitlines()
+    return json.loads(line)["negative_light"] < 1e-6
+
+
 def test_each_mesh_has_a_folder_and_what_was_written_is_attacked_again(run, tmp_path, capsys):
     assert run("attack=lighting+geometry", "attack.checks=false") == 0
-    first = tmp_path / "out" / "0_solid_orange_0"
-    light, shape = (first / f"example_000{ending}" for ending in ("_light.json", "_shape.glb"))
+    first = tmp_path / "out" / "0_solid_orange_0" / "example_000"
+    light, shape = first / "light.json", first / "mesh.glb"
     assert load_light(str(light)).shape == (49, 3) and len(load_mesh(shape).faces) > 0
     meshes = f"scene.meshes=[{shape},{{mesh: 'solid:orange:0', label: apple}}]"
     assert run("attack=pixels", "out=again", meshes, f"scene.light={light}", "attack.checks=false") == 0
     folders = {path.name for path in (tmp_path / "again").iterdir() if path.is_dir()}
-    assert folders == {"0_example_000_shape", "1_solid_orange_0"}
+    assert folders == {"0_mesh", "1_solid_orange_0"}
     (line,) = (tmp_path / "again" / "1_solid_orange_0" / "attack.jsonl").read_text().splitlines()
     assert json.loads(line)["label"] == ["apple"]
+
+
+def test_an_adversary_is_rendered_again_and_gone_on_from(run, tmp_path, capsys):
+    assert run("attack=lighting+geometry+albedo", "attack.checks=false", "scene.views=2", "attack.shared=true") == 0
+    first = tmp_path / "out" / "0_solid_orange_0"
+    line = json.loads((first / "attack.jsonl").read_text())
+    capsys.readouterr()
+    assert run(f"reload={first / 'example_000'}", "out=none") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert not (tmp_path / "none").exists() and len(lines) == 2
+    for view, (told, answer, confidence) in enumerate(zip(lines, line["answer"], line["confidence"], strict=True)):
+        assert told.startswith(f"view {view}: orange is taken for {answer} ({confidence:.1%}); values differ ")
+        assert float(told.rpartition("by ")[2].partition("/255")[0]) <= 1
+    assert run(f"reload={first / 'example_000'}", "attack=lighting", "attack.checks=false", "out=again") == 0
+    again = json.loads((tmp_path / "again" / "0_solid_orange_0" / "attack.jsonl").read_text())
+    assert again["answer_before"] == line["answer"]
+    assert again["cost_before"] == pytest.approx(line["cost"], abs=0.05)
 
 
 REFUSED = [
@@ -98,6 +118,8 @@ REFUSED = [
     (["label=ornage"], "has no class 'ornage': choose one, such as orange"),
     (["target=[apple,pear]", "attack.shared=true"], "target=['apple', 'pear'] names 2 classes for 1 views"),
     (["classifier=alexnet"], "classifier=alexnet is not known: choose one of "),
+    (["attack.verify=blender"], "attack.verify=blender: choose from reload, mitsuba, or null"),
+    (["reload=absent"], "absent/adversary.json does not exist: give a folder that an attack wrote"),
     (["label=apple", "attack.force=false"], "of solid:orange:0 are not recognised as 'apple' before any attack"),
 ]
 

@@ -1,15 +1,33 @@
 """An attack from its configuration: scene, criterion, and what is changed."""
 
+from collections.abc import Iterator
+
 import torch
 
+from augment.attacks.adversary import Adversary
 from augment.attacks.criteria import Criterion, LeastLikely, Misclassification, Targeted
 from augment.attacks.run import Attacked, attack
 from augment.build import build_scene
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
+from renderer.errors import InputError
+from renderer.visibility import choose
 from train.attacks.settings import AttackExperimentSettings
+from train.settings import read_object
 
 LEAST_LIKELY = "least_likely"
+
+
+def attacks(
+    settings: AttackExperimentSettings, classifier: Classifier, device: torch.device, adversary: Adversary | None = None
+) -> Iterator[tuple[str, Attacked]]:
+    """(name, what came of it) for an adversary to go on from or, without one, for each mesh."""
+    if adversary is not None:
+        yield adversary.shown.name, attack_adversary(adversary, settings, classifier, device)
+        return
+    for index, item in enumerate(settings.scene.meshes):
+        named = read_object(item, settings.label, index)
+        yield named.mesh, attack_mesh(named, settings, classifier, device)
 
 
 def attack_mesh(
@@ -30,6 +48,18 @@ def attack_mesh(
     )
     wanted, force = criterion(settings.target), settings.attack.force
     return attack(classifier, scene, wanted, settings.attack, seed=settings.seed, force=force)
+
+
+def attack_adversary(
+    adversary: Adversary, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
+) -> Attacked:
+    """Go on from an adversary that was read back; norm-balls are around where it is."""
+    if adversary.pixels is not None:
+        raise InputError(
+            "reload: this adversary's pixels were changed, from which no attack goes on: leave attack= out"
+        )
+    scene = adversary.scene(choose(settings.renderer.visibility), device)
+    return attack(classifier, scene, criterion(settings.target), settings.attack, seed=settings.seed, force=True)
 
 
 def criterion(target: object) -> Criterion:

@@ -4,17 +4,31 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from augment.attacks.settings import AttackSettings
+from augment.attacks.verification import require_renderers
 from renderer.errors import InputError, require_range
 from train.settings import LARGEST_SEED, RendererSettings, SceneSettings
 
 
 @dataclass
 class AttackCommandSettings(AttackSettings):
-    """shared: the views share what is attacked. force: go on where nothing is recognised. checks: see `Checks`."""
+    """shared: the views share what is attacked. force: go on where nothing is recognised. checks: see `Checks`.
+
+    verify: what renders the adversaries anew from their files, "reload" or "mitsuba" or both joined by +; or None.
+    """
 
     shared: bool = False
     force: bool = False
     checks: bool = True
+    verify: str | None = "reload"
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_renderers(self.renderers)
+
+    @property
+    def renderers(self) -> list[str]:
+        """Those of `verify`."""
+        return self.verify.split("+") if self.verify else []
 
 
 @dataclass
@@ -33,7 +47,8 @@ class AttackSceneSettings(SceneSettings):
 
 @dataclass
 class AttackExperimentSettings:
-    """One attack on one classifier. target: None, a class, least_likely, or a class per view."""
+    """One attack on one classifier. target: None, a class, least_likely, or a class per view. reload: an adversary's
+    folder, to render or to attack instead of the scene."""
 
     classifier: str = "efficientnet_lite0"
     weights: str | None = None
@@ -41,6 +56,7 @@ class AttackExperimentSettings:
     target: Any = None
     seed: int = 0
     out: str = ""
+    reload: str | None = None
     device: str = "auto"
     attack: AttackCommandSettings = field(default_factory=AttackCommandSettings)
     scene: AttackSceneSettings = field(default_factory=AttackSceneSettings)

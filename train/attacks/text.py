@@ -1,11 +1,18 @@
 """An attack's outcome as text for the terminal."""
 
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from augment.attacks.adversary import Adversary
 from augment.attacks.checks import Checks
-from augment.attacks.run import Attacked
+from augment.attacks.run import Attacked, logits_of
+from augment.attacks.verification import Verdict
+from augment.classifiers import Classifier
 from train.photographs.shares import share
 
 
-def format_attack(mesh: str, attacked: Attacked, checks: Checks | None) -> str:
+def format_attack(mesh: str, attacked: Attacked, checks: Checks | None, verdicts: Sequence[Verdict] = ()) -> str:
     """A paragraph on one mesh's attack, without a newline at the end."""
     result = attacked.result
     kinds = "+".join(kind.name for kind in attacked.problem.kinds)
@@ -23,7 +30,18 @@ def format_attack(mesh: str, attacked: Attacked, checks: Checks | None) -> str:
             f"fooled by as many random draws: {checks.random_search:.0%}; by longer attacks: {by_steps} steps",
             *(f"warning: {warning}" for warning in checks.warnings),
         ]
+    fooled = attacked.success & attacked.recognised
+    lines += [_survival(verdict, fooled) for verdict in verdicts if fooled.any()]
     return "\n".join(lines)
+
+
+def _survival(verdict: Verdict, fooled: Tensor) -> str:
+    """How many of the adversaries fool in another version, and how far its values are from theirs, of 255."""
+    largest, mean = 255 * verdict.largest[fooled].max(), 255 * verdict.mean[fooled].mean()
+    return (
+        f"{verdict.version}: {int(verdict.fooled[fooled].sum())} of {int(fooled.sum())} still fool; "
+        f"values differ by {mean:.2g}/255 on average, {largest:.2g}/255 at most"
+    )
 
 
 def _success(attacked: Attacked) -> str:
@@ -38,3 +56,16 @@ def _success(attacked: Attacked) -> str:
         text += f", {int(views.sum())} of {views.numel()} views"
     wrong = int((~recognised).sum())
     return text + (f"; {wrong} not recognised before, which do not count" if wrong else "")
+
+
+def format_reloaded(adversary: Adversary, images: Tensor, classifier: Classifier) -> str:
+    """A line per view: what an adversary's images (V, 3, size, size), rendered anew, are taken for."""
+    best = logits_of(classifier, images[None], len(images))[0].softmax(1).max(1)
+    off = 255 * (images - adversary.images.to(images)).abs().flatten(1).amax(1)
+    return "\n".join(
+        f"view {view}: {adversary.shown.label} is taken for {classifier.classes[index]} ({confidence:.1%}); "
+        f"values differ from the saved image's by {largest:.2g}/255 at most"
+        for view, (index, confidence, largest) in enumerate(
+            zip(best.indices.tolist(), best.values.tolist(), off.tolist(), strict=True)
+        )
+    )

@@ -1,15 +1,13 @@
 """A shot's scene, path-traced by Mitsuba 3: an object on a table, a projector, weak light from everywhere."""
 
 from collections.abc import Sequence
-from contextlib import contextmanager
 
 import numpy as np
 
-from renderer.errors import InputError
+from renderer.mitsuba_scene import mitsuba
 from train.laboratory.props import Part
 from train.laboratory.shots import FIELD_OF_VIEW, Shot
 
-VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
 ROUGHNESS = 0.5  # of the objects' surface: a soft gloss, as peel has
 THROW = 2.6  # half of the width that the projector lights where it aims, in world units
 FLOOR = 100.0  # half of the table's width
@@ -21,7 +19,7 @@ def photograph(parts: Sequence[Part], shot: Shot, size: int, samples: int, bounc
     The projector and the surroundings are rendered one by one and added: with both in one scene each path would draw
     which of them to look at, which is most of the noise. InputError: Mitsuba is not installed.
     """
-    with _mitsuba() as mi:
+    with mitsuba() as mi:
         surroundings = {"type": "constant", "radiance": _rgb(shot.ambient)}
         still = {
             "type": "scene",
@@ -36,22 +34,6 @@ def photograph(parts: Sequence[Part], shot: Shot, size: int, samples: int, bounc
         }
         scenes = [mi.load_dict({**still, "light": light}) for light in (_projector(mi, shot), surroundings)]
         return sum(np.array(mi.render(scene, spp=samples, seed=seed)) for scene in scenes)
-
-
-@contextmanager
-def _mitsuba():
-    """The module under our variant; that of before, if any, comes back."""
-    try:
-        import mitsuba
-    except ImportError as error:
-        raise InputError("the laboratory needs Mitsuba, which is not installed: pip install '.[lab]'") from error
-    before = mitsuba.variant()
-    mitsuba.set_variant(VARIANT)
-    try:
-        yield mitsuba
-    finally:
-        if before:
-            mitsuba.set_variant(before)
 
 
 def _sensor(mi, shot: Shot, size: int) -> dict:

@@ -56,7 +56,7 @@ def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifi
     attacked.save(tmp_path / "new", checks)
     *lines, last = [json.loads(line) for line in (tmp_path / "new" / "attack.jsonl").read_text().splitlines()]
     assert lines[0]["largest_change"].keys() == kinds.keys() and last["checks"]["random_search"] == checks.random_search
-    shape = load_mesh(tmp_path / "new" / "example_000_shape.glb")
+    shape = load_mesh(tmp_path / "new" / "example_000" / "mesh.glb")
     assert len(shape.faces) == len(scene.mesh(0).faces)
 
 

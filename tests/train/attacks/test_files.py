@@ -7,10 +7,10 @@ import pytest
 import torch
 import trimesh
 from hydra import compose, initialize_config_module
-from PIL import Image
 
+from augment.attacks.adversary_folder import MAP_HEIGHT
 from augment.attacks.checks import check
-from augment.attacks.files import LINES, MAP_HEIGHT, write_files
+from augment.attacks.files import LINES, write_files
 from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
 from augment.descent import DescentSettings
@@ -62,33 +62,31 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(tmp_path):
         assert line["largest_change"] == {"lighting": change} and change > 0
 
 
-def test_the_light_is_read_back_to_the_bit_and_as_a_map_to_its_precision(tmp_path):
-    done = attacked("scene.backgrounds=[0.4,0.6]")
-    written(done, tmp_path)
-    for example in range(2):
-        stem, light = f"example_{example:03d}", done.result.values[example].unflatten(0, (49, 3))
-        assert torch.equal(load_light(str(tmp_path / f"{stem}_light.json")), light)
-        expected = to_map(light, MAP_HEIGHT).double()
-        found = read_map(tmp_path / f"{stem}_light.hdr").double()
-        # A channel has 8 bits of the texel's largest; what is below zero cannot be told.
-        step = expected.clamp(min=0).amax(2, keepdim=True) / 128
-        positive = expected.clamp(min=0)
-        assert found.shape == (MAP_HEIGHT, 2 * MAP_HEIGHT, 3)
-        assert ((found - positive).abs() <= step + 1e-6).all()
-        with Image.open(tmp_path / f"{stem}.png") as sheet:
-            assert min(sheet.size) > 100
+def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_physical(tmp_path):
+    """`st_peters` is positive all round and stays so within a small ball; `grace` is negative in places."""
+    for light, physical in [("st_peters", True), ("grace", False)]:
+        done = attacked(f"scene.light={light}", "attack.lighting.radius=0.001", "scene.exposure=2")
+        (line,) = written(done, tmp_path / light)
+        folder, values = tmp_path / light / "example_000", done.result.values[0].unflatten(0, (49, 3))
+        assert torch.equal(load_light(str(folder / "light.json")), values)
+        expected = to_map(values, MAP_HEIGHT).float()
+        assert (line["negative_light"] < 1e-6) == physical == (expected.min() >= 0).item()
+        assert (folder / "light.hdr").is_file() == (folder / "light.exr").is_file() == physical
+        torch.testing.assert_close(read_map(folder / "mitsuba" / "light.exr"), expected.clamp(min=0), rtol=0, atol=0)
+    found = read_map(tmp_path / "st_peters" / "example_000" / "light.hdr")
+    expected = read_map(tmp_path / "st_peters" / "example_000" / "light.exr")
+    # A channel has 8 bits of the texel's largest.
+    assert ((found - expected).abs() <= expected.amax(2, keepdim=True) / 128).all()
 
 
-@pytest.mark.parametrize(("suffix", "up"), [(".glb", "auto"), (".ply", "z")])
-def test_the_shape_is_read_back_where_the_attack_left_it(tmp_path, suffix, up):
+def test_the_shape_is_read_back_where_the_attack_left_it(tmp_path):
     done = attacked("attack=[geometry]")
     (line,) = written(done, tmp_path)
     mesh = done.problem.scene.mesh(0)
-    moved = mesh.vertices + done.result.values[0].unflatten(0, (-1, 3)).double().numpy()
-    found = load_mesh(tmp_path / f"example_000_shape{suffix}", up=up)
-    # Half of float32's step below 1, and the file's axes are turned exactly.
-    np.testing.assert_allclose(found.vertices[found.faces], moved[mesh.faces], rtol=0, atol=2**-23)
-    damage = mesh_damage(mesh.vertices, moved, mesh.faces)
+    moved = done.problem.scene.vertices[0] + done.result.values[0].unflatten(0, (-1, 3))
+    found = load_mesh(tmp_path / "example_000" / "mesh.glb")
+    np.testing.assert_array_equal(found.vertices[found.faces], moved.double().numpy()[mesh.faces])
+    damage = mesh_damage(mesh.vertices, moved.double().numpy(), mesh.faces)
     assert line["shape"] == {
         "flipped": damage.flipped,
         "degenerate": damage.degenerate,
@@ -98,13 +96,31 @@ def test_the_shape_is_read_back_where_the_attack_left_it(tmp_path, suffix, up):
 
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
-def test_the_shapes_file_has_the_normals_that_the_renderer_shades_with_and_the_view(tmp_path, normals):
+def test_the_meshs_file_has_the_normals_that_the_renderer_shades_with_and_the_view(tmp_path, normals):
     done = attacked("attack=[geometry]", f"renderer.normals={normals}")
     written(done, tmp_path)
-    scene = trimesh.load(tmp_path / "example_000_shape.glb", process=False)
-    (part,) = scene.geometry.values()
+    path = tmp_path / "example_000" / "mesh.glb"
+    (part,) = trimesh.load(path, process=False).geometry.values()
     turns = np.linalg.norm(part.vertex_normals[part.faces] - part.face_normals[:, None], axis=2)
     assert (turns.max() < 1e-4) == (normals == "flat")  # float32 positions of faces a thousandth wide
-    blob = (tmp_path / "example_000_shape.glb").read_bytes()
+    blob = path.read_bytes()
     tree = json.loads(blob[20 : 20 + int.from_bytes(blob[12:16], "little")])
     assert [node["name"] for node in tree["nodes"] if "camera" in node] == ["view 0"]
+
+
+def test_every_line_has_each_versions_answer(tmp_path):
+    done = attacked("scene.backgrounds=[0.4,0.6]")
+    lines = written(done, tmp_path)
+    for example, line in enumerate(lines):
+        assert set(line["versions"]) == {"8 bits", "JPEG 90", "reload"}
+        rounded = (done.images[example] * 255).round() / 255
+        answer = CLASSES[rounded.mean((0, 2, 3)).argmax()]
+        off = (rounded - done.images[example]).abs()
+        assert line["versions"]["8 bits"] == {
+            "fooled": answer != "orange",
+            "answer": [answer],
+            "confidence": [pytest.approx((30 * rounded.mean((2, 3))).softmax(1).max().item(), abs=1e-5)],
+            "largest_difference": pytest.approx(off.max().item(), abs=1e-7),
+            "mean_difference": pytest.approx(off.mean().item(), abs=1e-7),
+        }
+        assert line["versions"]["reload"]["largest_difference"] < 1e-5

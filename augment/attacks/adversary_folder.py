@@ -1,0 +1,131 @@
+"""An adversary as a folder: adversary.json, which describes it, and the files that it names.
+
+mesh.glb has normals, albedo and cameras; light.json all coefficients; light.hdr and light.exr are there where a lamp
+could shine so, which is where radiance is negative nowhere. Images are before_0.png, after_0.png, ... by view, and
+before.npy, after.npy (V, 3, size, size) unrounded. mitsuba/scene.xml shows it in Mitsuba 3.
+"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from augment.attacks.adversary import Adversary
+from augment.backgrounds import load_background
+from augment.objects import SceneObject
+from renderer.basis import HARMONICS
+from renderer.camera import OrthographicCamera
+from renderer.environment import negative_share, to_map, write_map
+from renderer.errors import FACTOR, InputError, require_bounded, require_range
+from renderer.image import ImageSettings, to_bytes
+from renderer.lights import load_light, save_light
+from renderer.mesh import load_mesh
+from renderer.mesh_export import export_mesh
+from renderer.mitsuba_scene import write_mitsuba_scene
+
+DESCRIPTION, MESH, LIGHT, BACKGROUND, PIXELS = (
+    "adversary.json",
+    "mesh.glb",
+    "light.json",
+    "background.png",
+    "pixels.npy",
+)
+BEFORE, AFTER, MITSUBA = "before", "after", "mitsuba"
+MAP_HEIGHT = 256
+NOWHERE = 2.0**-8  # of the brightest radiance: what an .hdr file rounds off
+
+
+def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
+    """Write the folder; what its light lacks to be physical: {"negative_light": the negative share}."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shown, settings = adversary.shown, adversary.settings
+    export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras)
+    save_light(folder / LIGHT, adversary.light, adversary.basis)
+    description = {
+        "label": shown.label,
+        "name": Path(shown.name).name,
+        "mesh": MESH,
+        "gain": shown.gain,
+        "light": LIGHT,
+        "background": _write_background(adversary.background, folder),
+        "cameras": [asdict(camera) for camera in adversary.cameras],
+        "image": asdict(settings),
+    }
+    if adversary.pixels is not None:
+        np.save(folder / PIXELS, adversary.pixels.numpy())
+        description["pixels"] = PIXELS
+    for name, images in ((BEFORE, adversary.images_before), (AFTER, adversary.images)):
+        np.save(folder / f"{name}.npy", images.numpy())
+        for view, image in enumerate(to_bytes(images)):
+            Image.fromarray(image.permute(1, 2, 0).numpy()).save(folder / f"{name}_{view}.png")
+    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+    return _write_radiance(adversary, folder)
+
+
+def _write_radiance(adversary: Adversary, folder: Path) -> dict[str, float]:
+    """The light's maps, and the Mitsuba scene, in which what is negative of the light is left out."""
+    radiance = to_map(adversary.light, MAP_HEIGHT)
+    if radiance.min() >= -NOWHERE * radiance.max():
+        for suffix in (".hdr", ".exr"):
+            write_map(folder / f"light{suffix}", radiance)
+    shown = adversary.shown
+    write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.gain, adversary.cameras, adversary.settings, "light.exr")
+    write_map(folder / MITSUBA / "light.exr", radiance.clamp(min=0))
+    return {"negative_light": negative_share(radiance)}
+
+
+def read_adversary(folder: Path) -> Adversary:
+    """What `write_adversary` wrote. InputError: something is missing, damaged or not to be rendered."""
+    path = folder / DESCRIPTION
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: give a folder that an attack wrote, such as .../example_000")
+    try:
+        description = json.loads(path.read_text(encoding="utf-8"))
+        settings = ImageSettings(**description["image"])
+        cameras = tuple(OrthographicCamera(**camera) for camera in description["cameras"])
+        label, name, gain = str(description["label"]), str(description["name"]), float(description["gain"])
+        mesh, light, pixels = (folder / str(description.get(key)) for key in ("mesh", "light", "pixels"))
+        background = description["background"]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path} does not describe an adversary ({error}): write it again") from error
+    require_range(f"{path}: gain", gain, 1 / FACTOR, FACTOR)
+    if not cameras:
+        raise InputError(f"{path} has no cameras: write it again")
+    shape = len(cameras), 3, settings.size, settings.size
+    return Adversary(
+        shown=SceneObject(label, load_mesh(mesh), gain, name),
+        cameras=cameras,
+        light=load_light(str(light)),
+        basis=HARMONICS,
+        background=load_background(folder / background if isinstance(background, str) else background, settings.size),
+        settings=settings,
+        images_before=_read_images(folder / f"{BEFORE}.npy", shape),
+        images=_read_images(folder / f"{AFTER}.npy", shape),
+        pixels=_read_images(pixels, shape) if "pixels" in description else None,
+    )
+
+
+def _write_background(background: Tensor, folder: Path) -> float | str:
+    """A grey value, or the file of what is none."""
+    grey = float(background.flatten()[0])
+    if (background == grey).all():
+        return grey
+    Image.fromarray(to_bytes(background.expand(3, -1, -1)).permute(1, 2, 0).numpy()).save(folder / BACKGROUND)
+    return BACKGROUND
+
+
+def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
+    try:
+        images = torch.from_numpy(np.load(path, allow_pickle=False)).float()
+        require_bounded(images=images)
+    except (OSError, ValueError, TypeError, EOFError) as error:
+        raise InputError(f"{path} cannot be read ({error}): write the adversary again") from error
+    if images.shape != shape:
+        raise InputError(f"{path} has shape {tuple(images.shape)}, not {shape}: write the adversary again")
+    return images

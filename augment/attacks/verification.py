@@ -1,0 +1,102 @@
+"""Whether adversaries fool outside of the floats that they were found in: rounded, compressed, rendered from files."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from augment.attacks.adversary import Adversary
+from augment.attacks.adversary_folder import MITSUBA, read_adversary
+from augment.attacks.run import Attacked, logits_of
+from renderer.errors import InputError
+from renderer.image import behind, clamp, develop_composite, to_bytes, to_unit
+from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
+from renderer.visibility import Backend
+
+JPEG_QUALITY = 90
+RENDERERS = ("reload", "mitsuba")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a classifier makes of another version of E examples' images after an attack.
+
+    logits: (E, V, C). fooled: (E,) bool, in every view. largest, mean: (E,) absolute differences of values.
+    """
+
+    version: str
+    logits: Tensor
+    fooled: Tensor
+    largest: Tensor
+    mean: Tensor
+
+    def of(self, example: int, classes: Sequence[str]) -> dict:
+        """One example's numbers."""
+        best = self.logits[example].softmax(1).max(1)
+        return {
+            "fooled": bool(self.fooled[example]),
+            "answer": [classes[index] for index in best.indices.tolist()],
+            "confidence": best.values.tolist(),
+            "largest_difference": float(self.largest[example]),
+            "mean_difference": float(self.mean[example]),
+        }
+
+
+def require_renderers(names: Sequence[str]) -> None:
+    """InputError unless each is known and installed."""
+    for name in names:
+        if name not in RENDERERS:
+            raise InputError(f"attack.verify={name}: choose from {', '.join(RENDERERS)}, or null")
+    if MITSUBA in names:
+        with mitsuba():
+            pass
+
+
+def verify(attacked: Attacked, folders: Sequence[Path], renderers: Sequence[str]) -> list[Verdict]:
+    """A verdict on the images rounded to 8 bits, on those as JPEG, and on what each renderer makes of the folders.
+
+    renderers: "reload", ours; "mitsuba", Mitsuba's direct illumination, in which concave meshes shade themselves.
+    """
+    images = attacked.images.cpu()
+    versions = {"8 bits": to_unit(to_bytes(images)), f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY)}
+    for name in renderers:
+        backend = attacked.problem.scene.backend
+        versions[name] = torch.stack([rendered(folder, name, backend) for folder in folders])
+    return [_verdict(attacked, name, seen.to(attacked.images)) for name, seen in versions.items()]
+
+
+def rendered(folder: Path, renderer: str, backend: Backend) -> Tensor:
+    """(V, 3, size, size) from an adversary's files alone."""
+    adversary = read_adversary(folder)
+    return adversary.render(backend) if renderer == "reload" else _by_mitsuba(adversary, folder / MITSUBA / SCENE)
+
+
+def as_jpeg(images: Tensor, quality: int) -> Tensor:
+    """Images (..., 3, H, W) in [0, 1] after compression."""
+    flat = [_through_jpeg(image, quality) for image in to_bytes(images).flatten(0, -4)]
+    return to_unit(torch.stack(flat)).view(images.shape)
+
+
+def _through_jpeg(image: Tensor, quality: int) -> Tensor:
+    file = io.BytesIO()
+    Image.fromarray(image.permute(1, 2, 0).numpy()).save(file, "JPEG", quality=quality)
+    with Image.open(file) as read:
+        return torch.from_numpy(np.array(read)).permute(2, 0, 1)
+
+
+def _by_mitsuba(adversary: Adversary, scene: Path) -> Tensor:
+    seen = render_mitsuba_scene(scene, len(adversary.cameras))
+    encoding = adversary.settings.encoding
+    images = develop_composite(seen[:, :3] + behind(seen[:, 3:], adversary.background, encoding), encoding)
+    return images if adversary.pixels is None else clamp(images + adversary.pixels)
+
+
+def _verdict(attacked: Attacked, version: str, images: Tensor) -> Verdict:
+    logits = logits_of(attacked.classifier, images, attacked.settings.batch_size)
+    off = (images - attacked.images).abs().flatten(1)
+    return Verdict(version, logits, attacked.goal.reached(logits.argmax(2)), off.amax(1), off.mean(1))

@@ -1,0 +1,153 @@
+"""Views of a mesh as a Mitsuba 3 scene in files: scene.xml, .ply parts with their normals, and their textures.
+
+Direct illumination by an environment map: what a concave mesh throws on itself is dark there, and lit here. Mitsuba's
+diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the map's scale makes up for that, and for the
+albedo's gain. Its radiance is premultiplied with alpha, as ours with the coverage.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+import torch
+from PIL import Image
+
+from renderer.albedo_bake import with_added_albedo
+from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
+from renderer.image import ImageSettings, decode
+from renderer.mesh import Mesh
+from renderer.mesh_export import DISTANCE, corner_normals
+
+SCENE = "scene.xml"
+SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
+_VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
+_TO_Z_UP = "0 0 1 0 1 0 0 0 0 1 0 0 0 0 0 1"  # see `renderer.environment`
+
+_XML = """<scene version="3.0.0">
+    <integrator type="direct">
+        <integer name="emitter_samples" value="0"/>
+        <integer name="bsdf_samples" value="1"/>
+        <boolean name="hide_emitters" value="true"/>
+    </integrator>
+    <emitter type="envmap">
+        <string name="filename" value="{light}"/>
+        <float name="scale" value="{scale}"/>
+        <transform name="to_world"><matrix value="{to_z_up}"/></transform>
+    </emitter>
+{sensors}
+{shapes}
+</scene>
+"""
+_SENSOR = """    <sensor type="orthographic">
+        <transform name="to_world"><matrix value="{pose}"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="{size}"/>
+            <integer name="height" value="{size}"/>
+            <string name="pixel_format" value="rgba"/>
+            <rfilter type="box"/>
+        </film>
+        <sampler type="multijitter"><integer name="sample_count" value="{samples}"/></sampler>
+    </sensor>"""
+_SHAPE = """    <shape type="ply">
+        <string name="filename" value="{file}"/>
+        <boolean name="flip_tex_coords" value="true"/>
+        <bsdf type="twosided"><bsdf type="diffuse">{albedo}</bsdf></bsdf>
+    </shape>"""
+_VERTEX_COLOR = '<texture name="reflectance" type="mesh_attribute"><string name="name" value="vertex_color"/></texture>'
+_BITMAP = (
+    '<texture name="reflectance" type="bitmap"><string name="filename" value="{file}"/>'
+    '<boolean name="raw" value="{raw}"/></texture>'
+)
+
+
+def write_mitsuba_scene(
+    folder: Path, mesh: Mesh, gain: float, cameras: Sequence[OrthographicCamera], settings: ImageSettings, light: str
+) -> None:
+    """Write a folder whose scene.xml shows a mesh to each camera, a sensor each. light: the map's file, as seen from
+    there. Where a texture is on corners of other colours it is painted anew, since Mitsuba has no product of the two.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
+        mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), settings.encoding)
+    scene = _XML.format(
+        light=escape(light),
+        scale=math.pi * gain,
+        to_z_up=_TO_Z_UP,
+        sensors="\n".join(_sensor(camera, settings.size) for camera in cameras),
+        shapes="\n".join(_write_parts(folder, mesh, settings)),
+    )
+    (folder / SCENE).write_text(scene, encoding="utf-8")
+
+
+def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
+    """(views, 4, size, size) float32 linear radiance and coverage of a scene's .xml file, a sensor each.
+
+    InputError: Mitsuba is not installed, or refuses the file.
+    """
+    with mitsuba() as mi:
+        try:
+            scene = mi.load_file(str(path))
+            images = [np.array(mi.render(scene, sensor=view)) for view in range(views)]
+        except RuntimeError as error:
+            raise InputError(f"{path} is not rendered by Mitsuba: {str(error).splitlines()[0]}") from error
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+
+
+@contextmanager
+def mitsuba() -> Iterator:
+    """The module under our variant; that of before, if any, comes back. InputError: it is not installed."""
+    try:
+        import mitsuba as module
+    except ImportError as error:
+        raise InputError("Mitsuba is not installed: pip install '.[lab]'") from error
+    before = module.variant()
+    module.set_variant(_VARIANT)
+    try:
+        yield module
+    finally:
+        if before:
+            module.set_variant(before)
+
+
+def _sensor(camera: OrthographicCamera, size: int) -> str:
+    """Mitsuba's orthographic camera looks along +z, has x to the left, and sees [-1, 1] in x and y."""
+    right, up, back = camera.axes()
+    half, pose = camera.field_of_view / 2, np.eye(4)
+    pose[:3, :3] = np.stack([-half * right, half * up, -back], axis=1)
+    pose[:3, 3] = DISTANCE * back - camera.right * right - camera.up * up
+    return _SENSOR.format(pose=" ".join(f"{value:.17g}" for value in pose.ravel()), size=size, samples=SAMPLES)
+
+
+def _write_parts(folder: Path, mesh: Mesh, settings: ImageSettings) -> Iterator[str]:
+    """A shape for each texture, and one for the faces without: part_0.ply and so on, with its texture_0.png."""
+    normals, raw = corner_normals(mesh, settings.normals), str(settings.encoding == "linear").lower()
+    for number, index in enumerate(np.unique(mesh.texture_ids)):
+        here = mesh.texture_ids == index
+        colors = decode(torch.from_numpy(mesh.corner_colors[here]), settings.encoding).numpy()
+        corners = [mesh.vertices[mesh.faces[here]], normals[here], mesh.corner_uvs[here], colors]
+        (folder / f"part_{number}.ply").write_bytes(_ply(np.concatenate(corners, axis=-1).astype("<f4")))
+        albedo = _VERTEX_COLOR
+        if index >= 0:
+            Image.fromarray(mesh.textures[index]).save(folder / f"texture_{number}.png")
+            albedo = _BITMAP.format(file=f"texture_{number}.png", raw=raw)
+        yield _SHAPE.format(file=f"part_{number}.ply", albedo=albedo)
+
+
+def _ply(corners: np.ndarray) -> bytes:
+    """Faces (F, 3, 11) whose corners have a position, normal, uv and linear colour each."""
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {3 * len(corners)}",
+        *(f"property float {name}" for name in (*"xyz", "nx", "ny", "nz", *"uvrgb")),
+        f"element face {len(corners)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    faces = np.empty(len(corners), dtype=[("count", "u1"), ("indices", "<i4", 3)])
+    faces["count"], faces["indices"] = 3, np.arange(3 * len(corners)).reshape(-1, 3)
+    return "\n".join(header).encode() + corners.tobytes() + faces.tobytes()

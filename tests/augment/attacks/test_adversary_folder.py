@@ -1,0 +1,120 @@
+"""What an attack leaves behind is read back to the same image, and what is damaged is refused."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import augment
+from augment.attacks.adversary import Adversary
+from augment.attacks.adversary_folder import DESCRIPTION, read_adversary, write_adversary
+from augment.parameters import KINDS
+from augment.scene import Example, Scene
+from renderer.errors import InputError
+from renderer.mesh import Mesh
+from renderer.shapes import solid
+from renderer.visibility import choose
+
+CLASSES = ("orange", "lime", "sky")
+SOFTWARE = choose("software")
+
+
+def attacked(kinds: set[str], scene: Scene) -> augment.Attacked:
+    classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), scene.settings.size, CLASSES)
+    radii = {"albedo": 0.2, "geometry": 0.01, "pixels": 0.05, "lighting": 0.3}
+    settings = {name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name]) for name in kinds}
+    return augment.attack(classifier, scene, settings=augment.AttackSettings(**settings, max_steps=3), force=True)
+
+
+def textured() -> Mesh:
+    """A pear with a texture on half of its faces, colours at the corners of the others."""
+    mesh, draws = solid("pear"), np.random.default_rng(0)
+    ids = np.where(np.arange(len(mesh.faces)) % 2, 0, -1).astype(np.int32)
+    return replace(
+        mesh,
+        texture_ids=ids,
+        corner_uvs=draws.random((len(ids), 3, 2), dtype=np.float32),
+        corner_colors=np.where((ids >= 0)[:, None, None], 1, mesh.corner_colors).astype(np.float32),
+        textures=(draws.integers(0, 256, (16, 8, 3), dtype=np.uint8),),
+    )
+
+
+def adversary_of(done: augment.Attacked) -> Adversary:
+    return Adversary.of(done.problem.scene, 0, done.conditions, done.images_before[0], done.images[0])
+
+
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+@pytest.mark.parametrize(
+    "kinds", [{"lighting"}, {"geometry"}, {"albedo"}, {"pixels"}, set(KINDS) - {"skylight"}], ids=str
+)
+def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, kinds, encoding):
+    """And exactly but for rounding to float32 where no texture is painted."""
+    scene = augment.build_scene(
+        [(textured(), "orange")], 24, views=2, shared=True, visibility="software", encoding=encoding, field_of_view=2.4
+    )
+    done = attacked(kinds, scene)
+    write_adversary(adversary_of(done), tmp_path)
+    found = read_adversary(tmp_path)
+    assert torch.equal(found.images, done.images[0]) and torch.equal(found.images_before, done.images_before[0])
+    assert (done.images - done.images_before).abs().max() > 0.02
+    limit = 1 / 255 if "albedo" in kinds else 1e-5
+    torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=limit)
+
+
+def test_exposure_gain_background_and_place_are_kept(tmp_path):
+    """A row as training draws them: its own exposure, an image behind it, a camera that looks past the middle."""
+    scene = augment.build_scene([("solid:orange", "orange")], 16, visibility="software")
+    backgrounds = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
+    ((camera,),) = scene.cameras
+    row = Example(0, (replace(camera, right=0.3, up=-0.2, field_of_view=3.0),), 1, exposure=1.7)
+    objects = [replace(each, gain=0.6) for each in scene.objects]
+    done = attacked({"albedo", "lighting"}, scene.with_rows([row], objects=objects, backgrounds=backgrounds))
+    write_adversary(adversary_of(done), tmp_path)
+    found = read_adversary(tmp_path)
+    assert torch.equal(found.background, backgrounds[1]) and found.cameras == row.cameras
+    torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=1e-5)
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    scene = augment.build_scene([("solid:orange", "orange")], 8, visibility="software")
+    write_adversary(adversary_of(attacked({"pixels"}, scene)), tmp_path)
+    return tmp_path
+
+
+def described(**changes):
+    def change(folder: Path) -> None:
+        path = folder / DESCRIPTION
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+    return change
+
+
+DAMAGES = {
+    "no description": (lambda folder: (folder / DESCRIPTION).unlink(), "does not exist: give a folder that an attack"),
+    "no JSON": (lambda folder: (folder / DESCRIPTION).write_text("{"), "does not describe an adversary"),
+    "a list": (lambda folder: (folder / DESCRIPTION).write_text("[]"), "does not describe an adversary"),
+    "a key less": (described(image={"size": 8, "colour": 1}), "does not describe an adversary"),
+    "no size": (described(image={"size": 0}), "must be at least 1"),
+    "another size": (described(image={"size": 9}), "has shape"),
+    "no cameras": (described(cameras=[]), "has no cameras"),
+    "a flat camera": (described(cameras=[{"polar": 0, "azimuth": 0, "field_of_view": 0}]), "field_of_view=0"),
+    "no gain": (described(gain=0), "gain=0.0 must be at least"),
+    "no mesh": (described(mesh="absent.glb"), "absent.glb does not exist"),
+    "no light": (described(light="absent.json"), "absent.json does not exist"),
+    "a number for a name": (described(mesh=3), "3 does not exist"),
+    "too bright a background": (described(background=3), "give grey values"),
+    "images cut short": (lambda folder: (folder / "after.npy").write_bytes(b"\\x93NUMPY"), "after.npy cannot be read"),
+    "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy cannot be read"),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_folder_is_refused_in_one_sentence(folder, damage, message):
+    damage(folder)
+    with pytest.raises(InputError, match=message) as refused:
+        read_adversary(folder)
+    assert "\n" not in str(refused.value)
