@@ -89,4 +89,43 @@ def test_an_installation_runs_from_any_folder(installed, tmp_path):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("train is powered by Hydra")
-    assert "experiment: cpu, demo, fast, paper" in done.stdout and "learning_rate" in done.stdout
+    assert "experiment: best, cpu, demo, fast" in done.stdout and "learning_rate" in done.stdout
+
+
+DOORS = """
+import pathlib, re, sys
+import torch, trimesh
+from torch import nn
+import augment, renderer, train
+readme, where = sys.argv[1:]
+assert all(pathlib.Path(each.__file__).is_relative_to(where) for each in (augment, renderer, train))
+trimesh.creation.icosphere(2).export("orange.glb")
+CLASSES = [*map(str, range(99)), "orange"]
+data = torch.utils.data.TensorDataset(torch.rand(8, 3, 32, 32), torch.arange(8))
+data = [(image, int(label)) for image, label in data]
+class Data(torch.utils.data.Dataset):
+    __len__ = lambda self: len(data)
+    __getitem__ = lambda self, index: data[index]
+for block in re.findall(r"```python\\n(.*?)```", pathlib.Path(readme).read_text(), re.DOTALL):
+    network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 100))
+    network[2].bias.data[99] = 9.0
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
+    exec(block, dict(torch=torch, network=network, CLASSES=CLASSES, data=Data(), optimizer=optimizer))
+"""
+OWN_NETWORK = """
+from torch import nn
+def build():
+    return nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 2)), 24, ["orange", "plum"]
+"""
+
+
+@pytest.mark.slow
+def test_the_doors_of_the_readme_open_from_an_installation_in_an_empty_folder(installed, tmp_path):
+    (tmp_path / "mine.py").write_text(OWN_NETWORK)
+    own = "classifier=python:mine:build"
+    attack = [str(ROOT / "scripts" / "attack.py"), own, "attack.force=true", "attack.checks=false", "out=found"]
+    env = os.environ | {"PYTHONPATH": str(installed), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    for arguments in (["-c", DOORS, str(ROOT / "README.md"), str(installed)], attack):
+        done = subprocess.run([sys.executable, *arguments], cwd=tmp_path, env=env, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / "adversaries" / "attack.jsonl").is_file() and any((tmp_path / "found").rglob("attack.jsonl"))
