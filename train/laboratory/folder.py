@@ -4,7 +4,7 @@ import csv
 import json
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,11 +16,12 @@ from tqdm import tqdm
 
 from augment.objects import load_object
 from augment.seeding import stream_seed
+from renderer.environment import read_map
 from renderer.errors import InputError
 from renderer.image import encode
 from renderer.shapes import LOOK_ALIKES
 from train.laboratory.props import Part, split_parts
-from train.laboratory.settings import LabSettings
+from train.laboratory.settings import LabSettings, environment_name
 from train.laboratory.shots import Shot, draw_shots
 from train.laboratory.studio import photograph
 from train.outputs import writable_folder
@@ -49,13 +50,22 @@ def write_laboratory(settings: LabSettings) -> int:
     """
     out = writable_folder(settings.out, "out")
     subjects = [read_subject(item, index) for index, item in enumerate(settings.meshes)]
+    environments = {environment_name(path): _read_environment(Path(path)) for path in settings.environments}
     sides = [[item for item in subjects if (item.label == settings.label) is wanted] for wanted in (True, False)]
     if not all(sides):
         raise InputError(f"meshes: name at least one of label={settings.label} and one of something else")
     with sole_writer("out", out):
         if any(path.name != LOCK for path in out.iterdir()):
             raise InputError(f"out={out} is not an empty folder: name another, or delete it")
-        return _write(_sittings(sides, settings), settings, out)
+        return _write(_sittings(sides, settings, environments), settings, out)
+
+
+def _read_environment(path: Path) -> np.ndarray:
+    """Radiance (H, W, 3), which is nowhere negative; InputError otherwise, and where nothing falls from above."""
+    radiance = read_map(path).numpy()
+    if radiance.min() < 0 or not radiance[: len(radiance) // 2].max() > 0:
+        raise InputError(f"environments: {path} is negative somewhere or dark above: give a map of what lamps emit")
+    return radiance
 
 
 def _write(sittings: Iterator[tuple[int, Shot, Subject]], settings: LabSettings, out: Path) -> int:
@@ -97,9 +107,11 @@ def _label_of_solid(mesh: str) -> str:
     return FOREIGN + name if name in LOOK_ALIKES else name
 
 
-def _sittings(sides: list[list[Subject]], settings: LabSettings) -> Iterator[tuple[int, Shot, Subject]]:
+def _sittings(
+    sides: list[list[Subject]], settings: LabSettings, environments: Mapping[str, np.ndarray]
+) -> Iterator[tuple[int, Shot, Subject]]:
     """Each light with its number, once with an object of the label and once with another; either side takes turns."""
-    shots = draw_shots(settings.lights, settings.patterns, settings.brightness, settings.seed)
+    shots = draw_shots(settings.lights, settings.patterns, settings.brightness, settings.seed, environments)
     for light, shot in enumerate(shots):
         for side in sides:
             yield light, shot, side[light % len(side)]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from renderer.errors import FACTOR, InputError, require_range
 from train.laboratory.patterns import FAMILIES
@@ -10,12 +11,17 @@ from train.settings import LARGEST_SEED, LARGEST_SIZE
 MOST_LIGHTS = 10**6
 
 
+def environment_name(path: str) -> str:
+    """By which photographs under a map are told from others."""
+    return Path(path).stem
+
+
 @dataclass
 class LabSettings:
     """What is photographed, and how. meshes: each a file, a `solid:NAME`, or a mapping with ObjectSettings' keys.
 
-    lights: draws of light, camera and pose, each shown with one object of `label` and one other. brightness: of the
-    projector, from dim to bright; see `Shot`.
+    lights: draws of light, camera and pose, each shown with one object of `label` and one other. environments: files of
+    maps, beside or in place of the projector's patterns. brightness: of either, from dim to bright; see `Shot`.
     """
 
     out: str
@@ -23,6 +29,7 @@ class LabSettings:
     label: str = "orange"
     lights: int = 180
     patterns: list[str] = field(default_factory=lambda: list(FAMILIES))
+    environments: list[str] = field(default_factory=list)
     brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])
     exposure: float = 1.0
     size: int = 64
@@ -33,8 +40,13 @@ class LabSettings:
     def __post_init__(self) -> None:
         if unknown := [name for name in self.patterns if name not in FAMILIES]:
             raise InputError(f"patterns: {unknown[0]!r} is not known: choose from {', '.join(FAMILIES)}")
-        if not self.patterns or self.lights < 1 or self.lights % len(self.patterns):
-            raise InputError(f"lights={self.lights} must be a positive multiple of the {len(self.patterns)} patterns")
+        kinds = [*self.patterns, *map(environment_name, self.environments)]
+        if not kinds or self.lights < 1 or self.lights % len(kinds):
+            raise InputError(
+                f"lights={self.lights} must be a positive multiple of the {len(kinds)} patterns and environments"
+            )
+        if repeated := next((name for name in kinds if kinds.count(name) > 1), None):
+            raise InputError(f"patterns and environments: {repeated} is named twice, and names the photographs' source")
         if len(self.brightness) != 2 or not 0 < self.brightness[0] <= self.brightness[1] < math.inf:
             raise InputError(f"brightness={self.brightness} must be two positive numbers, the dimmer one first")
         require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)

@@ -5,12 +5,15 @@ RGB; a radiance of 1 is white at an exposure of 1.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
+import torch
 
 from augment.seeding import stream_seed
+from renderer.harmonics import equirectangular
 from train.laboratory.patterns import draw_colour, draw_pattern
 
 
@@ -18,9 +21,11 @@ from train.laboratory.patterns import draw_colour, draw_pattern
 class Shot:
     """One light, camera and pose, for whatever object.
 
-    brightness: radiance of a white surface that faces the projector where its image is white. pattern: the image
-    (H, W, 3). ambient: radiance from everywhere (3,). table: albedo (3,). projector, camera: places (3,). centre,
-    aim: the points (3,) that they look at. turn: the object's rotation (3, 3). scale: the object's largest coordinate.
+    brightness: radiance of a white surface that faces the projector where its image is white, or that faces up under an
+    environment. pattern: the image (H, W, 3). environment: radiance (H, W, 3) laid out as in `renderer.environment`, in
+    place of projector and ambient. ambient: radiance from everywhere (3,). table: albedo (3,). projector, camera:
+    places (3,). centre, aim: the points (3,) that they look at. turn: the object's rotation (3, 3). scale: the object's
+    largest coordinate.
     """
 
     family: str
@@ -34,19 +39,41 @@ class Shot:
     aim: np.ndarray
     turn: np.ndarray
     scale: float
+    environment: np.ndarray | None = None
 
 
 FIELD_OF_VIEW = 25.0  # degrees, of the camera
 
 
-def draw_shots(lights: int, families: Sequence[str], brightness: Sequence[float], seed: int) -> Iterator[Shot]:
-    """`lights` shots, equally many of each family, in its order and evenly (by ratios) from dim to bright."""
+def draw_shots(
+    lights: int,
+    families: Sequence[str],
+    brightness: Sequence[float],
+    seed: int,
+    environments: Mapping[str, np.ndarray] = MappingProxyType({}),
+) -> Iterator[Shot]:
+    """`lights` shots, equally many of each family of patterns and each environment by its name, in this order and
+    evenly (by ratios) from dim to bright."""
     dimmest, brightest = brightness
-    of_each = lights // len(families)
-    for family in families:
+    kinds = [*families, *environments]
+    of_each = lights // len(kinds)
+    for kind in kinds:
         for rank in range(of_each):
-            rng = np.random.default_rng(stream_seed(seed, "shot", family, rank))
-            yield draw_shot(family, dimmest * (brightest / dimmest) ** ((rank + rng.uniform()) / of_each), rng)
+            rng = np.random.default_rng(stream_seed(seed, "shot", kind, rank))
+            light = dimmest * (brightest / dimmest) ** ((rank + rng.uniform()) / of_each)
+            if kind in environments:
+                yield _under(kind, environments[kind], draw_shot("solid", light, rng), rng)
+            else:
+                yield draw_shot(kind, light, rng)
+
+
+def _under(name: str, environment: np.ndarray, shot: Shot, rng: np.random.Generator) -> Shot:
+    """The shot under a map, turned about the vertical by any angle."""
+    turned = np.roll(environment, rng.integers(environment.shape[1]), axis=1)
+    directions, solid_angles = equirectangular(*environment.shape[:2])
+    falling = directions[..., 2].clamp(min=0) * solid_angles
+    on_white = float((falling[..., None] * torch.from_numpy(turned)).sum((0, 1)).mean()) / math.pi
+    return replace(shot, family=name, environment=(shot.brightness / on_white * turned).astype(np.float32))
 
 
 def draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:

@@ -1,4 +1,5 @@
-"""A shot's scene, path-traced by Mitsuba 3: an object on a table, a projector, weak light from everywhere."""
+"""A shot's scene, path-traced by Mitsuba 3: an object on a table under a projector with weak light from everywhere, or
+under an environment map."""
 
 from collections.abc import Sequence
 
@@ -20,7 +21,6 @@ def photograph(parts: Sequence[Part], shot: Shot, size: int, samples: int, bounc
     which of them to look at, which is most of the noise. InputError: Mitsuba is not installed.
     """
     with mitsuba() as mi:
-        surroundings = {"type": "constant", "radiance": _rgb(shot.ambient)}
         still = {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": bounces + 1},
@@ -32,7 +32,7 @@ def photograph(parts: Sequence[Part], shot: Shot, size: int, samples: int, bounc
             },
             **{f"part_{index}": shape for index, shape in enumerate(_object(mi, parts, shot))},
         }
-        scenes = [mi.load_dict({**still, "light": light}) for light in (_projector(mi, shot), surroundings)]
+        scenes = [mi.load_dict({**still, "light": light}) for light in _lights(mi, shot)]
         return sum(np.array(mi.render(scene, spp=samples, seed=seed)) for scene in scenes)
 
 
@@ -40,6 +40,13 @@ def _sensor(mi, shot: Shot, size: int) -> dict:
     look = mi.ScalarTransform4f().look_at(origin=list(shot.camera), target=list(shot.aim), up=[0, 0, 1])
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     return {"type": "perspective", "fov": FIELD_OF_VIEW, "to_world": look, "film": film}
+
+
+def _lights(mi, shot: Shot) -> list[dict]:
+    if shot.environment is not None:  # Mitsuba's maps have y up and +z in the middle column, ours z up and +x there
+        turn = mi.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+        return [{"type": "envmap", "bitmap": mi.Bitmap(shot.environment), "to_world": turn}]
+    return [_projector(mi, shot), {"type": "constant", "radiance": _rgb(shot.ambient)}]
 
 
 def _projector(mi, shot: Shot) -> dict:

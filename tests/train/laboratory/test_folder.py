@@ -3,6 +3,7 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -125,3 +126,17 @@ def test_a_folder_that_holds_something_is_left_alone(laboratory):
     with pytest.raises(InputError, match=r"out=.*lab is not an empty folder: name another, or delete it"):
         write_laboratory(settings(laboratory))
     assert before == {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}
+
+
+def test_environments_stand_beside_patterns_and_name_the_source(tmp_path):
+    np.save(tmp_path / "noon.npy", np.ones((8, 16, 3), np.float32))
+    out = tmp_path / "lab"
+    write_laboratory(settings(out, patterns=["solid"], environments=[str(tmp_path / "noon.npy")], lights=2))
+    assert sorted({row["source_tag"] for row in rows(out)}) == ["noon", "solid"]
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0])
+def test_an_environment_that_nothing_emits_is_refused(tmp_path, value):
+    np.save(tmp_path / "odd.npy", np.full((8, 16, 3), value, np.float32))
+    with pytest.raises(InputError, match=r"odd\.npy is negative somewhere or dark above"):
+        write_laboratory(settings(tmp_path / "lab", patterns=[], environments=[str(tmp_path / "odd.npy")], lights=2))

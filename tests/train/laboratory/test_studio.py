@@ -121,3 +121,34 @@ def test_a_texture_and_colours_of_vertices_at_once_are_refused():
     mesh = replace(mesh, corner_colors=np.linspace(0, 1, 18, dtype=np.float32).reshape(2, 3, 3))
     with pytest.raises(InputError, match=r"card.glb has a texture and colours of its vertices, too: paint them into"):
         split_parts(mesh, 1.0, "card.glb")
+
+
+def test_a_table_under_an_environment_has_the_brightness_of_white_times_its_albedo_whatever_the_turn():
+    """A map of one direction, off the vertical, is a distant lamp: the table under it is even."""
+    sky = np.zeros((64, 128, 3), np.float32)
+    sky[16, 40] = 1e4, 1e4, 1e4
+    for seed in range(2):
+        [shot] = draw_shots(1, [], (0.7, 0.7), seed, {"lamp": sky})
+        shot = replace(shot, scale=1e-4)
+        image = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 8, 256, bounces=1, seed=0)
+        assert shot.family == "lamp"
+        # The map is sampled by bilinear interpolation, which spreads the lamp over two texels.
+        np.testing.assert_allclose(image, np.broadcast_to(0.7 * shot.table, image.shape), rtol=0.02)
+
+
+def test_an_environment_lights_from_where_its_map_says():
+    """The upper half of a map towards +x lights a card's side that faces +x, and not the one that faces -x."""
+    sky = np.zeros((32, 64, 3), np.float32)
+    sky[:, 16:48] = 1.0
+    shot = frontal(environment=sky, camera=np.array([6.0, 0, 1.0]), table=np.zeros(3))
+    front = photograph(split_parts(turned_card(), 1.0, "card"), shot, 8, 256, bounces=1, seed=0)
+    back = photograph(
+        split_parts(turned_card(), 1.0, "card"), replace(shot, camera=np.array([-6.0, 0, 1.0])), 8, 256, 1, 0
+    )
+    assert front[3:5, 3:5].mean() > 20 * back[3:5, 3:5].mean()
+
+
+def turned_card() -> Mesh:
+    """The card's square in the plane x = 0."""
+    mesh = card(np.full((2, 2, 3), 255, np.uint8))
+    return replace(mesh, vertices=mesh.vertices[:, [1, 0, 2]])
