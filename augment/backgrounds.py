@@ -20,13 +20,13 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
 
 def load_background(choice: float | str | Path, size: int) -> Tensor:
     """A grey value (1, size, size), or an image's centre square (3, size, size), in [0, 1]."""
+    if isinstance(choice, Path):
+        return _image(choice, size)
     try:
         grey = float(choice)
     except ValueError:
-        return _image(Path(choice), size)
+        return _image(Path(str(choice)), size)
     except TypeError:
-        if isinstance(choice, Path):
-            return _image(choice, size)
         grey = math.nan
     if not 0 <= grey <= 1:
         raise InputError(f"scene.backgrounds={choice}: give grey values in [0, 1] or image files")

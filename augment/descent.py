@@ -36,10 +36,11 @@ class DescentSettings:
 
 
 class Problem(Protocol):
-    """What is attacked: E examples of V views each, whose images follow from values (E, D); `start` is where they
-    begin."""
+    """What is attacked: E examples of V views each, whose images follow from values (E, D)."""
 
-    start: Tensor
+    @property
+    def start(self) -> Tensor:
+        """The values (E, D) where they begin."""
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         """Images (A, V, 3, H, W) in [0, 1] of the values (A, D) of examples (A,)."""

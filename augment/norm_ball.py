@@ -50,7 +50,7 @@ class NormBall:
             offset = 2 * torch.rand(centre.shape, generator=generator) - 1
         else:
             direction = torch.randn(centre.shape, generator=generator)
-            axes = centre.shape[1]
+            axes: int | Tensor = centre.shape[1]
             if used is not None:
                 direction, axes = direction * used.cpu(), used.cpu().sum(1, keepdim=True)
             share = torch.rand(len(centre), 1, generator=generator) ** (1 / axes)

@@ -5,7 +5,7 @@ can be attacked at once.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -196,4 +196,4 @@ class Pixels(Kind):
         return replace(conditions, pixels=values.unflatten(1, (self.scene.views, 3, size, size)))
 
 
-KINDS = {kind.name: kind for kind in (Lighting, Skylight, Geometry, Albedo, Pixels)}
+KINDS: dict[str, Callable[..., Kind]] = {kind.name: kind for kind in (Lighting, Skylight, Geometry, Albedo, Pixels)}

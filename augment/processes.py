@@ -24,7 +24,7 @@ def merged(part: Tensor, examples: Tensor, total: int) -> Tensor:
     """All `total` rows, of which every process has those of its examples; the same in every process."""
     if count() == 1:
         return part
-    parts = [None] * count()
+    parts = [(part, examples)] * count()  # to be overwritten
     dist.all_gather_object(parts, (part.cpu(), examples.cpu()))
     whole = part.new_empty(total, *part.shape[1:])
     for rows, places in parts:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -122,15 +122,19 @@ class Scene:
         objects: Sequence[SceneObject],
         cameras: Sequence[OrthographicCamera],
         backgrounds: Tensor,
-        *of_scene,
+        light: Tensor,
+        settings: ImageSettings,
+        backend: Backend,
+        operators: OperatorCache | None = None,
+        *,
         shared: bool = False,
         basis: Basis = HARMONICS,
     ) -> Scene:
         """Every object from every camera over every background, in that order; or, where the views share what is
-        attacked, every object over every background from all cameras. of_scene: the other arguments."""
+        attacked, every object over every background from all cameras."""
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = [Example(*row) for row in product(range(len(objects)), views, range(len(backgrounds)))]
-        return cls(objects, examples, backgrounds, *of_scene, basis=basis)
+        return cls(objects, examples, backgrounds, light, settings, backend, operators, basis)
 
     @classmethod
     def of_mesh(
@@ -148,9 +152,9 @@ class Scene:
         examples = [Example(0, tuple(views), index) for index, views in enumerate(cameras)]
         return cls([SceneObject("", mesh, gain)], examples, backgrounds, light, settings, backend, operators)
 
-    def with_rows(self, examples: Sequence[Example], **changed) -> Scene:
+    def with_rows(self, examples: Sequence[Example], **changed: Any) -> Scene:
         """Other rows, as many as before, of the same scene but for what is given: keywords are the constructor's."""
-        same = {
+        same: dict[str, Any] = {
             "objects": self.objects,
             "backgrounds": self.images_behind,
             "light": self.lights,
@@ -324,7 +328,7 @@ class Scene:
     def _faces(self) -> list[Tensor]:
         return [torch.from_numpy(item.mesh.faces).to(self.lights.device) for item in self.objects]
 
-    def _column(self, values) -> Tensor:
+    def _column(self, values: Iterable[int]) -> Tensor:
         return torch.tensor(list(values), device=self.lights.device)
 
     def _padded(self, parts: Sequence[Tensor]) -> Tensor:

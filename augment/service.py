@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -113,7 +114,7 @@ class AugmentationSettings:
 
 
 @dataclass(frozen=True)
-class Renders(Dataset):
+class Renders(Dataset[tuple[Tensor, int]]):
     """Labelled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
 
     specimens: a few of those that fool, with what they were before; None where that is not known any more.
@@ -152,6 +153,8 @@ class AugmentationService:
         label: the class that is to be told from look-alikes, the examples of all other labels: attacks light these
         towards it. None: every attack leads away from the example's own class.
         """
+        if scene is None and settings.renders:
+            raise InputError(f"augment.arm={settings.arm} renders augment.examples={settings.examples}: give a scene")
         self.settings = settings
         self._scene = scene
         self._labels = labels
@@ -171,7 +174,7 @@ class AugmentationService:
         backgrounds: Sequence[float | str | Path] = (0.0, 0.25, 0.5, 0.75, 1.0),
         seed: int = 0,
         device: torch.device | str = "cpu",
-        **of_scene,
+        **of_scene: Any,
     ) -> "AugmentationService":
         """For any training loop: meshes × views × backgrounds renders, as the paper has them unless told otherwise.
 
@@ -195,7 +198,7 @@ class AugmentationService:
         number: counts the regenerations of a run from 0. The draw depends on it and the seed alone, so a resumed run
         repeats it.
         """
-        if not self.settings.renders:
+        if self._scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
         make = self._random if self.settings.arm == "random" else self._adversarial
         scene = vary(self._scene, self.settings.vary, generator(self._seed, number, "rows"))

@@ -45,4 +45,4 @@ def choose_specimens(
     with as_found(model), torch.no_grad():
         images = [problem.scene.render(conditions, rows)[:, 0] for conditions in (before, after)]
         answers = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
-    return Specimens(*images, before.light, after.light, *answers, labels[rows])
+    return Specimens(images[0], images[1], before.light, after.light, answers[0], answers[1], labels[rows])

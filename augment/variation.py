@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from augment.objects import another_individual
 from augment.scene import Example, Scene
 from augment.snapshot import SnapshotSettings, draw_snapshot
 from renderer.cache import OperatorCache
+from renderer.camera import OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.harmonics import irradiance_basis, live_coefficients
 from renderer.image import clamp, decode, encode
@@ -78,10 +80,10 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> S
     place = settings.place * (2 * torch.rand(len(scene), 2, generator=draws, dtype=torch.float64) - 1)
     scale, exposure = (_between(limits, len(scene), draws) for limits in (settings.scale, settings.exposure))
     rows = [
-        replace(_moved(row, *moved, size) if settings.moves else row, exposure=row.exposure * bright)
-        for row, moved, size, bright in zip(scene.examples, place.tolist(), scale, exposure, strict=True)
+        replace(_moved(row, right, up, size) if settings.moves else row, exposure=row.exposure * bright)
+        for row, (right, up), size, bright in zip(scene.examples, place.tolist(), scale, exposure, strict=True)
     ]
-    changed = {}
+    changed: dict[str, Any] = {}
     if settings.backgrounds is not None:
         changed["backgrounds"] = _images(Path(settings.backgrounds), len(scene), scene.settings.size, draws)
         rows = [replace(row, background=index) for index, row in enumerate(rows)]
@@ -109,7 +111,7 @@ def _between(limits: Sequence[float], count: int, draws: torch.Generator) -> lis
 
 
 def _moved(row: Example, right: float, up: float, scale: float) -> Example:
-    def moved(camera):
+    def moved(camera: OrthographicCamera) -> OrthographicCamera:
         width = camera.field_of_view / scale
         return replace(camera, field_of_view=width, right=camera.right + right * width, up=camera.up + up * width)
 
@@ -131,7 +133,7 @@ def _angles(most: float, count: int, draws: torch.Generator) -> list[list[float]
 
 
 def _turned(row: Example, polar: float, azimuth: float) -> Example:
-    def turned(camera):
+    def turned(camera: OrthographicCamera) -> OrthographicCamera:
         return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
     return replace(row, cameras=tuple(turned(camera) for camera in row.cameras))

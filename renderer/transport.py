@@ -8,6 +8,7 @@ which no other surface is to be seen, all of a convex mesh, cast none.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -120,8 +121,8 @@ class Transport:
 
     def _overlooked(self, receivers: Receivers) -> Tensor:
         """The pixels with a sample on a face above whose plane the mesh rises."""
-        rises = [(part @ self._outermost.T).amax(1) for part in receivers.planes.split(BLOCK // 2**7)]
-        rises = torch.cat(rises) - (receivers.planes * receivers.corners).sum(1) > self._offset
+        reach = torch.cat([(part @ self._outermost.T).amax(1) for part in receivers.planes.split(BLOCK // 2**7)])
+        rises = reach - (receivers.planes * receivers.corners).sum(1) > self._offset
         pixel = torch.arange(len(receivers.count)).repeat_interleave(receivers.count)
         return pixel[rises[receivers.face]].unique()
 
@@ -159,7 +160,7 @@ def _outermost(vertices: np.ndarray) -> np.ndarray:
         return vertices
 
 
-def _embree_scene(mesh: Mesh):
+def _embree_scene(mesh: Mesh) -> Any:
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -78,19 +79,19 @@ def read_figure(path: Path) -> list[Column]:
     """The columns of an image of `save_figure`, with tiles as they were drawn; ValueError for another file."""
     try:
         with Image.open(path, formats=["PNG"]) as sheet:
-            told = json.loads(sheet.text[COLUMNS])
+            told = json.loads(sheet.info[COLUMNS])
             pixels = np.asarray(sheet.convert("RGB"))
         return [(str(column["title"]), [_cut(tile, pixels) for tile in column["tiles"]]) for column in told]
     except Exception as error:  # Pillow raises almost anything at a broken file
         raise ValueError(f"{path} is no image of an attack") from error
 
 
-def _told(tile: Tile, corner: tuple[int, int]) -> dict:
+def _told(tile: Tile, corner: tuple[int, int]) -> dict[str, object]:
     height, width, _ = tile.image.shape
     return {"left": corner[0], "top": corner[1], "width": width, "height": height, "caption": tile.caption}
 
 
-def _cut(tile: dict, pixels: np.ndarray) -> Tile:
+def _cut(tile: dict[str, Any], pixels: np.ndarray) -> Tile:
     left, top, width, height = (tile[key] for key in ("left", "top", "width", "height"))
     image = pixels[top : top + height, left : left + width]
     if image.shape != (height, width, 3) or not image.size:

@@ -55,7 +55,8 @@ def _write_image(attacked: Attacked, before: Conditions, after: Conditions, exam
         (attacked.images_before, attacked.logits_before, before),
         (attacked.result.images, attacked.logits, after),
     ]
-    save_figure(*(_exhibit(attacked, *side, example) for side in sides), path)
+    initial, adversarial = (_exhibit(attacked, *side, example) for side in sides)
+    save_figure(initial, adversarial, path)
 
 
 def _exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Conditions, example: int) -> Exhibit:
@@ -69,7 +70,7 @@ def _exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Con
     return Exhibit(images[example], captions, torch.stack(spheres))
 
 
-def _numbers(attacked: Attacked, example: int) -> dict:
+def _numbers(attacked: Attacked, example: int) -> dict[str, object]:
     result, classes = attacked.result, attacked.classifier.classes
     before, after = (logits[example].softmax(1) for logits in (attacked.logits_before, attacked.logits))
     return {

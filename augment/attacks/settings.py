@@ -64,7 +64,7 @@ class AttackSettings:
 
 
 def _kind(name: str, scene: Scene, settings: StepSettings) -> Kind:
-    if name == Skylight.name:
+    if isinstance(settings, SkylightSettings):
         angles = math.radians(settings.zenith), math.radians(settings.azimuth)
         return Skylight(scene, settings, *angles, settings.turbidity)
     return KINDS[name](scene, settings)

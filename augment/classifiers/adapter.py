@@ -69,6 +69,9 @@ class Normalise(nn.Module):
     The result is laid out channels last, in which a CPU convolves about a quarter faster.
     """
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self, mean: Sequence[float], std: Sequence[float], bgr: bool = False):
         super().__init__()
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))

@@ -17,7 +17,6 @@ from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.image import ImageSettings
 from renderer.lights import probe
-from renderer.mesh import normalise
 from renderer.shapes import solid
 from renderer.visibility import choose
 
@@ -85,6 +84,11 @@ def test_without_an_arm_or_examples_the_batch_is_empty(serve, model, settings):
     assert not choices.renders
     service = AugmentationService(choices, None, torch.zeros(0, dtype=torch.int64), 0, Phases())
     assert len(service.regenerate(model, 0).labels) == 0
+
+
+def test_what_is_to_be_rendered_needs_a_scene():
+    with pytest.raises(InputError, match="give a scene"):
+        AugmentationService(AugmentationSettings(), None, torch.zeros(0, dtype=torch.int64), 0, Phases())
 
 
 @pytest.mark.parametrize("arm", ["random", "adversarial"])
@@ -294,7 +298,7 @@ def test_restarts_go_on_where_no_descent_has_fooled_and_repeat_with_the_epoch(fe
 def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, monkeypatch, tmp_path):
     """Built from meshes, label indices and a size; what it gives is what a service around the same scene gives."""
     monkeypatch.chdir(tmp_path)
-    meshes = [("solid:plate", 0), (normalise(solid("table")), 2)]
+    meshes = [("solid:plate", 0), (solid("table"), 2)]
     attack = TrainingAttackSettings(max_steps=2)
     settings = AugmentationSettings(lights="continue", attack=attack)
     choices = dict(views=2, backgrounds=[0.25, 0.75], samples=2, visibility="software")
