@@ -7,12 +7,14 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, require_bounded
+from renderer.errors import InputError, require_bounded, require_range
 
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
 TRANSPORTS = ("direct", "shadows")
+LARGEST_SIZE = 4096  # pixels per side
 MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
+FINEST = 64  # samples per pixel side: the share of a pixel that is covered is told to 1/4096
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class ImageSettings:
     """Image size in pixels, samples per pixel side, encoding, a normal per face or interpolated vertex normals, and
     what the mesh does to its own light: nothing, or shadows.
 
-    InputError: none of the first two, an unknown choice.
+    InputError: none or too many of the first two, an unknown choice.
     """
 
     size: int = 32
@@ -30,8 +32,9 @@ class ImageSettings:
     transport: str = "direct"
 
     def __post_init__(self) -> None:
-        if self.size < 1 or self.samples < 1:
-            raise InputError(f"renderer.samples={self.samples} and the size {self.size} must be at least 1")
+        if self.size < 1:
+            raise InputError(f"the size {self.size} must be at least 1 pixel per side")
+        require_range("renderer.samples", self.samples, 1, FINEST)
         if self.size * self.samples > MOST_SAMPLES:
             raise InputError(
                 f"renderer.samples={self.samples} for each of {self.size} pixels in a row are more than "

@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
-from train.cli import one_sentence_errors, quoted, with_suggestions
+from train.cli import one_sentence_errors, quoted, run_command
 from train.data import DataSet
 from train.distributed import announce, announced, first_process_first, process_group
 from train.experiment import load_data, prepare, write_images
@@ -85,7 +85,7 @@ def start() -> None:
             console.setLevel("WARNING")
             sys.argv.append(f"run={quoted(announced())}")
         sys.argv[1:] = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
-        with_suggestions(main, "train")
+        run_command(main, "train")
 
 
 if __name__ == "__main__":

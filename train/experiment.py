@@ -39,7 +39,14 @@ from train.distributed import first_process_first
 from train.fit import Trainer, evaluate
 from train.logs import NoLog, RunLog, console
 from train.networks import build_network
-from train.photographs import FIGURES, evaluate_photographs, find_figure, find_photographs, format_summary
+from train.photographs import (
+    FIGURES,
+    evaluate_photographs,
+    find_figure,
+    find_photographs,
+    format_summary,
+    require_outside,
+)
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
 from train.settings import (
@@ -91,7 +98,8 @@ def run(config: DictConfig, data: DataSet, folder: Path) -> None:
 def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], None]:
     """Everything of `run` that comes before the first epoch, where wrong input shows; the result is the rest of it."""
     settings = read_settings(ExperimentSettings, config)
-    for photographs in settings.evaluate.folders.values():
+    for name, photographs in settings.evaluate.folders.items():
+        require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)
     device = choose_device(settings.train.device)
     set_threads(settings.train.threads)

@@ -274,8 +274,9 @@ class Trainer:
         if not all(finite):
             name = list(tensors)[finite.index(False)]
             raise InputError(
-                f"train.learning_rate={self.settings.learning_rate} made the {name} NaN or infinite in epoch {epoch}: "
-                "set a lower one; the checkpoint before, if any, is kept"
+                f"train.learning_rate={self.settings.learning_rate} with train.weight_decay="
+                f"{self.settings.weight_decay} made the {name} NaN or infinite in epoch {epoch}: set lower ones; the "
+                "checkpoint before, if any, is kept"
             )
 
     def _select(self, accuracy: float) -> None:
