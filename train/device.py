@@ -128,7 +128,7 @@ def compiles(choice: str, device: torch.device) -> bool:
         raise InputError("train.compile=always is for a GPU, whose graphs it replays: use auto or never")
     if choice != "auto":
         return choice == "always"
-    return device.type == "cuda" and processes.count() == 1 and compiler_works(device)
+    return device.type == "cuda" and processes.world_size() == 1 and compiler_works(device)
 
 
 @functools.cache
