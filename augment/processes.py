@@ -16,7 +16,7 @@ def rank() -> int:
 
 
 def share(total: int) -> Tensor:
-    """Ascending indices of this process's examples: every `world_size()`-th, at least one, which others may have too."""
+    """Ascending indices of this process's examples: every `world_size()`-th, at least one, also if others have it."""
     return torch.arange(rank() % total, total, world_size())
 
 

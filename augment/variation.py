@@ -35,7 +35,7 @@ class VariationSettings:
     backgrounds: a folder of images, each example before one of them. individuals: every solid that is named without a
     seed is another of its kind. turn: degrees that the camera goes around the mesh, at most, to either side and up and
     down. lights: each example is in one of these, as `load_light` takes them. lamps: the share of examples that stand
-    in the parallel light of a lamp on the camera's side, up to 70° off, over [least, most] `ambient` of their own light.
+    in the parallel light of a lamp on the camera's side, up to 70° off, over [least, most] `ambient` of their own.
     lit: a background is a wall that faces the camera in the example's light. snapshot: what a camera makes of the
     images.
     """

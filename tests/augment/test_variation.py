@@ -124,7 +124,7 @@ def test_lights_are_shared_out_among_the_examples(scene):
 
 
 def test_a_lamp_is_white_parallel_light_from_the_cameras_side_over_some_of_the_own_light(scene):
-    """The harmonics of degree 1 point to where it comes from; the mean is a quarter of what a surface facing it gets."""
+    """Its harmonics of degree 1 point to where it comes from; its mean is a quarter of what it gives."""
     lit = drawn(scene, lamps=1.0, ambient=[0.5, 0.5])
     lamps = (lit.lights - 0.5 * scene.lights)[:, :, 0].double()
     towards = lamps[:, [3, 1, 2]] / lamps[:, 1:4].norm(dim=1, keepdim=True)  # Y₁₁ ∝ x, Y₁₋₁ ∝ y, Y₁₀ ∝ z
