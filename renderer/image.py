@@ -1,5 +1,6 @@
 """Radiance to image: background, clamp and encoding, in one place and last, since clamping is not linear."""
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,8 @@ from renderer.errors import InputError, require_bounded, require_range
 
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
-TRANSPORTS = ("direct", "shadows")
+TRANSPORTS = ("direct", "shadows")  # and bounces:N
+MOST_BOUNCES = 100
 LARGEST_SIZE = 4096  # pixels per side
 MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
 FINEST = 64  # samples per pixel side: the share of a pixel that is covered is told to 1/4096
@@ -20,7 +22,7 @@ FINEST = 64  # samples per pixel side: the share of a pixel that is covered is t
 @dataclass(frozen=True)
 class ImageSettings:
     """Image size in pixels, samples per pixel side, encoding, a normal per face or interpolated vertex normals, and
-    what the mesh does to its own light: nothing, or shadows.
+    what the mesh does to its own light: nothing, shadows, or bounces:N as well.
 
     InputError: none or too many of the first two, an unknown choice.
     """
@@ -43,8 +45,20 @@ class ImageSettings:
         check_encoding(self.encoding)
         if self.normals not in NORMALS:
             raise InputError(f"renderer.normals={self.normals}: choose one of {', '.join(NORMALS)}")
-        if self.transport not in TRANSPORTS:
-            raise InputError(f"renderer.transport={self.transport}: choose one of {', '.join(TRANSPORTS)}")
+        bounces(self.transport)
+
+
+def bounces(transport: str) -> int:
+    """How often light goes on from one surface to another: N of "bounces:N", else 0. InputError: an unknown choice."""
+    if transport in TRANSPORTS:
+        return 0
+    name, _, count = transport.partition(":")
+    if name == "bounces" and re.fullmatch("[0-9]{1,3}", count) and 1 <= int(count) <= MOST_BOUNCES:
+        return int(count)
+    raise InputError(
+        f"renderer.transport={transport}: choose one of {', '.join(TRANSPORTS)}, or bounces:N with N from 1 to "
+        f"{MOST_BOUNCES}"
+    )
 
 
 def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:

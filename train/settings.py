@@ -95,7 +95,7 @@ class TrainingSceneSettings(SceneSettings):
 class RendererSettings:
     """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb. normals: flat or smooth.
 
-    transport: direct, or with shadows that a mesh casts on itself. cache: the folder of what is rendered once, auto or
+    transport: direct, shadows or bounces:N; see `renderer.render`. cache: the folder of what is rendered once, auto or
     None; see `renderer.cache.cache_folder`.
     """
 
