@@ -1,15 +1,28 @@
 """Norm-balls in a space of parameters: the exact projection into them and uniform draws from them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from renderer.basis import Ends
 from renderer.errors import FACTOR, InputError, require_range
 
 NORMS = ("linf", "l2")
-Domain = Callable[[Tensor], Tensor]
+SECANTS = 20  # four are usual; what they end with is within the ball, at most that much short of the nearest
+
+
+class Domain(Protocol):
+    """A convex set of values (D,)."""
+
+    def __call__(self, values: Tensor, ends: Ends | None = None) -> Tensor:
+        """Its nearest points to values (A, D), between ends (A, D) each that some of its points lie between."""
+
+
+def anywhere(values: Tensor, ends: Ends | None = None) -> Tensor:
+    """The domain without a bound."""
+    return values if ends is None else values.clamp(*ends)
 
 
 @dataclass
@@ -28,16 +41,16 @@ class NormBall:
             raise InputError(f"attack: norm={self.norm}: choose one of {', '.join(NORMS)}")
         require_range("attack: radius", self.radius, 0, FACTOR)  # no limit: null
 
-    def project(self, values: Tensor, centre: Tensor, domain: Domain = lambda values: values) -> Tensor:
-        """The nearest points of the ball in the Euclidean sense; values and centre (A, D).
+    def project(self, values: Tensor, centre: Tensor, domain: Domain = anywhere) -> Tensor:
+        """The nearest points of what ball and domain share, in the Euclidean sense; values and centre (A, D).
 
-        domain: clamps values to a box that holds the centre; then the nearest points of what ball and box share.
+        The domain holds the centre.
         """
         if self.radius is None:
             return domain(values)
         if self.norm == "linf":
-            return domain(values).clamp(centre - self.radius, centre + self.radius)
-        return _project_on_sphere(values, centre, self.radius, domain)
+            return domain(values, (centre - self.radius, centre + self.radius))
+        return _project_into_sphere(values, centre, self.radius, domain)
 
     def sample(self, centre: Tensor, generator: torch.Generator, used: Tensor | None = None) -> Tensor:
         """A uniform draw around each centre (A, D), on the generator's device. InputError where there is no radius.
@@ -60,21 +73,34 @@ class NormBall:
         return centre + self.radius * offset.to(centre)
 
 
-def _project_on_sphere(values: Tensor, centre: Tensor, radius: float, domain: Domain) -> Tensor:
-    """Straight towards the values and along the domain's ends from there on, as far as the radius goes.
+def _project_into_sphere(values: Tensor, centre: Tensor, radius: float, domain: Domain) -> Tensor:
+    """The domain's nearest points to points on the way from the centre to the values, as far as the radius goes.
 
-    Where the box cuts an axis off, the others may go further: what is left of the squared radius is theirs. Each round
-    but the last cuts off another axis.
+    With a multiplier λ for the ball, what is nearest to values v is the domain's nearest to c + (v - c) / (1 + λ), and
+    the farther on the way, the farther from the centre. How far is found by secants of the squared distance over the
+    squared share of the way, which for a box is straight between the corners that it cuts off.
     """
-    offset = values - centre
-    share = (radius / offset.norm(dim=1, keepdim=True)).clamp(max=1)
-    while True:
-        straight = torch.where(share < 1, centre + share * offset, values)
-        nearest = domain(straight)
-        cut = nearest != straight
-        left = radius**2 - torch.where(cut, nearest - centre, 0).square().sum(1, keepdim=True)
-        longer = (left.clamp(min=0).sqrt() / torch.where(cut, 0, offset).norm(dim=1, keepdim=True)).clamp(max=1)
-        further = cut.any(1, keepdim=True) & (longer > share)
-        if not further.any():
-            return nearest
-        share = torch.where(further, longer, share)
+    offset, squared = values - centre, radius**2
+
+    def at(share: Tensor) -> tuple[Tensor, Tensor]:
+        nearest = domain(torch.where(share < 1, centre + share.sqrt() * offset, values))
+        return nearest, (nearest - centre).square().sum(1, keepdim=True)
+
+    share = (squared / offset.square().sum(1, keepdim=True)).clamp(max=1)  # a domain's nearest points are no farther
+    nearest, distance = at(share)
+    other, its_distance = torch.zeros_like(share), torch.zeros_like(distance)
+    rounding = 8 * torch.finfo(values.dtype).eps * squared
+    for _ in range(SECANTS):
+        left = squared - distance
+        going = (share < 1) & (share != other) & (left > rounding)
+        if not going.any():
+            break
+        slope = ((distance - its_distance) / (share - other)).clamp(min=torch.finfo(values.dtype).tiny)
+        tried = torch.where(going, share + left / slope, share).clamp(max=1)
+        found, found_distance = at(tried)
+        inside = found_distance <= squared + rounding
+        other = torch.where(inside, share, tried)
+        its_distance = torch.where(inside, distance, found_distance)
+        share, distance = torch.where(inside, tried, share), torch.where(inside, found_distance, distance)
+        nearest = torch.where(inside, found, nearest)
+    return nearest

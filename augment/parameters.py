@@ -12,8 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from augment.norm_ball import NormBall
+from augment.norm_ball import NormBall, anywhere
 from augment.scene import Conditions, Scene
+from renderer.basis import Ends
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
 from renderer.lights import mean_luminance
 from renderer.skylight import TURBIDITY, ZENITH, coefficients
@@ -94,9 +95,9 @@ class Kind(ABC):
         reach = (values - start).norm(dim=1, keepdim=True)
         return self.within_domain(start + offset * reach / offset.norm(dim=1, keepdim=True))
 
-    def within_domain(self, values: Tensor) -> Tensor:
-        """Values (A, D) moved into their domain, a box around the start; by default there is no bound."""
-        return values
+    def within_domain(self, values: Tensor, ends: Ends | None = None) -> Tensor:
+        """See `augment.norm_ball.Domain`; by default there is no bound."""
+        return anywhere(values, ends)
 
     def step(self, gradient: Tensor) -> Tensor:
         """How far to go down a gradient (A, D)."""
@@ -115,18 +116,24 @@ class OfMesh(Kind):
 
 
 class Lighting(Kind):
-    """Every coefficient of the light, within the domain of the scene's basis; the start is the examples' own."""
+    """Every coefficient of the light. The start is the examples' own; or, where light is to be physical, what is
+    nearest to it that something can emit, and so is every light from there on."""
 
     name = "lighting"
 
-    def __init__(self, scene: Scene, settings: StepSettings):
-        super().__init__(scene, scene.lights.flatten(1), settings)
+    def __init__(self, scene: Scene, settings: StepSettings, physical: bool = False):
+        self.physical = physical or not scene.basis.signed
+        start = scene.basis.nearest_physical(scene.lights) if self.physical else scene.lights
+        super().__init__(scene, start.flatten(1), settings)
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return replace(conditions, light=values.unflatten(1, (-1, 3)))
 
-    def within_domain(self, values: Tensor) -> Tensor:
-        return self.scene.basis.within_domain(values.unflatten(1, (-1, 3))).flatten(1)
+    def within_domain(self, values: Tensor, ends: Ends | None = None) -> Tensor:
+        if not self.physical:
+            return super().within_domain(values, ends)
+        of_lights = None if ends is None else (ends[0].unflatten(1, (-1, 3)), ends[1].unflatten(1, (-1, 3)))
+        return self.scene.basis.nearest_physical(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
 
 
 class Skylight(Kind):
@@ -147,10 +154,11 @@ class Skylight(Kind):
         sky = coefficients(zenith, azimuth, turbidity * TURBIDITY_UNIT) * self._scale[examples]
         return replace(conditions, light=sky.to(conditions.light))
 
-    def within_domain(self, values: Tensor) -> Tensor:
+    def within_domain(self, values: Tensor, ends: Ends | None = None) -> Tensor:
         zenith, azimuth, turbidity = values.unbind(1)
-        low, high = (limit / TURBIDITY_UNIT for limit in TURBIDITY)
-        return torch.stack([zenith.clamp(*ZENITH), azimuth, turbidity.clamp(low, high)], dim=1)
+        clear, hazy = (limit / TURBIDITY_UNIT for limit in TURBIDITY)
+        possible = torch.stack([zenith.clamp(*ZENITH), azimuth, turbidity.clamp(clear, hazy)], dim=1)
+        return super().within_domain(possible, ends)
 
 
 class Geometry(OfMesh):

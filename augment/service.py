@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment import processes
-from augment.attacks.settings import AttackSettings
+from augment.attacks.settings import SIGNED, AttackSettings
 from augment.build import Shown, build_scene
 from augment.descent import NO_CLASS, AttackResult, Goal, Part, descend_repeatedly
 from augment.labels import is_right, label_loss
@@ -47,13 +47,15 @@ class RandomLights:
 
 @dataclass
 class TrainingAttackSettings(AttackSettings):
-    """Unless kinds are named, the paper's appendix C: 0.05 along the gradient's direction of the light, 30 steps.
+    """Unless kinds are named, the paper's appendix C: 0.05 along the gradient's direction of the light, 30 steps, any
+    coefficients.
 
     step, step_size: those of that light; see `StepSettings` for what "along the direction" means.
     """
 
     step: str = "unit"
     step_size: float = 0.05
+    light: str = SIGNED
     batch_size: int = 128
 
     def __post_init__(self) -> None:

@@ -7,6 +7,8 @@ from torch import Tensor
 
 from renderer.harmonics import basis, irradiance_basis, live_coefficients
 
+Ends = tuple[Tensor, Tensor]  # the lowest and the highest values
+
 
 class Basis(Protocol):
     """`size` functions of light; a light is a coefficient (size, 3) of each, RGB. Equal ones have equal fields."""
@@ -14,6 +16,10 @@ class Basis(Protocol):
     @property
     def name(self) -> str:
         """In files and messages."""
+
+    @property
+    def signed(self) -> bool:
+        """Whether coefficients that nothing can emit are of use, too."""
 
     @property
     def size(self) -> int:
@@ -29,17 +35,22 @@ class Basis(Protocol):
     def radiance(self, directions: Tensor) -> Tensor:
         """(N, size) that comes from unit directions (N, 3), per unit of each coefficient."""
 
-    def within_domain(self, coefficients: Tensor) -> Tensor:
-        """Coefficients (..., size, 3) clamped to a box, or as they are where any light is allowed."""
+    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
+        """The light (..., size, 3) nearest to the coefficients that something can emit.
+
+        ends: of the same shape, which it stays between; some such light does.
+        """
 
 
 @dataclass(frozen=True)
 class Harmonics:
-    """Distant light as real spherical harmonics; any coefficients, negative radiance included (the paper's)."""
+    """Distant light as real spherical harmonics. Any coefficients render, negative radiance included (the paper's);
+    only such exist whose radiance is nowhere negative."""
 
     degree: int = 6
 
     name = "harmonics"
+    signed = True
 
     def __str__(self) -> str:
         return f"{self.name} of degree {self.degree}"
@@ -58,8 +69,10 @@ class Harmonics:
     def radiance(self, directions: Tensor) -> Tensor:
         return basis(directions, self.degree)
 
-    def within_domain(self, coefficients: Tensor) -> Tensor:
-        return coefficients
+    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
+        from renderer.nonnegative import nearest_nonnegative  # scipy's optimisers take long to import
+
+        return nearest_nonnegative(coefficients, ends)
 
 
 HARMONICS = Harmonics()

@@ -4,10 +4,13 @@ import math
 from dataclasses import dataclass
 
 from augment.descent import DescentSettings
-from augment.parameters import KINDS, Kind, Skylight, StepSettings
+from augment.parameters import KINDS, Kind, Lighting, Skylight, StepSettings
 from augment.perturbation import Perturbation
 from augment.scene import Scene
 from renderer.errors import InputError, require_range
+
+PHYSICAL, SIGNED = "physical", "signed"
+LIGHTS = (PHYSICAL, SIGNED)
 
 
 @dataclass
@@ -23,6 +26,8 @@ class SkylightSettings(StepSettings):
 class AttackSettings:
     """None for what stays as it is. restarts: further starts, drawn from the norm-balls, where nothing is fooled yet.
 
+    light: what `lighting` may find: "physical", only what something can emit (of harmonics: radiance nowhere negative),
+    beginning with the nearest such light to the scene's; or "signed", any coefficients.
     max_steps, shorten, batch_size: see `DescentSettings`.
     """
 
@@ -31,6 +36,7 @@ class AttackSettings:
     geometry: StepSettings | None = None
     albedo: StepSettings | None = None
     pixels: StepSettings | None = None
+    light: str = "physical"
     max_steps: int = 30
     shorten: bool = False
     restarts: int = 0
@@ -39,6 +45,8 @@ class AttackSettings:
     def __post_init__(self) -> None:
         if self.lighting and self.skylight:
             raise InputError("attack: lighting and skylight both set the light: choose one of them")
+        if self.light not in LIGHTS:
+            raise InputError(f"attack.light={self.light}: choose one of {', '.join(LIGHTS)}")
         require_range("attack.restarts", self.restarts, 0, 10**6)
         if self.restarts and any(settings.radius is None for settings in self.kinds.values()):
             raise InputError("attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0")
@@ -60,11 +68,12 @@ class AttackSettings:
 
     def problem(self, scene: Scene) -> Perturbation:
         """What is changed of a scene."""
-        return Perturbation(scene, [_kind(name, scene, settings) for name, settings in self.kinds.items()])
+        return Perturbation(scene, [self._kind(name, scene, settings) for name, settings in self.kinds.items()])
 
-
-def _kind(name: str, scene: Scene, settings: StepSettings) -> Kind:
-    if isinstance(settings, SkylightSettings):
-        angles = math.radians(settings.zenith), math.radians(settings.azimuth)
-        return Skylight(scene, settings, *angles, settings.turbidity)
-    return KINDS[name](scene, settings)
+    def _kind(self, name: str, scene: Scene, settings: StepSettings) -> Kind:
+        if name == Lighting.name:
+            return Lighting(scene, settings, self.light == PHYSICAL)
+        if isinstance(settings, SkylightSettings):
+            angles = math.radians(settings.zenith), math.radians(settings.azimuth)
+            return Skylight(scene, settings, *angles, settings.turbidity)
+        return KINDS[name](scene, settings)

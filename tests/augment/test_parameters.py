@@ -15,8 +15,10 @@ from augment.parameters import KINDS, STEPS, Albedo, Geometry, Kind, Lighting, P
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
+from renderer.environment import read_map, to_map, write_map
 from renderer.errors import InputError
-from renderer.lights import mean_luminance
+from renderer.lights import directional, mean_luminance, project_environment
+from renderer.nonnegative import TOLERANCE
 from renderer.skylight import TURBIDITY, ZENITH, coefficients_by_quadrature
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -198,6 +200,45 @@ def test_a_new_kind_is_one_class_and_goes_with_the_others(make_scene, make_linea
         (model(p.flatten(0, 1)) @ torch.tensor([1.0, -1.0]).double()).view(3, 2).sum(1) for p in (lit, other)
     )
     assert (margin < worse).all()
+
+
+def ringing(scene: Scene) -> Scene:
+    """The same in the light of a sun, which dips below zero where harmonics of degree 6 cut it short."""
+    sun = directional(torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64), 0.3 * torch.ones(3, dtype=torch.float64))
+    return scene.with_rows(scene.examples, light=sun)
+
+
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_physical_light_is_the_nearest_within_the_ball_that_something_emits(make_scene, norm):
+    """q is nearest to v exactly when (v - q)·(p - q) ≤ 0 for all p of the set: here other lights that were projected
+    into it, the centre, and the light's own way there and beyond."""
+    scene, draws = ringing(make_scene()), torch.Generator().manual_seed(3)
+    light = Lighting(scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), physical=True)
+    assert not torch.equal(light.start, scene.lights.flatten(1))
+    wanted = light.start + 0.1 * torch.randn(3, 147, generator=draws, dtype=torch.float64)
+    nearest, offset = light.project(wanted, EVERY), light.start - wanted
+    reach = nearest - light.start
+    assert torch.all((reach.norm(dim=1) if norm == "l2" else reach.abs().amax(1)) <= light.settings.radius * (1 + 1e-9))
+    torch.testing.assert_close(light.within_domain(nearest), nearest, rtol=0, atol=TOLERANCE)
+    others = [light.sample(draws, EVERY) for _ in range(5)] + [light.start, light.start + reach / 2]
+    for other in others:
+        product = ((wanted - nearest) * (other - nearest)).sum(1)
+        assert (product <= 1e-3 * offset.norm(dim=1) * (other - nearest).norm(dim=1)).all()
+    torch.testing.assert_close(light.project(nearest, EVERY), nearest, rtol=0, atol=10 * TOLERANCE)
+
+
+def test_a_descent_in_physical_light_ends_in_light_that_an_environment_map_holds(make_scene, make_linear, tmp_path):
+    """And begins with the nearest to the scene's: RGBE, which has no negative numbers, gives the images back."""
+    scene, classes = ringing(make_scene()), torch.zeros(3, 2, dtype=torch.int64)
+    problem = Perturbation(scene, [Lighting(scene, StepSettings(step_size=0.5), physical=True)])
+    values, images = attack(make_linear(2, bias=50.0), problem, Goal(classes, classes + 1), steps=6)
+    assert (values - problem.start).norm(dim=1).min() > 1
+    written = []
+    for light in values:
+        write_map(tmp_path / "light.hdr", to_map(light.unflatten(0, (49, 3)), 128))
+        written.append(project_environment(read_map(tmp_path / "light.hdr")))
+    read = scene.render(Conditions(torch.stack(written)), EVERY)
+    torch.testing.assert_close(read, images, rtol=0, atol=0.5 / 255)
 
 
 FINITE = st.floats(-50, 50)

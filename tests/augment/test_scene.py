@@ -10,6 +10,7 @@ import renderer
 from augment import scene as scene_module
 from augment.backgrounds import load_backgrounds
 from augment.descent import DescentSettings, Goal, descend
+from augment.norm_ball import anywhere
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
@@ -380,14 +381,15 @@ class Lamps:
     """A basis that the package does not have: three lamps far away, along the axes, of power from 0 to 1."""
 
     name = "lamps"
+    signed = False
     size = 3
     live = torch.arange(3)
 
     def irradiance(self, normals: torch.Tensor) -> torch.Tensor:
         return normals.clamp(min=0)
 
-    def within_domain(self, coefficients: torch.Tensor) -> torch.Tensor:
-        return coefficients.clamp(0, 1)
+    def nearest_physical(self, coefficients: torch.Tensor, ends=None) -> torch.Tensor:
+        return anywhere(coefficients.clamp(0, 1), ends)
 
 
 def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its_own():

@@ -12,6 +12,7 @@ from renderer.mesh import Mesh, load_mesh
 from renderer.shapes import solid
 
 CLASSES = ("orange", "lime", "sky", "night")
+SIGNED = augment.AttackSettings(lighting=augment.StepSettings(), light="signed")
 SMALL = {"visibility": "software", "field_of_view": 2.4}
 
 
@@ -29,7 +30,7 @@ def classifier() -> augment.Classifier:
 def test_several_meshes_and_classes_are_attacked_in_one_scene_each_away_from_its_own(classifier):
     lime = Mesh.plain(solid("orange").vertices, solid("orange").faces, (0.1, 0.9, 0.1))
     scene = augment.build_scene([("solid:orange", "orange"), (lime, "lime")], 8, views=2, **SMALL)
-    attacked = augment.attack(classifier, scene)
+    attacked = augment.attack(classifier, scene, settings=SIGNED)
     assert attacked.goal.decrease.tolist() == [[0], [0], [1], [1]]
     assert attacked.success.all() and (attacked.steps > 0).all()
     assert torch.equal(attacked.logits.argmax(2) != attacked.goal.decrease, attacked.success[:, None])
@@ -39,7 +40,7 @@ def test_several_meshes_and_classes_are_attacked_in_one_scene_each_away_from_its
 @pytest.mark.parametrize("target", ["lime", ["lime", "night"]])
 def test_shared_views_may_each_have_a_target(classifier, target):
     scene = augment.build_scene([("solid:orange", "orange")], 8, views=2, shared=True, **SMALL)
-    attacked = augment.attack(classifier, scene, augment.Targeted(target))
+    attacked = augment.attack(classifier, scene, augment.Targeted(target), SIGNED)
     assert attacked.conditions.light.shape == (1, 49, 3) and attacked.images.shape == (1, 2, 3, 8, 8)
     names = [target] * 2 if isinstance(target, str) else target
     assert attacked.goal.increase.tolist() == [[CLASSES.index(name) for name in names]]
@@ -48,7 +49,7 @@ def test_shared_views_may_each_have_a_target(classifier, target):
 def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifier, tmp_path):
     kinds = {name: augment.StepSettings("linf", 0.01, "sign", 0.004) for name in KINDS.keys() - {"skylight"}}
     scene = augment.build_scene([("solid:orange", "orange")], 8, **SMALL)
-    attacked = augment.attack(classifier, scene, settings=augment.AttackSettings(**kinds, max_steps=4))
+    attacked = augment.attack(classifier, scene, settings=augment.AttackSettings(**kinds, max_steps=4, light="signed"))
     moved = (attacked.result.values - attacked.problem.start).abs()
     assert 0.009 < moved.max() <= 0.01 + 1e-6
     checks = attacked.check()

@@ -1,7 +1,7 @@
 """One attack of each kind as an image (the paper's Section 4: skylight, several views, the illusion, and more)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from augment.attacks.figure import Exhibit, answer_caption, save_figure
 from augment.attacks.run import Attacked
-from augment.attacks.settings import SkylightSettings
+from augment.attacks.settings import SIGNED, SkylightSettings
 from augment.objects import ObjectSettings
 from augment.parameters import StepSettings
 from augment.scene import Conditions
@@ -86,7 +86,7 @@ class Case:
         return AttackExperimentSettings(
             target=self.target,
             seed=seed,
-            attack=self.attack,
+            attack=replace(self.attack, light=SIGNED),
             scene=AttackSceneSettings(
                 views=self.views,
                 backgrounds=[self.background],
