@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -98,7 +99,7 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
 
 
 @contextmanager
-def mitsuba() -> Iterator:
+def mitsuba() -> Iterator[Any]:
     """The module under our variant; that of before, if any, comes back. InputError: it is not installed."""
     try:
         import mitsuba as module

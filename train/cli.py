@@ -11,6 +11,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra import compose, initialize_config_module
@@ -54,7 +55,7 @@ def one_sentence(error: Exception) -> str | None:
     return None
 
 
-def one_sentence_errors(function: Callable) -> Callable:
+def one_sentence_errors(function: Callable[..., Any]) -> Callable[..., Any]:
     """Print what the user can mend as one line, without a traceback, and exit with status 2.
 
     Where nobody reads the output any more, exit in silence, as a shell says it of SIGPIPE: 128 + number.
@@ -127,7 +128,7 @@ def _is_misread(override: str, value: str, exists: bool) -> bool:
     return exists and (read.is_sweep_override() or read.value() != value)
 
 
-def script(function: Callable, settings: type | None = None) -> None:
+def script(function: Callable[..., Any], settings: type | None = None) -> None:
     """Run a script of scripts/ under the configuration of its own name, read into a dataclass where one is given.
 
     What the function returns are failures, in words, which the script ends with.

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ class Evaluation:
         return self.run.config.seed
 
     @cached_property
-    def figures(self) -> dict[str, dict]:
+    def figures(self) -> dict[str, dict[str, Any]]:
         """By source, as `train.photographs.figures.figures` returns them."""
         return {source: figures(pool, self.label) for source, pool in self.pools.items()}
 
@@ -75,7 +76,7 @@ def have_same_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]
     return sorted(run.seed for run in group) == sorted(run.seed for run in reference)
 
 
-def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], source: str, name: str) -> dict:
+def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], source: str, name: str) -> dict[str, Any]:
     """How far the mean of a figure over a group's seeds is from that over the reference's: value, low and high.
 
     The interval is a 95 % bootstrap interval over images, of which each replicate has the same ones for all runs, and
@@ -171,7 +172,7 @@ def _format_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) 
     return f"different seeds ({len(group)} and {len(reference)})"
 
 
-def _format_difference(figure: dict) -> str:
+def _format_difference(figure: dict[str, Any]) -> str:
     return f"{figure['value']:+.3f} [{figure['low']:+.3f}, {figure['high']:+.3f}]" if figure else "-"
 
 

@@ -139,7 +139,9 @@ def compiler_works(device: torch.device) -> bool:
     return True
 
 
-def training_pass(model: nn.Module, label_smoothing: float, compiled: bool) -> Callable[[Tensor, Tensor], tuple]:
+def training_pass(
+    model: nn.Module, label_smoothing: float, compiled: bool
+) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """A function of uint8 images (B, 3, H, W) and labels (B,): the mean `label_loss`, and how many are right.
 
     compiled: torch forgets what it compiled before, since its limit counts the graphs of all runs of a process.

@@ -49,7 +49,7 @@ class Trainer:
         self,
         settings: TrainSettings,
         model: MixedPrecision,
-        architecture: dict,
+        architecture: dict[str, Any],
         service: AugmentationService,
         phases: Phases,
         folder: Path,
@@ -304,7 +304,9 @@ class Trainer:
             checkpoint.save(self.folder / checkpoint.BEST, best)
         checkpoint.save(self.folder / checkpoint.LAST, state, self.folder / checkpoint.PREVIOUS)
 
-    def _report(self, log: RunLog, trained: dict, validated: dict, diagnostics: Mapping[str, float]) -> None:
+    def _report(
+        self, log: RunLog, trained: dict[str, Any], validated: dict[str, Any], diagnostics: Mapping[str, float]
+    ) -> None:
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()  # one resumed after its last attack has no more
         scalars = {
             **{f"train/{name}": value for name, value in trained.items()},
@@ -351,7 +353,7 @@ def _one_error_out_of_memory(setting: str) -> Iterator[None]:
         raise InputError(f"{setting} needs more memory than there is: set a lower one") from error
 
 
-def _progress(batches: Iterable, first: int, total: int, description: str) -> Iterable:
+def _progress(batches: Iterable[Any], first: int, total: int, description: str) -> Iterable[Any]:
     """A progress bar on a terminal, nothing elsewhere."""
     hidden = not sys.stderr.isatty()
     return tqdm(batches, initial=first, total=total, desc=description, leave=False, disable=hidden)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean, stdev
+from typing import Any
 
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -43,7 +44,7 @@ class RunSummary:
     config: DictConfig
     scores: dict[str, float]
     seconds: dict[str, float]
-    photographs: dict[str, dict]
+    photographs: dict[str, dict[str, Any]]
 
     @property
     def arm(self) -> str:
@@ -192,7 +193,7 @@ def _titles(runs: Sequence[RunSummary]) -> list[str]:
     return [figure_title(name, runs[0].config.label) for name in FIGURES]
 
 
-def _figures(run: RunSummary, folder: str) -> list[dict]:
+def _figures(run: RunSummary, folder: str) -> list[dict[str, Any]]:
     return [find_figure(run.photographs.get(folder, {}), name) for name in FIGURES]
 
 

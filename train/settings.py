@@ -60,8 +60,8 @@ class SceneSettings:
     ObjectSettings' keys.
     """
 
-    meshes: list = field(default_factory=list)
-    backgrounds: list = field(default_factory=list)
+    meshes: list[Any] = field(default_factory=list)
+    backgrounds: list[Any] = field(default_factory=list)
     views: int | None = None
     polar: float = 60.0
     azimuth: float = 0.0
@@ -85,7 +85,7 @@ class SceneSettings:
 class TrainingSceneSettings(SceneSettings):
     """look_alikes: like meshes, of what `label` is to be told from; of no class, unless a mapping names one."""
 
-    look_alikes: list = field(default_factory=list)
+    look_alikes: list[Any] = field(default_factory=list)
 
 
 @dataclass
@@ -247,7 +247,7 @@ def require_same_settings(folder: Path, config: DictConfig) -> None:
             )
 
 
-def dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
+def dotted(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
     """The values of nested settings by dotted key."""
     for key, value in node.items():
         if isinstance(value, dict) and prefix + key not in CIRCUMSTANCES:
@@ -256,7 +256,7 @@ def dotted(node: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
             yield prefix + key, value
 
 
-def read_object(item: str | dict, label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
+def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
     """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own."""
     keys = item if isinstance(item, dict) else {"mesh": item}
     return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")

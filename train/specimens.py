@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -62,7 +63,7 @@ def read_specimens(path: Path) -> list[tuple[str, Side, Side]]:
         raise InputError(f"{path} is damaged or of another version ({' '.join(str(error).split())})") from error
 
 
-def _sides(tensors: dict[str, Tensor], answers: dict, name: str, count: int) -> list[Side]:
+def _sides(tensors: dict[str, Tensor], answers: dict[str, Any], name: str, count: int) -> list[Side]:
     images, lights = tensors[f"images_{name}"], tensors[f"lights_{name}"]
     if not (len(images) == len(lights) == count <= MOST and images.dtype == torch.uint8):
         raise ValueError(f"{len(images)} images and {len(lights)} lights for {count} answers")

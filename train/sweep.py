@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
@@ -125,7 +125,7 @@ def _reason(error: Exception) -> str:
     return reason
 
 
-def _one_outcome(callback: Callable) -> Callable:
+def _one_outcome(callback: Callable[..., Any]) -> Callable[..., Any]:
     """Of a callback, whose exceptions Hydra turns into warnings, exit status 0 with them: end the process instead."""
 
     @functools.wraps(callback)

@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -98,7 +99,7 @@ def _numbers(attacked: Attacked, example: int) -> dict[str, object]:
     }
 
 
-def _damage(attacked: Attacked, after: Conditions, example: int) -> dict[str, dict]:
+def _damage(attacked: Attacked, after: Conditions, example: int) -> dict[str, dict[str, Any]]:
     """What became of the shape, where it was attacked."""
     mesh = attacked.problem.scene.mesh(example)
     if after.vertices is None:

@@ -4,6 +4,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ class Verdict:
     largest: Tensor
     mean: Tensor
 
-    def of(self, example: int, classes: Sequence[str]) -> dict:
+    def of(self, example: int, classes: Sequence[str]) -> dict[str, Any]:
         """One example's numbers."""
         best = self.logits[example].softmax(1).max(1)
         return {

@@ -35,8 +35,8 @@ class AttackCommandSettings(AttackSettings):
 class AttackSceneSettings(SceneSettings):
     """One view of a solid orange before grey, unless told otherwise."""
 
-    meshes: list = field(default_factory=lambda: ["solid:orange:0"])
-    backgrounds: list = field(default_factory=lambda: [0.5])
+    meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
+    backgrounds: list[Any] = field(default_factory=lambda: [0.5])
     views: int = 1
 
     def __post_init__(self) -> None:

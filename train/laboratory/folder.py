@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,7 +84,7 @@ def _write(sittings: Iterator[tuple[int, Shot, Subject]], settings: LabSettings,
     return len(rows)
 
 
-def read_subject(item: str | dict, index: int) -> Subject:
+def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     """An entry of `meshes`. Without a label, a solid has its own name, with `other_` before that of a look-alike.
 
     InputError: as `load_object`; a file without a label.

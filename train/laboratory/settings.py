@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from renderer.errors import FACTOR, InputError, require_range
 from train.laboratory.patterns import FAMILIES
@@ -25,7 +26,7 @@ class LabSettings:
     """
 
     out: str
-    meshes: list
+    meshes: list[Any]
     label: str = "orange"
     lights: int = 180
     patterns: list[str] = field(default_factory=lambda: list(FAMILIES))

@@ -2,6 +2,7 @@
 under an environment map."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -36,20 +37,20 @@ def photograph(parts: Sequence[Part], shot: Shot, size: int, samples: int, bounc
         return sum(np.array(mi.render(scene, spp=samples, seed=seed)) for scene in scenes)
 
 
-def _sensor(mi, shot: Shot, size: int) -> dict:
+def _sensor(mi, shot: Shot, size: int) -> dict[str, Any]:
     look = mi.ScalarTransform4f().look_at(origin=list(shot.camera), target=list(shot.aim), up=[0, 0, 1])
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     return {"type": "perspective", "fov": FIELD_OF_VIEW, "to_world": look, "film": film}
 
 
-def _lights(mi, shot: Shot) -> list[dict]:
+def _lights(mi, shot: Shot) -> list[dict[str, Any]]:
     if shot.environment is not None:  # Mitsuba's maps have y up and +z in the middle column, ours z up and +x there
         turn = mi.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
         return [{"type": "envmap", "bitmap": mi.Bitmap(shot.environment), "to_world": turn}]
     return [_projector(mi, shot), {"type": "constant", "radiance": _rgb(shot.ambient)}]
 
 
-def _projector(mi, shot: Shot) -> dict:
+def _projector(mi, shot: Shot) -> dict[str, Any]:
     """Mitsuba's gives a white surface that faces it at distance 1 the radiance of its image."""
     distance = float(np.linalg.norm(shot.projector - shot.centre))
     return {
@@ -61,7 +62,7 @@ def _projector(mi, shot: Shot) -> dict:
     }
 
 
-def _object(mi, parts: Sequence[Part], shot: Shot) -> list:
+def _object(mi, parts: Sequence[Part], shot: Shot) -> list[Any]:
     """The object turned, scaled and set down on the table."""
     turned = [shot.scale * part.positions @ shot.turn.T for part in parts]
     lowest = min(positions[..., 2].min() for positions in turned)
@@ -94,5 +95,5 @@ def _shape(mi, part: Part, positions: np.ndarray, normals: np.ndarray):
     return shape
 
 
-def _rgb(color: np.ndarray) -> dict:
+def _rgb(color: np.ndarray) -> dict[str, Any]:
     return {"type": "rgb", "value": [float(channel) for channel in color]}

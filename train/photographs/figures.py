@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def _paired(source: str, pool: Pool, known: Iterable[str]) -> list[str]:
     return sorted({source}.union(*(answer.photograph.look_alikes for answer in pool.mine)).intersection(known))
 
 
-def figures(pool: Pool, label: str) -> dict:
+def figures(pool: Pool, label: str) -> dict[str, Any]:
     """recall, top5 and false_alarms, as `share` returns them, and auc and recall_at, as `rank` does."""
     return {
         "recall": share_true(answer.true_rank == 1 for answer in pool.mine),
@@ -94,13 +95,13 @@ def replicate_figures(pool: Pool, label: str) -> dict[str, np.ndarray]:
     return replicates
 
 
-def share_true(outcomes: Iterable[bool]) -> dict:
+def share_true(outcomes: Iterable[bool]) -> dict[str, Any]:
     """The share of the outcomes that are true."""
     outcomes = list(outcomes)
     return share(sum(outcomes), len(outcomes))
 
 
-def find_figure(summary: dict, name: str) -> dict:
+def find_figure(summary: dict[str, Any], name: str) -> dict[str, Any]:
     """A figure of a summary, or of one of its sources, by its name in FIGURES; empty where it has none."""
     return reduce(lambda part, key: part.get(key, {}), name.split("/"), summary)
 

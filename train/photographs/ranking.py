@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ class Ranking:
         return alarms, recall, thresholds
 
 
-def rank(label: Sequence[float], others: Sequence[float]) -> dict:
+def rank(label: Sequence[float], others: Sequence[float]) -> dict[str, Any]:
     """Images of a class against others, by their scores.
 
     Returns auc: value, low, high, and how many images of the class (label) and others; recall_at: by rate, value, low,

@@ -4,6 +4,7 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -29,7 +30,7 @@ def evaluate_photographs(
     skip_unreadable: bool = False,
     batch_size: int = 256,
     device: str | torch.device = "cpu",
-) -> dict:
+) -> dict[str, Any]:
     """Ask the model about every photograph of a folder; write and return what came out.
 
     `model`, which lies on `device`, takes (N, 3, size, size) float32 sRGB in [0, 1] and gives logits
@@ -82,7 +83,7 @@ def _summarise(
     size: int,
     unreadable: Sequence[str],
     others: Sequence[str],
-) -> dict:
+) -> dict[str, Any]:
     by_class = defaultdict(list)
     for answer in answers:
         by_class[answer.photograph.label].append(answer)
@@ -110,7 +111,7 @@ def _summarise(
     }
 
 
-def _class_figures(answers: Sequence[Answer], label: str) -> dict:
+def _class_figures(answers: Sequence[Answer], label: str) -> dict[str, Any]:
     ranks = [answer.true_rank for answer in answers if answer.true_rank is not None]
     return {
         "n": len(answers),

@@ -2,9 +2,10 @@
 
 from math import sqrt
 from statistics import NormalDist
+from typing import Any
 
 
-def share(hits: int, n: int) -> dict:
+def share(hits: int, n: int) -> dict[str, Any]:
     """The share hits / n with its 95 % Wilson score interval (Wilson 1927).
 
     Returns {value, low, high, hits, n}, the first three in [0, 1], or None with n = 0.

@@ -1,6 +1,7 @@
 """The summary of an evaluation as text for the terminal."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from train.photographs.figures import RANKED, figure_title, find_figure
 
@@ -8,7 +9,7 @@ COUNTED = ("recall", "top5", "false_alarms")
 NAMED = 10  # how many of the files that were left out
 
 
-def format_summary(summary: dict) -> str:
+def format_summary(summary: dict[str, Any]) -> str:
     """The summary of `evaluate_photographs` as aligned plain text, without a newline at the end."""
     label, n = summary["label"], summary["n"]
     pools = {"overall": summary, **summary["by_source"]}
@@ -50,18 +51,18 @@ def format_summary(summary: dict) -> str:
     return "\n\n".join(paragraphs)
 
 
-def format_interval(figure: dict) -> str:
+def format_interval(figure: dict[str, Any]) -> str:
     """A figure's value and interval; "-" where it is unknown or absent."""
     if figure.get("value") is None:
         return "-"
     return f"{figure['value']:.3f} [{figure['low']:.3f}, {figure['high']:.3f}]"
 
 
-def _value(share: dict) -> str:
+def _value(share: dict[str, Any]) -> str:
     return "-" if share["n"] == 0 else f"{share['value']:.3f}"
 
 
-def _counted(share: dict) -> str:
+def _counted(share: dict[str, Any]) -> str:
     return "-" if share["n"] == 0 else f"{share['hits']}/{share['n']} = {format_interval(share)}"
 
 

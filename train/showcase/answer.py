@@ -1,6 +1,7 @@
 """What was asked and answered, in two sentences with numbers."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from renderer.errors import InputError
 from train.comparison import difference, read_evaluations
@@ -30,7 +31,7 @@ def of_runs(arms: Mapping[str, Sequence[Run]], name: str) -> str:
     )
 
 
-def _told(summary: dict) -> str:
+def _told(summary: dict[str, Any]) -> str:
     recall, alarms, auc = (find_figure(summary, figure) for figure in ("recall", "false_alarms", "auc"))
     if recall.get("value") is None or alarms.get("value") is None:
         return "has no score"

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 from omegaconf import OmegaConf
@@ -50,7 +51,7 @@ class Attack:
 
     folder: Path
     examples: Sequence[Example]
-    checks: dict
+    checks: dict[str, Any]
 
     @property
     def fooled(self) -> int:
@@ -78,7 +79,7 @@ def read_attack(folder: Path) -> Attack:
         raise InputError(f"{path} is damaged or no file of an attack ({' '.join(str(error).split())})") from error
 
 
-def _read_example(line: dict) -> Example:
+def _read_example(line: dict[str, Any]) -> Example:
     before = _answers(line["answer_before"], line["confidence_before"]) if "answer_before" in line else None
     return Example(
         number=int(line["example"]),

@@ -5,6 +5,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -27,7 +28,7 @@ def attack_command(config: DictConfig) -> str:
     return _command("python scripts/attack.py", "attack", config, "attack", config.attack)
 
 
-def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapping) -> str:
+def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapping[str, Any]) -> str:
     """Also of a run from another version, whose keys this one may lack; they are left out."""
     kinds = [kind for kind in KINDS if kind in attack]
     chosen = [f"{group}=[{','.join(kinds)}]"] if kinds else []

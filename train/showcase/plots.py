@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ RC = {
 Series = Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]]  # by arm, (x, y) of each seed
 
 
-def style(index: int) -> dict:
+def style(index: int) -> dict[str, Any]:
     """The look of an arm's line, by its place among the arms."""
     return {"color": COLOURS[index % len(COLOURS)], "linestyle": LINES[index % len(LINES)]}
 
@@ -76,7 +76,7 @@ def roc(rankings: Mapping[str, Sequence[Ranking]], label: str, title: str) -> Il
     return _figure(draw, title, f"{title}; AUC: {', '.join(f'{arm} {auc:.3f}' for arm, auc in told.items())}")
 
 
-def bars(values: Mapping[str, Sequence[Mapping]], names: Sequence[str], title: str) -> Illustration | None:
+def bars(values: Mapping[str, Sequence[Mapping[str, Any]]], names: Sequence[str], title: str) -> Illustration | None:
     """A row of bars per name, one for each arm, with its interval: {value, low, high}, of which value may be None."""
     if not any(figure.get("value") is not None for figures in values.values() for figure in figures):
         return None
@@ -105,7 +105,7 @@ def bars(values: Mapping[str, Sequence[Mapping]], names: Sequence[str], title: s
     return _figure(draw, title, f"{title}. {'; '.join(told)}", height)
 
 
-def _known(figure: Mapping) -> bool:
+def _known(figure: Mapping[str, Any]) -> bool:
     return figure.get("value") is not None
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -144,7 +145,9 @@ def _rankings(group: Sequence[RunSummary], name: str, label: str) -> list[Rankin
     return [ranking for each in pools if (ranking := rank_pools({OVERALL: each[OVERALL]}).get(OVERALL))]
 
 
-def _plots(scored: Mapping[str, Sequence[RunSummary]], rankings: Mapping, name: str, label: str) -> list[Illustration]:
+def _plots(
+    scored: Mapping[str, Sequence[RunSummary]], rankings: Mapping[str, Any], name: str, label: str
+) -> list[Illustration]:
     first = {arm: group[0].photographs[name] for arm, group in scored.items()}
     sources = sorted({source for summary in first.values() for source in summary.get("by_source", {})})[:MOST_ROWS]
     drawn = [plots.roc(rankings, label, "ROC")]

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from math import inf
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,7 +80,7 @@ class Setup:
     settings: ImageSettings = SETTINGS
     backend: Backend = BACKEND
     dtype: torch.dtype = torch.float64
-    lift: Callable = extended
+    lift: Callable[..., Any] = extended
 
     @property
     def degree(self) -> int:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from functools import wraps
 from mmap import mmap
+from typing import Any
 
 from train import checkpoint, experiment
 from train.__main__ import start
@@ -32,7 +33,7 @@ def observe(memory: mmap) -> None:
             setattr(owner, name, _telling(getattr(owner, name), number, memory))
 
 
-def _telling(function: Callable, number: int, memory: mmap) -> Callable:
+def _telling(function: Callable[..., Any], number: int, memory: mmap) -> Callable[..., Any]:
     @wraps(function)
     def told(*arguments, **keywords):
         before, memory[0] = memory[0], number

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from PIL import Image
@@ -198,7 +199,7 @@ def changes(attacked: Attacked) -> dict[str, float]:
     }
 
 
-def record(case: Case, attacked: Attacked) -> dict:
+def record(case: Case, attacked: Attacked) -> dict[str, Any]:
     target = attacked.goal.increase
     reached = None if target is None else attacked.logits[0].softmax(1).gather(1, target[0, :, None])[:, 0].tolist()
     return {
@@ -217,7 +218,7 @@ def record(case: Case, attacked: Attacked) -> dict:
     }
 
 
-def row(case: Case, numbers: dict) -> list[str]:
+def row(case: Case, numbers: dict[str, Any]) -> list[str]:
     outcome = str(numbers["steps"]) if numbers["fooled"] else f"{numbers['steps']}, not fooled"
     return [
         case.title,
@@ -231,7 +232,7 @@ def row(case: Case, numbers: dict) -> list[str]:
     ]
 
 
-def finding(numbers: Sequence[dict]) -> str:
+def finding(numbers: Sequence[dict[str, Any]]) -> str:
     """What the paper claims of these figures, and what came of it here."""
     outcomes = {
         each["case"]: f"{'fooled' if each['fooled'] else 'not fooled'} after {each['steps']} steps" for each in numbers

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -193,7 +194,7 @@ def joined(found: Sequence[Outcome]) -> Outcome:
     return Outcome(*(torch.cat([getattr(each, field.name) for each in found]) for field in fields(Outcome)))
 
 
-def record(mesh: str, name: str, radius: float, outcome: Outcome) -> dict:
+def record(mesh: str, name: str, radius: float, outcome: Outcome) -> dict[str, Any]:
     """A ball's shares with their intervals, and averages: how far its images went, and the share of pixels that
     changed by more than half of the most that any did."""
     shares = {method: share(int(hits.sum()), len(hits)) for method in METHODS for hits in [getattr(outcome, method)]}
@@ -217,7 +218,7 @@ def header(steps: int) -> list[str]:
     return ["space", "radius", *methods, "L∞ on the image", "pixels beyond half of it", "L∞, one draw"]
 
 
-def row(found: dict) -> list[str]:
+def row(found: dict[str, Any]) -> list[str]:
     space = SPACES[found["space"]]
     radius = f"{found['radius']:g}" + (" (paper)" if found["radius"] in space.paper else "")
     shares = [interval(found[method]) for method in METHODS]
@@ -225,7 +226,7 @@ def row(found: dict) -> list[str]:
     return [space.title, radius, *shares, *change]
 
 
-def at_paper_radius(pooled: Sequence[dict]) -> dict[str, str]:
+def at_paper_radius(pooled: Sequence[dict[str, Any]]) -> dict[str, str]:
     """The cells of the comparison with the paper's figure: light_adversarial, shape_random and so on."""
     return {
         f"{SPACES[each['space']].title}_{method}": interval(each[method])
@@ -247,7 +248,7 @@ def fineness(subject: Subject) -> str:
     return f"{len(mesh.vertices):,} with edges of {np.linalg.norm(edges, axis=2).mean():.3f} on average"
 
 
-def draw_success(pooled: Sequence[dict], steps: int, path: Path) -> None:
+def draw_success(pooled: Sequence[dict[str, Any]], steps: int, path: Path) -> None:
     """Success against radius, a panel per space; the paper's radii are dashed."""
     figure, panels = panels_beside(len(SPACES), (3.7, 4), layout="constrained")
     for panel, (name, space) in zip(panels, SPACES.items(), strict=True):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -148,7 +149,7 @@ def by_field(views: Sequence[View]) -> str:
     return ", ".join(f"{share:.2f} at {field:g}" for field, share in shares.items())
 
 
-def histograms(views: Sequence[View]) -> Iterator[dict]:
+def histograms(views: Sequence[View]) -> Iterator[dict[str, Any]]:
     """A record per mesh, field of view and grey: how many were rendered, and recognised at which confidence."""
     for mesh, field in sorted({(view.mesh, view.field_of_view) for view in views}):
         here = [view.confidence for view in views if (view.mesh, view.field_of_view) == (mesh, field)]

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -168,7 +169,13 @@ def classifier_pass(model: nn.Module, images: Tensor, labels: Tensor, batch_size
 
 
 def milliseconds(
-    attack: Callable, model: nn.Module, images: Tensor, labels: Tensor, batch_size: int, passes: int, turns: int
+    attack: Callable[..., Any],
+    model: nn.Module,
+    images: Tensor,
+    labels: Tensor,
+    batch_size: int,
+    passes: int,
+    turns: int,
 ) -> list[tuple[float, ...]]:
     """Bare, whole and inside of an `Iteration`. attack: of so many passes, given a stopwatch; the first rehearses."""
     rows = []

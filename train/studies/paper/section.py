@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
@@ -44,5 +45,5 @@ class Section:
     """text: Markdown. records: what was measured, a line each. figures: by file name, what draws each."""
 
     text: str
-    records: Iterable[Mapping]
+    records: Iterable[Mapping[str, Any]]
     figures: Mapping[str, Callable[[Path], None]]

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -99,7 +100,7 @@ def networks(study: Study, settings: TransferSettings) -> list[Classifier]:
 
 def transfer(
     subject: Subject, seen_by: Sequence[Classifier], count: int, light: str, draws: torch.Generator
-) -> Iterator[tuple[list[dict], list[Seen]]]:
+) -> Iterator[tuple[list[dict[str, Any]], list[Seen]]]:
     """For some examples at a time and each kind of attack: a record per example, and images of the first."""
     for scene, kept in recognised_parts(subject, seen_by[0], light, count, draws):
         greys = scene.backgrounds[:, 0, 0]
@@ -119,7 +120,7 @@ def _attacked(
     subject: Subject,
     seen_by: Sequence[Classifier],
     draws: torch.Generator,
-) -> tuple[list[dict], list[Seen]]:
+) -> tuple[list[dict[str, Any]], list[Seen]]:
     """Attack the first network in the examples (A,) of its problem, and show what comes of it to all."""
     start = problems[0].start[kept]
     first, further = ATTACKS[kind].adversaries(Part(problems[0], kept, start), seen_by[0], subject.label, views=1)
@@ -145,7 +146,7 @@ def _attacked(
     return records, seen
 
 
-def outcomes(records: Iterable[Mapping], network: str, state: str, source: str, label: str) -> list[bool]:
+def outcomes(records: Iterable[Mapping[str, Any]], network: str, state: str, source: str, label: str) -> list[bool]:
     """Whether a network is fooled by what fools the source at that strength, where it recognised the original."""
     strength = state.removesuffix("_random")
     return [
@@ -155,7 +156,7 @@ def outcomes(records: Iterable[Mapping], network: str, state: str, source: str, 
     ]
 
 
-def results(records: Sequence[Mapping], names: Sequence[str], label: str) -> str:
+def results(records: Sequence[Mapping[str, Any]], names: Sequence[str], label: str) -> str:
     """A table per kind of attack, a row per target."""
     parts = []
     for kind in ATTACKS:
@@ -168,7 +169,7 @@ def results(records: Sequence[Mapping], names: Sequence[str], label: str) -> str
     return "\n\n".join(parts)
 
 
-def source_success(records: Sequence[Mapping], source: str, label: str) -> str:
+def source_success(records: Sequence[Mapping[str, Any]], source: str, label: str) -> str:
     """How many examples fool the network that was attacked, by kind."""
     parts = []
     for kind in ATTACKS:
@@ -181,7 +182,7 @@ def source_success(records: Sequence[Mapping], source: str, label: str) -> str:
     return "; ".join(parts)
 
 
-def distances(records: Sequence[Mapping]) -> str:
+def distances(records: Sequence[Mapping[str, Any]]) -> str:
     """Medians, as a sentence."""
     parts = []
     for kind in ATTACKS:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,14 +113,16 @@ def attack_views(
     return dict(zip(STATES, (first, further, random), strict=True))
 
 
-def summary(scene: Scene, kind: str, values: Tensor, classifier: Classifier, label: str) -> dict:
+def summary(scene: Scene, kind: str, values: Tensor, classifier: Classifier, label: str) -> dict[str, Any]:
     """How far values (1, D) went, and whether they fool the classifier in every view of a scene."""
     problem, every = ATTACKS[kind].problem(scene), torch.arange(len(scene))
     said = answers(problem, values.expand(len(scene), -1), every, classifier)
     return {"distance": round(float((values - problem.start[:1]).norm()), 4), "fooled": label not in said}
 
 
-def unseen(subject: Subject, classifier: Classifier, index: int, count: int, light: str, seed: int) -> Iterator[dict]:
+def unseen(
+    subject: Subject, classifier: Classifier, index: int, count: int, light: str, seed: int
+) -> Iterator[dict[str, Any]]:
     """A record per unseen view of a subject: what it is called under all that was found in one set of views."""
     draws = generator(seed, subject.name, "unseen views", index)
     scenes = {
@@ -163,11 +166,11 @@ def _angle(scene: Scene, example: int, attacked: Scene) -> float:
     return round(math.degrees(min(apart)), 2)
 
 
-def outcomes(records: Sequence[Mapping], kind: str, views: int, state: str, label: str) -> list[bool]:
+def outcomes(records: Sequence[Mapping[str, Any]], kind: str, views: int, state: str, label: str) -> list[bool]:
     return [record["answers"][f"{kind}, {views} attacked"][state] != label for record in records]
 
 
-def cell(records: Sequence[Mapping], kind: str, views: int, state: str, label: str) -> str:
+def cell(records: Sequence[Mapping[str, Any]], kind: str, views: int, state: str, label: str) -> str:
     """The share of all views, and the lowest and highest of the sets."""
     sets = {(record["mesh"], record["set"]): [] for record in records}
     found = outcomes(records, kind, views, state, label)
@@ -177,7 +180,7 @@ def cell(records: Sequence[Mapping], kind: str, views: int, state: str, label: s
     return f"{percent(found)}; {min(shares):.0f} to {max(shares):.0f} %"
 
 
-def results(records: Sequence[Mapping], label: str) -> str:
+def results(records: Sequence[Mapping[str, Any]], label: str) -> str:
     """A row per kind of attack and number of views, the paper's share last."""
     rows = [
         [kind, str(views), *(cell(records, kind, views, state, label) for state in STATES), f"{paper} %"]
@@ -187,7 +190,7 @@ def results(records: Sequence[Mapping], label: str) -> str:
     return markdown(["", "views attacked", *STATES.values(), "the paper's"], rows)
 
 
-def attacked_success(records: Sequence[Mapping]) -> str:
+def attacked_success(records: Sequence[Mapping[str, Any]]) -> str:
     """In how many sets the attack reached its goal and how far it went, by kind and number of views."""
     sets = list({(record["mesh"], record["set"]): record["attacked"] for record in records}.values())
     parts = []
@@ -198,7 +201,7 @@ def attacked_success(records: Sequence[Mapping]) -> str:
     return "; ".join(parts)
 
 
-def far(records: Sequence[Mapping], label: str) -> str:
+def far(records: Sequence[Mapping[str, Any]], label: str) -> str:
     """How the strongest adversaries of one view do near it and behind it."""
     parts = []
     for kind in ATTACKS:
@@ -212,7 +215,7 @@ def far(records: Sequence[Mapping], label: str) -> str:
     return "; ".join(parts)
 
 
-def draw(records: Sequence[Mapping], label: str, path: Path) -> None:
+def draw(records: Sequence[Mapping[str, Any]], label: str, path: Path) -> None:
     """A panel per kind: success by angle, a line per number of attacked views."""
     figure, panels = panels_beside(len(ATTACKS), (4.2, 3.2))
     for panel, kind in zip(panels, ATTACKS, strict=True):
@@ -224,7 +227,7 @@ def draw(records: Sequence[Mapping], label: str, path: Path) -> None:
     save(figure, path)
 
 
-def _line(panel, records: Sequence[Mapping], kind: str, views: int, label: str) -> None:
+def _line(panel, records: Sequence[Mapping[str, Any]], kind: str, views: int, label: str) -> None:
     angles = np.array([record["angle"][str(views)] for record in records])
     fooled = np.array(outcomes(records, kind, views, "further", label))
     places, shares = [], []

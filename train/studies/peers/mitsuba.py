@@ -1,6 +1,7 @@
 """Mitsuba 3 as its users would set it up for this task: an environment map of the light and plain AD."""
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,7 +80,7 @@ class MitsubaPeer:
         buffers.update()
         return mesh
 
-    def _sensor(self, camera: OrthographicCamera, size: int) -> dict:
+    def _sensor(self, camera: OrthographicCamera, size: int) -> dict[str, Any]:
         _, up, back = camera.axes()
         half = camera.field_of_view / 2  # its image spans [-1, 1]
         look = self._mi.ScalarTransform4f().look_at(origin=list(4 * back), target=[0, 0, 0], up=list(up))

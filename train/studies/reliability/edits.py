@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,10 +63,10 @@ def flipped(seed: int) -> Edit:
     return replaced(change)
 
 
-def at(*keys: str | int, value: object) -> Callable[[dict], None]:
+def at(*keys: str | int, value: object) -> Callable[[dict[str, Any]], None]:
     """Sets a value in nested mappings and lists."""
 
-    def change(tree: dict) -> None:
+    def change(tree: dict[str, Any]) -> None:
         for key in keys[:-1]:
             tree = tree[key]
         tree[keys[-1]] = value

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,10 +29,10 @@ SAMPLES_OF = {MITSUBA: 16, PYTORCH3D: 1}  # per pixel
 COARSER, FINER = 2, 4  # samples per side: as attacks have by default, and as many in all as Mitsuba has
 SHADINGS = {ANALYTIC: shading.radiance, BY_FACE: shade_by_face, BY_SAMPLE: reference.radiance}
 
-Peers = Mapping[str, Callable]  # makers by name
+Peers = Mapping[str, Callable[..., Any]]  # makers by name
 
 
-def installed_peers() -> tuple[dict[str, Callable], list[str]]:
+def installed_peers() -> tuple[dict[str, Callable[..., Any]], list[str]]:
     """(the peers that start here, by name, and a sentence about each that does not)."""
     from train.studies.peers.mitsuba import MitsubaPeer
     from train.studies.peers.pytorch3d import PyTorch3DPeer

@@ -1,5 +1,7 @@
 """How far a path is from what its view converges to: of the image, and of a gradient."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -28,7 +30,9 @@ class Exact:
         image = self._view.canvas(radiance.detach(), operator.pixels)
         return self.errors(image, gradient, self.by_light[: len(light)])
 
-    def vertex_errors(self, view: View, samples: int, light: Tensor, shade: Shading = shading.radiance) -> dict:
+    def vertex_errors(
+        self, view: View, samples: int, light: Tensor, shade: Shading = shading.radiance
+    ) -> dict[str, Any]:
         """Of a way to shade. view: the same one, perhaps with another rasteriser."""
         variable = view.vertices(light.dtype).requires_grad_()
         fragments, albedo, _ = seen(view, samples, variable)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from train.studies.figures import pyplot, save
 from train.studies.renderer_speed.results import Row, pareto_front
@@ -70,7 +71,7 @@ def _by_work(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return {work: [row for row in rows if row.setting == work] for work in dict.fromkeys(row.setting for row in rows)}
 
 
-def _draw_lines(ax, lines: dict[str, Sequence], x: str, y: str) -> None:
+def _draw_lines(ax, lines: dict[str, Sequence[Any]], x: str, y: str) -> None:
     for name, line in lines.items():
         ax.plot([getattr(point, x) for point in line], [getattr(point, y) for point in line], "o-", ms=4, label=name)
     _logarithmic(ax, "x", "y")

@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 NOISE = 0.05  # of a median: times closer than that may change places from run to run
 
@@ -72,7 +73,7 @@ def verdict(rows: Sequence[Row]) -> str:
     )
 
 
-def write_csv(path: Path, records: Sequence[dict]) -> None:
+def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> None:
     """One line per record, with four significant digits, and a column per key; the first record has them all."""
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(records[0]), lineterminator="\n")
@@ -80,7 +81,7 @@ def write_csv(path: Path, records: Sequence[dict]) -> None:
         writer.writerows({key: _plain(value) for key, value in record.items()} for record in records)
 
 
-def records(panels: Sequence[Sequence[Row]]) -> list[dict]:
+def records(panels: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
     """The rows of panels for `write_csv`, with a column that tells who lies on the panel's front."""
     return [asdict(row) | {"front": row in pareto_front(rows)} for rows in panels for row in rows]
 
