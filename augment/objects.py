@@ -22,6 +22,8 @@ class ObjectSettings:
     gain: float = 1.0
 
     def __post_init__(self) -> None:
+        if not self.mesh:
+            raise InputError("scene.meshes: a mesh is '': give a file or solid:NAME")
         require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
 
 

@@ -19,10 +19,11 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.harmonics import irradiance_basis, live_coefficients
 from renderer.image import clamp, decode, encode
 from renderer.image_files import SUFFIXES, read_image
-from renderer.lights import load_light
+from renderer.lights import directional, load_light
 from renderer.transfer import DEGREE
 
 UNCHANGED = (1.0, 1.0)
+LAMP_REACH = 70.0  # degrees around the mesh and up or down, from the camera
 
 
 @dataclass
@@ -33,8 +34,10 @@ class VariationSettings:
     scale, exposure: [least, most] that its size in the frame and the light are multiplied by, uniform in the logarithm.
     backgrounds: a folder of images, each example before one of them. individuals: every solid that is named without a
     seed is another of its kind. turn: degrees that the camera goes around the mesh, at most, to either side and up and
-    down. lights: each example is in one of these, as `load_light` takes them. lit: a background is a wall that faces
-    the camera in the example's light. snapshot: what a camera makes of the images.
+    down. lights: each example is in one of these, as `load_light` takes them. lamps: the share of examples that stand
+    in the parallel light of a lamp on the camera's side, up to 70° off, over [least, most] `ambient` of their own.
+    lit: a background is a wall that faces the camera in the example's light. snapshot: what a camera makes of the
+    images.
     """
 
     place: float = 0.0
@@ -44,6 +47,8 @@ class VariationSettings:
     individuals: bool = False
     turn: float = 0.0
     lights: list[str] = field(default_factory=list)
+    lamps: float = 0.0
+    ambient: list[float] = field(default_factory=lambda: [0.0, 0.0])
     lit: bool = False
     snapshot: SnapshotSettings = field(default_factory=SnapshotSettings)
 
@@ -51,6 +56,9 @@ class VariationSettings:
         if not 0 <= self.place <= 1:
             raise InputError(f"augment.vary.place={self.place} must be a share of the frame's width, from 0 to 1")
         require_range("augment.vary.turn", self.turn, 0, 180)
+        require_range("augment.vary.lamps", self.lamps, 0, 1)
+        if len(self.ambient) != 2 or not 0 <= self.ambient[0] <= self.ambient[1] <= 1:
+            raise InputError(f"augment.vary.ambient={list(self.ambient)}: give [least, most], from 0 to 1")
         for name in ("scale", "exposure"):
             limits = getattr(self, name)
             if len(limits) != 2 or not 1 / FACTOR <= limits[0] <= limits[1] <= FACTOR:
@@ -66,7 +74,7 @@ class VariationSettings:
     @property
     def varies(self) -> bool:
         """Whether anything is drawn at all."""
-        of_light = tuple(self.exposure) != UNCHANGED or self.lights or self.lit
+        of_light = tuple(self.exposure) != UNCHANGED or self.lights or self.lamps > 0 or self.lit
         return bool(self.moves or of_light or self.backgrounds is not None or self.snapshot.changes)
 
 
@@ -96,6 +104,8 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> S
     if settings.lights:
         which = torch.randint(len(settings.lights), (len(rows),), generator=draws)
         changed["light"] = torch.stack([load_light(light) for light in settings.lights])[which].to(scene.lights)
+    if settings.lamps > 0:
+        changed["light"] = _in_lamplight(changed.get("light", scene.lights), rows, settings, draws)
     if settings.snapshot.changes:
         snapshot = draw_snapshot(settings.snapshot, len(rows), scene.settings, draws)
         changed["taken"] = snapshot.to(scene.lights.device)
@@ -137,6 +147,21 @@ def _turned(row: Example, polar: float, azimuth: float) -> Example:
         return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
     return replace(row, cameras=tuple(turned(camera) for camera in row.cameras))
+
+
+def _in_lamplight(
+    lights: Tensor, rows: Sequence[Example], settings: VariationSettings, draws: torch.Generator
+) -> Tensor:
+    """The lights (E, 49, 3), some of them dimmed, with a white lamp that gives 1 to a surface facing it."""
+    low, high = settings.ambient
+    shape = (len(rows), 1, 1)
+    ambient = low + (high - low) * torch.rand(shape, generator=draws)
+    chosen = torch.rand(shape, generator=draws) < settings.lamps
+    angles = _angles(LAMP_REACH, len(rows), draws)
+    cameras = [_turned(row, *each).cameras[0] for row, each in zip(rows, angles, strict=True)]
+    towards = [torch.from_numpy(camera.axes()[2]) for camera in cameras]
+    lamps = torch.stack([directional(direction, torch.ones(3)) for direction in towards]).to(lights)
+    return torch.where(chosen.to(lights.device), lamps + ambient.to(lights) * lights, lights)
 
 
 def _with_lit_walls(scene: Scene) -> Scene:

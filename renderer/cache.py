@@ -168,7 +168,7 @@ class OperatorCache(TensorCache):
         missing = [camera for camera in keys if camera not in views]
         if missing:
             fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, backend, closed=mesh.closed)
-            transport = build_transport(mesh, settings)
+            transport = build_transport(mesh, settings, gain, basis)
             for camera, seen in zip(missing, fragments, strict=True):
                 operator = build_operator(mesh, seen, settings, gain, basis, dtype, transport)
                 views[camera] = _pack(mesh, seen, operator)

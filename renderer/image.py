@@ -1,5 +1,6 @@
 """Radiance to image: background, clamp and encoding, in one place and last, since clamping is not linear."""
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,20 +8,23 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, require_bounded
+from renderer.errors import InputError, require_bounded, require_range
 
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
-TRANSPORTS = ("direct", "shadows")
+TRANSPORTS = ("direct", "shadows")  # and bounces:N
+MOST_BOUNCES = 100
+LARGEST_SIZE = 4096  # pixels per side
 MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
+FINEST = 64  # samples per pixel side: the share of a pixel that is covered is told to 1/4096
 
 
 @dataclass(frozen=True)
 class ImageSettings:
     """Image size in pixels, samples per pixel side, encoding, a normal per face or interpolated vertex normals, and
-    what the mesh does to its own light: nothing, or shadows.
+    what the mesh does to its own light: nothing, shadows, or bounces:N as well.
 
-    InputError: none of the first two, an unknown choice.
+    InputError: none or too many of the first two, an unknown choice.
     """
 
     size: int = 32
@@ -30,8 +34,9 @@ class ImageSettings:
     transport: str = "direct"
 
     def __post_init__(self) -> None:
-        if self.size < 1 or self.samples < 1:
-            raise InputError(f"renderer.samples={self.samples} and the size {self.size} must be at least 1")
+        if self.size < 1:
+            raise InputError(f"the size {self.size} must be at least 1 pixel per side")
+        require_range("renderer.samples", self.samples, 1, FINEST)
         if self.size * self.samples > MOST_SAMPLES:
             raise InputError(
                 f"renderer.samples={self.samples} for each of {self.size} pixels in a row are more than "
@@ -40,8 +45,20 @@ class ImageSettings:
         check_encoding(self.encoding)
         if self.normals not in NORMALS:
             raise InputError(f"renderer.normals={self.normals}: choose one of {', '.join(NORMALS)}")
-        if self.transport not in TRANSPORTS:
-            raise InputError(f"renderer.transport={self.transport}: choose one of {', '.join(TRANSPORTS)}")
+        bounces(self.transport)
+
+
+def bounces(transport: str) -> int:
+    """How often light goes on from one surface to another: N of "bounces:N", else 0. InputError: an unknown choice."""
+    if transport in TRANSPORTS:
+        return 0
+    name, _, count = transport.partition(":")
+    if name == "bounces" and re.fullmatch("[0-9]{1,3}", count) and 1 <= int(count) <= MOST_BOUNCES:
+        return int(count)
+    raise InputError(
+        f"renderer.transport={transport}: choose one of {', '.join(TRANSPORTS)}, or bounces:N with N from 1 to "
+        f"{MOST_BOUNCES}"
+    )
 
 
 def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:

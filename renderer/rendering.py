@@ -1,5 +1,6 @@
 """Meshes to images in one call: `render` by all that can be differentiated, `operators` for many lights."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.fragments import Fragments, build_fragments
@@ -43,8 +45,9 @@ def render(
     `renderer.image.as_background`; an image per view with (V, 3, size, size). vertices: (N, 3) in place of the mesh's;
     the gradient holds fixed which face covers each sample. albedo: linear, in place of the mesh's colours, (F, 3) per
     face, or (H, W, 3) in place of the texture of a mesh that has one. gain multiplies the albedo. samples: per pixel
-    side. encoding: linear or srgb. normals: flat or smooth. transport: direct, or shadows that a mesh casts on itself,
-    which the gradient by vertices and albedo holds fixed. visibility: auto, opengl or software.
+    side. encoding: linear or srgb. normals: flat or smooth. transport: direct; shadows, that a mesh casts on itself; or
+    bounces:N, with light that its own colours send on N times; the gradient by vertices and albedo holds both fixed.
+    visibility: auto, opengl or software.
     InputError: NaN, shapes that do not fit, unknown choices.
     """
     settings = ImageSettings(size, samples, encoding, normals, transport)
@@ -53,14 +56,14 @@ def render(
     views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(visibility), closed=mesh.closed)
     backgrounds = as_background(background, size, light).expand(len(views), -1, -1, -1)
     smooth_faces = torch.from_numpy(mesh.faces).to(light.device) if normals == "smooth" else None
-    shaping = build_transport(replace(mesh, vertices=positions), settings)
+    indirect = build_transport(replace(mesh, vertices=positions), settings, gain, Harmonics(math.isqrt(len(light)) - 1))
     images = []
     for view, behind in zip(views, backgrounds, strict=True):
         seen = view.to(light.device)
         surface = _albedo(mesh, seen, albedo, encoding).to(light) * gain
         shade = radiance(seen, vertices, light, surface, smooth_faces)
-        if shaping is not None:
-            shade = shade + shaping.radiance(view, surface.detach().cpu().double(), light)
+        if indirect is not None:
+            shade = shade + indirect.radiance(view, surface.detach().cpu().double(), light)
         images.append(compose(shade, seen.coverage.to(light), seen.pixels, behind, encoding))
     return torch.stack(images)
 

@@ -1,11 +1,13 @@
 """Finer meshes of the same shape, so that an attack on the vertices has more of them to move."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from renderer.mesh import Mesh
 
+PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids")
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and the middles of the edges as 3 to 5
 
@@ -20,6 +22,27 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
     while len(mesh.vertices) <= vertices:
         mesh = _quartered(mesh)
     return mesh
+
+
+def refine(mesh: Mesh, area: float) -> Mesh:
+    """The same surface with faces no larger than that: each that is becomes four, as often as it takes.
+
+    The faces come in another order; the old vertices keep their indices, and new ones may lie on a neighbour's edge.
+    """
+    parts = []
+    while True:
+        large = mesh.face_areas() > area
+        parts.append(_select(mesh, ~large))
+        if not large.any():
+            break
+        mesh = _quartered(_select(mesh, large))
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_FACE}
+    return replace(mesh, **joined)
+
+
+def _select(mesh: Mesh, faces: np.ndarray) -> Mesh:
+    """Some of the faces, over all vertices."""
+    return replace(mesh, **{name: getattr(mesh, name)[faces] for name in PER_FACE})
 
 
 def _quartered(mesh: Mesh) -> Mesh:

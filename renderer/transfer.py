@@ -2,7 +2,7 @@
 
 Before clamping, every pixel of a diffuse mesh is linear in the lighting coefficients U (the paper's appendix B.2):
 radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do shadows
-(`renderer.transport`).
+and bounces (`renderer.transport`).
 """
 
 from collections.abc import Callable, Sequence
@@ -154,7 +154,7 @@ def build_operators(
     camera sees, with normals as the settings say. InputError: `renderer.transport`.
     """
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, backend, closed=mesh.closed)
-    transport = build_transport(mesh, settings)
+    transport = build_transport(mesh, settings, gain, basis)
     return [build_operator(mesh, view, settings, gain, basis, dtype, transport) for view in views]
 
 
@@ -170,14 +170,14 @@ def build_operator(
     """The operator of one view that has been rasterised; see `build_operators`. transport: `build_transport`'s."""
     require_bounded(gain=torch.tensor(gain))
     albedo = surface_albedo(mesh, fragments, settings.encoding) * gain
-    factor = _pixel_albedo(fragments, albedo, dtype)
+    factor = None if transport and transport.colors else _pixel_albedo(fragments, albedo, dtype)
     if factor is None:
         factor = torch.ones(len(fragments.pixels), 3)
     else:
         albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
     transfer = _box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype)
     kept = basis.live
-    change = transport.change(fragments, albedo, basis) if transport else None
+    change = transport.change(fragments, albedo) if transport else None
     if change is not None:
         transfer, kept = change.index_add_(1, kept, transfer.double()).to(dtype), torch.arange(basis.size)
     return Operator(

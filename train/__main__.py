@@ -13,7 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
-from train.cli import one_sentence_errors, quoted, with_suggestions
+from train.cli import one_sentence_errors, quoted, run_command
 from train.data import DataSet
 from train.distributed import announce, announced, first_process_first, process_group
 from train.experiment import load_data, prepare, write_images
@@ -32,7 +32,7 @@ NAMED_MODEL = re.compile(r"^model=(?!\{)")  # by its name alone
 def main(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
-    if processes.index() == 0:
+    if processes.rank() == 0:
         announce(str(folder))
     config.run = str(folder)
     if hydra_config.mode == RunMode.MULTIRUN:
@@ -47,9 +47,9 @@ def run_arms(config: DictConfig, folder: Path) -> None:
     data = load_data(config)
     arms = {folder / str(arm): OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
     arms[folder] = config
-    with sole_writer("run", *arms) if processes.index() == 0 else nullcontext():
+    with sole_writer("run", *arms) if processes.rank() == 0 else nullcontext():
         with first_process_first():
-            if processes.index() == 0:
+            if processes.rank() == 0:
                 write_images(config, data.size)
         _train_arms(arms, data, folder)
 
@@ -63,14 +63,18 @@ def _train_arms(arms: Mapping[Path, DictConfig], data: DataSet, folder: Path) ->
         except Interrupted as stop:
             console.info("ended by %s; to go on: %s", stop.signal, resume_command(folder))
             raise
-    if processes.index() == 0:
+    if processes.rank() == 0:
         console.info("\n%s", format_table([summarise(path) for path in arms]))
         console.info("%s", report_of([folder], folder))
 
 
 def resume_command(folder: Path) -> str:
     """The command that goes on with this run."""
-    start = f"torchrun --nproc_per_node={processes.count()} -m train" if processes.count() > 1 else "python -m train"
+    start = (
+        f"torchrun --nproc_per_node={processes.world_size()} -m train"
+        if processes.world_size() > 1
+        else "python -m train"
+    )
     overrides = [
         override for override in HydraConfig.get().overrides.task if not override.startswith(("run=", "train.resume="))
     ]
@@ -81,11 +85,11 @@ def start() -> None:
     """`main` in this process, or in each that torchrun starts; all take the first one's folder, and it alone writes."""
     one_sentence_errors(check_launcher)(sys.argv[1:])
     with process_group():
-        if processes.index() > 0:
+        if processes.rank() > 0:
             console.setLevel("WARNING")
             sys.argv.append(f"run={quoted(announced())}")
         sys.argv[1:] = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
-        with_suggestions(main, "train")
+        run_command(main, "train")
 
 
 if __name__ == "__main__":

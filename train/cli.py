@@ -1,4 +1,4 @@
-"""What every entry point shares: one-sentence errors, and the nearest valid key for a mistyped override."""
+"""What every entry point shares: one-sentence errors, also of what Hydra refuses, with the nearest valid key."""
 
 import difflib
 import errno
@@ -9,7 +9,9 @@ import re
 import shlex
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ TEXTS = {  # keys of names and folders
     *("weights", "light", "label", "classifier"),
 }
 NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false", re.IGNORECASE)
+HYDRAS_ADVICE = re.compile(r"\n(?:To append|See https:|Config search path:)")  # begins what serves nobody here
 FOLDERS = re.compile(r"(?<!\w)(~|\.{1,2})?/([^\s,:=]*/)?")  # of a path that does not begin in the clone
 
 
@@ -80,25 +83,58 @@ def one_sentence_errors(function: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def with_suggestions(main: Callable[[], None], config_name: str) -> None:
-    """Run a Hydra main; where Hydra rejects an override, print the nearest valid key below its error.
+def run_command(main: Callable[[], None], config_name: str) -> None:
+    """Run a Hydra main; what Hydra refuses is one sentence, with the nearest valid key, and exit status 2.
 
     Ctrl-C ends it with one line, as a shell says it of SIGINT. A terminal shows what it has no letters for as escapes.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    sys.argv[1:] = map(_as_text, sys.argv[1:])
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors then; else it prints them, in several lines
     try:
-        main()
+        _run(main, config_name)
     except KeyboardInterrupt:
         print("ended by SIGINT", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
-    except SystemExit as stop:
-        if stop.code == 1:
-            for line in _suggestions(sys.argv[1:], config_name):
-                print(line, file=sys.stderr)
-        raise
+
+
+@one_sentence_errors
+def _run(main: Callable[[], None], config_name: str) -> None:
+    sys.argv[1:] = map(_as_text, sys.argv[1:])
+    try:
+        main()
+    except Exception as error:
+        if not _is_hydras(error):
+            raise
+        raise InputError(_refusal(error, sys.argv[1:], config_name)) from error
+
+
+def _is_hydras(error: Exception) -> bool:
+    """Whether Hydra refused an override, in an error of its own or another that it raised."""
+    *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
+    return isinstance(error, HydraException) or innermost.f_globals["__name__"].startswith("hydra.")
+
+
+def _refusal(error: Exception, arguments: list[str], config_name: str) -> str:
+    """What Hydra says, the override that it says it of, and what else to try."""
+    said = " ".join(HYDRAS_ADVICE.split(str(error))[0].split())
+    overrides, nearest = [argument for argument in arguments if not argument.startswith("-")], []
+    with initialize_config_module("conf", version_base="1.3"):
+        culprits = [override for override in overrides if not _composes(config_name, override)]
+        with suppress(HydraException, ValueError):  # of a group without such a choice, whose choices Hydra lists
+            nearest = list(_suggestions(overrides, config_name))
+    unnamed = [override for override in culprits if override.partition("=")[0] not in said]
+    named = ": ".join([*unnamed[:1], said])
+    return "; ".join([named.removesuffix("."), *nearest])
+
+
+def _composes(config_name: str, override: str) -> bool:
+    try:
+        compose(config_name, [override], return_hydra_config=True)
+    except Exception:  # a HydraException, or one of Python's for a value that Hydra has no rule for
+        return False
+    return True
 
 
 def quoted(text: str) -> str:
@@ -111,9 +147,14 @@ def _as_text(argument: str) -> str:
     """The override, quoted where its value is text that Hydra would take for something else, or not at all.
 
     Such are numbers (1.10), the names of what is there (a,b) and what its grammar has no rule for (schäl).
+    InputError for a name that is empty, which would stand for the current folder, and for a setting taken away.
     """
+    if argument.startswith("~"):
+        raise InputError(f"{argument}: no setting can be taken away: leave this out, or set it to another value")
     key, _, value = argument.partition("=")
     is_text = not TEXTS.isdisjoint(key.lstrip("+").split("."))
+    if is_text and value in ("", "''", '""'):
+        raise InputError(f"{key} is empty: give a name, or leave it out")
     if is_text and (NUMBER.fullmatch(value) or _is_misread(argument, value, os.path.lexists(value))):
         return f"{key}={quoted(value)}"
     return argument
@@ -141,7 +182,7 @@ def script(function: Callable[..., Any], settings: type | None = None) -> None:
         if failed := function(read_settings(settings, config) if settings else config):
             sys.exit("\n".join(failed))
 
-    with_suggestions(main, name)
+    run_command(main, name)
 
 
 def command_line() -> str:
@@ -151,20 +192,16 @@ def command_line() -> str:
     return shlex.join(FOLDERS.sub("", word) for word in ("python", f"scripts/{script}", *arguments))
 
 
-def _suggestions(arguments: list[str], config_name: str) -> Iterator[str]:
-    """A line for each override whose key is neither a key nor a group of the configuration that the groups make."""
-    overrides = [argument.partition("=") for argument in arguments if "=" in argument and argument[0] not in "+~-"]
-    try:
-        with initialize_config_module("conf", version_base="1.3"):
-            groups = compose(config_name, return_hydra_config=True).hydra.runtime.choices
-            chosen = [f"{key}={value.split(',')[0]}" for key, _, value in overrides if key in groups]
-            known = [*groups, *_keys(compose(config_name, chosen, return_hydra_config=True))]
-    except HydraException:  # a group has no such choice: Hydra's own error lists those it has
-        return
-    for key, _, _ in overrides:
+def _suggestions(overrides: list[str], config_name: str) -> Iterator[str]:
+    """For each override whose key is neither a key nor a group of the configuration that the groups make."""
+    pairs = [override.partition("=") for override in overrides if "=" in override and override[0] != "+"]
+    groups = compose(config_name, return_hydra_config=True).hydra.runtime.choices
+    chosen = [f"{key}={value.split(',')[0]}" for key, _, value in pairs if key in groups]
+    known = [*groups, *_keys(compose(config_name, chosen, return_hydra_config=True))]
+    for key, _, _ in pairs:
         nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
         if key not in known and nearest:
-            yield f"Nearest valid key to {key!r}: {nearest[0]}"
+            yield f"nearest valid key to {key!r}: {nearest[0]}"
 
 
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:

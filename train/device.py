@@ -33,7 +33,8 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and "LOCAL_RANK" in os.environ:
         name = f"cuda:{os.environ['LOCAL_RANK']}"
     try:
-        return torch.zeros(1, device=name).device
+        (made := torch.zeros(1, device=name)).item()  # which meta's tensors have none of
+        return made.device
     except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
         raise InputError(f"device={name} is not available here: use auto or cpu") from error
 
@@ -120,11 +121,14 @@ def _step_time(layer: MixedPrecision, images: Tensor, precision: str) -> float:
 def compiles(choice: str, device: torch.device) -> bool:
     """Whether to compile.
 
-    "auto" does on one GPU where a trial succeeds; several processes wait for each other inside a pass.
+    "auto" does on one GPU where a trial succeeds; several processes wait for each other inside a pass. InputError for
+    "always" on a CPU, which has no graphs to replay.
     """
+    if choice == "always" and device.type == "cpu":
+        raise InputError("train.compile=always is for a GPU, whose graphs it replays: use auto or never")
     if choice != "auto":
         return choice == "always"
-    return device.type == "cuda" and processes.count() == 1 and compiler_works(device)
+    return device.type == "cuda" and processes.world_size() == 1 and compiler_works(device)
 
 
 @functools.cache

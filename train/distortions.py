@@ -33,7 +33,7 @@ def distortion(name: str, model: nn.Module, seed: int) -> Distort:
     if name == "none":
         return lambda images, labels, step: images
     if name == "pgd":
-        return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", processes.index()))
+        return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", processes.rank()))
     transform = TRANSFORMS[name]()
     return lambda images, labels, step: _each(transform, images, seed, step)
 
@@ -56,7 +56,7 @@ def pgd(model: nn.Module, images: Tensor, labels: Tensor, draws: torch.Generator
 
 def _each(transform: nn.Module, images: Tensor, seed: int, step: int) -> Tensor:
     """torchvision's transforms draw once for a whole batch, and from the global generator."""
-    first = processes.index() * len(images)
+    first = processes.rank() * len(images)
     changed = []
     with torch.random.fork_rng(devices=[]):
         for place, image in enumerate(images, first):

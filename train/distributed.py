@@ -30,16 +30,16 @@ def process_group() -> Iterator[None]:
 @contextmanager
 def first_process_first() -> Iterator[None]:
     """Let the first process do alone what the others then find done, such as a download."""
-    if processes.index() > 0:
+    if processes.rank() > 0:
         _wait()
     yield
-    if processes.index() == 0:
+    if processes.rank() == 0:
         _wait()
 
 
 def announce(value: str) -> None:
     """Tell the other processes, each of which waits in `announced`; the first one's to call."""
-    if processes.count() > 1:
+    if processes.world_size() > 1:
         dist.broadcast_object_list([value], src=0)
 
 
@@ -52,7 +52,7 @@ def announced() -> str:
 
 def any_process(flag: bool) -> bool:
     """Whether the flag is set in any process."""
-    if processes.count() == 1:
+    if processes.world_size() == 1:
         return flag
     flags = torch.tensor([float(flag)])  # on the CPU, so that no device has to catch up
     dist.all_reduce(flags, dist.ReduceOp.MAX)
@@ -61,7 +61,7 @@ def any_process(flag: bool) -> bool:
 
 def summed(values: Tensor) -> Tensor:
     """The sum over all processes, in place."""
-    if processes.count() > 1:
+    if processes.world_size() > 1:
         dist.all_reduce(values)
     return values
 
@@ -72,7 +72,7 @@ def replicated(model: nn.Module) -> nn.Module:
     Batch normalisation takes its statistics over the global batch (`nn.SyncBatchNorm`), so that the result does not
     depend on the number of processes.
     """
-    if processes.count() == 1:
+    if processes.world_size() == 1:
         return model
     synchronise_norms(model)
     return DistributedDataParallel(model)
@@ -97,7 +97,7 @@ class SyncBatchNormCPU(nn.BatchNorm2d):
         mean = _average(values.mean((0, 2, 3)))
         centred = values - mean.view(1, -1, 1, 1)
         variance = _average(centred.square().mean((0, 2, 3)))
-        self._track(mean.detach(), variance.detach(), processes.count() * x.numel() // x.shape[1])
+        self._track(mean.detach(), variance.detach(), processes.world_size() * x.numel() // x.shape[1])
         scale = self.weight * (variance + self.eps).rsqrt()
         return (centred * scale.view(1, -1, 1, 1) + self.bias.view(1, -1, 1, 1)).to(x.dtype)
 
@@ -121,7 +121,7 @@ class _Sum(torch.autograd.Function):
 
 
 def _average(values: Tensor) -> Tensor:
-    return _Sum.apply(values) / processes.count()
+    return _Sum.apply(values) / processes.world_size()
 
 
 def _converted(norm: nn.BatchNorm2d, kind: type[nn.Module]) -> nn.Module:
@@ -131,5 +131,5 @@ def _converted(norm: nn.BatchNorm2d, kind: type[nn.Module]) -> nn.Module:
 
 
 def _wait() -> None:
-    if processes.count() > 1:
+    if processes.world_size() > 1:
         dist.barrier()

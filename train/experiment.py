@@ -39,7 +39,14 @@ from train.distributed import first_process_first
 from train.fit import Trainer, evaluate
 from train.logs import NoLog, RunLog, console
 from train.networks import build_network
-from train.photographs import FIGURES, evaluate_photographs, find_figure, find_photographs, format_summary
+from train.photographs import (
+    FIGURES,
+    evaluate_photographs,
+    find_figure,
+    find_photographs,
+    format_summary,
+    require_outside,
+)
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
 from train.settings import (
@@ -91,7 +98,8 @@ def run(config: DictConfig, data: DataSet, folder: Path) -> None:
 def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], None]:
     """Everything of `run` that comes before the first epoch, where wrong input shows; the result is the rest of it."""
     settings = read_settings(ExperimentSettings, config)
-    for photographs in settings.evaluate.folders.values():
+    for name, photographs in settings.evaluate.folders.items():
+        require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)
     device = choose_device(settings.train.device)
     set_threads(settings.train.threads)
@@ -110,9 +118,9 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
             device,
             trainer.model.precision,
             torch.get_num_threads(),
-            processes.count(),
+            processes.world_size(),
         )
-        log = NoLog() if processes.index() else RunLog(folder, trainer.history)
+        log = NoLog() if processes.rank() else RunLog(folder, trainer.history)
         trainer.fit(train.to(device), validation.to(device), log)
         log.scalars(_test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device))
 
@@ -163,7 +171,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
         console.info("resumed %s after epoch %d%s", folder, trainer.epoch, trainer.part_of_epoch)
     elif trainer.settings.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
-    if processes.index() == 0:
+    if processes.rank() == 0:
         _write_config(config, folder)
 
 
@@ -254,7 +262,7 @@ def _photograph_scores(
 ) -> dict[str, float]:
     """The network's figures on each folder of photographs, as NAME/FIGURE; empty without one."""
     scores = {}
-    for name, photographs in settings.evaluate.folders.items() if processes.index() == 0 else ():
+    for name, photographs in settings.evaluate.folders.items() if processes.rank() == 0 else ():
         summary = evaluate_photographs(
             trainer.selected,
             data.classes,

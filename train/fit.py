@@ -59,9 +59,9 @@ class Trainer:
 
         InputError where the run's processes cannot share a batch equally.
         """
-        if settings.batch_size % processes.count():
+        if settings.batch_size % processes.world_size():
             raise InputError(
-                f"train.batch_size={settings.batch_size} is not a multiple of the {processes.count()} processes"
+                f"train.batch_size={settings.batch_size} is not a multiple of the {processes.world_size()} processes"
             )
         self.settings = settings
         self.model = model
@@ -274,8 +274,9 @@ class Trainer:
         if not all(finite):
             name = list(tensors)[finite.index(False)]
             raise InputError(
-                f"train.learning_rate={self.settings.learning_rate} made the {name} NaN or infinite in epoch {epoch}: "
-                "set a lower one; the checkpoint before, if any, is kept"
+                f"train.learning_rate={self.settings.learning_rate} with train.weight_decay="
+                f"{self.settings.weight_decay} made the {name} NaN or infinite in epoch {epoch}: set lower ones; the "
+                "checkpoint before, if any, is kept"
             )
 
     def _select(self, accuracy: float) -> None:
@@ -298,7 +299,7 @@ class Trainer:
     def _save(self) -> None:
         """Write last.pt, keeping the one before, and best.pt where there is a better network, by the first process."""
         state, best, self._best = self.state_dict(), self._best, None
-        if processes.index() > 0:
+        if processes.rank() > 0:
             return
         if best:
             checkpoint.save(self.folder / checkpoint.BEST, best)
@@ -365,7 +366,7 @@ def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
 
     Every process of a run scores its share of the images; all get the result.
     """
-    share = slice(processes.index(), None, processes.count())
+    share = slice(processes.rank(), None, processes.world_size())
     loss_sum, correct = totals = torch.zeros(2, device=split.images.device)
     with eval_mode(model):
         for images, labels in zip(split.images[share].split(BATCH), split.labels[share].split(BATCH), strict=True):

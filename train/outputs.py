@@ -53,7 +53,7 @@ class Folders(Callback):
 
     @one_sentence_errors
     def on_run_start(self, config: DictConfig, **_) -> None:
-        if processes.index() == 0:
+        if processes.rank() == 0:
             _try_setting(config.hydra.run.dir, "run")
 
     @one_sentence_errors

@@ -14,6 +14,7 @@ from augment.scene import count_views
 from augment.service import AugmentationSettings
 from renderer.cache import OperatorCache, cache_folder
 from renderer.errors import FACTOR, InputError, require_range
+from renderer.image import LARGEST_SIZE
 from renderer.visibility import choose
 from train.networks import WIDERESNET
 from train.recipe import TrainSettings
@@ -27,7 +28,7 @@ CIRCUMSTANCES = (
 OTHER = "other"  # in place of the class of a look-alike that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
-SMALLEST_SIZE, LARGEST_SIZE = 5, 4096  # pixels per side: 4 are padded by reflection
+SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
 MOST_VERTICES = 10**7  # some 5 GB
 COUNTED = ("meshes", "views")  # what a scene shows and how often; the rest says how
@@ -74,6 +75,8 @@ class SceneSettings:
         require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
         require_range("scene.views", self.views, 1, MOST_VIEWS)
         require_range("scene.vertices", self.vertices, 0, MOST_VERTICES)
+        require_range("scene.polar", self.polar, 0, 180)
+        require_range("scene.azimuth", self.azimuth, -360, 360)
 
     @property
     def choices(self) -> dict[str, Any]:
@@ -92,7 +95,7 @@ class TrainingSceneSettings(SceneSettings):
 class RendererSettings:
     """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb. normals: flat or smooth.
 
-    transport: direct, or with shadows that a mesh casts on itself. cache: the folder of what is rendered once, auto or
+    transport: direct, shadows or bounces:N; see `renderer.render`. cache: the folder of what is rendered once, auto or
     None; see `renderer.cache.cache_folder`.
     """
 
@@ -206,8 +209,18 @@ def read_settings(kind: type, config: DictConfig, parent: str = ""):
     try:
         return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), config))
     except OmegaConfBaseException as error:
-        key = ".".join(filter(None, (parent, error.full_key)))
+        at_fault = error.full_key or next(key for key in config if not _merges(kind, config, key))
+        key = ".".join(filter(None, (parent, at_fault)))
         raise InputError(": ".join(filter(None, (key, str(error.msg).splitlines()[0])))) from error
+
+
+def _merges(kind: type, config: DictConfig, key: str) -> bool:
+    """Whether one of the configuration's groups is no fault by itself, of which OmegaConf names no key."""
+    try:
+        OmegaConf.merge(OmegaConf.structured(kind), OmegaConf.masked_copy(config, key))
+    except OmegaConfBaseException:
+        return False
+    return True
 
 
 def decisive_settings(config: DictConfig) -> dict[str, object]:

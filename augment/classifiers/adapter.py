@@ -8,7 +8,8 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from renderer.errors import InputError
+from renderer.errors import InputError, is_out_of_memory, require_range
+from renderer.image import LARGEST_SIZE
 
 
 class Classifier(nn.Module):
@@ -20,8 +21,9 @@ class Classifier(nn.Module):
 
     def __init__(self, function: Callable[[Tensor], Tensor], size: int, classes: Sequence[str], name: str = "callable"):
         """function: any callable from such images to logits. A module is moved with this one, frozen and put in eval
-        mode. InputError for a class name that occurs twice, since labels are found by name."""
+        mode. InputError for a class name that occurs twice, since labels are found by name, and a size beyond 4,096."""
         super().__init__()
+        require_range(f"classifier={name}: size", size, 1, LARGEST_SIZE)
         self.function = function
         self.size = size
         self.classes = tuple(classes)
@@ -31,22 +33,36 @@ class Classifier(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, images: Tensor) -> Tensor:
-        """InputError for images of another size, and for a callable that gives no logits or none with a gradient."""
+        """InputError for images of another size, and for a callable that fails or gives no logits, such that are not
+        finite or none with a gradient."""
         if images.shape[1:] != (3, self.size, self.size):
             raise InputError(
                 f"classifier={self.name} takes images (N, 3, {self.size}, {self.size}), not {tuple(images.shape)}: "
                 f"render at {self.size} pixels per side"
             )
-        logits = self.function(images)
+        logits = self._call(images)
         expected = (len(images), len(self.classes))
         if not isinstance(logits, Tensor) or logits.shape != expected:
             found = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
             raise InputError(f"classifier={self.name} gives {found}: make it return logits {expected}")
+        if not logits.is_floating_point() or not logits.isfinite().all():
+            raise InputError(f"classifier={self.name} gives logits that are not finite real numbers: mend its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
             raise InputError(
                 f"classifier={self.name} gives logits without a gradient: compute them in torch, undetached"
             )
         return logits
+
+    def _call(self, images: Tensor) -> object:
+        try:
+            return self.function(images)
+        except Exception as error:
+            if isinstance(error, InputError) or is_out_of_memory(error):
+                raise
+            said = " ".join(f"{type(error).__name__}: {error}".split())
+            raise InputError(
+                f"classifier={self.name} fails on float32 images {tuple(images.shape)} ({said}): make it take these"
+            ) from error
 
     def train(self, mode: bool = True) -> Self:
         """Stays in eval mode: running batch statistics, no dropout."""

@@ -2,6 +2,7 @@
 
 import importlib
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,8 @@ def load_python(name: str, weights: str | Path | None = None) -> Classifier:
     """`package.module:function`, found from the current folder or installed, called without arguments.
 
     The function returns (module, size, classes): a torch.nn.Module from images (N, 3, size, size), RGB in [0, 1], to
-    logits, and the names of its classes. InputError where there is no such function or it returns something else, and
-    for weights=, since the function loads its own; what the module or the function itself raises is raised.
+    logits, and the names of its classes in order. InputError where there is no such function, where it or its module
+    raises or returns something else, and for weights=, since the function loads its own.
     """
     if weights is not None:
         raise InputError(f"weights={weights} is not for classifier=python:{name}, which loads its own: leave it out")
@@ -31,17 +32,31 @@ def call_python(name: str, setting: str) -> tuple[nn.Module, int, Sequence[str]]
     place, _, attribute = name.partition(":")
     if not place or not attribute:
         raise InputError(f"{setting} names no function: give {FORM}")
-    made = _function(place, attribute, setting)()
+    made = _made(place, attribute, setting)
     if not (isinstance(made, tuple | list) and len(made) == 3):
         raise InputError(f"{setting} returns {type(made).__name__}: return (module, size, classes)")
     network, size, classes = made
     if not isinstance(network, nn.Module):
         raise InputError(f"{setting} returns {type(network).__name__} first: return a torch.nn.Module")
-    if not isinstance(size, int) or size < 1:
+    if not isinstance(size, int) or isinstance(size, bool) or size < 1:
         raise InputError(f"{setting} returns the size {size!r}: return its images' pixels per side")
-    if isinstance(classes, str) or not all(isinstance(each, str) for each in classes):
+    if isinstance(classes, str) or not isinstance(classes, Sequence) or not all(isinstance(c, str) for c in classes):
         raise InputError(f"{setting} returns no list of class names: return one name per logit")
     return network, size, classes
+
+
+def _made(place: str, attribute: str, setting: str) -> Any:
+    """What the function returns. InputError that says where it or its module raised something else."""
+    try:
+        return _function(place, attribute, setting)()
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        said = " ".join(str(error).split())
+        raise InputError(
+            f"{setting} raises {type(error).__name__} ({said}) in line {at.lineno} of {at.filename}: mend it"
+        ) from error
 
 
 def _function(place: str, attribute: str, setting: str) -> Callable[[], Any]:

@@ -120,6 +120,10 @@ MISUSES = [
     pytest.param(lambda x: x[:, :2, 0, 0], (2, 3, 8, 8), "gives (2, 2): make it return logits (2, 3)", id="classes"),
     pytest.param(lambda x: [x], (2, 3, 8, 8), "gives list: make it return logits", id="list"),
     pytest.param(lambda x: x.detach().mean((2, 3)), (2, 3, 8, 8), "logits without a gradient", id="detached"),
+    pytest.param(lambda x: x.mean((2, 3)) / 0, (2, 3, 8, 8), "gives logits that are not finite", id="infinite"),
+    pytest.param(lambda x: x.mean((2, 3)) * 1j, (2, 3, 8, 8), "gives logits that are not finite real", id="complex"),
+    pytest.param(lambda x: x @ x.double(), (2, 3, 8, 8), "fails on float32 images (2, 3, 8, 8) (Runtime", id="double"),
+    pytest.param(lambda x: x.no_such_name, (2, 3, 8, 8), "'Tensor' object has no attribute", id="a mistake in it"),
 ]
 
 
@@ -129,6 +133,14 @@ def test_a_misfit_of_images_and_classifier_is_one_sentence(function, shape, mess
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         classifier(torch.rand(shape, requires_grad=True))
     assert str(caught.value).startswith("classifier=mine ")
+
+
+def test_memory_that_ran_out_in_a_classifier_is_not_its_mistake():
+    def crowded(images):
+        raise torch.OutOfMemoryError
+
+    with pytest.raises(torch.OutOfMemoryError):
+        Classifier(crowded, 8, ["red"])(random_images(8))
 
 
 def test_logits_need_no_gradient_where_none_is_asked_for():

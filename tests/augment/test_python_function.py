@@ -17,6 +17,12 @@ def one(): return 3
 def no_module(): return "a", 16, ["red"]
 def no_size(): return nn.Identity(), "16", ["red"]
 def no_classes(): return nn.Identity(), 16, "red"
+def classes_without_order(): return nn.Identity(), 16, {"red", "blue"}
+def a_truth_for_a_size(): return nn.Identity(), True, ["red"]
+def huge(): return nn.Identity(), 10**9, ["red"]
+def needs_more(argument): pass
+def leaves(): raise SystemExit(0)
+def broken(): return 1 / 0
 value = 4
 """
 
@@ -52,6 +58,17 @@ def test_a_function_in_the_current_folder_makes_a_classifier():
         ("own_networks.colour:no_module", "returns str first: return a torch.nn.Module"),
         ("own_networks.colour:no_size", "returns the size '16'"),
         ("own_networks.colour:no_classes", "returns no list of class names"),
+        ("own_networks.colour:classes_without_order", "returns no list of class names"),
+        ("own_networks.colour:a_truth_for_a_size", "returns the size True"),
+        ("own_networks.colour:huge", ": size=1000000000 must be at least 1 and at most 4096"),
+        ("own_networks.colour:needs_more", "raises TypeError .*missing 1 required positional argument"),
+        ("own_networks.colour:leaves", r"raises SystemExit \(0\) in line 15 of .*colour.py: mend it"),
+        (
+            "own_networks.colour:broken",
+            r"raises ZeroDivisionError \(division by zero\) in line 16 of .*colour.py",
+        ),
+        ("own_networks.broken:f", r"raises ModuleNotFoundError \(No module named 'a_library_that_is_not_there'\)"),
+        ("..colour:f", "raises TypeError"),
     ],
 )
 def test_what_makes_no_classifier_is_refused_in_one_sentence(name, message):
@@ -62,8 +79,3 @@ def test_what_makes_no_classifier_is_refused_in_one_sentence(name, message):
 def test_weights_of_a_file_are_refused():
     with pytest.raises(InputError, match=r"weights=w\.pt is not for classifier=python:"):
         load_classifier("python:own_networks.colour:red_or_not", "w.pt")
-
-
-def test_what_a_module_itself_lacks_is_its_own_error():
-    with pytest.raises(ModuleNotFoundError, match="a_library_that_is_not_there"):
-        load_classifier("python:own_networks.broken:f")

@@ -123,6 +123,31 @@ def test_lights_are_shared_out_among_the_examples(scene):
     assert counts.sum() == 12 and (counts > 0).all()
 
 
+def test_a_lamp_is_white_parallel_light_from_the_cameras_side_over_some_of_the_own_light(scene):
+    """Its harmonics of degree 1 point to where it comes from; its mean is a quarter of what it gives."""
+    lit = drawn(scene, lamps=1.0, ambient=[0.5, 0.5])
+    lamps = (lit.lights - 0.5 * scene.lights)[:, :, 0].double()
+    towards = lamps[:, [3, 1, 2]] / lamps[:, 1:4].norm(dim=1, keepdim=True)  # Y₁₁ ∝ x, Y₁₋₁ ∝ y, Y₁₀ ∝ z
+    for example, direction in zip(scene.examples, towards, strict=True):
+        camera = example.cameras[0]
+        polar, azimuth = math.acos(direction[2]), math.atan2(direction[1], direction[0])
+        off = [  # beyond the pole an angle is negative, and the azimuth turned around
+            (sign * polar - camera.polar, math.remainder(azimuth + turned - camera.azimuth, 2 * math.pi))
+            for sign, turned in ((1, 0.0), (-1, math.pi))
+        ]
+        assert min(max(map(abs, angles)) for angles in off) <= math.radians(70) + 1e-6
+    assert torch.equal(lit.lights[:, :, 0], lit.lights[:, :, 2])
+    torch.testing.assert_close(lamps[:, 0], torch.full((12,), 1 / math.sqrt(4 * math.pi)).double(), rtol=1e-6, atol=0)
+    assert len(towards.unique(dim=0)) == 12
+
+
+def test_a_share_of_the_examples_stands_in_lamplight_and_the_rest_in_their_own_light(scene):
+    lit = drawn(scene, lamps=0.5)
+    own = (lit.lights == scene.lights).all((1, 2))
+    assert 0 < own.sum() < len(scene)
+    assert (lit.lights[~own, 0] > 0).all()
+
+
 def test_a_lit_background_is_a_wall_that_faces_the_camera():
     """It looks as the middle of a white ball does, and is white or grey in the same light."""
     ball = trimesh.creation.icosphere(subdivisions=4)

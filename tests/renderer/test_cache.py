@@ -145,6 +145,7 @@ CHANGES = {
     "the size": {"settings": replace(SETTINGS, size=9)},
     "the samples": {"settings": replace(SETTINGS, samples=3)},
     "the encoding": {"settings": replace(SETTINGS, encoding="srgb")},
+    "the transport": {"settings": replace(SETTINGS, transport="shadows")},
     "the gain": {"gain": 1.1},
     "the basis": {"basis": Harmonics(2)},
     "the dtype": {"dtype": torch.float64},

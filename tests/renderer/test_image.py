@@ -178,7 +178,8 @@ def test_an_unknown_encoding_is_refused(function):
     [
         (dict(samples=0), r"renderer\.samples=0"),
         (dict(size=0), r"size 0 must be at least 1"),
-        (dict(size=-3, samples=-1), r"renderer\.samples=-1 and the size -3"),
+        (dict(size=-3), r"size -3 must be at least 1"),
+        (dict(samples=65), r"renderer\.samples=65 must be at least 1 and at most 64"),
         (dict(encoding="gamma"), r"renderer\.encoding=gamma: choose one of linear, srgb"),
     ],
 )

@@ -17,7 +17,7 @@ from renderer.image import ImageSettings
 from renderer.mesh import Mesh, concatenate
 from renderer.shading import radiance
 from renderer.shapes import solid
-from renderer.subdivision import subdivide
+from renderer.subdivision import refine, subdivide
 from renderer.visibility import choose
 
 EPS, EPS32 = np.finfo(np.float64).eps, np.finfo(np.float32).eps
@@ -200,3 +200,17 @@ def test_a_sample_sees_the_same_face_unless_rounded_corners_moved_an_edge_over_i
     assert (seen[0] >= 0).sum() > 1000
     changed = seen[0] != seen[1]
     assert changed.any() and (near[0] | near[1])[changed].all()
+
+
+def test_refined_faces_are_no_larger_than_asked_and_cover_what_the_large_ones_did():
+    """Each in four as often as it takes: those that are small enough stay as they are."""
+    mesh = Mesh.plain([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 1]], [[0, 1, 2], [0, 3, 1]], np.eye(4)[:, :3])
+    fine = refine(mesh, 0.6)
+    assert np.array_equal(fine.vertices[:4], mesh.vertices)
+    np.testing.assert_allclose(np.sort(fine.face_areas()), [0.5] * 4 + [0.5] * 16)
+    flat = fine.vertices[fine.faces][..., 2].max(axis=1) == 0
+    np.testing.assert_allclose(fine.face_areas()[flat].sum(), 8)
+    np.testing.assert_allclose(np.abs(fine.face_normals()[flat] - [0, 0, 1]).max(), 0)
+    x, y = fine.vertices[fine.faces[flat]][..., :2].reshape(-1, 2).T / 4
+    np.testing.assert_allclose(fine.corner_colors[flat].reshape(-1, 3), np.stack([1 - x - y, x, y], axis=1), atol=1e-7)
+    assert np.array_equal(refine(mesh, 8.0).faces, mesh.faces)

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from renderer import reference
+from renderer import radiosity, reference
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
@@ -19,9 +19,9 @@ from renderer.harmonics import basis, live_coefficients, rotate
 from renderer.image import ImageSettings
 from renderer.lights import ambient, load_light
 from renderer.mesh import Mesh, concatenate
+from renderer.rays import DIRECTIONS, sphere
 from renderer.rendering import operators, render
 from renderer.transfer import Operator, build_operators
-from renderer.transport import DIRECTIONS, sphere
 from renderer.visibility import choose
 
 BACKEND = choose("software")
@@ -85,9 +85,11 @@ CONVEX = {
 @pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
 def test_a_convex_mesh_keeps_the_operator_of_direct_light_to_the_bit(mesh, normals):
     camera = OrthographicCamera(1.0, 0.3, 2.2)
-    direct, shadowed = (operator_of(mesh, camera, transport, normals=normals) for transport in ("direct", "shadows"))
-    assert torch.equal(shadowed.transfer, direct.transfer)
-    assert torch.equal(shadowed.kept, live_coefficients(6))
+    direct = operator_of(mesh, camera, "direct", normals=normals)
+    for transport in ("shadows", "bounces:2"):
+        shaped = operator_of(mesh, camera, transport, normals=normals)
+        assert torch.equal(shaped.transfer, direct.transfer)
+        assert torch.equal(shaped.kept, live_coefficients(6))
 
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
@@ -128,12 +130,28 @@ def test_the_middle_of_a_pit_sees_the_share_of_the_sky_that_a_square_has(depth):
 
 @pytest.mark.parametrize("samples", [1, 3])
 def test_no_pixel_is_brighter_than_under_an_open_sky_or_darker_than_none(samples):
-    """A white furnace. What is lost is added up from directions, and what is there in closed form."""
+    """What is lost is added up from directions, and what is there in closed form."""
     for mesh in (dented(1), parts(), pit(3.0)):
         shares = sky_share(operator_of(mesh, size=16, samples=samples)).amax(0)
         assert shares.max() <= 1 + 1e-9
         assert shares.min() >= -QUADRATURE
         assert shares.min() < 0.9
+
+
+def white(mesh: Mesh) -> Mesh:
+    return replace(mesh, corner_colors=np.ones_like(mesh.corner_colors))
+
+
+@pytest.mark.parametrize("mesh", [white(dented(1)), white(parts())], ids=["dented", "parts"])
+def test_a_white_mesh_in_a_white_furnace_brightens_with_each_bounce_until_it_cannot_be_seen(mesh, monkeypatch):
+    """All light is kept, and what a direction does not bring comes from what is met there."""
+    monkeypatch.setattr(radiosity, "PATCHES", 2**7)
+    shares = [sky_share(operator_of(mesh, size=12, samples=2, transport=f"bounces:{n}")) for n in (1, 2, 4, 8, 100)]
+    before = sky_share(operator_of(mesh, size=12, samples=2))
+    for share in shares:
+        assert (share >= before - 1e-9).all() and share.max() <= 1 + 1e-9
+        before = share
+    torch.testing.assert_close(shares[-1], torch.ones_like(before), rtol=0, atol=1e-6)
 
 
 def test_samples_share_the_directions_of_their_pixel():
@@ -173,9 +191,12 @@ def test_missing_embree_is_told_in_a_sentence(monkeypatch):
         operator_of(dented())
 
 
-def test_an_unknown_transport_is_refused():
-    with pytest.raises(InputError, match=r"renderer\.transport=caustics: choose one of direct, shadows"):
-        ImageSettings(transport="caustics")
+@pytest.mark.parametrize("unknown", ["caustics", "bounces", "bounces:0", "bounces:101", "bounces:-1", "bounces:²", ""])
+def test_an_unknown_transport_is_refused(unknown):
+    with pytest.raises(
+        InputError, match=rf"renderer\.transport={unknown}: choose one of direct, shadows, or bounces:N"
+    ):
+        ImageSettings(transport=unknown)
 
 
 @pytest.mark.parametrize("degree", [2, 6])

@@ -30,7 +30,7 @@ class Recorded:
 
 @pytest.mark.parametrize(
     "choice, device, expected",
-    [("auto", GPU, True), ("auto", CPU, False), ("always", CPU, True), ("never", GPU, False)],
+    [("auto", GPU, True), ("auto", CPU, False), ("always", GPU, True), ("never", GPU, False)],
 )
 def test_one_gpu_compiles_unless_told(monkeypatch, choice, device, expected):
     monkeypatch.setattr(compute, "compiler_works", lambda device: True)

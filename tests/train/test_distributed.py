@@ -59,22 +59,22 @@ def train_two_steps(folder: Path) -> None:
     """Writes the losses, the gradients of the second step, and the buffers, and what the processes agree on."""
     model = network()
     replica, losses = replicated(model), []
-    share = torch.arange(12).view(processes.count(), -1)[processes.index()]
+    share = torch.arange(12).view(processes.world_size(), -1)[processes.rank()]
     for step in range(2):
         torch.manual_seed(step)
         loss = F.cross_entropy(replica(BATCH[share]), LABELS[share])
         model.zero_grad()
         loss.backward()
-        losses.append(float(summed(loss.detach().clone())) / processes.count())
+        losses.append(float(summed(loss.detach().clone())) / processes.world_size())
     state = {
         "losses": losses,
         "gradients": {name: parameter.grad for name, parameter in model.named_parameters()},
         "buffers": dict(model.named_buffers()),
-        "any": [any_process(processes.index() == 1), any_process(False)],
+        "any": [any_process(processes.rank() == 1), any_process(False)],
         "merged": processes.merged(processes.share(5) * 10, processes.share(5), 5),
         "few": processes.merged(processes.share(1) + 7, processes.share(1), 1),
     }
-    torch.save(state, folder / f"{processes.index()}_of_{processes.count()}.pt")
+    torch.save(state, folder / f"{processes.rank()}_of_{processes.world_size()}.pt")
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def interrupted_at(epoch: int, step: int, process: int) -> Iterator[None]:
 
     def signalled(images, labels, batch_size, seed, now, *rest, **more):
         for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
-            if (now.epoch, count, processes.index()) == (epoch, step, process):
+            if (now.epoch, count, processes.rank()) == (epoch, step, process):
                 signal.raise_signal(signal.SIGTERM)
             yield batch
 

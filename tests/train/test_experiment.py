@@ -619,7 +619,11 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["augment.examples=1000000000000"], "augment.examples=1000000000000 must be at least 0"),
         (["augment.random.amplitude=1e30"], r"augment.random.amplitude=1e\+30 must be"),
         (["augment.attack.step_size=nan"], "augment.attack.step_size=nan must be"),
-        (["renderer.samples=100000"], "renderer.samples=100000 for each of 16 pixels in a row are more than 32768"),
+        (["renderer.samples=65"], "renderer.samples=65 must be at least 1 and at most 64"),
+        (["renderer=x"], "renderer: Merge error: str is not a subclass of RendererSettings"),
+        (["scene.meshes=['']"], "scene.meshes: a mesh is '': give a file or solid:NAME"),
+        (["train.compile=always"], "train.compile=always is for a GPU"),
+        (["train.device=meta"], "device=meta is not available here"),
         (["model.width=100000"], "model.depth=10, model.width=100000 make"),
         (["model.depth=1000000"], "model.depth=1000000, model.width=1 make"),
         (["+data.size=1"], "data.size=1 must be at least 5"),
@@ -704,3 +708,11 @@ def test_training_takes_the_attacks_of_scripts_attack_and_the_papers_where_none_
         alone = compose("attack", ["attack=[geometry,lighting]"]).attack
     both = kinds("attack@augment.attack=[geometry,lighting]", "augment.attack.geometry.radius=0.01")
     assert both == {"lighting": dict(alone.lighting), "geometry": dict(alone.geometry) | {"radius": 0.01}}
+
+
+def test_photographs_among_which_the_scores_would_lie_are_refused_before_training(tiny, photos, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(photos, folder / "photographs")
+    config = tiny(f"evaluate.photos={folder / 'photographs'}")
+    with pytest.raises(InputError, match="photographs lies inside the photographs' folder: choose another"):
+        prepare(config, load_data(config), folder)

@@ -247,7 +247,10 @@ def test_a_loss_that_is_not_finite_ends_the_run_with_the_last_good_checkpoint(tm
     trainer = make_trainer(tmp_path)
     losses = iter([1.0, math.nan])
     monkeypatch.setattr(fit, "evaluate", lambda *arguments: {"loss": next(losses), "accuracy": 0.5})
-    with pytest.raises(InputError, match=r"train.learning_rate=0.05 made the loss NaN or infinite in epoch 2"):
+    with pytest.raises(
+        InputError,
+        match=r"_rate=0.05 with .*_decay=.* made the loss NaN or infinite in epoch 2",
+    ):
         fit_noise(trainer)
     assert checkpoint.load(tmp_path / checkpoint.LAST)["epoch"] == 1
     assert [line["epoch"] for line in read_metrics(tmp_path)] == [1]
@@ -300,7 +303,7 @@ def test_weights_that_are_not_finite_are_named_and_the_last_good_checkpoint_stay
         return loss * math.inf, hits
 
     monkeypatch.setattr(trainer, "_training_pass", spoilt)
-    with pytest.raises(InputError, match=r"0.05 made the weight stem.weight NaN or infinite in epoch 2: set a lower"):
+    with pytest.raises(InputError, match=r"made the weight stem.weight NaN or infinite in epoch 2: set lower"):
         fit_noise(trainer)
     assert checkpoint.load(tmp_path / checkpoint.LAST)["epoch"] == 1
 

@@ -392,7 +392,7 @@ def test_joblib_trains_cells_in_processes_at_once(tiny_npz, cell, tmp_path):
     folder = tmp_path / "sweep"
     overrides = [f"data.path={tiny_npz}", "train.learning_rate=0.05,-1", "launcher=joblib", "hydra.launcher.n_jobs=2"]
     done = command(folder, *overrides)
-    assert done.returncode == 1 and "Traceback" not in done.stderr and "Nearest" not in done.stderr
+    assert done.returncode == 1 and "Traceback" not in done.stderr and "nearest" not in done.stderr
     good, bad = (cell(folder, "train.epochs=1", f"train.learning_rate={rate}") for rate in ("0.05", "-1"))
     assert {path for path in folder.iterdir() if path.is_dir()} == {good, bad, folder / "report_files"}
     assert [row[0] for row in rows(done.stdout)] == ["augment", "none"]

@@ -36,6 +36,12 @@ class Photograph:
     look_alikes: tuple[str, ...] = ()
 
 
+def require_outside(out: Path, folder: Path) -> None:
+    """InputError where what is written of photographs would lie among them: the contact sheet would be scored, too."""
+    if out.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"out={out} lies inside the photographs' folder: choose another")
+
+
 def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[Photograph]:
     """The images of a folder, sorted by path, each with its class.
 

@@ -8,12 +8,11 @@ from typing import Any
 
 import torch
 
-from renderer.errors import InputError
 from train.photographs.answers import Answer, ask, rank_classes
 from train.photographs.answers_table import ANSWERS, write_answers
 from train.photographs.contact_sheet import choose_sections, draw_contact_sheet
 from train.photographs.figures import OVERALL, Pool, figures, pool_answers, share_true
-from train.photographs.folder import find_photographs, left_out, load_photographs
+from train.photographs.folder import find_photographs, left_out, load_photographs, require_outside
 from train.photographs.roc import draw_roc, rank_pools, write_roc_csv
 
 SUMMARY = "summary.json"
@@ -55,8 +54,7 @@ def evaluate_photographs(
     Raises InputError as `find_photographs` and `load_photographs` do, for `out` inside `folder`, and for logits of
     another shape or not finite.
     """
-    if out.resolve().is_relative_to(folder.resolve()):  # the contact sheet would be scored next time
-        raise InputError(f"out={out} lies inside the photographs' folder: choose another")
+    require_outside(out, folder)
     found = find_photographs(folder, classes, label)
     photographs, images, unreadable = load_photographs(folder, found, size, skip_unreadable)
     logits = ask(model, images, len(classes), batch_size, device)

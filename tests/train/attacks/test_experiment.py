@@ -190,6 +190,8 @@ REFUSED = [
     (["attack.max_steps=-1"], r"attack: max_steps=-1 must be at least 0"),
     (["attack.batch_size=0"], r"attack: batch_size=0 must be at least 1"),
     (["scene.views=0"], r"scene.views=0 must be at least 1"),
+    (["scene.polar=1e30"], r"scene.polar=1e\+30 must be at least 0 and at most 180"),
+    (["scene.azimuth=inf"], r"scene.azimuth=inf must be at least -360 and at most 360"),
     (["scene.exposure=0"], r"scene.exposure=0.0 must be at least 1e-05 and at most 100000"),
     (["scene.exposure=inf"], r"scene.exposure=inf must be at least"),
     (["scene.exposure=1e30"], r"scene.exposure=1e[+]30 must be at least"),

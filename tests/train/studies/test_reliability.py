@@ -39,8 +39,7 @@ ENDINGS = [
     (Ending(2, "error: something is wrong\n"), True, "neither out is named: error: something is wrong"),
     (Ending(2, SENTENCE + "and more\n"), True, "status 2: error: out=x cannot be written: choose another | and more"),
     (Ending(1, SENTENCE), True, "status 1: error: out=x cannot be written: choose another"),
-    (Ending(1, "Key 'x' is not in struct\nSet the environment variable HYDRA_FULL_ERROR=1 ...\n"), True, None),
-    (Ending(1, "Traceback\nSet the environment variable HYDRA_FULL_ERROR=1 ...\n"), True, "status 1: Traceback | Set"),
+    (Ending(1, "Traceback\nValueError: x\n"), True, "status 1: Traceback | ValueError: x"),
     (Ending(139, ""), False, "status 139: "),
     (Ending(None, ""), False, "hung"),
 ]

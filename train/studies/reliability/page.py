@@ -14,7 +14,7 @@ Made by `{command}`. {versions} Of {all:,} hostile inputs {tried:,} were tried, 
 command in a process and a folder of its own, with good files that the project makes for everything else.
 
 - *Used*: exit status 0, where what is meant can be clear. *Refused*: exit status 2 and one sentence that names the file
-  or the key, or Hydra's own words of an override that it cannot read, with status 1.
+  or the key.
 - *Mishandled*: a traceback, another status, a hang of {patience} s, code from an input that ran, damage that was taken
   without a word, or a sentence that names neither file nor key. Each of the last column is listed below.
 """

@@ -25,7 +25,6 @@ NAMES = [
 VALUES = ["-1", "0", "0.5", "nan", "inf", "1e+30", "1000000000000", "abc", "[]", "{a: 1}", "null", "''"]
 CROWDED = {"no room": Surroundings(largest=1000), "output to a full disk": Surroundings(output="/dev/full")}
 NOWHERE = ("background.png", "background.png/a", "/proc/none", "/dev/full", "a" * 300)  # where no folder can be made
-HYDRA = "Set the environment variable HYDRA_FULL_ERROR=1"  # ends what Hydra says of its own, in more lines than one
 
 
 @dataclass(frozen=True)
@@ -62,8 +61,6 @@ class Trial:
             case 0 if self.refused:
                 return "taken"
             case 0:
-                return None
-            case 1 if lines and lines[-1].startswith((HYDRA, "Nearest")) and "Traceback" not in ending.errors:
                 return None
             case status if status != USER_ERROR or len(lines) != 1 or not lines[0].startswith("error: "):
                 return f"status {status}: {' | '.join(lines[-2:])}"

@@ -1,0 +1,127 @@
+"""Light that bounces between the surfaces of a mesh: radiosity (Goral et al. 1984), per coefficient of the light.
+
+A patch is one side of some small faces that lie together and face alike, or of a piece of a large one. Its irradiance
+is found as that of a pixel which shows just the patch.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix, vstack
+from torch import Tensor
+
+from renderer.albedo import surface_albedo
+from renderer.basis import Basis
+from renderer.fragments import Fragments
+from renderer.mesh import Mesh
+from renderer.normals import face_normals
+from renderer.rays import Looks, Rays
+from renderer.subdivision import refine
+
+PATCHES = 2**11  # the mesh's area over that is about the area of a patch
+MIDDLE = [[-1.0, -1.0], [1.0, -1.0], [0.0, 2.0]]  # a triangle around the only sample of an image
+
+
+@dataclass(frozen=True)
+class Patches:
+    """N patches of a mesh's F pieces. view: a pixel for each patch, with the middles of its pieces as samples (S,).
+
+    shares: (S, 1), of a piece's area in its patch. of_side: (2, F), the patches of each piece's front and back.
+    """
+
+    pieces: Mesh
+    view: Fragments
+    shares: Tensor
+    of_side: Tensor
+
+    @staticmethod
+    def of(mesh: Mesh) -> "Patches":
+        area = float(mesh.face_areas().sum()) / PATCHES
+        pieces = refine(mesh, area)
+        count, sides = len(pieces.faces), [1.0] if pieces.closed else [1.0, -1.0]
+        facing, faces = np.repeat(sides, count)[:, None], np.tile(np.arange(count), len(sides))
+        middles = pieces.vertices[pieces.faces].mean(axis=1)[faces]
+        alike = np.hstack([np.floor(middles / math.sqrt(area)), np.rint(pieces.face_normals()[faces]), facing])
+        _, patch = np.unique(alike, axis=0, return_inverse=True)
+        order = np.argsort(patch, kind="stable")
+        pixel, piece = torch.from_numpy(patch[order]), torch.from_numpy(faces[order])
+        areas = torch.from_numpy(pieces.face_areas())[piece]
+        totals = areas.new_zeros(int(pixel[-1]) + 1).index_add_(0, pixel, areas)
+        view = Fragments(
+            size=1,
+            samples=1,
+            pixels=torch.arange(len(totals)),
+            coverage=torch.ones_like(totals),
+            faces=piece,
+            corners=torch.from_numpy(pieces.faces)[piece],
+            facing=torch.from_numpy(facing[order]),
+            outlines=areas.new_tensor(MIDDLE).expand(len(piece), 3, 2),
+            pixel=pixel,
+            face=torch.arange(len(piece)),
+            sample=torch.zeros_like(piece),
+        )
+        shares = areas / totals.clamp(min=torch.finfo(areas.dtype).tiny)[pixel]
+        of_side = torch.from_numpy(patch).view(len(sides), -1).expand(2, -1)
+        return Patches(pieces, view, shares[:, None], of_side)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """(N, D) of values (S, D) at the samples."""
+        summed = values.new_zeros(len(self.view.pixels), values.shape[1])
+        return summed.index_add_(0, self.view.pixel, values * self.shares)
+
+    def seen(self, looks: Looks, weights: Tensor) -> csr_matrix:
+        """(B, N) the weights (B, D) of directions, by the patch that is met there."""
+        pixel, direction = torch.nonzero(weights, as_tuple=True)
+        met = looks.met[pixel, direction]
+        behind = (self._normals[met] * looks.directions[direction]).sum(1) > 0
+        places = pixel.numpy(), self.of_side[behind.long(), met].numpy()
+        return csr_matrix((weights[pixel, direction].numpy(), places), (len(weights), len(self.view.pixels)))
+
+    @cached_property
+    def _normals(self) -> Tensor:
+        return torch.from_numpy(self.pieces.face_normals())
+
+
+class Radiosity:
+    """What the patches of a mesh send per unit of each coefficient of a basis, after one bounce or several.
+
+    colors: whether any patch is not grey.
+    """
+
+    def __init__(self, mesh: Mesh, encoding: str, gain: float, basis: Basis, bounces: int):
+        """gain multiplies the mesh's albedo."""
+        self.patches = patches = Patches.of(mesh)
+        albedo = patches.mean(surface_albedo(patches.pieces, patches.view, encoding)) * gain
+        self.colors = bool((albedo != albedo[:, :1]).any())
+        reflected = albedo[:, None, : 3 if self.colors else 1] / math.pi
+        from_sky, receiving, links = _first_bounce(patches, basis)
+        self._sent = from_sky * reflected
+        for _ in range(bounces - 1):
+            arriving = torch.from_numpy(links @ self._sent.flatten(1).numpy()).view(-1, *self._sent.shape[1:])
+            self._sent = from_sky.expand_as(self._sent).index_add(0, receiving, arriving) * reflected
+
+    def gather(self, looks: Looks, weights: Tensor, channel: int) -> Tensor:
+        """(B, size) radiance of what pixels meet, summed over directions with weights (B, D)."""
+        sent = self._sent[..., channel if self.colors else 0].numpy()
+        return torch.from_numpy(self.patches.seen(looks, weights) @ sent)
+
+
+def _first_bounce(patches: Patches, basis: Basis) -> tuple[Tensor, Tensor, csr_matrix]:
+    """(N, size, 1) irradiance of the patches from the sky alone; those (M,) that see others, and how much of the
+    radiance of each (M, N) is their irradiance."""
+    view, rays = patches.view, Rays(patches.pieces)
+    normals = face_normals(torch.from_numpy(patches.pieces.vertices), view.corners) * view.facing
+    from_sky = normals.new_zeros(len(view.pixels), basis.size)
+    from_sky[:, basis.live] = patches.mean(basis.irradiance(normals))
+    receiving, links, radiance = [], [], basis.radiance(rays.directions)
+    for looks in rays.looks(view):
+        weights = looks.blocked() * patches.shares[looks.sample, 0]
+        from_sky[looks.pixels] -= weights @ radiance
+        receiving.append(looks.pixels)
+        links.append(patches.seen(looks, weights))
+    if not links:
+        return from_sky[..., None], torch.arange(0), csr_matrix((0, len(from_sky)))
+    return from_sky[..., None], torch.cat(receiving), vstack(links, format="csr")

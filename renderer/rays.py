@@ -1,0 +1,136 @@
+"""Rays from a view's samples among the faces of a mesh, cast by Embree (Wald et al. 2014).
+
+All pixels look in the same directions, which are dealt out among the samples of each: so an edge of shadow, of albedo
+or of the mesh is averaged as any other, and a pixel costs as many rays however many samples it has. Pixels from which
+no other surface is to be seen, all of a convex mesh, cast none.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import ConvexHull, QhullError
+from torch import Tensor
+
+from renderer.errors import InputError
+from renderer.fragments import Fragments
+from renderer.harmonics import per_degree, unit_vectors
+from renderer.mesh import Mesh
+from renderer.normals import face_normals
+from renderer.shading import smooth_normals
+
+DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
+OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32
+BLOCK = 2**17  # directions of pixels at a time: bounds the memory
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What B pixels (B,), numbered among a view's, see of their own mesh in D directions, (B, D) each.
+
+    directions: (D, 3). sample: the one that looks, of the view's. weight: of the radiance from there in the pixel's
+    irradiance: solid angle × cosine × the number of the pixel's samples. met: the face that the ray meets, -1 where
+    there is none.
+    """
+
+    pixels: Tensor
+    directions: Tensor
+    sample: Tensor
+    weight: Tensor
+    met: Tensor
+
+    def blocked(self) -> Tensor:
+        """The weight where anything is met, else zero."""
+        return self.weight.masked_fill(self.met < 0, 0)
+
+
+class Rays:
+    """Rays among the faces of one mesh. InputError where Embree is not installed.
+
+    directions: (D, 3), equally far apart. smooth_faces: (F, 3), all faces of the views, whose vertices are the mesh's,
+    to shade with interpolated vertex normals.
+    """
+
+    def __init__(self, mesh: Mesh, smooth_faces: np.ndarray | None = None):
+        self.directions = sphere(DIRECTIONS)
+        self._vertices = torch.from_numpy(mesh.vertices).double()
+        self._smooth_faces = None if smooth_faces is None else torch.from_numpy(smooth_faces)
+        self._offset = OFFSET * float(np.abs(mesh.vertices).max())
+        self._outermost = torch.from_numpy(_outermost(mesh.vertices[np.unique(mesh.faces)])).double()
+        self._scene = _embree_scene(mesh)
+
+    def looks(self, fragments: Fragments) -> Iterator[Looks]:
+        """Those of the view's pixels that see any other surface, some at a time.
+
+        No ray is cast into a sample's own face, on which smooth normals shade the light nevertheless.
+        """
+        corners = self._vertices[fragments.corners]
+        planes = face_normals(self._vertices, fragments.corners) * fragments.facing
+        pixels = self._overlooked(fragments, planes, corners[:, 0])
+        if not len(pixels):
+            return
+        planes = planes.index_select(0, fragments.face)
+        origins = fragments.interpolate(corners) + planes * self._offset
+        normals = planes
+        if self._smooth_faces is not None:
+            normals = unit_vectors(smooth_normals(fragments, self._vertices, self._smooth_faces).T)[0].T
+        count = fragments.pixel.bincount(minlength=len(fragments.pixels))
+        first = count.cumsum(0) - count
+        directions, solid_angle = self.directions, 4 * math.pi / len(self.directions)
+        for some in pixels.split(max(1, BLOCK // len(directions))):
+            of_pixel = count[some, None]
+            sample = first[some, None] + (_shuffled(len(directions)) + some[:, None]) % of_pixel
+            cosine = torch.einsum("bdi,di->bd", normals[sample], directions).clamp(min=0)
+            above = torch.einsum("bdi,di->bd", planes[sample], directions)
+            cast = torch.nonzero((cosine > 0) & (above > 0), as_tuple=True)
+            met = self._meet(origins[sample[cast]], directions[cast[1]])
+            met = torch.full_like(sample, -1).index_put_(cast, met)
+            yield Looks(some, directions, sample, cosine * of_pixel * solid_angle, met)
+
+    def _overlooked(self, fragments: Fragments, planes: Tensor, corners: Tensor) -> Tensor:
+        """The pixels with a sample on a face above whose plane, through a corner, the mesh rises. (G, 3) each."""
+        reach = torch.cat([(part @ self._outermost.T).amax(1) for part in planes.split(BLOCK // 2**7)])
+        rises = reach - (planes * corners).sum(1) > self._offset
+        return fragments.pixel[rises[fragments.face]].unique()
+
+    def _meet(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """(N,) the face that each ray of (N, 3) meets first, -1 where there is none."""
+        rays = (np.ascontiguousarray(part.numpy(), dtype=np.float32) for part in (origins, directions))
+        return torch.from_numpy(self._scene.run(*rays)).long()
+
+
+@per_degree
+def sphere(count: int) -> Tensor:
+    """(count, 3) float64 directions that share the sphere equally: the spherical Fibonacci lattice."""
+    index = torch.arange(count, dtype=torch.float64)
+    z, azimuth = 1 - (2 * index + 1) / count, math.pi * (3 - math.sqrt(5)) * index
+    radius = (1 - z**2).sqrt()
+    return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=1)
+
+
+@per_degree
+def _shuffled(count: int) -> Tensor:
+    """0 to count - 1 in an order that has nothing to do with that of `sphere`, for all to be everywhere in a pixel."""
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))
+
+
+def _outermost(vertices: np.ndarray) -> np.ndarray:
+    """Vertices (N, 3) in whose convex hull all of them are: those of the hull itself, unless they lie in a plane."""
+    try:
+        return vertices[ConvexHull(vertices).vertices]
+    except QhullError:
+        return vertices
+
+
+def _embree_scene(mesh: Mesh) -> Any:
+    try:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+    except ImportError as error:
+        raise InputError("renderer.transport: rays are cast by Embree: pip install embreex") from error
+    scene = EmbreeScene(robust=True)
+    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+    return scene
