@@ -114,7 +114,7 @@ def comparison_tables(runs: Sequence[RunSummary], exclude: Sequence[str], photog
         pooled = f"all but {', '.join(exclude)}" if exclude else "all"
         tables[1:1] = [
             *(_figure_table(evaluations, name, pooled) for name in FIGURES),
-            *_difference_tables(evaluations, pooled),
+            *difference_tables(evaluations, pooled),
         ]
     return tables
 
@@ -149,7 +149,7 @@ def _name(evaluation: Evaluation, evaluations: Sequence[Evaluation]) -> str:
     return name_among(evaluation.run, [other.run for other in evaluations])
 
 
-def _difference_tables(evaluations: Sequence[Evaluation], pooled: str) -> list[Table]:
+def difference_tables(evaluations: Sequence[Evaluation], pooled: str) -> list[Table]:
     """A table for each group of runs but the first: how far it is from the first, by source and figure."""
     by_folder = {evaluation.run.folder: evaluation for evaluation in evaluations}
     groups = group_by_settings([evaluation.run for evaluation in evaluations])

@@ -1,48 +1,50 @@
 """What was asked and answered, in two sentences with numbers."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from statistics import fmean
 
 from renderer.errors import InputError
 from train.comparison import difference, read_evaluations
-from train.photographs import figure_title, find_figure
+from train.photographs import figure_title
 from train.photographs.figures import OVERALL
+from train.showcase.arms import Arms, Score
 from train.showcase.attacks import Attack
-from train.showcase.folders import Run
-from train.showcase.sections import scored_on
+from train.showcase.photographs import Scored, scored, scored_on, scores_of
 
 RATE = "recall_at/0.10"  # what tells discernment: recall at equal false alarms
 
 
-def of_runs(arms: Mapping[str, Sequence[Run]], name: str) -> str:
-    """About the first and the last arm, on the photographs in the sub-folder `name`."""
-    scored = {
-        arm: [run.summary for run in group] for arm, group in arms.items() if name in group[0].summary.photographs
-    }
-    if not scored:
-        accuracy = ", ".join(f"{arm} {group[0].summary.scores['test/accuracy']:.3f}" for arm, group in arms.items())
-        return f"Asked: what do {len(arms)} ways of training reach on the test set? Answered: accuracy {accuracy}."
-    first = next(iter(scored.values()))[0]
-    label, where = first.config.label, scored_on(first, name)
-    told = "; ".join(f"{arm} {_told(group[0].photographs[name])}" for arm, group in scored.items())
+def of_runs(arms: Arms, name: str) -> str:
+    """About all arms, and the last beside the first, on the images `name`, or on the test set where there are none."""
+    runs = scored(arms, name)
+    if not runs:
+        accuracies = {arm: [run.summary.scores["test/accuracy"] for run in group] for arm, group in arms.items()}
+        told = ", ".join(f"{arm} {fmean(values):.3f}" for arm, values in accuracies.items())
+        return f"Asked: what do {len(arms)} ways of training reach on the test set? Answered: accuracy {told}."
+    first = next(iter(runs.values()))[0]
+    scores = [scores_of(runs, name, figure) for figure in ("recall", "false_alarms", "auc")]
+    told = "; ".join(f"{arm} {_told(*(each.get(arm) for each in scores))}" for arm in runs)
+    most = max(map(len, runs.values()))
     return (
-        f"Asked: does a network trained in another way tell {label} from other things on {where}, and not only call "
-        f"more of them {label}? Answered, of the first seed of each arm: {told}{_difference(scored, name)}."
+        f"Asked: which network tells {first.config.label} from other things on {scored_on(first, name)}, and does not "
+        f"only call more of them {first.config.label}? Answered, of {'one seed' if most == 1 else f'{most} seeds'}: "
+        f"{told}{_difference(runs, name)}."
     )
 
 
-def _told(summary: dict[str, Any]) -> str:
-    recall, alarms, auc = (find_figure(summary, figure) for figure in ("recall", "false_alarms", "auc"))
-    if recall.get("value") is None or alarms.get("value") is None:
-        return "has no score"
-    ranked = f", AUC {auc['value']:.3f}" if auc.get("value") is not None else ""
-    return f"recognised {recall['value']:.0%} with {alarms['value']:.1%} false alarms{ranked}"
+def _told(recall: Score | None, alarms: Score | None, auc: Score | None) -> str:
+    parts = [
+        f"recognised {recall.value:.0%}" if recall else "",
+        f"{alarms.value:.1%} false alarms" if alarms else "",
+        f"AUC {auc.value:.3f}" if auc else "",
+    ]
+    return ", ".join(filter(None, parts)) or "has no score"
 
 
-def _difference(scored: Mapping[str, Sequence], name: str) -> str:
-    if len(scored) < 2:
+def _difference(runs: Scored, name: str) -> str:
+    if len(runs) < 2:
         return ""
-    (reference, base), *_, (arm, group) = scored.items()
+    (reference, base), *_, (arm, group) = runs.items()
     try:
         evaluations = read_evaluations([*base, *group], [], name)
         figure = difference(evaluations[len(base) :], evaluations[: len(base)], OVERALL, RATE)

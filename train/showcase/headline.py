@@ -3,15 +3,12 @@
 import io
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from statistics import fmean
 
-from train.photographs import find_figure
-from train.report import RunSummary
+from train.showcase.arms import Arms, Score
 from train.showcase.blocks import Illustration
 from train.showcase.images import turned
+from train.showcase.photographs import scored, scored_on, scores_of
 from train.showcase.plots import COLOURS
-from train.showcase.sections import scored_on
 from train.specimens import Side
 
 EXAMPLES = 3
@@ -21,35 +18,21 @@ TOP, LINE = 1.4, 0.22  # inches: of titles and margins, and of a line of an arm'
 LONGEST_LINE, LONGEST_ANSWER, LONGEST_TITLE = 14, 9, 25  # characters; more are wrapped, or set smaller
 FONT = 14  # points
 LOOK = {"axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False, "font.size": FONT}
-
-
-@dataclass(frozen=True)
-class Score:
-    """A figure of an arm: the mean of its seeds and, of a single one, its interval."""
-
-    seeds: Sequence[float]
-    interval: tuple[float, float] | None
-
-    @property
-    def mean(self) -> float:
-        return fmean(self.seeds)
-
-
 Pairs = Sequence[tuple[Side, Side]]  # before and after
 Scores = Mapping[str, Mapping[str, Score]]  # by the figure's title and the arm's name
 
 
-def headline(arms: Mapping[str, Sequence[RunSummary]], photographs: str) -> Illustration | None:
-    """Of the runs of each arm by its name, with their scores in the sub-folder `photographs`.
+def headline(arms: Arms, name: str) -> Illustration | None:
+    """Of the runs of each arm by its name, with their scores in the sub-folder `name`.
 
     None where no arm's first run keeps an example that was right before and wrong after.
     """
     pairs = next((found for group in reversed(arms.values()) if (found := turned(group[0].folder, EXAMPLES))), [])
     if not pairs:
         return None
-    first = next(iter(arms.values()))[0]
-    label, where = first.config.label, f"on {scored_on(first, photographs)}"
-    scores = {title: _scores(arms, photographs, name) for name, title in FIGURES.items()}
+    first = next(iter(arms.values()))[0].summary
+    label, where = first.config.label, f"on {scored_on(first, name)}"
+    scores = {title: scores_of(scored(arms, name), name, figure) for figure, title in FIGURES.items()}
     scores = {title: found for title, found in scores.items() if found}
     answers = "; ".join(f"{_said(before)}, then {_said(after)}" for before, after in pairs)
     alt = f"{label.capitalize()} before and after its light changed, called {answers}."
@@ -57,20 +40,7 @@ def headline(arms: Mapping[str, Sequence[RunSummary]], photographs: str) -> Illu
     return Illustration(_drawn(pairs, scores, label, where), "png", "".join([alt, *told]), int(100 * WIDTH))
 
 
-def _scores(arms: Mapping[str, Sequence[RunSummary]], photographs: str, name: str) -> dict[str, Score]:
-    """Of the arms that have the figure."""
-    scores = {}
-    for arm, runs in arms.items():
-        found = [find_figure(run.photographs.get(photographs, {}), name) for run in runs]
-        if known := [figure for figure in found if figure.get("value") is not None]:
-            interval = (known[0]["low"], known[0]["high"]) if len(known) == 1 else None
-            scores[arm] = Score([figure["value"] for figure in known], interval)
-    return scores
-
-
-def _drawn(
-    pairs: Sequence[tuple[Side, Side]], scores: Mapping[str, Mapping[str, Score]], label: str, where: str
-) -> bytes:
+def _drawn(pairs: Pairs, scores: Scores, label: str, where: str) -> bytes:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -102,8 +72,8 @@ def _draw_pairs(figure, pairs: Pairs, label: str) -> None:
 
 def _draw_scores(figure, scores: Scores, where: str) -> None:
     _draw_title(figure, where.capitalize())
-    most = max(len(score.seeds) for found in scores.values() for score in found.values())
-    note = "one seed, 95 % intervals" if most == 1 else f"means of up to {most} seeds, each a dot"
+    most = max(score.seeds for found in scores.values() for score in found.values())
+    note = "one seed, 95 % intervals" if most == 1 else f"means of {most} seeds, lowest to highest"
     figure.supxlabel(note, color="0.35", fontsize=11)
     grid = figure.subplots(len(scores), 1, sharex=True, squeeze=False)
     for axes, (name, found) in zip(grid.flat, scores.items(), strict=True):
@@ -123,12 +93,9 @@ def _draw_title(figure, text: str) -> None:
 
 
 def _draw_bar(axes, row: int, score: Score) -> None:
-    axes.barh(row, score.mean, 0.75, color=COLOURS[row % len(COLOURS)])
-    if score.interval:
-        axes.hlines(row, *score.interval, color="0.1", linewidth=2)
-    else:
-        axes.plot(score.seeds, [row] * len(score.seeds), "o", ms=4, mfc="white", mec="0.1")
-    axes.annotate(f" {score.mean:.2f}", (max(*score.seeds, *(score.interval or [0])), row), va="center")
+    axes.barh(row, score.value, 0.75, color=COLOURS[row % len(COLOURS)])
+    axes.hlines(row, score.low, score.high, color="0.1", linewidth=2)
+    axes.annotate(f" {score.value:.2f}", (max(score.high, score.value), row), va="center")
 
 
 def _said(side: Side) -> str:
@@ -136,4 +103,4 @@ def _said(side: Side) -> str:
 
 
 def _told(found: Mapping[str, Score]) -> str:
-    return ", ".join(f"{arm} {score.mean:.2f}" for arm, score in found.items())
+    return ", ".join(f"{arm} {score.value:.2f}" for arm, score in found.items())

@@ -12,6 +12,8 @@ from train.showcase.blocks import Illustration
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from train.showcase.arms import Score
+
 # Okabe and Ito 2008, without yellow, which white paper swallows; a line style and a marker tell the same.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES, MARKERS = ("--", "-", ":", "-."), "osD^vP"
@@ -51,7 +53,7 @@ def curves(series: Series, title: str, xlabel: str, limits: tuple[float, float] 
                 marker = MARKERS[index % len(MARKERS)] if len(x) < 30 else None
                 axes.plot(x, y, marker=marker, ms=4, label=None if number else arm, **style(index))
         axes.set(xlabel=xlabel, ylim=limits and (limits[0] - 0.02, limits[1] + 0.02))
-        axes.locator_params(axis="x", integer=True)
+        axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
     ends = [f"{arm} {np.mean([y[-1] for _, y in lines]):.2f}" for arm, lines in drawn.items() if lines]
     return _figure(draw, title, f"{title} over {xlabel}s, at the end: {', '.join(ends)}")
@@ -76,37 +78,34 @@ def roc(rankings: Mapping[str, Sequence[Ranking]], label: str, title: str) -> Il
     return _figure(draw, title, f"{title}; AUC: {', '.join(f'{arm} {auc:.3f}' for arm, auc in told.items())}")
 
 
-def bars(values: Mapping[str, Sequence[Mapping[str, Any]]], names: Sequence[str], title: str) -> Illustration | None:
-    """A row of bars per name, one for each arm, with its interval: {value, low, high}, of which value may be None."""
-    if not any(figure.get("value") is not None for figures in values.values() for figure in figures):
+def bars(scores: Mapping[str, Mapping[str, "Score | None"]], title: str) -> Illustration | None:
+    """A row of bars per source, one for each arm, with its interval; None where there is nothing to draw."""
+    if not scores:
         return None
-    thickness = 0.8 / len(values)
+    sources, arms = [*scores], [*next(iter(scores.values()))]
+    thickness = 0.8 / len(arms)
 
     def draw(axes: "Axes") -> None:
-        for index, (arm, figures) in enumerate(values.items()):
-            known = [(row, each) for row, each in enumerate(figures) if each.get("value") is not None]
-            at = [row + (index - (len(values) - 1) / 2) * thickness for row, _ in known]
-            told = [each["value"] for _, each in known]
+        for index, arm in enumerate(arms):
+            known = [(row, found) for row, source in enumerate(sources) if (found := scores[source][arm])]
+            at = [row + (index - (len(arms) - 1) / 2) * thickness for row, _ in known]
+            told = [each.value for _, each in known]
             error = [
-                [max(0, each["value"] - each["low"]) for _, each in known],
-                [max(0, each["high"] - each["value"]) for _, each in known],
+                [max(0, each.value - each.low) for _, each in known],
+                [max(0, each.high - each.value) for _, each in known],
             ]
             look = {"color": style(index)["color"], "label": arm, "ecolor": INK}
             axes.barh(at, told, thickness * 0.9, xerr=error, error_kw={"linewidth": 1}, **look)
-        axes.set_yticks(range(len(names)), [name if len(name) < 24 else f"{name[:22]}…" for name in names])
+        axes.set_yticks(range(len(sources)), [name if len(name) < 24 else f"{name[:22]}…" for name in sources])
         axes.set_xlim(0, 1.02)
         axes.invert_yaxis()
 
     told = [
-        f"{name}: " + ", ".join(f"{arm} {each[row]['value']:.2f}" for arm, each in values.items() if _known(each[row]))
-        for row, name in enumerate(names)
+        f"{source}: " + ", ".join(f"{arm} {found.value:.2f}" for arm, found in by_arm.items() if found)
+        for source, by_arm in scores.items()
     ]
-    height = max(SIZE[1], 0.9 + 0.24 * len(names) * len(values))
+    height = max(SIZE[1], 0.9 + 0.24 * len(sources) * len(arms))
     return _figure(draw, title, f"{title}. {'; '.join(told)}", height)
-
-
-def _known(figure: Mapping[str, Any]) -> bool:
-    return figure.get("value") is not None
 
 
 def _figure(draw, title: str, alt: str, height: float = SIZE[1]) -> Illustration:

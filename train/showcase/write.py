@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from train.cli import one_sentence
-from train.settings import PHOTOGRAPHS
-from train.showcase import answer, sections
+from train.showcase import answer, photographs, sections
+from train.showcase.arms import arms_of, drawn
 from train.showcase.attacks import sections as attack_sections
 from train.showcase.blocks import Block, Code, Gallery, Illustration, Section
 from train.showcase.folders import find
@@ -27,15 +27,15 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     Returns the page. What cannot be read is named in it. InputError as of `find`.
     """
     runs, attacks, problems = find(folders)
-    arms = sections.arms_of(runs)
-    scored = sorted({name for group in arms.values() for run in group for name in run.summary.photographs})
-    name = PHOTOGRAPHS if PHOTOGRAPHS in scored or not scored else scored[0]
-    told = [answer.of_runs(arms, name)] if arms else []
-    told += [answer.of_attacks(attacks)] if attacks else []
-    summaries = {arm: [run.summary for run in group] for arm, group in arms.items()}
-    top = headline(summaries, name) if arms else None
-    first = [*told, *([Gallery("", [top])] if top else []), *problems]
-    parts = [Section("In short", first), *(sections.of_runs(runs) if runs else ()), *attack_sections(attacks)]
+    arms = arms_of(runs)
+    few, top = drawn(arms), None
+    told = [answer.of_attacks(attacks)] if attacks else []
+    if few:
+        name = photographs.most_scored(few)
+        top = headline(few, name)
+        told.insert(0, answer.of_runs(few, name))
+    first = Section("In short", [*told, *([Gallery("", [top])] if top else []), *problems])
+    parts = [first, *(sections.of_runs(runs, arms) if runs else ()), *attack_sections(attacks)]
     parts = [part for part in map(_without_empty, parts) if part.blocks]
     done = sum(run.summary is not None for run in runs)
     about = f"{done} of {len(runs)} runs finished, {len(attacks)} attacks"
