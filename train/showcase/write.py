@@ -2,6 +2,7 @@
 
 import base64
 import html
+import os
 import re
 import shutil
 import traceback
@@ -43,10 +44,11 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     if top:
         (out / HEADLINE).write_bytes(top.data)
-    (out / PAGE).write_text(_rendered("page.html.jinja", parts, about, _data_uri), encoding="utf-8", errors="replace")
+    page = _rendered("page.html.jinja", parts, about, _data_uri)
+    (out / PAGE).write_text(_from_here(page), encoding="utf-8", errors="replace")
     shutil.rmtree(out / IMAGES, ignore_errors=True)
     text = _rendered("page.md.jinja", parts, about, lambda image: _beside(image, out))
-    (out / MARKDOWN).write_text(re.sub(r"\n{3,}", "\n\n", text), encoding="utf-8", errors="replace")
+    (out / MARKDOWN).write_text(_from_here(re.sub(r"\n{3,}", "\n\n", text)), encoding="utf-8", errors="replace")
     return out / PAGE
 
 
@@ -66,6 +68,11 @@ def _rendered(template: str, parts: Sequence[Section], about: str, source) -> st
     )
     environment.filters |= {"kind": _kind, "shown": shown, "source": source, "md": _escaped, "fenced": _fenced}
     return environment.get_template(template).render(sections=parts, about=about)
+
+
+def _from_here(text: str) -> str:
+    """With paths below the current folder relative to it, so that the commands run in any clone."""
+    return re.sub(rf"(?<![\w./-]){re.escape(os.getcwd())}/", "", text)
 
 
 def _kind(block: Block) -> str:

@@ -97,6 +97,18 @@ def test_the_command_makes_the_same_settings_again(tmp_path, made_up_run, overri
     assert {key: value for key, value in found.items() if key in expected} == expected
 
 
+def test_paths_below_the_current_folder_are_relative(tmp_path, made_up_run, monkeypatch):
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    paths = [here / "a" / "data.npz", tmp_path / "there" / "orange.glb", f"/else{here}/data.glb"]
+    made_up_run(here / "run", "none", None, f"data.path={paths[0]}", f"scene.meshes=['{paths[1]}','{paths[2]}']")
+    report = write_report([here / "run"], here)
+    for text in (report.read_text(), report.with_suffix(".md").read_text()):
+        assert "data.path=a/data.npz" in text and str(paths[1]) in text and paths[2] in text
+        assert str(here) not in text.replace(paths[2], "")
+
+
 def test_where_there_is_nothing_one_sentence_says_so(tmp_path):
     with pytest.raises(InputError, match="holds no run and no attack"):
         write_report([tmp_path], tmp_path)
