@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import Any
 
 from train.photographs import format_interval
 from train.report import RunSummary, group_by_settings, name_among, varied_settings
@@ -56,7 +57,7 @@ class Score:
         return format_interval({"value": self.value, "low": self.low, "high": self.high})
 
 
-def score(figures: Iterable[Mapping]) -> Score | None:
+def score(figures: Iterable[Mapping[str, Any]]) -> Score | None:
     """Of the figures of an arm's seeds, {value, low, high} where they are known."""
     known = [figure for figure in figures if figure.get("value") is not None]
     if len(known) == 1:

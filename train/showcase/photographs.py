@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -76,11 +77,11 @@ def _scores(runs: Scored, name: str) -> dict[str, dict[str, dict[str, Score | No
     }
 
 
-def _by_arm(parts: Mapping[str, Sequence[dict]], source: str, figure: str) -> dict[str, Score | None]:
+def _by_arm(parts: Mapping[str, Sequence[dict[str, Any]]], source: str, figure: str) -> dict[str, Score | None]:
     return {arm: score(find_figure(part.get(source, {}), figure) for part in group) for arm, group in parts.items()}
 
 
-def _parts(run: RunSummary, name: str) -> dict[str, dict]:
+def _parts(run: RunSummary, name: str) -> dict[str, dict[str, Any]]:
     """A run's figures by source, those of all together first where there are several."""
     summary = run.photographs[name]
     with complete(run.folder):
@@ -90,7 +91,9 @@ def _parts(run: RunSummary, name: str) -> dict[str, dict]:
     return sources if len(sources) == 1 else {"all": summary, **sources}
 
 
-def _plots(runs: Scored, scores: Mapping, name: str, label: str) -> Iterator[Illustration | None]:
+def _plots(
+    runs: Scored, scores: Mapping[str, Mapping[str, Mapping[str, Score | None]]], name: str, label: str
+) -> Iterator[Illustration | None]:
     rankings = {arm: [*_rankings(group, name, label)] for arm, group in runs.items()}
     yield plots.roc(rankings, label, "ROC")
     for figure in FIGURES:
