@@ -12,6 +12,7 @@ from augment import processes
 from augment.memory import BatchSize
 from augment.model_state import as_found
 from augment.phases import Phases
+from augment.progress import progress
 from renderer.errors import require_range
 
 NO_CLASS = -1  # in place of a class that does not count
@@ -142,6 +143,29 @@ def adversarial_cost(logits: Tensor, decrease: Tensor, increase: Tensor | None =
     if increase is not None:
         cost = cost + F.cross_entropy(logits, increase, reduction="none", ignore_index=NO_CLASS)
     return cost
+
+
+def descend_in_parts(
+    model: nn.Module,
+    problem: Problem,
+    goal: Goal,
+    settings: DescentSettings,
+    phases: Phases,
+    starts: Iterable[Tensor],
+    at_once: int,
+) -> AttackResult:
+    """`descend_repeatedly`, of so many examples at a time, so that memory holds no more than these and the result."""
+    parts = torch.arange(len(problem.start), device=problem.start.device).split(at_once)
+    if len(parts) <= 1:
+        return descend_repeatedly(model, problem, goal, settings, phases, starts)
+    starts, whole = list(starts), {}
+    for rows in progress(parts, "attack"):
+        part, begin = Part(problem, rows, problem.start[rows]), (start[rows] for start in starts)
+        result = descend_repeatedly(model, part, goal.of(rows), settings, phases, begin)
+        for item in fields(result):
+            found = getattr(result, item.name)
+            whole.setdefault(item.name, found.new_empty(len(problem.start), *found.shape[1:]))[rows] = found
+    return AttackResult(**whole)
 
 
 def descend_repeatedly(

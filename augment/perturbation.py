@@ -28,6 +28,15 @@ class Perturbation:
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
         return self.scene.render(self.conditions(values, examples), examples)
 
+    @torch.no_grad()
+    def images(self, values: Tensor) -> Tensor:
+        """(E, V, 3, size, size) of values (E, D), rendered by parts, so that little memory beside theirs is used."""
+        size = self.scene.settings.size
+        images = values.new_empty(len(values), self.scene.views, 3, size, size)
+        for part in self.everything.split(self.scene.at_once):
+            images[part] = self.render(values[part], part)
+        return images
+
     def step(self, gradient: Tensor) -> Tensor:
         parts = zip(self.kinds, self.split(gradient), strict=True)
         return torch.cat([kind.step(part) for kind, part in parts], dim=1)

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from augment.memory import require_memory
 from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
+from augment.progress import progress
 from renderer.albedo import painted_albedo, surface_albedo
 from renderer.basis import HARMONICS, Basis
 from renderer.cache import OperatorCache
@@ -26,6 +28,7 @@ from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.visibility import Backend
 
+AT_ONCE = 2**24  # pixels of the images that are rendered at once: some 2 GB, with what a gradient needs of them
 STACKED = 2**16  # pixels of the images whose operators are multiplied at once; more would only be copied about
 
 
@@ -111,7 +114,11 @@ class Scene:
         self._distinct = sorted(dict.fromkeys(seen), key=lambda view: view[0])  # (object, camera) of each operator
         number = {view: index for index, view in enumerate(self._distinct)}
         self._operator = self._column(number[view] for view in seen)  # (E × V,)
-        self._per_stack = max(1, STACKED // settings.size**2)
+        pixels = settings.size**2
+        self.at_once = max(1, AT_ONCE // (self.views * pixels))  # examples
+        images = len(self.examples) * self.views
+        require_memory(f"{images} renders of {settings.size} pixels per side", 24 * images * pixels, self.lights.device)
+        self._per_stack = max(1, STACKED // pixels)
         # What is kept of views; `functools.cache` would tie a scene that each epoch replaces to itself.
         self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
         self._fragments_of_meshes: dict[tuple[int, OrthographicCamera], tuple[Fragments, Tensor]] = {}
@@ -192,7 +199,11 @@ class Scene:
     @property
     def stacks(self) -> list[OperatorStack]:
         """All operators, of which those that are missing are built now."""
-        return [self._stack(index)[0] for index in range(-(-len(self._distinct) // self._per_stack))]
+        return [self._stack(index)[0] for index in progress(range(self._stack_count), "views")]
+
+    @property
+    def _stack_count(self) -> int:
+        return -(-len(self._distinct) // self._per_stack)
 
     def mesh(self, example: int) -> Mesh:
         """What an example shows."""
@@ -289,7 +300,11 @@ class Scene:
 
     def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         if index not in self._stacks:
-            self._stacks[index] = self._build_stack(index)
+            self._stacks[index] = stack, _, added = self._build_stack(index)
+            if len(self._stacks) == 1:  # the others are as large
+                kept = (self._stack_count - 1) * (stack.transfer.nbytes + stack.albedo.nbytes + added.nbytes)
+                views = f"{len(self._distinct)} views of {self.settings.size} pixels per side"
+                require_memory(views, kept, self.lights.device)
         return self._stacks[index]
 
     def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:

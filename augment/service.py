@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 from augment import processes
 from augment.attacks.settings import SIGNED, AttackSettings
 from augment.build import Shown, build_scene
-from augment.descent import NO_CLASS, AttackResult, Goal, Part, descend_repeatedly
+from augment.descent import NO_CLASS, AttackResult, Goal, Part, descend_in_parts
 from augment.labels import is_right, label_loss
 from augment.memory import BatchSize
 from augment.model_state import as_found
@@ -225,8 +225,7 @@ class AugmentationService:
 
     def _random(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
         values = self._perturbed(problem, number)
-        with torch.no_grad():
-            images = problem.render(values, problem.everything)[:, 0]
+        images = problem.images(values)[:, 0]
         with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
             batches = BatchSize(self.settings.attack.batch_size).map(lambda part: model(images[part]), len(images))
             logits = torch.cat(list(batches))
@@ -244,7 +243,9 @@ class AugmentationService:
         part = Part(problem, mine, self._start(problem, number)[mine])
         draws = generator(self._seed, number, "restart")
         restarts = (problem.sample(draws)[mine] for _ in range(attack.restarts))
-        result = descend_repeatedly(model, part, goal.of(mine), attack.descent(), self._phases, restarts)
+        result = descend_in_parts(
+            model, part, goal.of(mine), attack.descent(), self._phases, restarts, problem.scene.at_once
+        )
         result = result.merged(mine, len(problem.start))
         if self.settings.lights == "continue":
             self._continued = result.values

@@ -20,6 +20,9 @@ class Settings:
     def __post_init__(self):
         if not self.runs:
             raise InputError("runs is empty: give the folders of one run or more, as in runs=[runs/a,runs/b]")
+        folders = [Path(run).resolve() for run in self.runs]
+        if twice := [run for run, folder in zip(self.runs, folders, strict=True) if folders.count(folder) > 1]:
+            raise InputError(f"runs names {twice[0]} twice, as if it were another seed: name each run once")
 
 
 def main(settings: Settings) -> None:

@@ -21,7 +21,7 @@ class Settings:
     held_out: int
 
     def __post_init__(self):
-        for name, least, most in [("zenith_degree", 0, 50), ("turbidity_degree", 0, 50), ("held_out", 1, 10**6)]:
+        for name, least, most in [("zenith_degree", 0, 50), ("turbidity_degree", 0, 50), ("held_out", 1, 10**4)]:
             require_range(name, getattr(self, name), least, most)
 
 

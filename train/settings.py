@@ -211,7 +211,8 @@ def read_settings(kind: type, config: DictConfig, parent: str = ""):
     except OmegaConfBaseException as error:
         at_fault = error.full_key or next(key for key in config if not _merges(kind, config, key))
         key = ".".join(filter(None, (parent, at_fault)))
-        raise InputError(": ".join(filter(None, (key, str(error.msg).splitlines()[0])))) from error
+        said = "give a list, as in [a,b]" if "is not a ListConfig" in str(error.msg) else str(error.msg).splitlines()[0]
+        raise InputError(f"{key}: {said}") from error
 
 
 def _merges(kind: type, config: DictConfig, key: str) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 from augment.attacks.criteria import Criterion, Misclassification
 from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier
-from augment.descent import AttackResult, Goal, descend_repeatedly
+from augment.descent import AttackResult, Goal, descend_in_parts
 from augment.memory import BatchSize
 from augment.parameters import StepSettings
 from augment.perturbation import Perturbation
@@ -113,7 +113,7 @@ def attack(
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_kinds()
     problem = settings.problem(scene)
-    images = problem.render(problem.start, problem.everything).detach()
+    images = problem.images(problem.start)
     before = logits_of(classifier, images, settings.batch_size)
     labels = torch.tensor([classifier.label(label) for label in scene.labels], device=before.device)
     if not force:
@@ -123,7 +123,7 @@ def attack(
     phases = Phases(problem.start.device)
     starts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))
     with phases("attack"):
-        result = descend_repeatedly(classifier, problem, goal, settings.descent(), phases, starts)
+        result = descend_in_parts(classifier, problem, goal, settings.descent(), phases, starts, scene.at_once)
     after = logits_of(classifier, result.images, settings.batch_size)
     return Attacked(problem, classifier, goal, settings, seed, images, before, after, result, phases.take())
 

@@ -30,6 +30,8 @@ def encoded(image: Image.Image, alt: str, width: int, text: str = "") -> Illustr
 def from_file(path: Path, alt: str, widest: int, text: str = "") -> list[Illustration]:
     """The image of a file, reduced to a width; [] where there is none that can be read."""
     try:
+        if not path.is_file():  # a pipe would be waited for
+            return []
         with Image.open(path) as image:
             shown = image.convert("RGB")
     except Exception:  # Pillow's decoders raise almost anything at a broken file

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import re
 import shlex
 import shutil
@@ -14,7 +15,7 @@ from hydra import compose, initialize_config_module
 from renderer.errors import InputError
 from train.report import summarise
 from train.settings import decisive_settings
-from train.showcase import plots, report_of, write_report
+from train.showcase import images, plots, report_of, write_report
 from train.showcase.command import training_command
 
 HOSTILE = "<script>alert(1)</script>|*x*"
@@ -137,3 +138,8 @@ def test_a_browser_shows_it_without_overflow_wide_and_narrow_light_and_dark(page
             assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
             assert [url for url in asked if not url.startswith("data:")] == [page.as_uri()]
         browser.close()
+
+
+def test_a_pipe_in_an_images_place_is_left_out(tmp_path):
+    os.mkfifo(tmp_path / "contact_sheet.png")
+    assert images.from_file(tmp_path / "contact_sheet.png", "answers", 100) == []
