@@ -16,11 +16,16 @@ from train.run_classifier import load_classifier
 from train.settings import SceneSettings, read_object, read_settings
 from train.studies.figures import pyplot
 from train.studies.page import joined, versions, wrapped, write
-from train.studies.paper import gallery, norm_balls, rendering_quality, run_time, transfer, unseen_views
+from train.studies.paper import gallery, norm_balls, physical_light, rendering_quality, run_time, transfer, unseen_views
 from train.studies.paper.section import Section, Study
 
 SECTIONS = {  # by their titles, in the order of the page
     "norm_balls": ("Adversarial against random perturbations", norm_balls.NormBallSettings, norm_balls.measure),
+    "physical_light": (
+        "Light that something can emit",
+        physical_light.PhysicalLightSettings,
+        physical_light.measure,
+    ),
     "transfer": ("Transfer to unseen networks", transfer.TransferSettings, transfer.measure),
     "unseen_views": ("Unseen views", unseen_views.UnseenViewSettings, unseen_views.measure),
     "rendering_quality": ("Rendering quality", rendering_quality.QualitySettings, rendering_quality.measure),
