@@ -1,7 +1,7 @@
 """What lights are made of. An image is linear in any light of fixed place, so that each of these has operators."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -10,7 +10,7 @@ from renderer.harmonics import basis, irradiance_basis, live_coefficients
 Ends = tuple[Tensor, Tensor]  # the lowest and the highest values
 
 
-class Basis(Protocol):
+class Functions(Protocol):
     """`size` functions of light; a light is a coefficient (size, 3) of each, RGB. Equal ones have equal fields."""
 
     @property
@@ -25,6 +25,16 @@ class Basis(Protocol):
     def size(self) -> int:
         """How many functions there are."""
 
+    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
+        """The light (..., size, 3) nearest to the coefficients that something can emit.
+
+        ends: of the same shape, which it stays between; some such light does.
+        """
+
+
+class Distant(Functions, Protocol):
+    """Light from so far away that all of a scene is in the same."""
+
     @property
     def live(self) -> Tensor:
         """(K,) ascending indices of those that reach a diffuse surface under an open sky; see `Operator.kept`."""
@@ -35,11 +45,27 @@ class Basis(Protocol):
     def radiance(self, directions: Tensor) -> Tensor:
         """(N, size) that comes from unit directions (N, 3), per unit of each coefficient."""
 
-    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
-        """The light (..., size, 3) nearest to the coefficients that something can emit.
 
-        ends: of the same shape, which it stays between; some such light does.
-        """
+@dataclass(frozen=True)
+class Reach:
+    """E ways on which light goes: point, function: (E,) int64, to which surface point and of which function of a basis.
+    place: (E, 3), where it comes from. irradiance: (E,) per unit of the function's coefficient."""
+
+    point: Tensor
+    function: Tensor
+    place: Tensor
+    irradiance: Tensor
+
+
+@runtime_checkable
+class Placed(Functions, Protocol):
+    """Light from places, which throws hard shadows. Outside of it there is none, so that no coefficient is negative."""
+
+    def reach(self, points: Tensor, normals: Tensor) -> Reach:
+        """All ways to surface points (S, 3) of unit normals (S, 3), were nothing in between."""
+
+
+Basis = Distant | Placed
 
 
 @dataclass(frozen=True)

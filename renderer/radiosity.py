@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
 from renderer.albedo import surface_albedo
-from renderer.basis import Basis
+from renderer.basis import Distant
 from renderer.fragments import Fragments
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
@@ -91,7 +91,7 @@ class Radiosity:
     colors: whether any patch is not grey.
     """
 
-    def __init__(self, mesh: Mesh, encoding: str, gain: float, basis: Basis, bounces: int):
+    def __init__(self, mesh: Mesh, encoding: str, gain: float, basis: Distant, bounces: int):
         """gain multiplies the mesh's albedo."""
         self.patches = patches = Patches.of(mesh)
         albedo = patches.mean(surface_albedo(patches.pieces, patches.view, encoding)) * gain
@@ -109,7 +109,7 @@ class Radiosity:
         return torch.from_numpy(self.patches.seen(looks, weights) @ sent)
 
 
-def _first_bounce(patches: Patches, basis: Basis) -> tuple[Tensor, Tensor, csr_matrix]:
+def _first_bounce(patches: Patches, basis: Distant) -> tuple[Tensor, Tensor, csr_matrix]:
     """(N, size, 1) irradiance of the patches from the sky alone; those (M,) that see others, and how much of the
     radiance of each (M, N) is their irradiance."""
     view, rays = patches.view, Rays(patches.pieces)

@@ -50,15 +50,15 @@ class Looks:
 class Rays:
     """Rays among the faces of one mesh. InputError where Embree is not installed.
 
-    directions: (D, 3), equally far apart. smooth_faces: (F, 3), all faces of the views, whose vertices are the mesh's,
-    to shade with interpolated vertex normals.
+    directions: (D, 3), equally far apart. offset: of where a ray starts above its surface. smooth_faces: (F, 3), all
+    faces of the views, whose vertices are the mesh's, to shade with interpolated vertex normals.
     """
 
     def __init__(self, mesh: Mesh, smooth_faces: np.ndarray | None = None):
         self.directions = sphere(DIRECTIONS)
         self._vertices = torch.from_numpy(mesh.vertices).double()
         self._smooth_faces = None if smooth_faces is None else torch.from_numpy(smooth_faces)
-        self._offset = OFFSET * float(np.abs(mesh.vertices).max())
+        self.offset = OFFSET * float(np.abs(mesh.vertices).max())
         self._outermost = torch.from_numpy(_outermost(mesh.vertices[np.unique(mesh.faces)])).double()
         self._scene = _embree_scene(mesh)
 
@@ -73,7 +73,7 @@ class Rays:
         if not len(pixels):
             return
         planes = planes.index_select(0, fragments.face)
-        origins = fragments.interpolate(corners) + planes * self._offset
+        origins = fragments.interpolate(corners) + planes * self.offset
         normals = planes
         if self._smooth_faces is not None:
             normals = unit_vectors(smooth_normals(fragments, self._vertices, self._smooth_faces).T)[0].T
@@ -86,17 +86,17 @@ class Rays:
             cosine = torch.einsum("bdi,di->bd", normals[sample], directions).clamp(min=0)
             above = torch.einsum("bdi,di->bd", planes[sample], directions)
             cast = torch.nonzero((cosine > 0) & (above > 0), as_tuple=True)
-            met = self._meet(origins[sample[cast]], directions[cast[1]])
+            met = self.meet(origins[sample[cast]], directions[cast[1]])
             met = torch.full_like(sample, -1).index_put_(cast, met)
             yield Looks(some, directions, sample, cosine * of_pixel * solid_angle, met)
 
     def _overlooked(self, fragments: Fragments, planes: Tensor, corners: Tensor) -> Tensor:
         """The pixels with a sample on a face above whose plane, through a corner, the mesh rises. (G, 3) each."""
         reach = torch.cat([(part @ self._outermost.T).amax(1) for part in planes.split(BLOCK // 2**7)])
-        rises = reach - (planes * corners).sum(1) > self._offset
+        rises = reach - (planes * corners).sum(1) > self.offset
         return fragments.pixel[rises[fragments.face]].unique()
 
-    def _meet(self, origins: Tensor, directions: Tensor) -> Tensor:
+    def meet(self, origins: Tensor, directions: Tensor) -> Tensor:
         """(N,) the face that each ray of (N, 3) meets first, -1 where there is none."""
         rays = (np.ascontiguousarray(part.numpy(), dtype=np.float32) for part in (origins, directions))
         return torch.from_numpy(self._scene.run(*rays)).long()
@@ -130,7 +130,7 @@ def _embree_scene(mesh: Mesh) -> Any:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
     except ImportError as error:
-        raise InputError("renderer.transport: rays are cast by Embree: pip install embreex") from error
+        raise InputError("shadows are found by rays that Embree casts: pip install embreex") from error
     scene = EmbreeScene(robust=True)
     TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
     return scene

@@ -16,13 +16,14 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer.albedo import surface_albedo
-from renderer.basis import HARMONICS, Basis
+from renderer.basis import HARMONICS, Basis, Distant, Placed
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.normals import face_normals
+from renderer.placed import placed_transfer
 from renderer.shading import smooth_normals
 from renderer.transport import Transport, build_transport
 from renderer.visibility import Backend
@@ -175,13 +176,16 @@ def build_operator(
         factor = torch.ones(len(fragments.pixels), 3)
     else:
         albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
-    transfer = _box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype)
-    kept = basis.live
-    change = transport.change(fragments, albedo) if transport else None
-    if change is not None:
-        transfer, kept = change.index_add_(1, kept, transfer.double()).to(dtype), torch.arange(basis.size)
+    if isinstance(basis, Placed):
+        transfer, kept = placed_transfer(mesh, fragments, albedo, settings, basis)
+    else:
+        transfer = _box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype)
+        kept = basis.live
+        change = transport.change(fragments, albedo) if transport else None
+        if change is not None:
+            transfer, kept = change.index_add_(1, kept, transfer.double()), torch.arange(basis.size)
     return Operator(
-        transfer=transfer,
+        transfer=transfer.to(dtype),
         albedo=factor.T.to(dtype).contiguous(),
         coverage=fragments.coverage.to(dtype),
         pixels=fragments.pixels,
@@ -207,7 +211,7 @@ class _Shades:
     basis: Callable[[slice], Tensor]
 
 
-def _shades(mesh: Mesh, fragments: Fragments, albedo: Tensor, settings: ImageSettings, basis: Basis) -> _Shades:
+def _shades(mesh: Mesh, fragments: Fragments, albedo: Tensor, settings: ImageSettings, basis: Distant) -> _Shades:
     vertices = torch.from_numpy(mesh.vertices)
     if settings.normals == "smooth":
         normals = smooth_normals(fragments, vertices, torch.from_numpy(mesh.faces))

@@ -7,7 +7,8 @@ what the surface there sends instead (`renderer.radiosity`).
 import torch
 from torch import Tensor
 
-from renderer.basis import Basis
+from renderer.basis import Basis, Distant, Placed
+from renderer.errors import InputError
 from renderer.fragments import Fragments
 from renderer.image import ImageSettings, bounces
 from renderer.mesh import Mesh
@@ -21,7 +22,7 @@ class Transport:
     colors: whether that light is of other colours than the sky's. InputError where Embree is not installed.
     """
 
-    def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis):
+    def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Distant):
         """gain multiplies the albedo of what sends light."""
         count = bounces(settings.transport)
         self._radiosity = Radiosity(mesh, settings.encoding, gain, basis, count) if count else None
@@ -55,5 +56,10 @@ class Transport:
 
 
 def build_transport(mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis) -> Transport | None:
-    """None where light goes from the sky to a surface and from there to the camera only."""
+    """None where light goes from the sky to a surface and from there to the camera only, and where it comes from
+    places: that throws shadows anyway. InputError: bounces of such light."""
+    if isinstance(basis, Placed):
+        if bounces(settings.transport):
+            raise InputError(f"renderer.transport={settings.transport}: light of {basis} does not bounce; set shadows")
+        return None
     return None if settings.transport == "direct" else Transport(mesh, settings, gain, basis)

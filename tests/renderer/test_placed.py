@@ -1,0 +1,167 @@
+"""Light from places against Mitsuba 3's projector and point emitters, on convex and concave meshes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from renderer.basis import Placed
+from renderer.camera import OrthographicCamera
+from renderer.image import ImageSettings
+from renderer.lamps import Lamps
+from renderer.mesh import Mesh, concatenate
+from renderer.mitsuba_scene import mitsuba
+from renderer.projector import Projector
+from renderer.transfer import Operator, build_operators
+from renderer.visibility import choose
+
+CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
+PROJECTOR = Projector(pixels=7, polar=0.5, azimuth=1.6, distance=3.0, field_of_view=math.radians(35))
+LAMPS = Lamps(((1.5, 1.0, 1.0), (-0.5, -1.5, 1.6), (0.0, 1.5, -1.2)))
+SIZE, SAMPLES = 24, 16
+
+
+def ball() -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.9)
+    return Mesh.plain(sphere.vertices, sphere.faces, (0.9, 0.5, 0.2))
+
+
+def ball_on_a_table() -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.45)
+    plate = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], (0.3, 0.6, 0.9))
+    return concatenate([Mesh.plain(sphere.vertices + np.array([0, 0, 0.45]), sphere.faces, (0.9, 0.5, 0.2)), plate])
+
+
+def operator(mesh: Mesh, basis: Placed, size: int = SIZE, samples: int = SAMPLES, **settings) -> Operator:
+    images = ImageSettings(size, samples, **settings)
+    return build_operators(mesh, [CAMERA], images, choose("software"), basis=basis, dtype=torch.float64)[0]
+
+
+def canvas(built: Operator, light: torch.Tensor) -> np.ndarray:
+    """(size, size, 3) linear radiance."""
+    whole = torch.zeros(3, built.settings.size**2, dtype=torch.float64)
+    whole[:, built.pixels] = built.radiance(light)
+    return whole.view(3, built.settings.size, -1).permute(1, 2, 0).numpy()
+
+
+def mitsuba_image(mesh: Mesh, basis: Placed, light: torch.Tensor) -> np.ndarray:
+    """(SIZE, SIZE, 3): 1,024 rays spread over each pixel, so that nothing but edges is noisy."""
+    pytest.importorskip("mitsuba")
+    with mitsuba() as mi:
+        rest = {
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "sensor": mitsuba_sensor(mi),
+            **mitsuba_parts(mi, mesh),
+        }
+        lights = mitsuba_lights(mi, basis, light)  # one by one, since Mitsuba draws one of several
+        return sum(np.array(mi.render(mi.load_dict(rest | {"light": each})), dtype=float) for each in lights)
+
+
+def look_at(mi, camera: OrthographicCamera, distance: float):
+    _, up, back = camera.axes()
+    return mi.ScalarTransform4f().look_at(origin=list(distance * back), target=[0, 0, 0], up=list(up))
+
+
+def mitsuba_sensor(mi) -> dict:
+    half = CAMERA.field_of_view / 2
+    return {
+        "type": "orthographic",
+        "to_world": look_at(mi, CAMERA, 4) @ mi.ScalarTransform4f().scale([half, half, 1]),
+        "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
+        "sampler": {"type": "multijitter", "sample_count": 1024},
+    }
+
+
+def mitsuba_parts(mi, mesh: Mesh) -> dict:
+    """A shape per colour."""
+    parts = {}
+    for index, color in enumerate(np.unique(mesh.corner_colors[:, 0], axis=0)):
+        here = (mesh.corner_colors[:, 0] == color).all(axis=1)
+        corners = mesh.vertices[mesh.faces[here]].astype(np.float32)
+        properties = mi.Properties()
+        properties["face_normals"] = True
+        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": color.tolist()}}
+        properties["bsdf"] = mi.load_dict({"type": "twosided", "material": diffuse})
+        part = mi.Mesh(f"part_{index}", 3 * len(corners), len(corners), props=properties)
+        buffers = mi.traverse(part)
+        buffers["faces"] = np.arange(3 * len(corners), dtype=np.uint32)
+        buffers["vertex_positions"] = corners.ravel()
+        buffers.update()
+        parts[f"part_{index}"] = part
+    return parts
+
+
+def mitsuba_lights(mi, basis: Placed, light: torch.Tensor) -> list[dict]:
+    if isinstance(basis, Projector):
+        pattern = mi.Bitmap(light.view(basis.pixels, basis.pixels, 3).numpy().astype(np.float32))
+        sharp = {"type": "bitmap", "bitmap": pattern, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+        return [
+            {
+                "type": "projector",
+                "irradiance": sharp,
+                "fov": math.degrees(basis.field_of_view),
+                "scale": basis.distance**2,
+                "to_world": look_at(mi, OrthographicCamera(basis.polar, basis.azimuth, 1.0), basis.distance),
+            }
+        ]
+    return [
+        {"type": "point", "position": list(place), "intensity": {"type": "rgb", "value": power}}
+        for place, power in zip(basis.places, (math.pi * light).tolist(), strict=True)  # we leave out 1/π
+    ]
+
+
+@pytest.mark.parametrize("basis", [PROJECTOR, LAMPS], ids=["projector", "lamps"])
+@pytest.mark.parametrize("solid", [ball, ball_on_a_table])
+def test_images_and_gradients_are_mitsubas(solid, basis):
+    """Direct light of a point has no noise but where edges of pattern, shadow and outline cross a pixel: most pixels
+    are equal to float32's digits of the rays, and the others on average.
+
+    The gradient of a sum over the image weighted at random is the image of one function each, since all is linear:
+    here by differences of Mitsuba's images in a few directions.
+    """
+    draws = torch.Generator().manual_seed(1)
+    light = 2 * torch.rand(basis.size, 3, generator=draws, dtype=torch.float64)
+    built = operator(solid(), basis)
+    ours, theirs = canvas(built, light), mitsuba_image(solid(), basis, light)
+    error = np.abs(ours - theirs)
+    assert theirs.max() > 0.1 and (theirs.max(axis=2) == 0).mean() > 0.1
+    assert np.median(error[theirs > 0]) < 1e-3 * theirs.max()
+    assert np.sqrt((error**2).mean()) < 0.01 * theirs.max()
+    assert abs((ours - theirs).mean()) < 2e-3 * theirs.mean()
+
+    weights = torch.rand(3, len(built.pixels), generator=draws, dtype=torch.float64)
+    gradient = built.light_gradient(weights)
+    direction = torch.rand(basis.size, 3, generator=draws, dtype=torch.float64)
+    change = torch.from_numpy(mitsuba_image(solid(), basis, light + direction) - theirs).flatten(0, 1)[built.pixels].T
+    torch.testing.assert_close((gradient * direction).sum(), (weights * change).sum(), rtol=5e-3, atol=0)
+
+
+def test_a_screen_at_the_origin_shows_the_pattern_upright_and_as_bright():
+    """Thrown along the camera's view, each pixel of a white screen is one of the pattern's."""
+    straight = Projector(4, CAMERA.polar, CAMERA.azimuth, 3.0, 2 * math.atan(CAMERA.field_of_view / 2 / 3.0))
+    right, up, _ = CAMERA.axes()
+    corners = 3 * np.array([-right - up, right - up, right + up, up - right])
+    screen = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
+    pattern = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    shown = canvas(operator(screen, straight, size=4, samples=3), pattern.flatten(0, 1))
+    np.testing.assert_allclose(shown, pattern.numpy(), rtol=1e-12)
+
+
+def test_pixels_that_reach_nothing_are_left_out_and_have_a_gradient_of_zero():
+    wide = Projector(16, PROJECTOR.polar, PROJECTOR.azimuth, 3.0, 1.5)
+    built = operator(ball(), wide, samples=2)
+    assert 0 < len(built.kept) < wide.size / 2
+    gradient = built.light_gradient(torch.ones(3, len(built.pixels), dtype=torch.float64))
+    assert torch.equal(gradient.any(1).nonzero().squeeze(1), built.kept) and (gradient >= 0).all()
+
+
+@pytest.mark.parametrize("basis", [PROJECTOR, LAMPS], ids=["projector", "lamps"])
+def test_nothing_emits_less_than_nothing_or_more_than_its_power(basis):
+    light = torch.tensor([-1.0, 0.5, 99.0]).expand(basis.size, 3)
+    expected = torch.tensor([0.0, 0.5, basis.power]).expand_as(light)
+    assert torch.equal(basis.nearest_physical(light), expected)
+    ends = torch.full_like(light, 0.1), torch.full_like(light, 0.3)
+    assert torch.equal(basis.nearest_physical(light, ends), torch.tensor([0.1, 0.3, 0.3]).expand_as(light))
