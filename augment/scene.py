@@ -378,13 +378,17 @@ def _taken(images: Tensor, rows: list[int] | None, pixels: Tensor) -> Tensor:
     return torch.stack([images[row].index_select(1, pixels) for row in rows])
 
 
-def count_views(examples: int, objects: int, backgrounds: int, views: int | None) -> int:
-    """Views per mesh, so that meshes × views × backgrounds are the examples; views=None derives them.
+def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
+    """Views per mesh, so that meshes × views × backgrounds are the examples; either is derived where it is None.
 
     The paper's 100 examples are 2 meshes × 10 views × 5 backgrounds. InputError where no such product exists.
     """
     if not objects or not backgrounds:
         raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
+    if examples is None:
+        if views is None:
+            raise InputError("augment.examples=null makes as many renders as scene.views says: set either")
+        return views
     derived, rest = divmod(examples, objects * backgrounds)
     if rest or derived < 1:
         raise InputError(

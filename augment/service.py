@@ -79,7 +79,7 @@ class AugmentationSettings:
     """
 
     arm: str = "adversarial"
-    examples: int = 100
+    examples: int | None = 100
     start: str = "light"
     lights: str = "restart"
     every: int | None = None
@@ -107,7 +107,7 @@ class AugmentationSettings:
     @property
     def renders(self) -> bool:
         """Whether any example is rendered at all."""
-        return self.arm != "none" and self.examples > 0
+        return self.arm != "none" and self.examples != 0
 
     @property
     def relights(self) -> bool:

@@ -1,21 +1,21 @@
 #!/usr/bin/env bash
-# Measures again what docs/ reports of training: speed, then three arms × five seeds; or hardened networks and what one
+# Measures again what docs/ reports of training: speed, then three arms × five seeds; or fine-tuned networks and what one
 # might do instead. Goes on where it was interrupted.
 set -euo pipefail
 
 usage() {
     cat >&2 <<'END'
-usage: DATA=cifar100.npz MESHES='[orange.glb]' PHOTOS=photos scripts/reproduce.sh gpu|cpu|harden [key=value ...]
+usage: DATA=cifar100.npz MESHES='[orange.glb]' PHOTOS=photos scripts/reproduce.sh gpu|cpu|harden|best [key=value ...]
 
 In the root of the clone. gpu: experiments paper and fast; cpu: experiment cpu; harden: experiment harden from a network,
-four arms and four other ways to robustness, three seeds each. Further settings of conf/train.yaml go to every training
-run. From the environment:
+four arms and four other ways to robustness, three seeds each; best: experiment best, three seeds. Further settings of
+conf/train.yaml go to every training run. From the environment:
   DATA      CIFAR-100 as data=npz reads it
   MESHES    scene.meshes, a list
   PHOTOS    a folder of photographs to score the networks on
   EXCLUDE   their sources that averages leave out; default []
-  LAB       harden: a folder that scripts/lab.py wrote
-  BASE      harden: the network to begin with; default pretrained/none
+  LAB       harden, best: a folder that scripts/lab.py wrote
+  BASE      harden, best: the network to begin with; default pretrained/none
   DISTANCE  harden: of the random lights of the fourth arm, as far as the adversarial ones go; default 0.6
   DOCS      where the pages go; default docs
   RUNS      where the runs go; default runs/reproduce
@@ -54,25 +54,32 @@ tables() {
     "$python" scripts/compare_runs.py "runs=[$(IFS=, && echo "${*%/}")]" "photographs=$photographs" "exclude=$exclude"
 }
 
-hardened() {
-    "$python" -m train --multirun experiment=harden "train.init_from=${BASE:-pretrained/none}" seed=0,1,2 \
+fine_tuned() {
+    local experiment=$1
+    shift
+    "$python" -m train --multirun "experiment=$experiment" "train.init_from=${BASE:-pretrained/none}" seed=0,1,2 \
         data=npz "data.path=$DATA" "scene.meshes=$MESHES" "evaluate.photos={photographs:$PHOTOS,laboratory:$LAB}" \
-        "sweep=$runs/harden" "$@"
+        "sweep=$runs/$experiment" "$@"
 }
 
 harden() {
     local pgd_images=1800 # so many take as long as the others' images, at three steps each
-    hardened augment=none,random,adversarial "$@"
-    hardened augment=random "augment.random.radius=${DISTANCE:-0.6}" "$@"
-    hardened augment=none train.distortion=color_jitter,trivial_augment,augmix "$@"
-    hardened augment=none train.distortion=pgd "train.images_per_epoch=$pgd_images" "$@"
+    fine_tuned harden augment=none,random,adversarial "$@"
+    fine_tuned harden augment=random "augment.random.radius=${DISTANCE:-0.6}" "$@"
+    fine_tuned harden augment=none train.distortion=color_jitter,trivial_augment,augmix "$@"
+    fine_tuned harden augment=none train.distortion=pgd "train.images_per_epoch=$pgd_images" "$@"
+}
+
+write_page() {
+    local experiment=$1 folder=$runs/$1
     {
-        printf '# experiment=harden\n\n`scripts/reproduce.sh` trains these runs and writes this page; do not edit.\n'
+        printf '# experiment=%s\n\n`scripts/reproduce.sh` trains these runs and writes this page; do not edit.\n' \
+            "$experiment"
         printf '\n## The laboratory\n\n'
-        tables laboratory [] "$runs"/harden/*/
+        tables laboratory [] "$folder"/*/
         printf '\n## Photographs\n\n'
-        tables photographs "${EXCLUDE:-[]}" "$runs"/harden/*/
-    } >"$docs/runs_harden.md"
+        tables photographs "${EXCLUDE:-[]}" "$folder"/*/
+    } >"$docs/runs_$experiment.md"
 }
 
 [[ -n ${DATA:-} && -n ${MESHES:-} && -n ${PHOTOS:-} ]] || usage
@@ -85,6 +92,14 @@ harden)
     [[ -n ${LAB:-} ]] || usage
     shift
     harden "$@"
+    write_page harden
+    exit
+    ;;
+best)
+    [[ -n ${LAB:-} ]] || usage
+    shift
+    fine_tuned best "$@"
+    write_page best
     exit
     ;;
 *) usage ;;

@@ -212,7 +212,8 @@ def _card(run: RunSummary, name: str) -> str:
     data = Path(config.data.path).name if config.data.name in ("npz", "folder") else config.data.name
     meshes = [Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in config.scene.meshes]
     often = f"every {config.augment.every} training images" if config.augment.get("every") else "each epoch"
-    renders = f"{config.augment.examples} renders of {', '.join(meshes)}" if run.arm != "none" else "none"
+    count = config.augment.examples or f"{config.scene.views} × {len(config.scene.backgrounds)}"
+    renders = f"{count} renders of {', '.join(meshes)}" if run.arm != "none" else "none"
     start = config.train.get("init_from")
     rows = [
         ("network", architecture),

@@ -180,7 +180,10 @@ class ExperimentSettings:
     def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)
         if self.augment.renders:
-            _ = self.views  # fails on an inconsistent product before any data is read
+            scene = self.scene
+            objects = len(scene.meshes) + len(scene.look_alikes)
+            self.augment.examples = self.views * objects * len(scene.backgrounds)
+            require_range("meshes × views × backgrounds", self.augment.examples, 1, MOST_IMAGES)
 
     @property
     def views(self) -> int:

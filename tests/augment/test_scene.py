@@ -177,7 +177,7 @@ def test_a_scene_that_nothing_covers_is_its_backgrounds():
 
 @pytest.mark.parametrize(
     ("examples", "objects", "backgrounds", "views", "expected"),
-    [(100, 2, 5, None, 10), (100, 2, 5, 10, 10), (5, 1, 5, None, 1), (6, 3, 1, None, 2)],
+    [(100, 2, 5, None, 10), (100, 2, 5, 10, 10), (5, 1, 5, None, 1), (6, 3, 1, None, 2), (None, 7, 5, 36, 36)],
 )
 def test_views_make_the_product_of_meshes_and_backgrounds_the_examples(examples, objects, backgrounds, views, expected):
     assert count_views(examples, objects, backgrounds, views) == expected
@@ -188,6 +188,7 @@ def test_views_make_the_product_of_meshes_and_backgrounds_the_examples(examples,
     [
         (100, 3, 5, None, r"augment\.examples=100 is not a multiple of 3 meshes × 5 backgrounds: .* multiple of 15"),
         (4, 2, 5, None, "set it to a multiple of 10"),
+        (None, 2, 5, None, r"augment\.examples=null makes as many renders as scene\.views says: set either"),
         (100, 2, 5, 9, r"2 meshes × 9 views × 5 backgrounds = 90: .*scene\.views=null"),
         (100, 2, 5, 0, r"scene\.views=null"),
         (100, 0, 5, None, r"scene\.meshes and scene\.backgrounds must not be empty"),

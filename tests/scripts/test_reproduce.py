@@ -90,3 +90,20 @@ def test_every_arm_that_is_reproduced_is_a_valid_run(tmp_path, machine):
         run = read_settings(ExperimentSettings, config)
         assert (run.augment.arm, run.seed, run.data.path) == (arm, 4, "cifar100.npz")
         assert run.scene.meshes == ["a.glb", {"mesh": "b.glb", "gain": 3.0}] and run.evaluate.photos == "photos"
+
+
+@pytest.mark.parametrize(("experiment", "trainings"), [("harden", 4), ("best", 1)])
+def test_fine_tuned_networks_are_valid_runs_that_end_in_a_page_of_both_folders(tmp_path, experiment, trainings):
+    status, calls, said = reproduce(tmp_path, experiment, "train.checkpoint_every=5", LAB="lab", **GIVEN)
+    assert (status, said, len(calls)) == (0, "", trainings + 2)
+    for train in calls[:trainings]:
+        assert train[:4] == ["-m", "train", "--multirun", f"experiment={experiment}"] and "seed=0,1,2" in train
+        single = [
+            each.split(",")[0] if each.startswith(("seed=", "augment=", "train.dist")) else each for each in train
+        ]
+        run = read_settings(ExperimentSettings, settings("train", *single[3:]))
+        assert run.train.init_from == "pretrained/none" and run.train.checkpoint_every == 5
+        assert run.evaluate.photos == {"photographs": "photos", "laboratory": "lab"}
+    compared = [settings("compare_runs", *call[1:]).photographs for call in calls[trainings:]]
+    assert compared == ["laboratory", "photographs"]
+    assert (tmp_path / f"runs_{experiment}.md").read_text().startswith(f"# experiment={experiment}\n")

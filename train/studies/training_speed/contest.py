@@ -66,7 +66,9 @@ def measure(settings: BenchmarkSettings, config: DictConfig, data: DataSet, devi
     plain, adversarial = (_with_arm(config, arm) for arm in ("none", "adversarial"))
     recipe = plain.train
     train, validation = stratified_split(data.train, plain.data.validation, seed=0)
-    work = Workload(len(train), len(validation), plain.augment.examples, recipe.batch_size, settings.steps or None)
+    work = Workload(
+        len(train), len(validation), adversarial.augment.examples, recipe.batch_size, settings.steps or None
+    )
     validation = validation[: work.validated].to(device)
     mean, std = channel_statistics(data.train.images)
     network = WideResNet(len(data.classes), **plain.model.shape, mean=(0, 0, 0), std=(1, 1, 1))
