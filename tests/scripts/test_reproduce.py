@@ -28,7 +28,7 @@ with open(os.environ["CALLS"], "a") as file:
 for argument in sys.argv:
     if argument.startswith("sweep="):
         for cell in ("augment-none+seed-0", "augment-none+seed-1"):
-            (pathlib.Path(argument[6:]) / cell).mkdir(parents=True)
+            (pathlib.Path(argument[6:]) / cell).mkdir(parents=True, exist_ok=True)
 """
 
 
