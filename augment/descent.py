@@ -13,7 +13,7 @@ from augment.memory import BatchSize
 from augment.model_state import as_found
 from augment.phases import Phases
 from augment.progress import progress
-from renderer.errors import require_range
+from renderer.errors import FACTOR, require_range
 
 NO_CLASS = -1  # in place of a class that does not count
 
@@ -24,16 +24,19 @@ class DescentSettings:
 
     max_steps: renders after the first; the paper's appendix C has 30. shorten: a step after which the cost has not
     fallen is taken back and tried at half its length, since the gradient of geometry holds visibility fixed.
-    batch_size: images per pass through the classifier, fewer where memory runs out.
+    batch_size: images per pass through the classifier, fewer where memory runs out. margin: by how much the logits of
+    what fools are to exceed all others, in every view, before an example leaves.
     """
 
     max_steps: int = 30
     shorten: bool = False
     batch_size: int = 128
+    margin: float = 0.0
 
     def __post_init__(self) -> None:
         require_range("attack: max_steps", self.max_steps, 0, 10**6)
         require_range("attack: batch_size", self.batch_size, 1, 10**6)
+        require_range("attack: margin", self.margin, 0, FACTOR)
 
 
 class Problem(Protocol):
@@ -85,8 +88,9 @@ class Goal:
 class AttackResult:
     """What an attack did, per example; all tensors have E rows and lie on the values' device.
 
-    values, images (E, V, 3, H, W): where the descent ended. steps: int64, taken. fooled_before, fooled: bool.
-    cost_before, cost: the paper's cost, summed over views. predicted: (E, V) int64, the last classes. zero_gradient:
+    values, images (E, V, 3, H, W): where the descent ended, or of those that fool the one of the lowest cost. steps:
+    int64, taken. fooled_before, fooled: bool.
+    cost_before, cost: the paper's cost, summed over views. predicted: (E, V) int64, the classes there. zero_gradient:
     bool, the first gradient was exactly zero.
     """
 
@@ -108,10 +112,12 @@ class AttackResult:
 
 @dataclass(frozen=True)
 class _Pass:
-    """What a classifier makes of A examples: the cost's gradient is by their images (A, V, 3, H, W)."""
+    """What a classifier makes of A examples: the cost's gradient is by their images (A, V, 3, H, W). gap: (A,), the
+    least over views of `logit_gap`."""
 
     cost: Tensor
     predicted: Tensor
+    gap: Tensor
     gradient: Tensor
 
 
@@ -143,6 +149,18 @@ def adversarial_cost(logits: Tensor, decrease: Tensor, increase: Tensor | None =
     if increase is not None:
         cost = cost + F.cross_entropy(logits, increase, reduction="none", ignore_index=NO_CLASS)
     return cost
+
+
+def logit_gap(logits: Tensor, decrease: Tensor, increase: Tensor | None = None) -> Tensor:
+    """By how much the goal is exceeded, negative where it is not reached: that of the wanted class over all others, or
+    without one, that of the best other class over `decrease`. (E,)
+
+    Shapes as in `adversarial_cost`.
+    """
+    wanted = torch.full_like(decrease, NO_CLASS) if increase is None else increase
+    chosen = torch.where(wanted == NO_CLASS, decrease, wanted)[:, None]
+    gap = logits.gather(1, chosen)[:, 0] - logits.scatter(1, chosen, -torch.inf).amax(1)
+    return torch.where(wanted == NO_CLASS, -gap, gap)
 
 
 def descend_in_parts(
@@ -199,7 +217,7 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
     active = torch.arange(len(values), device=values.device)
     steps, fooled = torch.zeros_like(active), torch.zeros_like(active, dtype=torch.bool)
     cost, length = values.new_full((len(values),), torch.inf), values.new_ones(len(values), 1)
-    candidate, slope = values.clone(), torch.zeros_like(values)
+    candidate, place, slope = values.clone(), values.clone(), torch.zeros_like(values)
     predicted, batch_size = torch.zeros_like(goal.decrease), BatchSize(settings.batch_size)
     with as_found(model):
         for step in range(settings.max_steps + 1):
@@ -213,16 +231,20 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
             if step == 0:
                 images, cost_before, fooled_before = rendered.detach().clone(), seen.cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
-            better = reached | (seen.cost < cost[active]) if settings.shorten else torch.ones_like(reached)
-            rows = torch.nonzero(better).squeeze(1)
+            done = reached & (seen.gap >= settings.margin)
+            fell = seen.cost < cost[active]
+            taken = done | fell if settings.shorten else torch.ones_like(done)
+            best = done | torch.where(fooled[active], reached & fell, reached | taken)
+            rows = torch.nonzero(best).squeeze(1)
             kept = active[rows]
-            values[kept], images[kept], slope[kept] = candidate[kept], rendered.detach()[rows], gradient[rows]
+            values[kept], images[kept] = candidate[kept], rendered.detach()[rows]
             cost[kept], predicted[kept], fooled[kept] = seen.cost[rows], seen.predicted[rows], reached[rows]
-            length[active[~better]] /= 2
-            active = active[~reached]
+            place[active[taken]], slope[active[taken]] = candidate[active[taken]], gradient[taken]
+            length[active[~taken]] /= 2
+            active = active[~done]
             if step == settings.max_steps or not len(active):
                 break
-            moved = values[active] - length[active] * problem.step(slope[active])
+            moved = place[active] - length[active] * problem.step(slope[active])
             candidate[active] = problem.project(moved, active)
             steps[active] += 1
     return AttackResult(values, images, steps, fooled_before, fooled, cost_before, cost, predicted, zero_gradient)
@@ -233,17 +255,19 @@ def _classifier_pass(model: nn.Module, images: Tensor, goal: Goal, batch_size: B
     decrease, increase = goal.decrease.flatten(), None if goal.increase is None else goal.increase.flatten()
     gradient = torch.empty_like(flat)
 
-    def judge(part: slice) -> tuple[Tensor, Tensor]:
+    def judge(part: slice) -> tuple[Tensor, Tensor, Tensor]:
         batch = flat[part].detach().requires_grad_(True)
         logits = model(batch)
-        cost = adversarial_cost(logits, decrease[part], None if increase is None else increase[part])
+        aim = decrease[part], None if increase is None else increase[part]
+        cost = adversarial_cost(logits, *aim)
         (by_image,) = torch.autograd.grad(cost.sum(), batch)
         gradient[part] = by_image  # laid out as the images are, not as the network's channels
-        return cost.detach(), logits.detach().argmax(1)
+        return cost.detach(), logits.detach().argmax(1), logit_gap(logits.detach(), *aim)
 
-    costs, predicted = zip(*batch_size.map(judge, len(flat)), strict=True)
+    costs, predicted, gaps = zip(*batch_size.map(judge, len(flat)), strict=True)
     return _Pass(
         torch.cat(costs).unflatten(0, (-1, views)).sum(1),
         torch.cat(predicted).unflatten(0, (-1, views)),
+        torch.cat(gaps).unflatten(0, (-1, views)).amin(1),
         gradient.unflatten(0, (-1, views)),
     )

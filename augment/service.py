@@ -20,7 +20,7 @@ from augment.parameters import Albedo, Geometry, Lighting, StepSettings, check_s
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
-from augment.seeding import generator
+from augment.seeding import generator, stream_seed
 from augment.specimens import Specimens, choose_specimens
 from augment.variation import VariationSettings, vary
 from renderer.errors import FACTOR, InputError, require_range
@@ -243,8 +243,9 @@ class AugmentationService:
         part = Part(problem, mine, self._start(problem, number)[mine])
         draws = generator(self._seed, number, "restart")
         restarts = (problem.sample(draws)[mine] for _ in range(attack.restarts))
+        seen = attack.observed(model, stream_seed(self._seed, number))
         result = descend_in_parts(
-            model, part, goal.of(mine), attack.descent(), self._phases, restarts, problem.scene.at_once
+            seen, part, goal.of(mine), attack.descent(), self._phases, restarts, problem.scene.at_once
         )
         result = result.merged(mine, len(problem.start))
         if self.settings.lights == "continue":

@@ -7,6 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from augment.attacks.adversary_folder import read_adversary
+from augment.attacks.run import logits_of
 from augment.parameters import KINDS
 from renderer.errors import InputError
 from renderer.visibility import choose
@@ -31,7 +32,8 @@ def main(config: DictConfig) -> None:
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
     if adversary is not None:
         images = adversary.render(choose(settings.renderer.visibility)).to(device)
-        print(format_reloaded(adversary, images, classifier))
+        logits = logits_of(settings.attack.judge(classifier), images[None], len(images))[0]
+        print(format_reloaded(adversary, images, logits, classifier.classes))
         if not settings.attack.kinds:
             return
     out = writable_folder(settings.out, "out")

@@ -52,9 +52,9 @@ def check(attacked: Attacked, descent: DescentSettings, seed: int) -> Checks:
         cost=float(result.cost.mean()),
         cost_fell=_share(fell[open_cases]) if open_cases.any() else 1.0,
         zero_gradient=_share(result.zero_gradient),
-        success=_share(result.fooled[attacked.recognised]),
+        success=_share(attacked.success[attacked.recognised]),
         random_search=_share(_random_search(attacked, descent, seed)[attacked.recognised]),
-        success_by_steps=_success_by_steps(attacked, descent),
+        success_by_steps=_success_by_steps(attacked, descent, seed),
     )
 
 
@@ -69,16 +69,15 @@ def _random_search(attacked: Attacked, descent: DescentSettings, seed: int) -> T
         drawn = problem.sample_as_far(result.values, draws)
         with torch.no_grad():
             images = problem.render(drawn[left], left)
-        predicted = logits_of(attacked.classifier, images, descent.batch_size).argmax(2)
+        predicted = logits_of(attacked.judge, images, descent.batch_size).argmax(2)
         fooled[left] = attacked.goal.of(left).reached(predicted)
     return fooled
 
 
-def _success_by_steps(attacked: Attacked, descent: DescentSettings) -> dict[int, float]:
+def _success_by_steps(attacked: Attacked, descent: DescentSettings, seed: int) -> dict[int, float]:
     longest = replace(descent, max_steps=descent.max_steps * max(GROWTH))
-    result = descend(
-        attacked.classifier, attacked.problem, attacked.goal, longest, Phases(attacked.problem.start.device)
-    )
+    seen, phases = attacked.settings.observed(attacked.classifier, seed), Phases(attacked.problem.start.device)
+    result = descend(seen, attacked.problem, attacked.goal, longest, phases)
     limits = [descent.max_steps * factor for factor in GROWTH]
     return {limit: _share((result.fooled & (result.steps <= limit))[attacked.recognised]) for limit in limits}
 

@@ -77,7 +77,7 @@ def _numbers(attacked: Attacked, example: int) -> dict[str, object]:
     return {
         "recognised": bool(attacked.recognised[example]),
         "fooled_before": bool(result.fooled_before[example]),
-        "fooled": bool(result.fooled[example]),
+        "fooled": bool(attacked.success[example]),
         "fooled_in_views": attacked.success_in_views[example].tolist(),
         "steps": int(result.steps[example]),
         "cost_before": float(result.cost_before[example]),

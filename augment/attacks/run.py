@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from augment.attacks.criteria import Criterion, Misclassification
 from augment.attacks.settings import AttackSettings
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 class Attacked:
     """What was attacked and what came of it, for E examples of V views.
 
-    images_before: (E, V, 3, size, size); those after are `images`. logits_before, logits: (E, V, C) of either. result:
-    where the descent ended. seconds: of the descent.
+    images_before: (E, V, 3, size, size); those after are `images`, neither of them rounded. logits_before, logits:
+    (E, V, C) of either, rounded where the settings say so. result: where the descent ended. seconds: of the descent.
     """
 
     problem: Perturbation
@@ -52,9 +52,14 @@ class Attacked:
         return self.result.images
 
     @property
+    def judge(self) -> nn.Module:
+        """The classifier, which is given what the settings say of an image."""
+        return self.settings.judge(self.classifier)
+
+    @property
     def success(self) -> Tensor:
         """(E,) bool: whether the criterion is met in every view."""
-        return self.result.fooled
+        return self.success_in_views.all(1)
 
     @property
     def success_in_views(self) -> Tensor:
@@ -114,7 +119,7 @@ def attack(
     settings.require_kinds()
     problem = settings.problem(scene)
     images = problem.images(problem.start)
-    before = logits_of(classifier, images, settings.batch_size)
+    before = logits_of(settings.judge(classifier), images, settings.batch_size)
     labels = torch.tensor([classifier.label(label) for label in scene.labels], device=before.device)
     if not force:
         require_recognised(scene, before, labels, classifier)
@@ -123,13 +128,14 @@ def attack(
     phases = Phases(problem.start.device)
     starts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))
     with phases("attack"):
-        result = descend_in_parts(classifier, problem, goal, settings.descent(), phases, starts, scene.at_once)
-    after = logits_of(classifier, result.images, settings.batch_size)
+        seen = settings.observed(classifier, seed)
+        result = descend_in_parts(seen, problem, goal, settings.descent(), phases, starts, scene.at_once)
+    after = logits_of(settings.judge(classifier), result.images, settings.batch_size)
     return Attacked(problem, classifier, goal, settings, seed, images, before, after, result, phases.take())
 
 
 @torch.no_grad()
-def logits_of(classifier: Classifier, images: Tensor, batch_size: int) -> Tensor:
+def logits_of(classifier: nn.Module, images: Tensor, batch_size: int) -> Tensor:
     """(E, V, C) of images (E, V, 3, H, W)."""
     flat = images.flatten(0, 1)
     logits = BatchSize(batch_size).map(lambda part: classifier(flat[part]), len(flat))

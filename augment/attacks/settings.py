@@ -1,12 +1,16 @@
 """What an attack may change, by which steps, and for how long: the same for a training and for a single attack."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from torch import nn
+
+from augment.attacks.observation import Expected, Rounded, TransformationSettings
 from augment.descent import DescentSettings
 from augment.parameters import KINDS, Kind, Lighting, Skylight, StepSettings
 from augment.perturbation import Perturbation
 from augment.scene import Scene
+from augment.seeding import generator
 from renderer.errors import InputError, require_range
 
 PHYSICAL, SIGNED = "physical", "signed"
@@ -28,7 +32,8 @@ class AttackSettings:
 
     light: what `lighting` may find: "physical", only what something can emit (of harmonics: radiance nowhere negative),
     beginning with the nearest such light to the scene's; or "signed", any coefficients.
-    max_steps, shorten, batch_size: see `DescentSettings`.
+    max_steps, shorten, batch_size, margin: see `DescentSettings`. rounded: the classifier is given images of 8 bits.
+    expectation: over random changes of them.
     """
 
     lighting: StepSettings | None = None
@@ -41,6 +46,9 @@ class AttackSettings:
     shorten: bool = False
     restarts: int = 0
     batch_size: int = 32
+    margin: float = 0.0
+    rounded: bool = False
+    expectation: TransformationSettings = field(default_factory=TransformationSettings)
 
     def __post_init__(self) -> None:
         if self.lighting and self.skylight:
@@ -64,7 +72,16 @@ class AttackSettings:
 
     def descent(self) -> DescentSettings:
         """How long a descent lasts."""
-        return DescentSettings(self.max_steps, self.shorten, self.batch_size)
+        return DescentSettings(self.max_steps, self.shorten, self.batch_size, self.margin)
+
+    def judge(self, classifier: nn.Module) -> nn.Module:
+        """A classifier that is given 8 bits, where they are rounded."""
+        return Rounded(classifier) if self.rounded else classifier
+
+    def observed(self, classifier: nn.Module, seed: int) -> nn.Module:
+        """The judge's mean over the random changes of its images, if there are any: what a descent goes by."""
+        judge, draws = self.judge(classifier), generator(seed, "expectation")
+        return Expected(judge, self.expectation, draws) if self.expectation.draws else judge
 
     def problem(self, scene: Scene) -> Perturbation:
         """What is changed of a scene."""

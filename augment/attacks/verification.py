@@ -1,18 +1,16 @@
 """Whether adversaries fool outside of the floats that they were found in: rounded, compressed, rendered from files."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from augment.attacks.adversary import Adversary
 from augment.attacks.adversary_folder import MITSUBA, read_adversary
+from augment.attacks.jpeg import as_jpeg
 from augment.attacks.run import Attacked, logits_of
 from renderer.errors import InputError
 from renderer.image import behind, clamp, develop_composite, to_bytes, to_unit
@@ -59,12 +57,13 @@ def require_renderers(names: Sequence[str]) -> None:
 
 
 def verify(attacked: Attacked, folders: Sequence[Path], renderers: Sequence[str]) -> list[Verdict]:
-    """A verdict on the images rounded to 8 bits, on those as JPEG, and on what each renderer makes of the folders.
+    """A verdict on the images as floats, rounded to 8 bits, as JPEG, and on what each renderer makes of the folders.
 
     renderers: "reload", ours; "mitsuba", Mitsuba's direct illumination, in which concave meshes shade themselves.
     """
     images = attacked.images.cpu()
-    versions = {"8 bits": to_unit(to_bytes(images)), f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY)}
+    rounded = to_unit(to_bytes(images))
+    versions = {"float": images, "8 bits": rounded, f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY)}
     for name in renderers:
         backend = attacked.problem.scene.backend
         versions[name] = torch.stack([rendered(folder, name, backend) for folder in folders])
@@ -75,19 +74,6 @@ def rendered(folder: Path, renderer: str, backend: Backend) -> Tensor:
     """(V, 3, size, size) from an adversary's files alone."""
     adversary = read_adversary(folder)
     return adversary.render(backend) if renderer == "reload" else _by_mitsuba(adversary, folder / MITSUBA / SCENE)
-
-
-def as_jpeg(images: Tensor, quality: int) -> Tensor:
-    """Images (..., 3, H, W) in [0, 1] after compression."""
-    flat = [_through_jpeg(image, quality) for image in to_bytes(images).flatten(0, -4)]
-    return to_unit(torch.stack(flat)).view(images.shape)
-
-
-def _through_jpeg(image: Tensor, quality: int) -> Tensor:
-    file = io.BytesIO()
-    Image.fromarray(image.permute(1, 2, 0).numpy()).save(file, "JPEG", quality=quality)
-    with Image.open(file) as read:
-        return torch.from_numpy(np.array(read)).permute(2, 0, 1)
 
 
 def _by_mitsuba(adversary: Adversary, scene: Path) -> Tensor:

@@ -15,7 +15,7 @@ from train.cli import USER_ERROR
 ROOT = Path(__file__).parents[2]
 SMALL = [
     f"classifier=run:{ROOT / 'pretrained' / 'none'}", "attack.force=true", "attack.max_steps=2", "device=cpu",
-    "renderer.visibility=software", "renderer.cache=null",
+    "renderer.visibility=software", "renderer.cache=null", "attack.light=signed",
 ]  # fmt: skip
 
 

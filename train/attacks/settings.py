@@ -19,6 +19,8 @@ class AttackCommandSettings(AttackSettings):
     shared: bool = False
     force: bool = False
     checks: bool = True
+    margin: float = 1.0
+    rounded: bool = True
     verify: str | None = "reload"
 
     def __post_init__(self):

@@ -6,9 +6,8 @@ from torch import Tensor
 
 from augment.attacks.adversary import Adversary
 from augment.attacks.checks import Checks
-from augment.attacks.run import Attacked, logits_of
+from augment.attacks.run import Attacked
 from augment.attacks.verification import Verdict
-from augment.classifiers import Classifier
 from train.photographs.shares import share
 
 
@@ -58,12 +57,12 @@ def _success(attacked: Attacked) -> str:
     return text + (f"; {wrong} not recognised before, which do not count" if wrong else "")
 
 
-def format_reloaded(adversary: Adversary, images: Tensor, classifier: Classifier) -> str:
-    """A line per view: what an adversary's images (V, 3, size, size), rendered anew, are taken for."""
-    best = logits_of(classifier, images[None], len(images))[0].softmax(1).max(1)
+def format_reloaded(adversary: Adversary, images: Tensor, logits: Tensor, classes: Sequence[str]) -> str:
+    """A line per view: what an adversary's images (V, 3, size, size), rendered anew, are taken for by logits (V, C)."""
+    best = logits.softmax(1).max(1)
     off = 255 * (images - adversary.images.to(images)).abs().flatten(1).amax(1)
     return "\n".join(
-        f"view {view}: {adversary.shown.label} is taken for {classifier.classes[index]} ({confidence:.1%}); "
+        f"view {view}: {adversary.shown.label} is taken for {classes[index]} ({confidence:.1%}); "
         f"values differ from the saved image's by {largest:.2g}/255 at most"
         for view, (index, confidence, largest) in enumerate(
             zip(best.indices.tolist(), best.values.tolist(), off.tolist(), strict=True)

@@ -26,7 +26,9 @@ def attacked(kinds: set[str], scene: Scene) -> augment.Attacked:
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), scene.settings.size, CLASSES)
     radii = {"albedo": 0.2, "geometry": 0.01, "pixels": 0.05, "lighting": 0.3}
     settings = {name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name]) for name in kinds}
-    return augment.attack(classifier, scene, settings=augment.AttackSettings(**settings, max_steps=3), force=True)
+    return augment.attack(
+        classifier, scene, settings=augment.AttackSettings(**settings, light="signed", max_steps=3), force=True
+    )
 
 
 def textured() -> Mesh:

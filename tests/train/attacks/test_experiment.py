@@ -43,6 +43,7 @@ def by_colour(classes: Sequence[str] = CLASSES) -> Classifier:
 def configured(*overrides: str) -> AttackExperimentSettings:
     """The real configuration; arguments are further overrides."""
     small = ["renderer.visibility=software", "renderer.cache=null", "attack.checks=false", "attack.max_steps=8"]
+    small += ["attack.margin=0", "attack.rounded=false"]
     with initialize_config_module("conf", version_base="1.3"):
         return read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
 

@@ -26,7 +26,13 @@ CLASSES = ("orange", "lime", "sky")
 
 
 def attacked(*overrides: str) -> Attacked:
-    small = ["renderer.visibility=software", "renderer.cache=null", "attack.max_steps=2", "attack.force=true"]
+    small = [
+        "renderer.visibility=software",
+        "renderer.cache=null",
+        "attack.max_steps=2",
+        "attack.force=true",
+        "attack.light=signed",
+    ]
     with initialize_config_module("conf", version_base="1.3"):
         settings = read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
     by_colour = Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES, "by_colour")
@@ -112,7 +118,7 @@ def test_every_line_has_each_versions_answer(tmp_path):
     done = attacked("scene.backgrounds=[0.4,0.6]")
     lines = written(done, tmp_path)
     for example, line in enumerate(lines):
-        assert set(line["versions"]) == {"8 bits", "JPEG 90", "reload"}
+        assert set(line["versions"]) == {"float", "8 bits", "JPEG 90", "reload"}
         rounded = (done.images[example] * 255).round() / 255
         answer = CLASSES[rounded.mean((0, 2, 3)).argmax()]
         off = (rounded - done.images[example]).abs()

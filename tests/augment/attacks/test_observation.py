@@ -1,0 +1,149 @@
+"""What an attack sees of a classifier: 8 bits, and the mean over random changes."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch import Tensor, nn
+
+import augment
+from augment.attacks import observation
+from augment.attacks.jpeg import as_jpeg
+from augment.attacks.observation import Expected, Rounded, TransformationSettings
+from augment.seeding import generator
+from renderer.errors import InputError
+
+CLASSES = ("orange", "lime", "sky")
+
+
+class Means(nn.Module):
+    """Logits are the channels' means, over which hangs a record of what was seen."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def forward(self, images: Tensor) -> Tensor:
+        self.seen.append(images.detach())
+        return 30 * images.mean((2, 3))
+
+
+def noise(*shape: int) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(0))
+
+
+def expected(**settings) -> tuple[Expected, Means]:
+    nothing = {"draws": 1, "jitter": 0.0, "exposure": 0.0, "noise": 0.0, "jpeg": 100}
+    means = Means()
+    return Expected(means, TransformationSettings(**nothing | settings), generator(0)), means
+
+
+def test_a_model_is_given_bytes_and_its_derivative_passes_them_by():
+    means, images = Means(), noise(2, 3, 8, 8).requires_grad_()
+    Rounded(means)(images).sum().backward()
+    assert torch.equal((means.seen[0] * 255).round() / 255, means.seen[0])
+    assert (means.seen[0] - images).abs().max() <= 0.5 / 255 + 1e-7
+    torch.testing.assert_close(images.grad, torch.full_like(images, 30 / 64))
+
+
+def test_the_mean_is_of_log_probabilities_over_the_image_and_its_changes():
+    model, means = expected(draws=3, noise=0.3, exposure=1.0, jitter=0.2, jpeg=50)
+    images = noise(4, 3, 16, 16)
+    found = model(images)
+    assert torch.equal(means.seen[0], images) and len(means.seen) == 4
+    assert all((means.seen[0] - each).abs().amax((1, 2, 3)).min() > 0.1 for each in means.seen[1:])
+    assert all(each.min() >= 0 and each.max() <= 1 for each in means.seen)
+    torch.testing.assert_close(
+        found, torch.stack([(30 * each.mean((2, 3))).log_softmax(1) for each in means.seen]).mean(0)
+    )
+
+
+def test_each_change_does_what_it_says(monkeypatch):
+    monkeypatch.setattr(observation, "as_jpeg", lambda images, quality: images)
+    images = 0.25 + 0.5 * noise(8, 3, 32, 32)
+    model, means = expected(exposure=0.5)
+    model(images)
+    stops = (means.seen[1].mean((1, 2, 3)) / images.mean((1, 2, 3))).log2()
+    assert stops.abs().max() < 0.52 and stops.min() < -0.1 and stops.max() > 0.1
+    model, means = expected(noise=0.05)
+    model(images)
+    assert (means.seen[1] - images).std().item() == pytest.approx(0.05, rel=0.1)
+    ramp = torch.linspace(0, 1, 32).expand(64, 3, 32, 32)
+    model, means = expected(jitter=0.1)
+    model(ramp)
+    inner = (means.seen[1] - ramp)[..., 12:20, 12:20].mean((1, 2, 3))
+    assert 0.05 < inner.abs().max() < 0.115  # a shift of a tenth of a ramp from 0 to 1, and a corner's turn
+
+
+def test_nothing_drawn_is_the_image_but_for_compression():
+    model, means = expected()
+    images = noise(1, 3, 16, 16)
+    model(images)
+    torch.testing.assert_close(means.seen[1], as_jpeg(images, 100), rtol=0, atol=1e-6)
+
+
+def test_jpeg_is_pillows():
+    images = noise(2, 3, 16, 16)
+    for image, found in zip(images, as_jpeg(images, 60), strict=True):
+        file = io.BytesIO()
+        Image.fromarray((image * 255).round().byte().permute(1, 2, 0).numpy()).save(file, "JPEG", quality=60)
+        expected = torch.from_numpy(np.array(Image.open(file))).permute(2, 0, 1) / 255
+        assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("draws", -1), ("jitter", 2.0), ("noise", float("nan")), ("exposure", 99.0), ("jpeg", 0)]
+)
+def test_settings_out_of_range_are_refused(key, value):
+    with pytest.raises(InputError, match=f"attack.expectation.{key}={value} must be at least"):
+        TransformationSettings(**{key: value})
+
+
+@pytest.mark.parametrize("rounded", [False, True])
+def test_adversaries_exceed_the_margin_and_without_one_stop_at_the_border(rounded):
+    """By the classifier's own logits on the images, rounded where they are to be."""
+    classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES)
+    scene = augment.build_scene([("solid:orange", "orange")], 8, views=2, shared=True, visibility="software")
+    for margin in (0.0, 2.0):
+        settings = augment.AttackSettings(
+            lighting=augment.StepSettings(step_size=0.02), light="signed", max_steps=100, margin=margin, rounded=rounded
+        )
+        done = augment.attack(classifier, scene, settings=settings)
+        images = (done.images * 255).round() / 255 if rounded else done.images
+        logits = 30 * images.mean((3, 4))
+        torch.testing.assert_close(done.logits, logits, rtol=0, atol=1e-4)
+        gap = (logits[..., 1:].amax(2) - logits[..., 0]).min()
+        assert done.success.all() and margin <= gap + 1e-4 < margin + 0.5
+
+
+def test_what_fools_is_kept_where_the_margin_is_out_of_reach():
+    """Of those that fool, the one of the lowest cost; it fools though the last step may not."""
+    classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES)
+    scene = augment.build_scene([("solid:orange", "orange")], 8, visibility="software")
+    light = augment.StepSettings(step_size=0.05)
+    first = augment.attack(
+        classifier, scene, settings=augment.AttackSettings(lighting=light, light="signed", max_steps=60)
+    )
+    further = augment.AttackSettings(lighting=light, light="signed", max_steps=60, margin=1e4)
+    done = augment.attack(classifier, scene, settings=further)
+    assert done.success.all() and done.steps.item() == 60
+    assert done.result.cost < first.result.cost
+
+
+def test_expected_adversaries_survive_changes_that_others_do_not():
+    """Noise and exposure of the classifier's own images, which are other ones than the attack's."""
+    classifier = augment.Classifier(lambda images: 100 * images.mean((2, 3)), 8, CLASSES)
+    scene = augment.build_scene([("solid:orange", "orange")], 8, visibility="software")
+    survived = []
+    for draws in (0, 8):
+        changes = TransformationSettings(draws=draws, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)
+        light = augment.StepSettings(step_size=0.02)
+        settings = augment.AttackSettings(lighting=light, light="signed", max_steps=100, expectation=changes)
+        done = augment.attack(classifier, scene, settings=settings)
+        others, means = Expected(Means(), TransformationSettings(200, 0.2, 0.5, 0.1, 60), generator(1)), []
+        others(done.images[:, 0])
+        means = torch.cat([each.mean((2, 3)) for each in others.model.seen[1:]])
+        survived.append((means.argmax(1) != 0).double().mean().item())
+    assert survived[1] > survived[0] + 0.1
