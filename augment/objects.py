@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, load_mesh, normalise
 from renderer.shapes import solid
@@ -13,18 +15,22 @@ class ObjectSettings:
     """One mesh of a scene.
 
     mesh: a file that trimesh reads, or `solid:NAME` or `solid:NAME:SEED`, a built-in procedural solid. label: the
-    name of its class. up: the axis that points up in the file, auto|y|z. gain: multiplies the albedo.
+    name of its class. up: the axis that points up in the file, auto|y|z. gain: multiplies the albedo. color: RGB (3),
+    sRGB-encoded in [0, 1], of a mesh that brings no colours.
     """
 
     mesh: str
     label: str
     up: str = "auto"
     gain: float = 1.0
+    color: list[float] | None = None
 
     def __post_init__(self) -> None:
         if not self.mesh:
             raise InputError("scene.meshes: a mesh is '': give a file or solid:NAME")
         require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
+        if self.color is not None and (len(self.color) != 3 or not all(0 <= each <= 1 for each in self.color)):
+            raise InputError(f"scene.meshes: {self.mesh}: color={self.color} must be red, green and blue from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,10 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
 
     InputError: as `load_mesh` and `solid`.
     """
-    return SceneObject(item.label, normalise(subdivide(_load(item), vertices)), item.gain, item.mesh)
+    mesh = _load(item)
+    if item.color is not None:
+        mesh = _colored(mesh, item)
+    return SceneObject(item.label, normalise(subdivide(mesh, vertices)), item.gain, item.mesh)
 
 
 def another_individual(item: SceneObject, seed: int) -> SceneObject:
@@ -51,6 +60,14 @@ def another_individual(item: SceneObject, seed: int) -> SceneObject:
     if kind != "solid" or len(rest) != 1:
         return item
     return replace(item, mesh=normalise(solid(rest[0], seed)))
+
+
+def _colored(mesh: Mesh, item: ObjectSettings) -> Mesh:
+    if not mesh.uncolored:
+        raise InputError(
+            f"scene.meshes: {item.mesh} brings colours of its own: leave color out; gain brightens or dims them"
+        )
+    return Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
 
 
 def _load(item: ObjectSettings) -> Mesh:
