@@ -1,8 +1,9 @@
 """Views of a mesh as a Mitsuba 3 scene in files: scene.xml, .ply parts with their normals, and their textures.
 
-Direct illumination by an environment map: what a concave mesh throws on itself is dark there, and lit here. Mitsuba's
-diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the map's scale makes up for that, and for the
-albedo's gain. Its radiance is premultiplied with alpha, as ours with the coverage.
+Light from an environment map, with shadows always and with the bounces of `ImageSettings.transport`: under "direct",
+what a concave mesh throws on itself is dark there, and lit here. Mitsuba's diffuse surfaces reflect albedo / π of the
+irradiance, ours all of it: the map's scale makes up for that, and for the albedo's gain, which only a bounce would have
+more than once. Its radiance is premultiplied with alpha, as ours with the coverage.
 """
 
 import math
@@ -19,7 +20,7 @@ from PIL import Image
 from renderer.albedo_bake import with_added_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.image import ImageSettings, decode
+from renderer.image import ImageSettings, bounces, decode
 from renderer.mesh import Mesh
 from renderer.mesh_export import DISTANCE, corner_normals
 
@@ -29,11 +30,7 @@ _VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any numbe
 _TO_Z_UP = "0 0 1 0 1 0 0 0 0 1 0 0 0 0 0 1"  # see `renderer.environment`
 
 _XML = """<scene version="3.0.0">
-    <integrator type="direct">
-        <integer name="emitter_samples" value="0"/>
-        <integer name="bsdf_samples" value="1"/>
-        <boolean name="hide_emitters" value="true"/>
-    </integrator>
+    {integrator}
     <emitter type="envmap">
         <string name="filename" value="{light}"/>
         <float name="scale" value="{scale}"/>
@@ -43,6 +40,14 @@ _XML = """<scene version="3.0.0">
 {shapes}
 </scene>
 """
+_DIRECT = (
+    '<integrator type="direct"><integer name="emitter_samples" value="0"/><integer name="bsdf_samples" value="1"/>'
+    '<boolean name="hide_emitters" value="true"/></integrator>'
+)
+_PATH = (
+    '<integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="{depth}"/>'
+    '<boolean name="hide_emitters" value="true"/></integrator>'
+)
 _SENSOR = """    <sensor type="orthographic">
         <transform name="to_world"><matrix value="{pose}"/></transform>
         <film type="hdrfilm">
@@ -74,7 +79,9 @@ def write_mitsuba_scene(
     folder.mkdir(parents=True, exist_ok=True)
     if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), settings.encoding)
+    count = bounces(settings.transport)
     scene = _XML.format(
+        integrator=_PATH.format(depth=count + 2) if count else _DIRECT,
         light=escape(light),
         scale=math.pi * gain,
         to_z_up=_TO_Z_UP,

@@ -55,6 +55,23 @@ def test_the_files_look_in_mitsuba_as_the_scene_does_here(tmp_path, encoding, no
         assert off[:3, inside].mean().abs() < 0.5 / 255 and off[:3, inside].square().mean().sqrt() < 0.005
 
 
+@pytest.mark.parametrize("transport", ["shadows", "bounces:2"])
+def test_a_bowl_is_as_dark_or_bright_within_as_its_transport_says(tmp_path, transport):
+    """To the quadrature of a pixel's rays, and far from what direct light makes of it."""
+    shell = trimesh.creation.icosphere(subdivisions=3)
+    lower = shell.vertices[shell.faces].mean(axis=1)[:, 2] < 0
+    bowl, settings = Mesh.plain(shell.vertices, shell.faces[lower], (0.8, 0.7, 0.5)), ImageSettings(24, 4)
+    camera, light = OrthographicCamera(0.3, 0.0, 2.2), load_light("st_peters")
+    write_mitsuba_scene(tmp_path, bowl, 1.0, [camera], replace(settings, transport=transport), "light.exr")
+    write_map(tmp_path / "light.exr", to_map(light, 128))
+    theirs = render_mitsuba_scene(tmp_path / SCENE, 1)[0].flatten(1)
+    for chosen, close in ((transport, True), ("direct", False)):
+        [operator] = build_operators(bowl, [camera], replace(settings, transport=chosen), choose("software"))
+        inside = (operator.coverage == 1) & (theirs[3, operator.pixels] == 1)
+        off = (operator.radiance(light) - theirs[:3, operator.pixels])[:, inside]
+        assert (off.square().mean().sqrt() < 0.02 * theirs[:3].max()) == close
+
+
 def test_a_file_that_mitsuba_refuses_is_named_in_one_sentence(tmp_path):
     (tmp_path / SCENE).write_text("<scene version='3.0.0'><shape type='ply'/></scene>")
     with pytest.raises(InputError, match=SCENE) as refused:
