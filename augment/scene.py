@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Any
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from augment.held_transport import HeldTransport
 from augment.memory import require_memory
 from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
@@ -80,7 +81,8 @@ class Scene:
 
     Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
     (`OperatorStack`), equal views share one, and what a background adds to an image is kept. Where vertices move, their
-    view is rasterised anew each time. light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are
+    view is rasterised anew each time, and shadows and bounces are those of the mesh's own shape (`HeldTransport`).
+    light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are
     those of the images. basis: what lights are coefficients of; 49 harmonics, unless another is given. taken: what a
     camera makes of rendered images (A, V, 3, size, size) of examples (A,), differentiable; see `Snapshot`.
     """
@@ -122,6 +124,7 @@ class Scene:
         # What is kept of views; `functools.cache` would tie a scene that each epoch replaces to itself.
         self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
         self._fragments_of_meshes: dict[tuple[int, OrthographicCamera], tuple[Fragments, Tensor]] = {}
+        self._held_transports: dict[tuple[int, OrthographicCamera], HeldTransport] = {}
 
     @classmethod
     def grid(
@@ -243,11 +246,6 @@ class Scene:
         light = conditions.light * self._exposure[examples]
         if conditions.vertices is None and conditions.albedo is None:
             return self._relit(light, examples)
-        if self.settings.transport != "direct":
-            raise InputError(
-                f"renderer.transport={self.settings.transport} holds for one shape in its colours: attack the light or "
-                "set renderer.transport=direct"
-            )
         return self._reshaded(light, conditions, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[_Layer]:
@@ -296,7 +294,10 @@ class Scene:
             added, gain = conditions.albedo[row, : len(mesh.faces)], self.objects[number].gain
             albedo = painted_albedo(mesh, fragments, self.settings.encoding, gain, added)
         smooth_faces = self._faces[number] if self.settings.normals == "smooth" else None
-        return fragments, radiance(fragments, vertices, light, albedo, smooth_faces)
+        seen = radiance(fragments, vertices, light, albedo, smooth_faces)
+        if self.settings.transport != "direct":
+            seen = seen + self._held(number, camera).radiance(fragments, albedo, light)
+        return fragments, seen
 
     def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         if index not in self._stacks:
@@ -329,6 +330,18 @@ class Scene:
         if view not in self._fragments_of_meshes:
             self._fragments_of_meshes[view] = self._fragments(number, camera, self.objects[number].mesh.vertices)
         return self._fragments_of_meshes[view]
+
+    def _held(self, number: int, camera: OrthographicCamera) -> HeldTransport:
+        view = number, camera
+        if view not in self._held_transports:
+            item, like = self.objects[number], (self.basis, self.lights.dtype)
+            shaped, direct = (
+                self._cache.operators(item.mesh, [camera], settings, self.backend, item.gain, *like)[0]
+                for settings in (self.settings, replace(self.settings, transport="direct"))
+            )
+            device = self.lights.device
+            self._held_transports[view] = HeldTransport(shaped.to(device), direct.to(device), *self._still(*view))
+        return self._held_transports[view]
 
     def _fragments(self, number: int, camera: OrthographicCamera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
         """What a camera sees of an object's moved vertices, and the albedo there (S, 3)."""

@@ -437,10 +437,35 @@ def test_a_scene_of_shadowed_and_open_meshes_shows_each_as_its_operator_does():
     torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=100 * EPS32)
 
 
-@pytest.mark.parametrize("changed", ["vertices", "albedo"])
-def test_a_scene_with_shadows_refuses_other_shapes_and_colours(changed):
-    scene = built([ObjectSettings("solid:cup", "cup")], ring(1, 2), replace(SETTINGS, transport="shadows"))
-    examples = torch.arange(len(scene))
-    conditions = replace(scene.conditions(examples), **{changed: torch.zeros(len(scene), 4, 3)})
-    with pytest.raises(InputError, match=r"set renderer\.transport=direct"):
-        scene.render(conditions, examples)
+@pytest.mark.parametrize("transport", ["shadows", "bounces:2"])
+def test_where_no_vertex_or_colour_has_moved_yet_shadows_are_those_of_the_operators(transport):
+    scene = built([ObjectSettings("solid:cup", "cup")], ring(2, 2), replace(SETTINGS, transport=transport))
+    examples, lights = torch.arange(len(scene)), random_lights(len(scene))
+    mesh = scene.mesh(0)
+    still = replace(scene.conditions(examples), light=lights)
+    expected = scene.render(still, examples)
+    for changed in (
+        {"vertices": torch.from_numpy(mesh.vertices).float().expand(len(scene), -1, -1)},
+        {"albedo": torch.zeros(len(scene), len(mesh.faces), 3)},
+    ):
+        images = scene.render(replace(still, **changed), examples)
+        torch.testing.assert_close(images, expected, rtol=0, atol=1000 * EPS32)
+
+
+def test_a_shadow_goes_with_the_colour_of_its_pixel():
+    """Half the albedo leaves half of all light, shadows included."""
+    grey = replace(load_object(ObjectSettings("solid:cup", "cup")).mesh, textures=())
+    grey = replace(grey, corner_colors=np.full_like(grey.corner_colors, 0.5))
+    settings = replace(SETTINGS, transport="shadows")
+    scene = Scene.grid(
+        [SceneObject("cup", grey)],
+        ring(1, 2),
+        torch.zeros(1, 1, 8, 8),
+        ambient(torch.full((3,), 0.3)),
+        settings,
+        BACKEND,
+    )
+    half = torch.full((1, len(grey.faces), 3), -0.25)
+    conditions, examples = scene.conditions(torch.arange(1)), torch.arange(1)
+    halved = scene.render(replace(conditions, albedo=half), examples)
+    torch.testing.assert_close(halved, scene.render(conditions, examples) / 2, rtol=0, atol=100 * EPS32)
