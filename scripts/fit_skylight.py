@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from renderer.errors import require_range
 from renderer.skylight import fit_error, fit_polynomials
@@ -29,7 +29,7 @@ def main(settings: Settings) -> None:
     out = writable_file(settings.out, "out")
     fit = fit_polynomials(settings.zenith_degree, settings.turbidity_degree).float()
     out.parent.mkdir(parents=True, exist_ok=True)
-    save_file({"fit": fit}, settings.out)
+    out.write_bytes(save({"fit": fit}))
     error = fit_error(fit, settings.held_out, torch.Generator().manual_seed(0))
     print(f"{settings.out}: off by up to {error:.1e} of the coefficients' norm on {settings.held_out} held-out skies")
 

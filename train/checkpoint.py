@@ -243,7 +243,7 @@ def publish(path: Path, state: Mapping[str, Any]) -> None:
         name: value.half().contiguous() if value.is_floating_point() else value
         for name, value in state["model"].items()
     }
-    safetensors.torch.save_file(weights, path, metadata={"architecture": json.dumps(state["architecture"])})
+    path.write_bytes(safetensors.torch.save(weights, {"architecture": json.dumps(state["architecture"])}))
 
 
 def _load_published(path: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -45,7 +45,7 @@ def write_specimens(path: Path, specimens: Specimens, classes: Sequence[str]) ->
         best = probabilities.max(1)
         answers[name] = [classes[index] for index in best.indices.tolist()]
         answers[f"confidence_{name}"] = best.values.tolist()
-    save_file(tensors, path, {"answers": json.dumps(answers)})
+    path.write_bytes(save(tensors, {"answers": json.dumps(answers)}))  # an error of which names the file
 
 
 def read_specimens(path: Path) -> list[tuple[str, Side, Side]]:

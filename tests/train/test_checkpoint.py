@@ -338,6 +338,12 @@ def test_a_published_network_is_the_same_to_half_precision(network, tmp_path):
             assert ((found.double() - value.double()).abs() <= bound).all(), name
 
 
+def test_a_published_file_that_cannot_be_written_is_an_error_that_names_it(network, tmp_path):
+    (tmp_path / "model.safetensors").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"model\.safetensors"):
+        publish(tmp_path / "model.safetensors", {"model": network.state_dict(), "architecture": {}})
+
+
 def test_a_published_file_takes_half_the_room_and_any_memory_layout(network, tmp_path):
     publish(tmp_path / "a.safetensors", state_of(network.to(memory_format=torch.channels_last)))
     numbers = sum(value.numel() for value in network.state_dict().values())

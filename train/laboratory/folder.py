@@ -96,6 +96,10 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
             f"meshes[{index}]: {named.mesh} has no label: give {{mesh: {named.mesh}, label: CLASS}}, with "
             f"{FOREIGN}NAME for what the network has no class for"
         )
+    if Path(label).name != label or label == "..":
+        raise InputError(
+            f"meshes[{index}]: the label {label!r} is no folder's name, where its photographs go: rename it"
+        )
     return Subject(label, named.mesh, split_parts(load_object(named).mesh, named.gain, named.mesh))
 
 

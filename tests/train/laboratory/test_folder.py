@@ -98,6 +98,11 @@ REFUSED = [
     ({"meshes": []}, "meshes: name at least one of label=orange and one of something else"),
     ({"meshes": ["solid:orange"]}, "meshes: name at least one of label=orange and one of something else"),
     ({"meshes": ["solid:lemon"]}, "meshes: name at least one of label=orange and one of something else"),
+    ({"meshes": [{"mesh": "solid:orange", "label": "../x"}]}, r"meshes\[0\]: the label '../x' is no folder's name"),
+    (
+        {"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]},
+        r"meshes\[0\]: the label 'other_../../x' is ",
+    ),
     ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\]: fruit.glb has no label: give {mesh: fruit.glb, label: "),
     ({"meshes": [{"mesh": "solid:orange", "gian": 2}]}, r"meshes\[0\].gian: Key 'gian' not in 'ObjectSettings'"),
     ({"meshes": ["solid:lime"]}, "No solid is called 'lime': use"),
