@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
 from renderer.errors import InputError, is_out_of_memory
+from train.distributed import is_process_lost
 from train.settings import read_settings
 
 USER_ERROR = 2
@@ -53,6 +54,8 @@ def one_sentence(error: Exception) -> str | None:
             return f"{error.filename} cannot be read or written: {error.strerror}"
         case OSError() if error.errno in NO_ROOM:
             return f"what was to be written found no room: {error.strerror}"
+        case RuntimeError() if is_process_lost(error):
+            return "another process of this run has ended: mend what ended it, and go on with train.resume=true"
         case RuntimeError() | MemoryError() if is_out_of_memory(error):
             return "memory ran out: ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
     return None

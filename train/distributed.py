@@ -27,6 +27,11 @@ def process_group() -> Iterator[None]:
         dist.destroy_process_group()
 
 
+def is_process_lost(error: Exception) -> bool:
+    """Whether another process is gone that this one waited for: what NCCL raises, or gloo, by its file alone."""
+    return isinstance(error, dist.DistError) or "/gloo/" in str(error)
+
+
 @contextmanager
 def first_process_first() -> Iterator[None]:
     """Let the first process do alone what the others then find done, such as a download."""

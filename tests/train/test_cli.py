@@ -163,6 +163,11 @@ def test_unset_and_unresolved_keys_are_one_line_too(tiny, capsys):
     [
         (PermissionError(13, "Permission denied", "/a/b"), "/a/b cannot be read or written: Permission denied"),
         (OSError(28, "No space left on device"), "what was to be written found no room: No space left on device"),
+        (
+            RuntimeError("[/gloo/x.cc:1] Connection closed by peer"),
+            "another process of this run has ended: ",
+        ),
+        (torch.distributed.DistBackendError("NCCL error"), "another process of this run has ended: mend what ended it"),
         (UnicodeEncodeError("utf-8", "a\udcffb", 1, 2, "no"), "'a\\udcffb' has letters that this system or library"),
     ],
 )

@@ -187,6 +187,23 @@ def test_one_process_writes_for_all(runs):
 
 
 @pytest.mark.slow
+def test_a_killed_process_ends_the_run_in_one_sentence_and_its_checkpoint_is_whole(tiny_npz, tmp_path):
+    small = ["model.depth=10", "model.width=1", "train.batch_size=16", "augment=none", "train.device=cpu"]
+    data = ["data=npz", f"data.path={tiny_npz}", "compare=[]", "train.epochs=10000", "run=here"]
+    start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*start, *small, *data], cwd=tmp_path, env=environment, **pipes) as run:
+        next(line for line in run.stdout if line.startswith("epoch 2/"))
+        _, other = map(int, Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split())
+        os.kill(other, signal.SIGKILL)
+        _, errors = run.communicate(timeout=60)
+    assert run.returncode != 0 and "[rank0]" not in errors
+    assert errors.count("error: another process of this run has ended: mend what ended it, and go on with") == 1
+    assert checkpoint.load(tmp_path / "here" / checkpoint.LAST)["epoch"] >= 1
+
+
+@pytest.mark.slow
 def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_path):
     """The command of the README; the second call goes on where SIGTERM stopped the first."""
     small = ["model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2", "augment.examples=10"]

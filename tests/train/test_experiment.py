@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -231,6 +232,35 @@ def test_a_full_disk_is_one_error_wherever_it_is_met_and_the_run_can_go_on(
     assert checkpoint.exists(tmp_path) == bool(done)
     run(config, load_data(config), tmp_path)
     assert len(read_metrics(tmp_path)) == 2
+
+
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Callable[[int], Path]]:
+    """Makes a file system of so many KiB, or changes its size."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1k", "tmpfs", str(folder)]
+    if not shutil.which("mount") or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting is not allowed")
+
+    def sized(kibibytes: int) -> Path:
+        subprocess.run(["mount", "-o", f"remount,size={kibibytes}k", str(folder)], check=True)
+        return folder
+
+    yield sized
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kibibytes", [8, 100, 500, 1300])
+def test_a_run_on_a_small_disk_ends_in_one_error_and_goes_on_when_there_is_room(tiny, small_disk, kibibytes):
+    disk = small_disk(kibibytes)
+    config = tiny("train.epochs=2", "train.resume=true", f"renderer.cache={disk / 'cache'}")
+    with pytest.raises(InputError, match=rf"{disk}\S* cannot be written \(No space left"):
+        run(config, load_data(config), disk / "run")
+    small_disk(8000)
+    run(config, load_data(config), disk / "run")
+    assert [line.get("epoch") for line in read_metrics(disk / "run")] == [1, 2, None]
 
 
 def test_an_error_of_the_system_that_room_would_not_mend_is_not_called_a_full_disk(tiny, tmp_path, monkeypatch):
