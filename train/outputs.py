@@ -11,6 +11,7 @@ from renderer.errors import InputError
 from train.cli import one_sentence_errors
 
 TRIAL = bytes(2**16)
+LOG = "train.log"
 
 
 def writable_folder(folder: str | Path, key: str) -> Path:
@@ -55,6 +56,7 @@ class Folders(Callback):
     def on_run_start(self, config: DictConfig, **_) -> None:
         if processes.rank() == 0:
             _try_setting(config.hydra.run.dir, "run")
+            writable_file(Path(config.hydra.run.dir) / LOG, "run")
 
     @one_sentence_errors
     def on_multirun_start(self, config: DictConfig, **_) -> None:

@@ -117,6 +117,16 @@ def test_a_folder_for_runs_that_cannot_be_meant_or_written_is_one_line(capsys, s
     assert printed.err.count("\n") == 1
 
 
+def test_a_log_that_cannot_be_written_is_one_line(capsys, tmp_path):
+    (tmp_path / "train.log").mkdir()
+    with pytest.raises(SystemExit) as stop:
+        Folders().on_run_start(OmegaConf.create({"hydra": {"run": {"dir": str(tmp_path)}}}))
+    assert stop.value.code == USER_ERROR
+    assert capsys.readouterr().err.startswith(
+        f"error: run={tmp_path / 'train.log'} cannot be written (it is no regular"
+    )
+
+
 @pytest.mark.parametrize("held", ["here", "here/none"])
 def test_two_commands_do_not_train_in_one_folder(tmp_path, tiny_npz, held):
     (tmp_path / held).mkdir(parents=True)

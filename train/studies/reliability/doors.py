@@ -108,6 +108,13 @@ DOORS = [
         ("out=out",),
         {"run={}": tuple(f"{RUN}/{name}" for name in ("best.pt", "config.yaml", "metrics.jsonl"))},
     ),
+    Door("report.py", "report", (f"runs=[{RUN}]", "out=out"), {}),
+    Door(
+        "fit_skylight.py",
+        "fit_skylight",
+        ("out=out/fit.safetensors", "zenith_degree=2", "turbidity_degree=1", "held_out=2"),
+        {},
+    ),
     Door("export_light.py", "export_light", ("out=out/light.exr", "height=8"), {"light={}": LIGHTS}),
     Door(
         "lab.py",
