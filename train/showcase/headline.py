@@ -37,7 +37,8 @@ def headline(arms: Arms, name: str) -> Illustration | None:
     answers = "; ".join(f"{_said(before)}, then {_said(after)}" for before, after in pairs)
     alt = f"{label.capitalize()} before and after its light changed, called {answers}."
     told = [f" {title} {where}: {_told(found)}." for title, found in scores.items()]
-    return Illustration(_drawn(pairs, scores, label, where), "png", "".join([alt, *told]), int(100 * WIDTH))
+    width = WIDTH if scores else WIDTH / 2
+    return Illustration(_drawn(pairs, scores, label, where), "png", "".join([alt, *told]), int(100 * width))
 
 
 def _drawn(pairs: Pairs, scores: Scores, label: str, where: str) -> bytes:
@@ -47,11 +48,12 @@ def _drawn(pairs: Pairs, scores: Scores, label: str, where: str) -> bytes:
     lines = sum(len(textwrap.wrap(arm, LONGEST_LINE)) for found in scores.values() for arm in found)
     file = io.BytesIO()
     with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(WIDTH, max(4.0, TOP + lines * LINE)), layout="constrained", dpi=DPI)
-        left, right = figure.subfigures(1, 2, width_ratios=(1.05, 1))
-        _draw_pairs(left, pairs, label)
+        size = WIDTH if scores else WIDTH / 2, max(4.0, TOP + lines * LINE)
+        figure = Figure(figsize=size, layout="constrained", dpi=DPI)
+        panels = figure.subfigures(1, 2 if scores else 1, squeeze=False)[0]
+        _draw_pairs(panels[0], pairs, label)
         if scores:
-            _draw_scores(right, scores, where)
+            _draw_scores(panels[1], scores, where)
         figure.savefig(file, format="png")
     return file.getvalue()
 

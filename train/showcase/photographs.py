@@ -22,6 +22,7 @@ from train.tables import Table
 FIGURES = ("recall", "false_alarms", "auc", "recall_at/0.10")
 MOST_SOURCES = 30
 Scored = Mapping[str, Sequence[RunSummary]]  # by arm
+ByArm = dict[str, Score | None]
 
 
 def scored(arms: Arms, name: str) -> dict[str, list[RunSummary]]:
@@ -66,7 +67,7 @@ def _by_source(runs: Scored, name: str) -> Iterator[Block]:
         yield str(error)
 
 
-def _scores(runs: Scored, name: str) -> dict[str, dict[str, dict[str, Score | None]]]:
+def _scores(runs: Scored, name: str) -> dict[str, dict[str, ByArm]]:
     """By figure, source and arm, without the sources that have none of a figure."""
     parts = {arm: [_parts(run, name) for run in group] for arm, group in runs.items()}
     sources = [*dict.fromkeys(source for group in parts.values() for part in group for source in part)][:MOST_SOURCES]
@@ -77,7 +78,7 @@ def _scores(runs: Scored, name: str) -> dict[str, dict[str, dict[str, Score | No
     }
 
 
-def _by_arm(parts: Mapping[str, Sequence[dict[str, Any]]], source: str, figure: str) -> dict[str, Score | None]:
+def _by_arm(parts: Mapping[str, Sequence[dict[str, Any]]], source: str, figure: str) -> ByArm:
     return {arm: score(find_figure(part.get(source, {}), figure) for part in group) for arm, group in parts.items()}
 
 
@@ -92,7 +93,7 @@ def _parts(run: RunSummary, name: str) -> dict[str, dict[str, Any]]:
 
 
 def _plots(
-    runs: Scored, scores: Mapping[str, Mapping[str, Mapping[str, Score | None]]], name: str, label: str
+    runs: Scored, scores: Mapping[str, Mapping[str, ByArm]], name: str, label: str
 ) -> Iterator[Illustration | None]:
     rankings = {arm: [*_rankings(group, name, label)] for arm, group in runs.items()}
     yield plots.roc(rankings, label, "ROC")

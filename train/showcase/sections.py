@@ -38,9 +38,9 @@ def _tables(arms: Arms) -> Iterator[Block]:
     several = [arm for arm, group in arms.items() if len(group) > 1]
     yield from _with_names(spread_tables(runs), several, runs)
     yield from _with_names(headline_tables(runs[:MOST_ROWS]), names[:MOST_ROWS], runs[:MOST_ROWS])
-    if len(every) > MOST_ROWS:
-        yield f"The first {MOST_ROWS} runs have a row of their own; {len(every) - MOST_ROWS} more are in the means."
     yield _cut(settings_table(arms))
+    told = [f"{run.folder}: {arm}, seed {run.config.seed}, {run.scores['test/accuracy']:.3f}" for arm, run in every]
+    yield Code(f"folders and test accuracy of all {len(every)} finished runs", "\n".join(told))
 
 
 def _with_names(tables: Sequence[Table], names: Sequence[str], runs: Sequence[RunSummary]) -> Iterator[Table]:
@@ -58,9 +58,9 @@ def _cut(table: Table) -> Table:
 def _states(runs: Sequence[Run]) -> Section:
     others = [run for run in runs if not run.summary]
     rows = [[str(run.folder), run.state, len(run.epochs)] for run in others[:MOST_ROWS]]
-    names = "\n".join(f"{run.folder}: {run.state}" for run in others[MOST_ROWS:])
-    blocks: list[Block] = [Table("", ["run", "state", "epochs"], rows)] if rows else []
-    return Section("Runs that are not finished", blocks + ([Code("the others", names)] if names else []))
+    more = [f"{run.folder}: {run.state}" for run in others[MOST_ROWS:]]
+    table = Table("", ["run", "state", "epochs"], rows)
+    return Section("Runs that are not finished", [table, Code(f"{len(more)} more", "\n".join(more))])
 
 
 def _training(runs: Sequence[Run], arms: Arms) -> Section:

@@ -53,7 +53,14 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
 
 
 def _without_empty(section: Section) -> Section:
-    return Section(section.title, [block for block in section.blocks if not isinstance(block, Gallery) or block.images])
+    return Section(section.title, [block for block in section.blocks if _holds_something(block)])
+
+
+def _holds_something(block: Block) -> bool:
+    match block:
+        case Gallery(images=content) | Table(rows=content) | Code(text=content):
+            return bool(content)
+    return bool(block)
 
 
 def _rendered(template: str, parts: Sequence[Section], about: str, source) -> str:

@@ -1,6 +1,7 @@
 """The report, of runs in every state, as a file and in a browser."""
 
 import base64
+import io
 import json
 import os
 import re
@@ -11,9 +12,11 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
+from PIL import Image
 
 from renderer.errors import InputError
 from train.report import summarise
+from train.run_folder import locked
 from train.settings import decisive_settings
 from train.showcase import images, plots, report_of, write_report
 from train.showcase.command import training_command
@@ -42,8 +45,11 @@ def page(finished, made_up_run, tmp_path_factory) -> Path:
     shutil.copytree(finished, folder / "finished")
     made_up_run(folder / "plain")
     made_up_run(folder / "old", "none", {"photographs": {"recall": {"value": 0.5}}})
-    for name in ("going", "damaged", "failed"):
+    for name in ("going", "damaged", "failed", "weights", "begun"):
         (folder / name).mkdir()
+    (folder / "weights" / "best.pt").write_bytes(b"")
+    for name in ("config.yaml", "train.log"):
+        (folder / "begun" / name).touch()
     (folder / "going" / "metrics.jsonl").write_text('{"epoch": 1, "train/accuracy": 0.5}\n{"epo')
     (folder / "damaged" / "metrics.jsonl").write_bytes(b"\xff{\n")
     (folder / "failed" / "failed.txt").write_text(HOSTILE)
@@ -52,7 +58,8 @@ def page(finished, made_up_run, tmp_path_factory) -> Path:
     line = {"example": 0, "label": [HOSTILE], "answer": ["b"], "confidence": [0.5], "fooled": True, "steps": 3}
     lines = [line, line | {"example": 1, "steps": 0, "fooled_before": True}]
     (attack / "attack.jsonl").write_text("".join(json.dumps(each) + "\n" for each in lines))
-    return write_report([folder], folder / "out")
+    with locked(folder / "begun"):
+        return write_report([folder], folder / "out")
 
 
 def test_a_page_loads_nothing_escapes_what_files_say_and_tells_images_in_words(page):
@@ -68,7 +75,11 @@ def test_runs_in_every_state_are_shown_or_named(page):
     text = page.read_text()
     assert re.search(r"<td[^>]*>[^<]*/going</td><td>interrupted</td><td>1</td>", text)
     assert re.search(r"<td[^>]*>[^<]*/failed</td><td>failed: &lt;script", text)
-    assert re.search(r"/damaged</td><td[^>]*>cannot be read", text)
+    assert re.search(r"<td[^>]*>[^<]*/weights</td><td>interrupted</td><td>0</td>", text)
+    assert re.search(r"<td[^>]*>[^<]*/begun</td><td>in training</td><td>0</td>", text)
+    for name in ("damaged", "old"):
+        assert re.search(rf"/{name}</td><td[^>]*>cannot be read: [^<]*/{name}", text)
+    assert "2 of 8 runs finished" in text
     assert "1 attacks" in text and "in 1 of 2, 1 more being wrong before any step" in text
 
 
@@ -123,21 +134,38 @@ def test_a_fault_of_the_report_is_told_with_its_place_and_raises_nothing(finishe
     assert any(frame.endswith(", in _training") for frame in frames)
 
 
-def test_a_browser_shows_it_without_overflow_wide_and_narrow_light_and_dark(page):
+@pytest.fixture(scope="module")
+def browser():
+    """The system's Chromium, or playwright's own."""
     api = pytest.importorskip("playwright.sync_api")
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium")
+    installed = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        for width, scheme in ((1280, "light"), (400, "dark")):
-            view, asked = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme), []
-            view.on("request", lambda request, asked=asked: asked.append(request.url))
-            view.goto(page.as_uri())
-            assert view.evaluate("document.documentElement.scrollWidth") <= width
-            assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
-            assert [url for url in asked if not url.startswith("data:")] == [page.as_uri()]
-        browser.close()
+        try:
+            found = playwright.chromium.launch(executable_path=installed, args=["--no-sandbox"])
+        except api.Error as error:
+            pytest.skip(f"no Chromium: {error.message.splitlines()[0]}")
+        yield found
+        found.close()
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+@pytest.mark.parametrize("scheme, paper", [("light", (255, 255, 255)), ("dark", (22, 24, 28))])
+def test_a_browser_shows_it_without_overflow_wide_and_narrow_light_and_dark(page, browser, width, scheme, paper):
+    view, asked = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme), []
+    view.on("request", lambda request: asked.append(request.url))
+    view.goto(page.as_uri())
+    assert view.evaluate("document.documentElement.scrollWidth") <= width
+    assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
+    outside = """width => [...document.querySelectorAll("p, h2, h3, img, figcaption, pre, a")]
+        .filter(each => each.getBoundingClientRect().right > width).map(each => each.outerHTML)"""
+    assert view.evaluate(outside, width) == []
+    smallest = """Math.min(...[...document.querySelectorAll("p, td, th, figcaption, pre, a")]
+        .map(each => parseFloat(getComputedStyle(each).fontSize)))"""
+    assert view.evaluate(smallest) >= 12
+    with Image.open(io.BytesIO(view.screenshot())) as shot:
+        assert shot.convert("RGB").getpixel((width - 3, 3)) == paper
+    assert [url for url in asked if not url.startswith("data:")] == [page.as_uri()]
+    view.close()
 
 
 def test_a_pipe_in_an_images_place_is_left_out(tmp_path):
