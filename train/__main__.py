@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
+from typing import cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -45,7 +46,8 @@ def run_arms(config: DictConfig, folder: Path) -> None:
     """Train the arms to compare with and the arm itself, and print their table."""
     OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
     data = load_data(config)
-    arms = {folder / str(arm): OmegaConf.merge(config, {"augment": {"arm": arm}}) for arm in config.compare}
+    choices = {folder / str(arm): {"augment": {"arm": arm}} for arm in config.compare}
+    arms = {path: cast(DictConfig, OmegaConf.merge(config, choice)) for path, choice in choices.items()}
     arms[folder] = config
     with sole_writer("run", *arms) if processes.rank() == 0 else nullcontext():
         with first_process_first():

@@ -117,7 +117,7 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
     if isinstance(value, Tensor):
         plain = value.detach().cpu().contiguous()
         yield f"{plain.dtype}{tuple(plain.shape)}".encode()
-        yield memoryview(plain.flatten().view(torch.uint8).numpy())
+        yield memoryview(plain.flatten().view(torch.uint8).numpy().data)
     elif isinstance(value, Mapping):
         for key, item in value.items():
             yield f"{key!r}:".encode()
@@ -265,7 +265,7 @@ def random_state() -> dict[str, Tensor | list[Tensor]]:
     return {"cpu": get_rng_state(), "cuda": cuda.get_rng_state_all() if cuda.is_available() else []}
 
 
-def restore_random_state(state: dict[str, Tensor | list[Tensor]]) -> None:
+def restore_random_state(state: Mapping[str, Any]) -> None:
     """What `random_state` gave, on as many GPUs as there were and are."""
     set_rng_state(state["cpu"])
     for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):

@@ -19,7 +19,7 @@ import hydra
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
 from renderer.errors import InputError, is_out_of_memory
@@ -68,7 +68,7 @@ def one_sentence_errors(function: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @functools.wraps(function)
-    def wrapped(*arguments, **keywords):
+    def wrapped(*arguments: Any, **keywords: Any) -> Any:
         try:
             result = function(*arguments, **keywords)
             print(end="", flush=True)  # here, where its errors are met
@@ -209,7 +209,8 @@ def _suggestions(overrides: list[str], config_name: str) -> Iterator[str]:
 
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
     for key in node:
-        yield prefix + key
+        name = prefix + str(key)
+        yield name
         child = node._get_node(key)
-        if OmegaConf.is_dict(child) and not child._is_none():
-            yield from _keys(child, f"{prefix}{key}.")
+        if isinstance(child, DictConfig) and not child._is_none():
+            yield from _keys(child, f"{name}.")

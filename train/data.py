@@ -29,7 +29,7 @@ class Split:
     def to(self, device: torch.device) -> "Split":
         return Split(self.images.to(device), self.labels.to(device))
 
-    def __getitem__(self, rows: Tensor) -> "Split":
+    def __getitem__(self, rows: Tensor | slice) -> "Split":
         return Split(self.images[rows], self.labels[rows])
 
 

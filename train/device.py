@@ -97,7 +97,7 @@ def _faster_precision(device: torch.device) -> str:
         layer = MixedPrecision(nn.Conv2d(64, 64, 3, padding=1, bias=False), "float32")
         images = torch.rand(32, 64, 32, 32)
     candidates = ("bfloat16", "float32")
-    seconds = {precision: [] for precision in candidates}
+    seconds: dict[str, list[float]] = {precision: [] for precision in candidates}
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # threads that wait for a busy core would blur the comparison
     try:
@@ -108,7 +108,7 @@ def _faster_precision(device: torch.device) -> str:
     best = {precision: min(times) for precision, times in seconds.items()}
     measured = ", ".join(f"{1000 * best[precision]:.1f} ms in {precision}" for precision in candidates)
     console.info("precision: a convolution's training step takes %s", measured)
-    return min(candidates, key=best.get)
+    return min(candidates, key=best.__getitem__)
 
 
 def _step_time(layer: MixedPrecision, images: Tensor, precision: str) -> float:

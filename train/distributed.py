@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -50,7 +51,7 @@ def announce(value: str) -> None:
 
 def announced() -> str:
     """What the first process announces."""
-    values = [None]
+    values = [""]
     dist.broadcast_object_list(values, src=0)
     return values[0]
 
@@ -85,11 +86,12 @@ def replicated(model: nn.Module) -> nn.Module:
 
 def synchronise_norms(model: nn.Module) -> None:
     """Replace every batch normalisation inside the model by one over all processes."""
+    like = next(model.parameters())
+    kind: type[nn.Module] = nn.SyncBatchNorm if like.is_cuda else SyncBatchNormCPU
     for parent in list(model.modules()):
         for name, child in parent.named_children():
             if isinstance(child, nn.BatchNorm2d):
-                kind = nn.SyncBatchNorm if child.weight.is_cuda else SyncBatchNormCPU
-                setattr(parent, name, _converted(child, kind))
+                setattr(parent, name, _converted(child, kind, like))
 
 
 class SyncBatchNormCPU(nn.BatchNorm2d):
@@ -103,25 +105,30 @@ class SyncBatchNormCPU(nn.BatchNorm2d):
         centred = values - mean.view(1, -1, 1, 1)
         variance = _average(centred.square().mean((0, 2, 3)))
         self._track(mean.detach(), variance.detach(), processes.world_size() * x.numel() // x.shape[1])
-        scale = self.weight * (variance + self.eps).rsqrt()
-        return (centred * scale.view(1, -1, 1, 1) + self.bias.view(1, -1, 1, 1)).to(x.dtype)
+        scale = (variance + self.eps).rsqrt()
+        if not self.affine:
+            return (centred * scale.view(1, -1, 1, 1)).to(x.dtype)
+        return (centred * (self.weight * scale).view(1, -1, 1, 1) + self.bias.view(1, -1, 1, 1)).to(x.dtype)
 
     @torch.no_grad()
     def _track(self, mean: Tensor, variance: Tensor, count: int) -> None:
+        if self.num_batches_tracked is None or self.running_mean is None or self.running_var is None:
+            return
         self.num_batches_tracked += 1
-        self.running_mean.lerp_(mean, self.momentum)
-        self.running_var.lerp_(variance * count / (count - 1), self.momentum)
+        momentum = 1 / float(self.num_batches_tracked) if self.momentum is None else self.momentum
+        self.running_mean.lerp_(mean, momentum)
+        self.running_var.lerp_(variance * count / (count - 1), momentum)
 
 
 class _Sum(torch.autograd.Function):
     """The sum over all processes; so is its gradient, since each process's loss depends on every one's values."""
 
     @staticmethod
-    def forward(context, values: Tensor) -> Tensor:
+    def forward(context: Any, values: Tensor) -> Tensor:
         return summed(values.clone())
 
     @staticmethod
-    def backward(context, gradient: Tensor) -> Tensor:
+    def backward(context: Any, gradient: Tensor) -> Tensor:
         return summed(gradient.clone())
 
 
@@ -129,8 +136,9 @@ def _average(values: Tensor) -> Tensor:
     return _Sum.apply(values) / processes.world_size()
 
 
-def _converted(norm: nn.BatchNorm2d, kind: type[nn.Module]) -> nn.Module:
-    converted = kind(norm.num_features, norm.eps, norm.momentum, device=norm.weight.device, dtype=norm.weight.dtype)
+def _converted(norm: nn.BatchNorm2d, kind: type[nn.Module], like: Tensor) -> nn.Module:
+    converted = kind(norm.num_features, norm.eps, norm.momentum, norm.affine, norm.track_running_stats)
+    converted.to(like.device, like.dtype)
     converted.load_state_dict(norm.state_dict())
     return converted
 

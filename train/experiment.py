@@ -54,6 +54,7 @@ from train.settings import (
     OTHER,
     SMALLEST_SIZE,
     ExperimentSettings,
+    as_dict,
     read_settings,
     require_same_settings,
 )
@@ -177,7 +178,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
 
 def _write_config(config: DictConfig, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    resolved = OmegaConf.to_container(config, resolve=True)
+    resolved = as_dict(config, resolve=True)
     resolved["versions"] = {
         "python": platform.python_version(),
         "torch": str(torch.__version__),
@@ -261,7 +262,7 @@ def _photograph_scores(
     settings: ExperimentSettings, trainer: Trainer, data: DataSet, device: torch.device
 ) -> dict[str, float]:
     """The network's figures on each folder of photographs, as NAME/FIGURE; empty without one."""
-    scores = {}
+    scores: dict[str, float | None] = {}
     for name, photographs in settings.evaluate.folders.items() if processes.rank() == 0 else ():
         summary = evaluate_photographs(
             trainer.selected,

@@ -36,7 +36,7 @@ from train.epoch import (
     with_room,
 )
 from train.interruption import Interruption
-from train.logs import RunLog, console
+from train.logs import Log, console
 from train.recipe import SCHEDULES, MovingAverage, TrainSettings
 
 BATCH = 512  # of images when a network is scored
@@ -76,7 +76,7 @@ class Trainer:
         self.history: list[dict[str, float]] = []
         self._device = next(model.parameters()).device
         self._under_way: EpochUnderWay | None = None
-        self._random_state: dict[str, Any] | None = None  # where the epoch under way was left
+        self._random_state: dict[str, Any] = {}  # where the epoch under way was left
         self._best: dict[str, Any] | None = None  # selected, but not written yet
         self._replica = replicated(model)
         self._average = MovingAverage(model, settings.averaging) if settings.averaging else None
@@ -103,7 +103,7 @@ class Trainer:
         """Of the epoch under way, in words; empty between two epochs."""
         return f" and {self._under_way.step} steps" if self._under_way else ""
 
-    def fit(self, train: Split, validation: Split, log: RunLog) -> None:
+    def fit(self, train: Split, validation: Split, log: Log) -> None:
         """Train to the last epoch; best.pt holds the network of the best validation.
 
         InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked for it.
@@ -116,8 +116,9 @@ class Trainer:
                     self._under_way = EpochUnderWay.begun(self._regenerate(rounds[0], log))
                 else:
                     restore_random_state(self._random_state)
-                if self._train(mixed, rounds, interruption, log):
-                    self._end_epoch(validation, log)
+                if self._train(self._under_way, mixed, rounds, interruption, log):
+                    now, self._under_way = self._under_way, None
+                    self._end_epoch(now, validation, log)
                 ending = interruption.requested()
                 if ending or self._checkpoint_is_due():
                     if self._under_way:
@@ -194,7 +195,7 @@ class Trainer:
         every = self.service.settings.every
         return rounds_of_epoch(images, len(self.service), self.seed, self.epoch, self.settings.images_per_epoch, every)
 
-    def _regenerate(self, now: Round, log: RunLog) -> Renders:
+    def _regenerate(self, now: Round, log: Log) -> Renders:
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
             renders = self.service.regenerate(self._attacked, now.number)
@@ -203,24 +204,28 @@ class Trainer:
                 log.specimens(renders.specimens, self.architecture["classes"], self.epoch + 1)
         return renders
 
-    def _train(self, mixed: Split, rounds: Sequence[Round], interruption: Interruption, log: RunLog) -> bool:
+    def _train(
+        self, so_far: EpochUnderWay, mixed: Split, rounds: Sequence[Round], interruption: Interruption, log: Log
+    ) -> bool:
         """Take the steps of what is left of the epoch; whether all were taken, since a signal ends them early."""
         steps = [batch_count(len(each.rows), self.settings.batch_size) for each in rounds]
         while True:
-            index = self._under_way.round
+            index = so_far.round
             with self.phases("training"):
-                put_last(mixed, self._under_way.renders)
-                self._train_round(mixed, rounds[index], sum(steps[:index]), sum(steps), interruption)
-            if self._under_way.step == sum(steps):
+                put_last(mixed, so_far.renders)
+                self._train_round(so_far, mixed, rounds[index], sum(steps[:index]), sum(steps), interruption)
+            if so_far.step == sum(steps):
                 return True
             if interruption.requested():
                 return False
-            self._under_way.next_round(self._regenerate(rounds[index + 1], log))
+            so_far.next_round(self._regenerate(rounds[index + 1], log))
 
-    def _train_round(self, mixed: Split, now: Round, before: int, total: int, interruption: Interruption) -> None:
+    def _train_round(
+        self, so_far: EpochUnderWay, mixed: Split, now: Round, before: int, total: int, interruption: Interruption
+    ) -> None:
         """The rest of a round. before: the epoch's steps in earlier rounds; total: in all."""
         self.model.train()
-        so_far, settings = self._under_way, self.settings
+        settings = self.settings
         first = so_far.step - before
         batches = training_batches(
             mixed.images, mixed.labels, settings.batch_size, self.seed, now, settings.flips, first=first
@@ -244,8 +249,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = self.settings.learning_rate * SCHEDULES[self.settings.schedule](progress)
 
-    def _end_epoch(self, validation: Split, log: RunLog) -> None:
-        now, self._under_way = self._under_way, None
+    def _end_epoch(self, now: EpochUnderWay, validation: Split, log: Log) -> None:
         seen = now.step * self.settings.batch_size
         loss_sum, hits = summed(now.sums).tolist()
         trained = {"loss": loss_sum / seen, "accuracy": hits / seen}
@@ -306,7 +310,7 @@ class Trainer:
         checkpoint.save(self.folder / checkpoint.LAST, state, self.folder / checkpoint.PREVIOUS)
 
     def _report(
-        self, log: RunLog, trained: dict[str, Any], validated: dict[str, Any], diagnostics: Mapping[str, float]
+        self, log: Log, trained: dict[str, Any], validated: dict[str, Any], diagnostics: Mapping[str, float]
     ) -> None:
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()  # one resumed after its last attack has no more
         scalars = {

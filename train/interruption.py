@@ -2,6 +2,8 @@
 
 import signal
 import threading
+from types import FrameType
+from typing import Any
 
 from train.distributed import any_process
 
@@ -26,7 +28,7 @@ class Interruption:
 
     def __init__(self) -> None:
         self._number: int | None = None
-        self._before = {}
+        self._before: dict[int, Any] = {}  # their handlers
 
     def __enter__(self) -> "Interruption":
         if threading.current_thread() is threading.main_thread():
@@ -34,7 +36,7 @@ class Interruption:
             self._before = {number: signal.signal(number, self._note) for number in heeded}
         return self
 
-    def __exit__(self, error: type | None, *rest) -> None:
+    def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
         self._restore()
         if error is None and self._number is not None:
             signal.raise_signal(self._number)
@@ -50,7 +52,7 @@ class Interruption:
             signal.raise_signal(number)
         raise Interrupted(number)
 
-    def _note(self, number: int, frame) -> None:
+    def _note(self, number: int, frame: FrameType | None) -> None:
         self._number = number
         self._restore()
 

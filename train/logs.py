@@ -72,7 +72,7 @@ class RunLog:
         self._renders.mkdir(exist_ok=True)
         write_specimens(self._renders / f"epoch_{epoch:03d}{SUFFIX}", specimens, classes)
 
-    def _show(self, step: int, **content) -> None:
+    def _show(self, step: int, **content: object) -> None:
         """Write an event for TensorBoard, at once; torch's SummaryWriter has a thread, whose errors nobody catches."""
         with open(self._board, "ab") as file:
             RecordWriter(file).write(Event(wall_time=time.time(), step=step, **content).SerializeToString())
@@ -89,6 +89,9 @@ class NoLog:
 
     def specimens(self, specimens: Specimens, classes: Sequence[str], epoch: int) -> None:
         pass
+
+
+Log = RunLog | NoLog
 
 
 def read_metrics(folder: Path) -> list[dict[str, float]]:

@@ -22,6 +22,9 @@ _OPTIONS = {"googlenet": _WITHOUT_AUXILIARY, "inception_v3": _WITHOUT_AUXILIARY}
 class Normalised(nn.Module):
     """A network behind the data's own normalisation: takes (N, 3, H, W) RGB in [0, 1]."""
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self, network: nn.Module, mean: Sequence[float], std: Sequence[float]):
         super().__init__()
         self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
@@ -49,7 +52,7 @@ def build_network(
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
     if name.startswith(TORCHVISION):
-        network = Normalised(_torchvision_network(name, len(classes), size), mean, std)
+        network: nn.Module = Normalised(_torchvision_network(name, len(classes), size), mean, std)
     elif name.startswith(PYTHON):
         network = _python_network(name, classes, size)
     else:

@@ -53,13 +53,13 @@ class Folders(Callback):
     """Tries a run's or sweep's folder before Hydra makes it and its log, whose errors would be tracebacks."""
 
     @one_sentence_errors
-    def on_run_start(self, config: DictConfig, **_) -> None:
+    def on_run_start(self, config: DictConfig, **_: object) -> None:
         if processes.rank() == 0:
             _try_setting(config.hydra.run.dir, "run")
             writable_file(Path(config.hydra.run.dir) / LOG, "run")
 
     @one_sentence_errors
-    def on_multirun_start(self, config: DictConfig, **_) -> None:
+    def on_multirun_start(self, config: DictConfig, **_: object) -> None:
         _try_setting(config.hydra.sweep.dir, "sweep")
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
@@ -13,6 +13,8 @@ from renderer.errors import InputError, require_range
 from train.device import COMPILE
 from train.distortions import DISTORTIONS
 from train.epoch import FLIPS
+
+Network = TypeVar("Network", bound=nn.Module)
 
 MOST = {"epochs": 10**6, "images_per_epoch": 10**9, "batch_size": 10**6, "checkpoint_every": 10**6, "threads": 1024}
 
@@ -35,18 +37,18 @@ def one_cycle(progress: float) -> float:
 SCHEDULES = {"step": step, "cosine": cosine, "one_cycle": one_cycle}
 
 
-class MovingAverage:
+class MovingAverage(Generic[Network]):
     """A copy of a model whose weights and statistics are the exponential moving average over its steps.
 
     As `torch.optim.swa_utils.AveragedModel`, which makes a GPU wait at every step, since it counts them on the CPU.
     """
 
-    def __init__(self, model: nn.Module, decay: float):
+    def __init__(self, model: Network, decay: float):
         self.module = deepcopy(model)
         self._decay = decay
         self._begun = False
 
-    def update(self, model: nn.Module) -> None:
+    def update(self, model: Network) -> None:
         """Take in what the model has become by a step; the first one counts whole."""
         average = get_ema_multi_avg_fn(self._decay if self._begun else 0.0)
         own, latest = _tensors(self.module), _tensors(model)

@@ -203,7 +203,8 @@ def _values(group: Sequence[RunSummary], folder: str) -> list[tuple[float | None
 
 
 def _spread(values: Sequence[float | None]) -> str:
-    return "-" if None in values else f"{fmean(values):.3f} ± {stdev(values):.3f}"
+    known = [value for value in values if value is not None]
+    return f"{fmean(known):.3f} ± {stdev(known):.3f}" if len(known) == len(values) else "-"
 
 
 def _card(run: RunSummary, name: str) -> str:

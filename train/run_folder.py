@@ -107,10 +107,10 @@ def read_numbers(path: Path) -> list[dict[str, float]]:
     return lines
 
 
-class _PlainLoader(get_yaml_loader()):
+class _PlainLoader(get_yaml_loader()):  # type: ignore[misc]  # OmegaConf makes its class in a function
     """Without aliases, which no run writes, and by which a short file stands for one beyond memory."""
 
-    def compose_node(self, parent, index):
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             raise ValueError("it holds an alias")
         return super().compose_node(parent, index)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -32,6 +32,7 @@ SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
 MOST_VERTICES = 10**7  # some 5 GB
 COUNTED = ("meshes", "views")  # what a scene shows and how often; the rest says how
+Settings = TypeVar("Settings")
 
 
 @dataclass
@@ -205,12 +206,12 @@ class ExperimentSettings:
         return objects
 
 
-def read_settings(kind: type, config: DictConfig, parent: str = ""):
+def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") -> Settings:
     """The dataclass from its configuration; InputError naming the key that is unknown, unset or of the wrong type."""
     if unset := OmegaConf.missing_keys(config):
         raise InputError(f"{min(unset)} is not set: give {min(unset)}=...")
     try:
-        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), config))
+        return cast(Settings, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), config)))
     except OmegaConfBaseException as error:
         at_fault = error.full_key or next(key for key in config if not _merges(kind, config, key))
         key = ".".join(filter(None, (parent, at_fault)))
@@ -227,9 +228,14 @@ def _merges(kind: type, config: DictConfig, key: str) -> bool:
     return True
 
 
+def as_dict(config: DictConfig, resolve: bool = False) -> dict[str, Any]:
+    """The settings as plain dictionaries and lists."""
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=resolve))
+
+
 def decisive_settings(config: DictConfig) -> dict[str, object]:
     """What decides a run's result, by dotted key: all but the circumstances, with `${run}` for its own folder."""
-    settings = OmegaConf.to_container(config, resolve=True)
+    settings = as_dict(config, resolve=True)
     own = re.compile(f"^{re.escape(str(settings.get('run')))}(?=/|$)")
     return {
         key: own.sub("${run}", value) if isinstance(value, str) else value
@@ -238,7 +244,7 @@ def decisive_settings(config: DictConfig) -> dict[str, object]:
     }
 
 
-def differing_settings(folder: Path, config: DictConfig) -> Iterator[tuple[str, object, object]]:
+def differing_settings(folder: Path, config: DictConfig) -> Iterator[tuple[str, Any, Any]]:
     """The decisive keys in which the run in a folder and a configuration differ, with both values.
 
     A key that the run is older than has its default.

@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -129,7 +130,7 @@ def _one_outcome(callback: Callable[..., Any]) -> Callable[..., Any]:
     """Of a callback, whose exceptions Hydra turns into warnings, exit status 0 with them: end the process instead."""
 
     @functools.wraps(callback)
-    def wrapped(*arguments, **keywords):
+    def wrapped(*arguments: Any, **keywords: Any) -> Any:
         try:
             return one_sentence_errors(callback)(*arguments, **keywords)
         except Exception:
@@ -144,10 +145,10 @@ class SweepReport(Callback):
 
     def __init__(self) -> None:
         self.folders: list[Path] = []
-        self._handler = signal.SIG_DFL
+        self._handler: Any = signal.SIG_DFL
 
     @_one_outcome
-    def on_multirun_start(self, config: DictConfig, **_) -> None:
+    def on_multirun_start(self, config: DictConfig, **_: object) -> None:
         """One sentence and exit status 2 rather than two cells in a folder, or a cell where one has other settings."""
         try:
             cells = _compose_cells(config)
@@ -162,7 +163,7 @@ class SweepReport(Callback):
         self._handler = signal.signal(signal.SIGTERM, _stop)
 
     @_one_outcome
-    def on_multirun_end(self, config: DictConfig, **_) -> None:
+    def on_multirun_end(self, config: DictConfig, **_: object) -> None:
         print(report_of([folder for folder in self.folders if folder.exists()], Path(config.hydra.sweep.dir)))
         atexit.unregister(self._print)
         self._print()
@@ -174,15 +175,15 @@ class SweepReport(Callback):
         print(format_sweep(self.folders), flush=True)
 
 
-def _stop(number: int, _) -> NoReturn:
+def _stop(number: int, _: FrameType | None) -> NoReturn:
     sys.exit(128 + number)  # an exception, so that launchers end their processes
 
 
 def _compose_cells(sweep: DictConfig) -> list[tuple[Path, DictConfig]]:
     """Folder and configuration of every cell that Hydra's basic sweeper makes of a --multirun's configuration."""
     loader = GlobalHydra.instance().config_loader()
-    overrides = [f"{key}={value}" for key, value in (sweep.hydra.sweeper.params or {}).items()]
-    overrides = OverridesParser.create(loader).parse_overrides([*overrides, *sweep.hydra.overrides.task])
+    params = [f"{key}={value}" for key, value in (sweep.hydra.sweeper.params or {}).items()]
+    overrides = OverridesParser.create(loader).parse_overrides([*params, *sweep.hydra.overrides.task])
     if any(override.key_or_group == "run" for override in overrides):
         raise InputError("run= names the folder of a single run: name a sweep's with sweep=")
     (grid,) = BasicSweeper.split_arguments(overrides, max_batch_size=None)
@@ -194,7 +195,7 @@ def _check_same_settings(folder: Path, cell: DictConfig) -> None:
     """InputError where the folder has a run, finished or begun, with other settings than the cell's."""
     if not (is_finished(folder) or checkpoint.exists(folder)):
         return
-    own = OmegaConf.masked_copy(cell, [key for key in cell if key != "hydra"])
+    own = OmegaConf.masked_copy(cell, [str(key) for key in cell if key != "hydra"])
     for key, found, asked in differing_settings(folder, own):
         raise InputError(
             f"{folder} has {key}={found}, and {asked} is asked for: give another folder with sweep=, or remove this one"

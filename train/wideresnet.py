@@ -21,6 +21,9 @@ class WideResNet(nn.Module):
     depth is 6n + 4: n blocks of two convolutions in each of three groups.
     """
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(
         self,
         classes: int,

@@ -21,7 +21,7 @@ from PIL import Image
 
 from augment import processes
 from train import checkpoint, fit
-from train.distributed import any_process, process_group, replicated, summed
+from train.distributed import SyncBatchNormCPU, any_process, process_group, replicated, summed, synchronise_norms
 from train.experiment import load_data, run
 from train.interruption import Interrupted
 from train.logs import read_metrics
@@ -108,6 +108,23 @@ def test_processes_agree_and_their_shares_become_whole(steps):
     for found in two:
         assert found["any"] == [True, False]
         assert found["merged"].tolist() == [0, 10, 20, 30, 40] and found["few"].tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"affine": False}, {"momentum": None}, {"track_running_stats": False}, {"affine": False, "momentum": None}],
+    ids=str,
+)
+def test_a_norm_of_any_options_becomes_one_over_all_processes(options):
+    """With one process, it is what it was."""
+    network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.BatchNorm2d(4, **options)).double()
+    plain = copy.deepcopy(network)
+    synchronise_norms(network)
+    assert type(network[1]) is SyncBatchNormCPU
+    for _ in range(2):
+        torch.testing.assert_close(network(BATCH), plain(BATCH))
+    torch.testing.assert_close(network.state_dict(), plain.state_dict())
+    torch.testing.assert_close(network.eval()(BATCH), plain.eval()(BATCH))
 
 
 def test_one_process_uses_the_model_as_it_is():

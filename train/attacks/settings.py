@@ -23,7 +23,7 @@ class AttackCommandSettings(AttackSettings):
     rounded: bool = True
     verify: str | None = "reload"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         require_renderers(self.renderers)
 

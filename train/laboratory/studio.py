@@ -2,6 +2,7 @@
 under an environment map."""
 
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -34,23 +35,23 @@ def photograph(parts: Sequence[Part], shot: Shot, size: int, samples: int, bounc
             **{f"part_{index}": shape for index, shape in enumerate(_object(mi, parts, shot))},
         }
         scenes = [mi.load_dict({**still, "light": light}) for light in _lights(mi, shot)]
-        return sum(np.array(mi.render(scene, spp=samples, seed=seed)) for scene in scenes)
+        return np.sum([np.array(mi.render(scene, spp=samples, seed=seed)) for scene in scenes], axis=0)
 
 
-def _sensor(mi, shot: Shot, size: int) -> dict[str, Any]:
+def _sensor(mi: ModuleType, shot: Shot, size: int) -> dict[str, Any]:
     look = mi.ScalarTransform4f().look_at(origin=list(shot.camera), target=list(shot.aim), up=[0, 0, 1])
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     return {"type": "perspective", "fov": FIELD_OF_VIEW, "to_world": look, "film": film}
 
 
-def _lights(mi, shot: Shot) -> list[dict[str, Any]]:
+def _lights(mi: ModuleType, shot: Shot) -> list[dict[str, Any]]:
     if shot.environment is not None:  # Mitsuba's maps have y up and +z in the middle column, ours z up and +x there
         turn = mi.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
         return [{"type": "envmap", "bitmap": mi.Bitmap(shot.environment), "to_world": turn}]
     return [_projector(mi, shot), {"type": "constant", "radiance": _rgb(shot.ambient)}]
 
 
-def _projector(mi, shot: Shot) -> dict[str, Any]:
+def _projector(mi: ModuleType, shot: Shot) -> dict[str, Any]:
     """Mitsuba's gives a white surface that faces it at distance 1 the radiance of its image."""
     distance = float(np.linalg.norm(shot.projector - shot.centre))
     return {
@@ -62,7 +63,7 @@ def _projector(mi, shot: Shot) -> dict[str, Any]:
     }
 
 
-def _object(mi, parts: Sequence[Part], shot: Shot) -> list[Any]:
+def _object(mi: ModuleType, parts: Sequence[Part], shot: Shot) -> list[Any]:
     """The object turned, scaled and set down on the table."""
     turned = [shot.scale * part.positions @ shot.turn.T for part in parts]
     lowest = min(positions[..., 2].min() for positions in turned)
@@ -72,9 +73,9 @@ def _object(mi, parts: Sequence[Part], shot: Shot) -> list[Any]:
     ]
 
 
-def _shape(mi, part: Part, positions: np.ndarray, normals: np.ndarray):
+def _shape(mi: ModuleType, part: Part, positions: np.ndarray, normals: np.ndarray) -> Any:
     """Every face gets corners of its own, as colours are kept."""
-    albedo = {"type": "mesh_attribute", "name": "vertex_color"}
+    albedo: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_color"}
     if part.textured:
         albedo = {"type": "bitmap", "bitmap": mi.Bitmap(part.albedo), "raw": True}
     surface = {"type": "principled", "base_color": albedo, "roughness": ROUGHNESS}

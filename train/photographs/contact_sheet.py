@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ FRAME = 4
 
 CELL = IMAGE + 2 * FRAME
 CAPTION_WIDTH = CELL + GAP - 4
+Item = TypeVar("Item")
 SHEET_WIDTH = 2 * MARGIN + COLUMNS * CELL + (COLUMNS - 1) * GAP
 
 
@@ -74,7 +76,7 @@ def _section(title: str, colour: str, asked: Sequence[tuple[Answer, np.ndarray]]
     return Section(title, colour, [Tile(image, caption(answer)) for answer, image in ordered])
 
 
-def evenly(ordered: Sequence, count: int) -> list:
+def evenly(ordered: Sequence[Item], count: int) -> list[Item]:
     """`count` of a sequence at equal distances, first and last among them; all where there are no more."""
     drawn = np.linspace(0, len(ordered) - 1, min(count, len(ordered))).round().astype(int)
     return [ordered[index] for index in drawn]
@@ -125,7 +127,7 @@ def _draw_tile(sheet: Image.Image, tile: Tile, colour: str, left: int, top: int)
         draw.text(position, _shortened(text, font), FAINT if line else INK, font)
 
 
-def _shortened(text: str, font: ImageFont.FreeTypeFont) -> str:
+def _shortened(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
     """The longest start of the text that fits under a tile, with an ellipsis where some was cut."""
     if font.getlength(text) <= CAPTION_WIDTH:
         return text

@@ -73,7 +73,7 @@ def figures(pool: Pool, label: str) -> dict[str, Any]:
     """recall, top5 and false_alarms, as `share` returns them, and auc and recall_at, as `rank` does."""
     return {
         "recall": share_true(answer.true_rank == 1 for answer in pool.mine),
-        "top5": share_true(answer.true_rank <= 5 for answer in pool.mine),
+        "top5": share_true(answer.true_rank is not None and answer.true_rank <= 5 for answer in pool.mine),
         "false_alarms": share_true(answer.prediction == label for answer in pool.others),
         **rank(*pool.scores),
     }

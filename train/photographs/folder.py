@@ -155,7 +155,7 @@ def split_sources(text: str) -> tuple[str, ...]:
 
 
 def _check_look_alikes(table: Path, photographs: Sequence[Photograph]) -> None:
-    sources = {photograph.source for photograph in photographs} - {None}
+    sources = {photograph.source for photograph in photographs if photograph.source is not None}
     for photograph in photographs:
         if unknown := set(photograph.look_alikes) - sources:
             raise InputError(
@@ -193,7 +193,8 @@ def load_photographs(
             f"{len(errors)} of {len(photographs)} photographs cannot be read, the first being "
             f"{folder / first.path} ({reason}): replace them{advice if kept else ''}"
         )
-    pixels = torch.from_numpy(np.stack([results[photograph] for photograph in kept]))
+    images = {photograph: result for photograph, result in results.items() if isinstance(result, np.ndarray)}
+    pixels = torch.from_numpy(np.stack([images[photograph] for photograph in kept]))
     return kept, pixels.permute(0, 3, 1, 2).contiguous(), [str(photograph.path) for photograph in errors]
 
 

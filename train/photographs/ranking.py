@@ -1,6 +1,6 @@
 """How well scores tell a class from other things: ROC curve, AUC, and recall at equal false alarms."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -21,9 +21,9 @@ class Ranking:
     """
 
     def __init__(self, label: Sequence[float], others: Sequence[float]):
-        label, others = np.asarray(label, np.float64), np.asarray(others, np.float64)
-        self._label_order, self._others_order = label.argsort(), others.argsort()
-        self._label, self._others = label[self._label_order], others[self._others_order]
+        scores, further = np.asarray(label, np.float64), np.asarray(others, np.float64)
+        self._label_order, self._others_order = scores.argsort(), further.argsort()
+        self._label, self._others = scores[self._label_order], further[self._others_order]
 
     def figures(self, label_counts: np.ndarray, others_counts: np.ndarray) -> dict[str, np.ndarray]:
         """AUC and recall at each of RATES, (B,) each, of B samples: (B, n) and (B, m) counts whose rows sum to n and m.
@@ -83,7 +83,8 @@ def rank(label: Sequence[float], others: Sequence[float]) -> dict[str, Any]:
     high and threshold. The intervals are 95 % bootstrap intervals over images, the class and the others apart. Values
     are None where either kind is missing.
     """
-    told, thresholds = {name: UNKNOWN for name in ("auc", *RATES)}, dict.fromkeys(RATES)
+    told: Mapping[str, Mapping[str, float | None]] = {name: UNKNOWN for name in ("auc", *RATES)}
+    thresholds: Mapping[str, float | None] = dict.fromkeys(RATES)
     if len(label) and len(others):
         ranking = Ranking(label, others)
         values, replicates, thresholds = ranking.values(), ranking.replicates(), ranking.thresholds()

@@ -1,11 +1,18 @@
 """Figures on disk. Needs matplotlib."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from renderer.errors import InputError
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-def pyplot():
+
+def pyplot() -> ModuleType:
     """matplotlib.pyplot without a display; InputError where it is not installed."""
     try:
         import matplotlib
@@ -17,7 +24,7 @@ def pyplot():
     return plt
 
 
-def panels_beside(count: int, size: tuple[float, float], layout: str = "tight"):
+def panels_beside(count: int, size: tuple[float, float], layout: str = "tight") -> tuple["Figure", Sequence["Axes"]]:
     """(figure, panels) side by side on one vertical scale. size: of each, in inches."""
     width, height = size
     figure, panels = pyplot().subplots(
@@ -28,7 +35,7 @@ def panels_beside(count: int, size: tuple[float, float], layout: str = "tight"):
     return figure, panels[0]
 
 
-def save(figure, path: Path, dpi: int = 110) -> None:
+def save(figure: "Figure", path: Path, dpi: int = 110) -> None:
     """Write the figure and let go of it."""
     figure.savefig(path, dpi=dpi)
     pyplot().close(figure)

@@ -248,9 +248,9 @@ def development() -> Iterator[Row]:
         for name, dtype in DTYPES.items():
             largest = min(1e8, torch.finfo(dtype).max)
             radiance = torch.tensor([inside, outside], dtype=torch.float64).clamp(-largest, largest)
-            parts = [part.to(dtype) for part in (radiance, coverage, background)]
+            seen, covered, behind = (part.to(dtype) for part in (radiance, coverage, background))
             does = "clamped to [0, 1]" + ("; the sRGB curve's slope stays finite at 0" if encoding == "srgb" else "")
-            yield Row(f"`{encoding}`, {name}", of_development(*parts, encoding), does)
+            yield Row(f"`{encoding}`, {name}", of_development(seen, covered, behind, encoding), does)
 
 
 def ten_to(power: int) -> str:

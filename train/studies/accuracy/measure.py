@@ -48,13 +48,13 @@ Errors = dict[str, Error]
 def error(ours: Tensor, wide: np.ndarray) -> Error:
     """ours: of the wide reference's shape."""
     eps = torch.finfo(ours.dtype).eps
-    ours = ours.detach().double().numpy()
-    if ours.shape != wide.shape or not np.isfinite(ours).all():
+    found = ours.detach().double().numpy()
+    if found.shape != wide.shape or not np.isfinite(found).all():
         return Error(inf, eps)
-    if not ours.size:
+    if not found.size:
         return Error(0.0, eps)
-    ours = exact(ours) if wide.dtype == object else extended(ours)
-    return Error(float(abs(ours - wide).max() / (abs(wide).max() or 1)), eps)
+    found = exact(found) if wide.dtype == object else extended(found)
+    return Error(float(abs(found - wide).max() / (abs(wide).max() or 1)), eps)
 
 
 def light(degree: int = 6) -> Tensor:
@@ -144,10 +144,10 @@ def with_vertex_normals(setup: Setup) -> Errors:
     (gradient,) = torch.autograd.grad(image, vertices, upstream.T.to(image))
     move = _upstream(len(vertices), seed=1)
     parts = vertices.detach().double(), fragments.barycentric(), light.double(), upstream, move
-    placed, barycentric, light, above, along = (extended(part.numpy()) for part in parts)
+    placed, barycentric, lit, above, along = (extended(part.numpy()) for part in parts)
 
-    def shade(vertices):
-        return reference.smooth_image(view, vertices, setup.mesh.faces, barycentric, light)
+    def shade(vertices: np.ndarray) -> np.ndarray:
+        return reference.smooth_image(view, vertices, setup.mesh.faces, barycentric, lit)
 
     slope = (above * reference.derivative(shade(reference.stepped(placed, along)))).sum()
     product = (gradient.double() * move).sum().to(image)
@@ -192,8 +192,8 @@ def of_development(radiance: Tensor, coverage: Tensor, background: Tensor, encod
     radiance = radiance.clone().requires_grad_()
     values = develop(radiance, coverage, background, encoding)
     (gradient,) = torch.autograd.grad(values.sum(), radiance)
-    parts = radiance.detach(), coverage, background
-    wide, slope, bounds = reference.develop(*(extended(part.double().numpy()) for part in parts), encoding)
+    seen, covered, behind = (extended(each.detach().double().numpy()) for each in (radiance, coverage, background))
+    wide, slope, bounds = reference.develop(seen, covered, behind, encoding)
     gradient = gradient.where(torch.from_numpy(~bounds), 0 * gradient)
     return {"image value": error(values, wide), "gradient by radiance": error(gradient, slope * ~bounds)}
 

@@ -4,13 +4,16 @@ Arrays hold long doubles (`extended`: 64 bits of mantissa on x86) or mpmath's 25
 complex; every function takes either. Derivatives are complex steps, Im f(x + ih) / h, which lose no digits.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from math import comb, factorial, perm
+from typing import Any
 
 import mpmath
 import numpy as np
+from numpy.typing import ArrayLike
 
 MP = mpmath.mp.clone()
 MP.prec = 256
@@ -18,7 +21,7 @@ STEP = "1e-60"  # its square is lost beside any number here
 AXES = np.eye(3, dtype=int)[:, :, None]
 
 
-def extended(values) -> np.ndarray:
+def extended(values: ArrayLike) -> np.ndarray:
     """As long doubles."""
     return np.asarray(values, dtype=np.longdouble)
 
@@ -43,7 +46,16 @@ class View:
     samples: int  # per pixel
 
 
-def view(ids, samples: int, placed, vertices, faces, albedo, towards, lift) -> View:
+def view(
+    ids: np.ndarray,
+    samples: int,
+    placed: np.ndarray,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    albedo: np.ndarray,
+    towards: np.ndarray,
+    lift: Callable[[np.ndarray], np.ndarray],
+) -> View:
     """Read a view off the ids (R, R) of an image with samples² samples per pixel.
 
     placed: vertices (V, 3) as the camera sees them. vertices: as they are shaded. towards: (3,) the camera's direction.
@@ -83,7 +95,7 @@ def vertex_gradient(view: View, upstream: np.ndarray, light: np.ndarray, vertice
     """(V, 3) of Σ upstream (P, 3) × image. Zero for a face without area."""
     weight = _face_weight(view, upstream)
 
-    def loss(first, second):
+    def loss(first: np.ndarray, second: np.ndarray) -> np.ndarray:
         return (irradiance(_unit(_cross(first, second)) * view.side, light) * weight).sum(axis=1)
 
     area = (_cross(view.first, view.second) ** 2).sum(axis=0)
@@ -93,7 +105,9 @@ def vertex_gradient(view: View, upstream: np.ndarray, light: np.ndarray, vertice
     return _add(vertices, view.corners.ravel(), by_corner.reshape(-1, 3))
 
 
-def smooth_image(view: View, vertices, faces, barycentric, light) -> np.ndarray:
+def smooth_image(
+    view: View, vertices: np.ndarray, faces: np.ndarray, barycentric: np.ndarray, light: np.ndarray
+) -> np.ndarray:
     """(P, 3) radiance with vertex normals, weighted with areas and interpolated to the samples (S, 3)."""
     first, second = _edges(vertices, faces)
     around = _add(len(vertices), faces.ravel(), _cross(first, second).T.repeat(3, axis=0))
@@ -109,7 +123,9 @@ def irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
     return sum(value[:, None] * light[index] for index, value in _reflected(normals, degree).items())
 
 
-def develop(radiance, coverage, background, encoding: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def develop(
+    radiance: np.ndarray, coverage: np.ndarray, background: np.ndarray, encoding: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Image values over a background, their derivative by the radiance, and where the radiance is a clamp's bound.
 
     sRGB: IEC 61966-2-1.
@@ -139,7 +155,7 @@ def basis_gradient(directions: np.ndarray, degree: int) -> np.ndarray:
     return np.stack(slopes, axis=-1) / np.where(scale == 0, 1, scale)[:, None, None]
 
 
-def harmonics(unit: np.ndarray, bands) -> dict[int, np.ndarray]:
+def harmonics(unit: np.ndarray, bands: Sequence[int]) -> dict[int, np.ndarray]:
     """{l² + l + m: (N,)} at unit vectors (3, N): √(…) dᵐP_l/dzᵐ × Re or Im of (x + iy)ᵐ, no Condon-Shortley sign."""
     x, y, z = unit
     powers, cosine, sine = [1 + 0 * z], [1 + 0 * z], [0 * z]
@@ -156,7 +172,7 @@ def harmonics(unit: np.ndarray, bands) -> dict[int, np.ndarray]:
 
 def lambertian(l: int) -> Fraction:
     """What the clamped cosine keeps of band l, over 2π: ∫₀¹ P_l(z) z dz."""
-    return sum(factor / (power + 2) for power, factor in _derivative_of_legendre(l, 0))
+    return sum((factor / (power + 2) for power, factor in _derivative_of_legendre(l, 0)), Fraction())
 
 
 def stepped(values: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -209,7 +225,7 @@ def _add(count: int, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _legendre(l: int, m: int) -> list[tuple[int, object]]:
+def _legendre(l: int, m: int) -> list[tuple[int, Any]]:
     """Normalised dᵐP_l/dzᵐ as (power, 256-bit factor)."""
     norm = MP.sqrt((2 * l + 1) * (2 if m else 1) * MP.mpf(factorial(l - m)) / factorial(l + m) / (4 * MP.pi))
     return [(power, norm * _number(factor)) for power, factor in _derivative_of_legendre(l, m)]
@@ -221,10 +237,10 @@ def _derivative_of_legendre(l: int, m: int) -> list[tuple[int, Fraction]]:
     return [(power - m, Fraction(factor * perm(power, m), 2**l)) for power, factor in terms if power >= m]
 
 
-def _number(fraction: Fraction):
+def _number(fraction: Fraction) -> Any:
     return MP.mpf(fraction.numerator) / fraction.denominator
 
 
-def _as_in(like: np.ndarray, number):
+def _as_in(like: np.ndarray, number: Any) -> Any:
     """A 256-bit number as the entries of an array are."""
     return number if like.dtype == object else np.longdouble(MP.nstr(number, 25))

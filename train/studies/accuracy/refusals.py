@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import inf, nan
+from typing import Any
 
 import torch
 
@@ -77,5 +78,5 @@ def _degenerate_settings() -> dict[str, Callable[[], object]]:
     }
 
 
-def _build(mesh: Mesh = TRIANGLE, camera: OrthographicCamera = CAMERA, **options) -> None:
+def _build(mesh: Mesh = TRIANGLE, camera: OrthographicCamera = CAMERA, **options: Any) -> None:
     build_operators(mesh, [camera], SETTINGS, BACKEND, **options)

@@ -1,15 +1,22 @@
 """Meshes that are hard to shade, each face of one colour, and a rasteriser that shows any face."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
 from renderer.mesh import Mesh, concatenate
+from renderer.visibility import Backend
 
 
-class Chart:
-    """A `renderer.visibility.Backend` whose every image is a chart: sample i sees face i, however thin that is."""
+@dataclass(frozen=True)
+class Chart(Backend):
+    """Whose every image is a chart: sample i sees face i, however thin that is."""
+
+    name: str = "chart"
+    description: str = "a chart of the faces"
 
     def rasterise(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
         ids = np.full((len(points), resolution**2), -1, dtype=np.int32)
@@ -17,7 +24,7 @@ class Chart:
         return ids.reshape(-1, resolution, resolution)
 
 
-def painted(vertices, faces) -> Mesh:
+def painted(vertices: ArrayLike, faces: Sequence[Sequence[int]] | np.ndarray) -> Mesh:
     """A colour per face, in multiples of 1/64, which every number type holds exactly."""
     colors = np.random.default_rng(0).integers(16, 65, (len(faces), 1, 3)) / 64
     return replace(Mesh.plain(vertices, faces), corner_colors=colors.repeat(3, axis=1).astype(np.float32))

@@ -29,12 +29,12 @@ LIMITS = {
     ),
     "no room for a line of metrics": Limit(
         "log",
-        lambda run, rng: (run / METRICS).stat().st_size + rng.integers(1, 300),
+        lambda run, rng: (run / METRICS).stat().st_size + int(rng.integers(1, 300)),
         lambda run, ending: not (run / METRICS).read_bytes().endswith(b"\n"),
     ),
     "no room for anything": Limit(
         "start-up",
-        lambda run, rng: rng.integers(1, 500),
+        lambda run, rng: int(rng.integers(1, 500)),
         lambda run, ending: True,
     ),
 }
@@ -63,12 +63,12 @@ def flip_bytes(path: Path, rng: Generator) -> None:
 
 
 def truncate(path: Path, rng: Generator) -> None:
-    os.truncate(path, rng.integers(1, path.stat().st_size))
+    os.truncate(path, int(rng.integers(1, path.stat().st_size)))
 
 
 def cut_last_line(path: Path, rng: Generator) -> None:
     start = path.read_bytes()[:-1].rfind(b"\n") + 1
-    os.truncate(path, rng.integers(start + 1, path.stat().st_size))
+    os.truncate(path, int(rng.integers(start + 1, path.stat().st_size)))
 
 
 class Damage(NamedTuple):

@@ -15,7 +15,7 @@ from train.__main__ import start
 from train.fit import Trainer
 from train.logs import RunLog
 
-PHASES = {  # entered with a function, and left with it
+PHASES: dict[str, list[tuple[object, str]]] = {  # entered with a function, and left with it
     "attack": [(Trainer, "_regenerate")],
     "training": [(Trainer, "fit"), (Trainer, "_train")],
     "evaluation": [(Trainer, "_end_epoch")],
@@ -35,7 +35,7 @@ def observe(memory: mmap) -> None:
 
 def _telling(function: Callable[..., Any], number: int, memory: mmap) -> Callable[..., Any]:
     @wraps(function)
-    def told(*arguments, **keywords):
+    def told(*arguments: Any, **keywords: Any) -> Any:
         before, memory[0] = memory[0], number
         try:
             return function(*arguments, **keywords)

@@ -1,6 +1,6 @@
 """What Tables 3 and 4 share: attacks by light and by shape, random changes as large, and what a classifier answers."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -36,7 +36,7 @@ class Unreachable(Goal):
 class Attack:
     """What changes, by which steps, and for how long."""
 
-    kind: type[Kind]
+    kind: Callable[[Scene, StepSettings], Kind]
     step: StepSettings
     descent: DescentSettings
 

@@ -102,7 +102,7 @@ def cases(lamp: ObjectSettings, orange: ObjectSettings, targets: Sequence[str], 
     """targets: a class per view of the illusion; the attack on the pixels takes the first."""
     noon = SkylightSettings("linf", None, "unit", 0.2)
     evening = SkylightSettings("linf", None, "unit", 0.2, zenith=75.0, turbidity=8.0)
-    several = dict(shared=True, max_steps=steps)
+    several: dict[str, Any] = dict(shared=True, max_steps=steps)
     return [
         Case("lighting", "light", lamp, AttackCommandSettings(lighting=LIGHT, max_steps=steps)),
         Case(

@@ -62,7 +62,7 @@ METHODS = {
     "random": "random, one draw",
     "search": "random, any of {steps} draws",
 }
-STYLES = {
+STYLES: dict[str, dict[str, Any]] = {
     "adversarial": {"color": "#c2410c", "marker": "o", "linestyle": "-"},
     "random": {"color": "#888888", "marker": "s", "linestyle": ":"},
     "search": {"color": "#222222", "marker": "^", "linestyle": "--"},
@@ -182,7 +182,8 @@ def outcomes(subject: Subject, study: Study, settings: NormBallSettings) -> dict
     classifier = study.classifier
     scene = recognised_scene(subject, classifier, study.light, settings.examples, study.seed)
     draws = {name: generator(study.seed, subject.name, name) for name in SPACES}
-    found = {(name, radius): [] for name, space in SPACES.items() for radius in space.radii}
+    balls = [(name, radius) for name, space in SPACES.items() for radius in space.radii]
+    found: dict[tuple[str, float], list[Outcome]] = {ball: [] for ball in balls}
     for part in parts(subject, scene, classifier, study.light):
         for (name, radius), outcome in found.items():
             outcome.append(attack_ball(part, classifier, study.label, name, radius, settings.steps, draws[name]))
@@ -270,7 +271,7 @@ def draw_success(pooled: Sequence[dict[str, Any]], steps: int, path: Path) -> No
 def most_comparable(found: dict[tuple[str, float], Outcome]) -> tuple[int, dict[tuple[str, str], float]]:
     """The example whose adversaries come nearest to the paper's levels on the image, and for each space and level the
     radius of its nearest one."""
-    off = {}  # by space and level, (radii, E)
+    off: dict[tuple[str, str], Tensor] = {}  # by space and level, (radii, E)
     for name, space in SPACES.items():
         balls = [found[name, radius] for radius in space.radii]
         reach = torch.stack([torch.where(ball.adversarial, ball.reach, torch.inf) for ball in balls])

@@ -163,7 +163,9 @@ def draw(found: dict[str, list[View]], path: Path) -> None:
     """A histogram per mesh, side by side, on one scale."""
     figure, panels = panels_beside(len(found), (3.6, 2.8))
     for panel, (name, views) in zip(panels, found.items(), strict=True):
-        panel.hist(np.concatenate([view.recognised for view in views]), BINS, color="#4269d0", edgecolor="white")
+        panel.hist(
+            np.concatenate([view.recognised for view in views]), BINS.tolist(), color="#4269d0", edgecolor="white"
+        )
         panel.set(title=name, xlabel="confidence in the correct label", xlim=(0, 1))
     panels[0].set_ylabel("renders")
     save(figure, path)

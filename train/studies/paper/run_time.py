@@ -1,21 +1,23 @@
 """What an iteration of an attack costs, and how many it takes (the paper's Section 4.2, "Runtime")."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from augment.backgrounds import load_backgrounds
+from augment.classifiers import Classifier
 from augment.descent import DescentSettings, Goal, adversarial_cost, descend
 from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.phases import Phases
 from augment.scene import Scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from renderer.camera import ring
@@ -30,6 +32,7 @@ from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import interval
 from train.studies.paper.subjects import GREYS, Subject, finer, recognised_scene, scene_of
 from train.tables import markdown
+from train.wideresnet import WideResNet
 
 FIELDS = (2.0, 2.8, 4.0, 5.7, 8.0)  # each halves the pixels of the one before
 TARGETS = {"lighting": 1.05, "geometry": 1.3}
@@ -142,10 +145,11 @@ class Attack:
     prepared: float
 
 
-class Stopwatch:
-    """Adds up the process time of a descent's passes through the classifier; see `augment.phases.Phases`."""
+class Stopwatch(Phases):
+    """Adds up the process time of a descent's passes through the classifier."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.seconds = 0.0
 
     @contextmanager
@@ -169,7 +173,7 @@ def classifier_pass(model: nn.Module, images: Tensor, labels: Tensor, batch_size
 
 
 def milliseconds(
-    attack: Callable[..., Any],
+    attack: Callable[[Stopwatch], None],
     model: nn.Module,
     images: Tensor,
     labels: Tensor,
@@ -178,17 +182,22 @@ def milliseconds(
     turns: int,
 ) -> list[tuple[float, ...]]:
     """Bare, whole and inside of an `Iteration`. attack: of so many passes, given a stopwatch; the first rehearses."""
+
+    def passes_alone() -> None:
+        for _ in range(passes):
+            classifier_pass(model, images, labels, batch_size)
+
     rows = []
     for _ in range(turns + 1):
         watch = Stopwatch()
-        whole = seconds(lambda watch=watch: attack(watch))
-        bare = seconds(lambda: [classifier_pass(model, images, labels, batch_size) for _ in range(passes)])
+        whole = seconds(partial(attack, watch))
+        bare = seconds(passes_alone)
         rows.append([1000 * value / passes for value in (bare, whole, watch.seconds)])
     return [tuple(column) for column in zip(*rows[1:], strict=True)]
 
 
 def stubborn(
-    setup: Setup, kind: str, classifier: nn.Module, light: str, field: float, passes: int, turns: int
+    setup: Setup, kind: str, classifier: Classifier, light: str, field: float, passes: int, turns: int
 ) -> Iteration:
     """An attack that never succeeds, since its targets are the least likely classes."""
     views = ring(setup.views, field)
@@ -216,7 +225,7 @@ def training_step(study: Study, settings: RunTimeSettings) -> Iteration:
     behind, drawn = load_backgrounds(GREYS, classifier.size), ImageSettings(classifier.size)
     scene = Scene.grid(objects, ring(views, 2.0), behind, load_light(study.light), drawn, choose())
     with torch.no_grad():
-        classifier.function.head.bias[label] += 100
+        cast(WideResNet, classifier.function).head.bias[label] += 100
     labels = torch.full((len(scene),), label)
     attack = AugmentationSettings(
         examples=len(scene), attack=TrainingAttackSettings(max_steps=settings.passes - 1, batch_size=len(scene))
@@ -248,7 +257,7 @@ def attacks(subject: Subject, study: Study, settings: RunTimeSettings) -> Iterat
     goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
     for example in range(len(scene)):
         one = scene_of(subject, classifier, study.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0])
-        prepared = seconds(lambda one=one: one.stacks)
+        prepared = seconds(partial(getattr, one, "stacks"))
         problem = ATTACKS["lighting"].problem(one)
         start = time.process_time()
         result = descend(classifier, problem, goal, DescentSettings(settings.max_steps), Stopwatch())
@@ -256,12 +265,12 @@ def attacks(subject: Subject, study: Study, settings: RunTimeSettings) -> Iterat
         yield Attack(subject.name, bool(result.fooled), int(result.steps), prepared + spent, prepared)
 
 
-def quartiles(values: Sequence[float], digits: int) -> str:
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
+def quartiles(values: Collection[float], digits: int) -> str:
+    low, middle, high = np.quantile([*values], [0.25, 0.5, 0.75])
     return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def one_digit(values: Sequence[float]) -> str:
+def one_digit(values: Collection[float]) -> str:
     return quartiles(values, 1)
 
 
@@ -364,5 +373,6 @@ def measure(study: Study, settings: RunTimeSettings) -> Section:
         distribution=markdown(ATTACK_COLUMNS, distribution_rows(done, [subject.name for subject in study.subjects])),
         finding=finding(done),
     )
-    records = [asdict(each) for each in (*by_pixels, *plain, *at_once, training, *done)]
+    found: list[Iteration | Attack] = [*by_pixels, *plain, *at_once, training, *done]
+    records = [asdict(each) for each in found]
     return Section(text, records, {"run_time.png": partial(draw, by_pixels)})

@@ -1,10 +1,14 @@
 """Shares of outcomes with their Wilson intervals, in words and in figures."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from train.photographs.shares import share
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def interval(found: Mapping[str, float]) -> str:
@@ -21,7 +25,7 @@ def percent(found: Sequence[bool]) -> str:
 
 
 def draw_shares(
-    panel, places: Sequence[float], shares: Sequence[Mapping[str, float]], scale: float = 1, **style
+    panel: "Axes", places: Sequence[float], shares: Sequence[Mapping[str, float]], scale: float = 1, **style: Any
 ) -> None:
     """A line of shares with their intervals as error bars."""
     value, low, high = (scale * np.array([each[name] for each in shares]) for name in ("value", "low", "high"))

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ from train.settings import SceneSettings, read_object, read_settings
 from train.studies.figures import pyplot
 from train.studies.page import joined, versions, wrapped, write
 from train.studies.paper import gallery, norm_balls, physical_light, rendering_quality, run_time, transfer, unseen_views
-from train.studies.paper.section import Section, Study
+from train.studies.paper.section import Section, SectionSettings, Study
 
-SECTIONS = {  # by their titles, in the order of the page
+Measure = Callable[[Study, Any], Section]
+SECTIONS: dict[str, tuple[str, type[SectionSettings], Measure]] = {  # by their titles, in the order of the page
     "norm_balls": ("Adversarial against random perturbations", norm_balls.NormBallSettings, norm_balls.measure),
     "physical_light": (
         "Light that something can emit",

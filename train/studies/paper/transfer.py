@@ -125,7 +125,7 @@ def _attacked(
     start = problems[0].start[kept]
     first, further = ATTACKS[kind].adversaries(Part(problems[0], kept, start), seen_by[0], subject.label, views=1)
     states = (start, first, with_random_signs(first, start, draws), further, with_random_signs(further, start, draws))
-    records = [
+    records: list[dict[str, Any]] = [
         {
             "kind": kind,
             "mesh": subject.name,
@@ -219,7 +219,8 @@ def _colour(seen: Seen, label: str) -> str:
 
 def measure(study: Study, settings: TransferSettings) -> Section:
     """Adversaries of every mesh and kind, before all networks."""
-    seen_by, records, seen = networks(study, settings), [], {}
+    seen_by, records = networks(study, settings), []
+    seen: dict[tuple[str, str], list[Seen]] = {}
     for subject in study.subjects:
         draws = generator(study.seed, subject.name, "transfer")
         for some, views in transfer(finer(subject), seen_by, settings.examples, study.light, draws):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,6 +23,9 @@ from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import draw_shares, percent
 from train.studies.paper.subjects import Subject, finer, recognised_scene
 from train.tables import markdown
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 ATTACKED = (1, 5)
 
@@ -172,7 +175,7 @@ def outcomes(records: Sequence[Mapping[str, Any]], kind: str, views: int, state:
 
 def cell(records: Sequence[Mapping[str, Any]], kind: str, views: int, state: str, label: str) -> str:
     """The share of all views, and the lowest and highest of the sets."""
-    sets = {(record["mesh"], record["set"]): [] for record in records}
+    sets: dict[tuple[str, int], list[bool]] = {(record["mesh"], record["set"]): [] for record in records}
     found = outcomes(records, kind, views, state, label)
     for record, outcome in zip(records, found, strict=True):
         sets[record["mesh"], record["set"]].append(outcome)
@@ -227,7 +230,7 @@ def draw(records: Sequence[Mapping[str, Any]], label: str, path: Path) -> None:
     save(figure, path)
 
 
-def _line(panel, records: Sequence[Mapping[str, Any]], kind: str, views: int, label: str) -> None:
+def _line(panel: "Axes", records: Sequence[Mapping[str, Any]], kind: str, views: int, label: str) -> None:
     angles = np.array([record["angle"][str(views)] for record in records])
     fooled = np.array(outcomes(records, kind, views, "further", label))
     places, shares = [], []

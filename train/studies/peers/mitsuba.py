@@ -1,6 +1,7 @@
 """Mitsuba 3 as its users would set it up for this task: an environment map of the light and plain AD."""
 
 import math
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,7 @@ class MitsubaPeer:
         positions = self._mi.Float(self._positions)
         return self._gradient("mesh.vertex_positions", positions, image_gradient).reshape(-1, 3)
 
-    def _gradient(self, key: str, value, image_gradient: np.ndarray) -> np.ndarray:
+    def _gradient(self, key: str, value: Any, image_gradient: np.ndarray) -> np.ndarray:
         self._dr.enable_grad(value)
         self._parameters[key] = value
         self._parameters.update()
@@ -65,10 +66,10 @@ class MitsubaPeer:
         self._dr.disable_grad(self._parameters[key])
         return gradient
 
-    def _render(self):
+    def _render(self) -> Any:
         return self._mi.render(self._scene, self._parameters, spp=self._samples)
 
-    def _mesh(self, faces: np.ndarray, albedo: np.ndarray):
+    def _mesh(self, faces: np.ndarray, albedo: np.ndarray) -> Any:
         properties = self._mi.Properties()
         properties["face_normals"] = True
         diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo.tolist()}}
@@ -88,7 +89,7 @@ class MitsubaPeer:
         return {"type": "orthographic", "to_world": look.scale([half, half, 1]), "film": film}
 
 
-def _mitsuba_on_one_thread():
+def _mitsuba_on_one_thread() -> tuple[ModuleType, ModuleType]:
     """The modules (mitsuba, drjit). InputError: not installed, or no LLVM library."""
     try:
         import drjit

@@ -5,6 +5,7 @@ the version of torch at hand.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,12 +55,12 @@ class PyTorch3DPeer:
         image = self._shade(meshes, self._rasterizer(meshes), self._light)
         return _gradient(image, vertices, image_gradient)
 
-    def _mesh_of(self, vertices: Tensor):
+    def _mesh_of(self, vertices: Tensor) -> Any:
         from pytorch3d.structures import Meshes
 
         return Meshes(verts=[vertices], faces=[self._faces])
 
-    def _shade(self, meshes, fragments, light: Tensor) -> Tensor:
+    def _shade(self, meshes: Any, fragments: Any, light: Tensor) -> Tensor:
         """(3, size, size) radiance: each face is shaded, each sample takes its face's, each pixel their mean."""
         harmonics = torch.stack(select_rows(meshes.faces_normals_packed().T, self._live.tolist()), dim=-1)
         shades = self._albedo * ((harmonics * self._factors) @ light[self._live])
@@ -68,7 +69,7 @@ class PyTorch3DPeer:
         return torch.nn.functional.avg_pool2d(radiance.permute(2, 0, 1), self._side)
 
 
-def _rasterizer(camera: OrthographicCamera, resolution: int):
+def _rasterizer(camera: OrthographicCamera, resolution: int) -> Any:
     """A rasteriser of resolution² samples. Its views have x left, y up, z forward, and points are rows: p R + T."""
     try:
         from pytorch3d.renderer import FoVOrthographicCameras, MeshRasterizer, RasterizationSettings

@@ -67,9 +67,10 @@ def at(*keys: str | int, value: object) -> Callable[[dict[str, Any]], None]:
     """Sets a value in nested mappings and lists."""
 
     def change(tree: dict[str, Any]) -> None:
+        node: Any = tree
         for key in keys[:-1]:
-            tree = tree[key]
-        tree[keys[-1]] = value
+            node = node[key]
+        node[keys[-1]] = value
 
     return change
 
@@ -102,7 +103,7 @@ def nan_weights(path: Path) -> None:
 
 def pickled_code(path: Path) -> None:
     class Code:
-        def __reduce__(self):
+        def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
             return os.system, (f"touch {CODE_RAN}",)
 
     torch.save(Code(), path)

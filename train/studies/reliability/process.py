@@ -54,7 +54,7 @@ def conduct(arguments: Sequence[str], folder: Path, around: Surroundings = USUAL
         process.join()
     code = process.exitcode
     said = errors.read_text(encoding="utf-8", errors="replace") if errors.exists() else ""
-    return Ending(None if hung else abs(code) + 128 * (code < 0), said)
+    return Ending(None if hung or code is None else abs(code) + 128 * (code < 0), said)
 
 
 def _command(arguments: list[str], folder: Path, around: Surroundings, errors: Path) -> None:
@@ -82,7 +82,7 @@ def _status(arguments: list[str]) -> int:
         else:
             sys.argv = [str(ROOT / arguments[0]), *arguments[1:]]
             runpy.run_path(sys.argv[0], run_name="__main__")
-        code = 0
+        code: object = 0
     except SystemExit as stop:
         code = stop.code
     except BaseException:

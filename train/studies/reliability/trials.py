@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from train.cli import USER_ERROR
 from train.studies.reliability.damages import damages
@@ -85,7 +85,7 @@ def file_trials(door: Door) -> Iterator[Trial]:
             named = (file.rpartition("/")[2], given(file), key.partition("=")[0])
             for damage in damages(file):
 
-                def prepare(folder: Path, edit=damage.edit, file=file) -> None:
+                def prepare(folder: Path, edit: Callable[[Path], object] = damage.edit, file: str = file) -> None:
                     edit(folder / file)
 
                 refused = damage.refused and file != door.renewed
@@ -99,7 +99,7 @@ def name_trials(door: Door) -> Iterator[Trial]:
         for name in NAMES:
             odd = name + Path(good).suffix
 
-            def prepare(folder: Path, good=good, odd=odd) -> None:
+            def prepare(folder: Path, good: str = good, odd: str = odd) -> None:
                 if len(odd) < 256:
                     os.rename(folder / good, folder / odd)
 
@@ -132,8 +132,8 @@ def place_trials(door: Door) -> Iterator[Trial]:
 
 def _leaves(node: DictConfig, prefix: str = "") -> Iterator[str]:
     for key in node:
-        child = node._get_node(key)
-        if OmegaConf.is_dict(child) and not child._is_none():
-            yield from _leaves(child, f"{prefix}{key}.")
+        name, child = prefix + str(key), node._get_node(key)
+        if isinstance(child, DictConfig) and not child._is_none():
+            yield from _leaves(child, f"{name}.")
         else:
-            yield prefix + key
+            yield name

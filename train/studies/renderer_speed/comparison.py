@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 from renderer import reference, shading
 from renderer.errors import InputError
 from renderer.transfer import DEGREE, Operator
-from train.studies.peers import PeerScene
+from train.studies.peers import Peer, PeerScene
 from train.studies.renderer_speed.errors import Exact
 from train.studies.renderer_speed.panels import SAMPLES, Bench, Entries, row_of
 from train.studies.renderer_speed.results import Row
@@ -29,16 +28,17 @@ SAMPLES_OF = {MITSUBA: 16, PYTORCH3D: 1}  # per pixel
 COARSER, FINER = 2, 4  # samples per side: as attacks have by default, and as many in all as Mitsuba has
 SHADINGS = {ANALYTIC: shading.radiance, BY_FACE: shade_by_face, BY_SAMPLE: reference.radiance}
 
-Peers = Mapping[str, Callable[..., Any]]  # makers by name
+Peers = Mapping[str, Callable[[PeerScene], Peer]]  # makers by name
 
 
-def installed_peers() -> tuple[dict[str, Callable[..., Any]], list[str]]:
+def installed_peers() -> tuple[Peers, list[str]]:
     """(the peers that start here, by name, and a sentence about each that does not)."""
     from train.studies.peers.mitsuba import MitsubaPeer
     from train.studies.peers.pytorch3d import PyTorch3DPeer
 
     peers, absent = {}, []
-    for name, make in {MITSUBA: MitsubaPeer, PYTORCH3D: PyTorch3DPeer}.items():
+    makers: Peers = {MITSUBA: MitsubaPeer, PYTORCH3D: PyTorch3DPeer}
+    for name, make in makers.items():
         triangle = np.eye(3), np.array([[0, 1, 2]])
         try:
             make(PeerScene(*triangle, np.array(ALBEDO), np.zeros((49, 3)), CAMERA, 4, SAMPLES_OF[name]))
@@ -59,11 +59,11 @@ def by_light(bench: Bench, size: int, peers: Peers) -> list[Row]:
         for name, call in _light_gradients(view, operator, light).items():
             yield replace(row, setting=name), call
         for name, peer in _set_up(view, peers):
-            call = partial(peer.light_gradient, view.image_gradient.cpu().float().numpy())
+            differentiate = partial(peer.light_gradient, view.image_gradient.cpu().float().numpy())
             errors = exact.errors(
-                torch.from_numpy(peer.image()), torch.from_numpy(call()), exact.by_light[: len(light)]
+                torch.from_numpy(peer.image()), torch.from_numpy(differentiate()), exact.by_light[: len(light)]
             )
-            yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
+            yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), differentiate
 
     return bench.timed(entries())
 
@@ -117,7 +117,7 @@ def _irradiance(normals: Tensor) -> Tensor:
     return reference.irradiance(normals, coefficients(DEGREE))
 
 
-def _set_up(view: View, peers: Peers) -> Iterator[tuple[str, object]]:
+def _set_up(view: View, peers: Peers) -> Iterator[tuple[str, Peer]]:
     light = coefficients(DEGREE).float().numpy()
     for name, make in peers.items():
         mesh, samples = view.mesh, SAMPLES_OF[name]

@@ -21,7 +21,7 @@ class Exact:
         self._view, self.image = view, converged.image(irradiance)
         self.by_light, self.by_vertices = converged.light_gradient(), converged.vertex_gradient(irradiance)
 
-    def light_errors(self, operator: Operator, light: Tensor) -> dict[str, float]:
+    def light_errors(self, operator: Operator, light: Tensor) -> dict[str, Any]:
         """Of an operator. Cutting the light off is an error of its image, not of the gradient by what is left."""
         variable = light.clone().requires_grad_()
         radiance = operator.radiance(variable)
@@ -41,7 +41,7 @@ class Exact:
         (gradient,) = torch.autograd.grad((radiance * upstream).sum(), variable)
         return self.errors(view.canvas(radiance.detach(), fragments.pixels), gradient, self.by_vertices)
 
-    def errors(self, image: Tensor, gradient: Tensor, exact_gradient: Tensor) -> dict[str, float]:
+    def errors(self, image: Tensor, gradient: Tensor, exact_gradient: Tensor) -> dict[str, Any]:
         """As fields of a `Row`."""
         return {
             "image_error": relative_error(image, self.image),

@@ -1,12 +1,15 @@
 """The figures: fronts of time and error, and how time and memory grow. Needs matplotlib."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from train.studies.figures import pyplot, save
 from train.studies.renderer_speed.results import Row, pareto_front
 from train.studies.renderer_speed.scaling import Point
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 RED = "#c62f2f"
 FEW = 12  # settings that can all be named in the figure
@@ -32,7 +35,7 @@ def draw_fronts(path: Path, panels: Sequence[Sequence[Row]]) -> None:
     save(figure, path, dpi=100)
 
 
-def _draw_front(ax, rows: Sequence[Row]) -> None:
+def _draw_front(ax: "Axes", rows: Sequence[Row]) -> None:
     front = pareto_front(rows)
     ax.plot([row.time_ms for row in front], [row.error for row in front], "k-", lw=1, zorder=1, label="front")
     for row in rows:
@@ -40,11 +43,11 @@ def _draw_front(ax, rows: Sequence[Row]) -> None:
             ax.plot(row.time_ms, row.error, "*", ms=15, color=RED, label="default")
 
 
-def _draw_by_degree(ax, rows: Sequence[Row], colors) -> None:
-    degrees = sorted({row.degree for row in rows})
+def _draw_by_degree(ax: "Axes", rows: Sequence[Row], colors: Callable[[float], Any]) -> None:
+    degrees = sorted({row.degree for row in rows if row.degree is not None})
     for place, degree in enumerate(degrees):
-        same = [(row.time_ms, row.error) for row in rows if row.degree == degree]
-        ax.scatter(*zip(*same, strict=True), s=22, color=colors(place / len(degrees)), label=f"degree {degree}")
+        times, errors = zip(*((row.time_ms, row.error) for row in rows if row.degree == degree), strict=True)
+        ax.scatter(times, errors, s=22, color=colors(place / len(degrees)), label=f"degree {degree}")
 
 
 def draw_scaling(path: Path, points: Sequence[Point], workloads: Sequence[Sequence[Row]]) -> None:
@@ -71,14 +74,14 @@ def _by_work(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return {work: [row for row in rows if row.setting == work] for work in dict.fromkeys(row.setting for row in rows)}
 
 
-def _draw_lines(ax, lines: dict[str, Sequence[Any]], x: str, y: str) -> None:
+def _draw_lines(ax: "Axes", lines: Mapping[str, Sequence[Any]], x: str, y: str) -> None:
     for name, line in lines.items():
         ax.plot([getattr(point, x) for point in line], [getattr(point, y) for point in line], "o-", ms=4, label=name)
     _logarithmic(ax, "x", "y")
     ax.legend(fontsize=8)
 
 
-def _logarithmic(ax, *names: str) -> None:
+def _logarithmic(ax: "Axes", *names: str) -> None:
     """With as many plain numbers beside an axis as there is room for, also where it spans less than a decade."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

@@ -35,7 +35,7 @@ class Clock:
         leaves the caches as they are in a loop and lets the threads of the one before come to rest.
         """
         bursts = {key: self._burst(call) for key, call in calls.items()}
-        times = {key: [] for key in calls}
+        times: dict[Key, list[float]] = {key: [] for key in calls}
         start = time.perf_counter()
         for past in range(rounds or self.rounds):
             if past >= 3 and time.perf_counter() - start > LIMIT:

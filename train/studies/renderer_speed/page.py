@@ -141,16 +141,16 @@ def _growth(findings: Findings) -> Iterator[str]:
     yield "![How time and memory grow](renderer_scaling.png)"
     methods = list(dict.fromkeys(point.method for point in findings.scaling))
     header = ["variables", *(f"{method}: {unit}" for method in methods for unit in ("ms", "MB"))]
-    by_count = {point.variables: {} for point in findings.scaling}
+    by_count: dict[int, dict[str, tuple[float, float]]] = {point.variables: {} for point in findings.scaling}
     for point in findings.scaling:
         by_count[point.variables][point.method] = point.time_ms, point.memory_mb
     lines = [(count, *(value for method in methods for value in found[method])) for count, found in by_count.items()]
     yield markdown(header, lines)
     for rows in findings.workloads:
         yield f"### {_title(rows)}"
-        lines = [(row.setting, row.size, row.vertices, row.samples, *_numbers(row)) for row in rows]
         yield markdown(
-            ["work", "size", "vertices", "samples per pixel", "ms", "image's error", "gradient's error"], lines
+            ["work", "size", "vertices", "samples per pixel", "ms", "image's error", "gradient's error"],
+            [(row.setting, row.size, row.vertices, row.samples, *_numbers(row)) for row in rows],
         )
 
 

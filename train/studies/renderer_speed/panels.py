@@ -1,9 +1,10 @@
 """Time against error, panel by panel: choices at one workload, which have a front, and workloads at one choice."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ from train.studies.renderer_speed.steps import LAYOUTS, laid_out, light_step, ve
 SAMPLES = ImageSettings().samples
 DTYPES = (torch.float32, torch.bfloat16, torch.float64)  # the default first
 
-Entries = Iterator[tuple[Row, Callable[[], object]]]
+Entries = Iterable[tuple[Row, Callable[[], object]]]
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,10 @@ class Bench:
         return [replace(row, time_ms=times[index]) for index, row in enumerate(rows)]
 
 
-def row_of(view: View, panel: str, setting: str, samples: int, **found) -> Row:
+def row_of(view: View, panel: str, setting: str, samples: int, **found: Any) -> Row:
     """Of a view with so many samples per side of a pixel, in float32 and at the default degree unless found says so."""
-    axes = {"degree": DEGREE, "dtype": "float32", "size": view.size, "vertices": len(view.mesh.vertices)}
+    vertices = len(view.mesh.vertices)
+    axes: dict[str, Any] = {"degree": DEGREE, "dtype": "float32", "size": view.size, "vertices": vertices}
     return Row(panel=panel, setting=setting, samples=samples**2, **axes | found)
 
 
@@ -184,7 +186,7 @@ def batches(bench: Bench) -> list[Row]:
             row = row_of(view, f"light step by lights, {view.size}²", setting, SAMPLES, **axes, **errors)
             yield row, light_step(view, operator, light.expand(count, -1, -1))
 
-    return [replace(row, time_ms=row.time_ms / row.batch) for row in bench.timed(entries())]
+    return [replace(row, time_ms=row.time_ms / (row.batch or 1)) for row in bench.timed(entries())]
 
 
 def workloads(bench: Bench, axis: str) -> list[Row]:

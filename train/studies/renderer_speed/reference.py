@@ -27,7 +27,7 @@ class Converged:
         self.view = view
         each = min(SAMPLES, max(1, RESOLUTION // view.size))
         self.samples = each * SHIFTS
-        found = {shift: _coverage(view, each, shift) for shift in product(range(SHIFTS), repeat=2)}
+        found = {shift: _coverage(view, each, shift) for shift in product(range(SHIFTS), range(SHIFTS))}
         halves = [[part for shift, part in found.items() if sum(shift) % 2 == half] for half in (0, 1)]
         self._halves = [_mean(half, len(view.mesh.faces)) for half in halves]
         self._pixel, self._face, self._weight = _mean([*found.values()], len(view.mesh.faces))

@@ -41,9 +41,13 @@ def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Targe
     ratio, found = other.time_ms / own.time_ms, f"{shown(other.time_ms / own.time_ms)}×"
     if theirs not in (comparison.MITSUBA, comparison.PYTORCH3D):
         return Target(what, asked, found, ratio >= least)
-    accurate = own.image_error <= other.image_error and own.gradient_error <= other.gradient_error
+    accurate = _at_most(own.image_error, other.image_error) and _at_most(own.gradient_error, other.gradient_error)
     errors = f"errors of image and gradient {_errors(own)} against {_errors(other)}"
     return Target(what, f"{asked}, error no larger", f"{found}, {errors}", ratio >= least and accurate)
+
+
+def _at_most(error: float | None, other: float | None) -> bool:
+    return error is not None and other is not None and error <= other
 
 
 def _unmeasured(own: Row, what: str, asked: str, theirs: str) -> Target:

@@ -1,6 +1,7 @@
 """An arm of an experiment in the real `Trainer`, an epoch at a time."""
 
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -9,6 +10,7 @@ from train.data import DataSet, Split
 from train.experiment import build_trainer
 from train.logs import RunLog
 from train.settings import ExperimentSettings
+from train.wideresnet import WideResNet
 
 EPOCH = "epoch"  # the phase that all others are part of
 MARGIN = 30.0  # of a logit: more than any other class reaches, and a gradient that float32 still holds
@@ -44,6 +46,6 @@ class Arm:
 
     @torch.no_grad()
     def _make_sure(self) -> None:
-        head = self.trainer.model.network.head
+        head = cast(WideResNet, self.trainer.model.network).head
         head.weight[self._label] = 0
         head.bias[self._label] = MARGIN

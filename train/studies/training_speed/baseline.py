@@ -1,6 +1,6 @@
 """The loop that one writes with torchvision: images through a DataLoader, eager float32, torch's own dropout."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -15,11 +15,13 @@ from train.epoch import PADDING
 from train.recipe import TrainSettings
 from train.wideresnet import Dropout
 
+Batches = DataLoader[tuple[Tensor, int]]
 
-class Images(Dataset):
+
+class Images(Dataset[tuple[Tensor, int]]):
     """A split as torchvision.datasets.CIFAR100 holds it: uint8 arrays that become PIL images one by one."""
 
-    def __init__(self, split: Split, transform):
+    def __init__(self, split: Split, transform: Callable[[Image.Image], Tensor]):
         self._images = split.images.permute(0, 2, 3, 1).contiguous().numpy()
         self._labels = split.labels.tolist()
         self._transform = transform
@@ -33,7 +35,7 @@ class Images(Dataset):
 
 def build_loader(
     split: Split, batch_size: int, mean: Sequence[float], std: Sequence[float], workers: int, device: torch.device
-) -> DataLoader:
+) -> Batches:
     """Shuffled batches of the split, cropped, flipped and normalised by torchvision, in `workers` processes."""
     transform = transforms.Compose(
         [
@@ -64,7 +66,7 @@ def use_plain_dropout(network: nn.Module) -> None:
 class Baseline:
     """Trains a network by itself; a turn is one pass over the loader's images."""
 
-    def __init__(self, network: nn.Module, loader: DataLoader, settings: TrainSettings, device: torch.device):
+    def __init__(self, network: nn.Module, loader: Batches, settings: TrainSettings, device: torch.device):
         use_plain_dropout(network)
         self._network = network.to(device).train()
         self._loader = loader

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -46,7 +47,7 @@ class BenchmarkSettings:
         """With a number for each None."""
         epochs = EPOCHS[device.type] if self.epochs is None else self.epochs
         steps = STEPS[device.type] if self.steps is None else self.steps
-        workers = min(MOST_WORKERS, os.cpu_count()) if self.workers is None else self.workers
+        workers = min(MOST_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
         return BenchmarkSettings(self.out, epochs, steps, workers)
 
 
@@ -73,9 +74,9 @@ def measure(settings: BenchmarkSettings, config: DictConfig, data: DataSet, devi
     mean, std = channel_statistics(data.train.images)
     network = WideResNet(len(data.classes), **plain.model.shape, mean=(0, 0, 0), std=(1, 1, 1))
     multiply_adds = forward_multiply_adds(network, data.size)
-    loader = build_loader(train[: work.trained], recipe.batch_size, mean, std, settings.workers, device)
+    loader = build_loader(train[: work.trained], recipe.batch_size, mean, std, settings.workers or 0, device)
     with TemporaryDirectory() as folder:
-        makers = {
+        makers: dict[str, Callable[[], Contestant]] = {
             PLAIN: lambda: Arm(plain, data, Path(folder, "plain"), train[: work.trained].to(device), validation),
             BASELINE: lambda: Baseline(network, loader, recipe, device),
             PRODUCTS: lambda: Products(device),
@@ -83,7 +84,7 @@ def measure(settings: BenchmarkSettings, config: DictConfig, data: DataSet, devi
                 adversarial, data, Path(folder, "adversarial"), train[: work.beside_renders].to(device), validation
             ),
         }
-        turns = compete(makers, settings.epochs, device)
+        turns = compete(makers, settings.epochs or 1, device)
     return Findings(device.type, choose_precision(recipe.precision, device), multiply_adds, work, turns)
 
 
@@ -95,7 +96,7 @@ def compete(makers: Mapping[str, Callable[[], Contestant]], rounds: int, device:
     if device.type == "cpu":
         others = {name: make for name, make in makers.items() if name != ADVERSARIAL}
         return take_turns(others, rounds) | take_turns({ADVERSARIAL: makers[ADVERSARIAL]}, -(-rounds // FEWER))
-    turns = {}
+    turns: dict[str, list[Turn]] = {}
     for name, make in makers.items():
         torch.compiler.reset()
         turns |= take_turns({name: make}, rounds)
@@ -105,7 +106,7 @@ def compete(makers: Mapping[str, Callable[[], Contestant]], rounds: int, device:
 def take_turns(makers: Mapping[str, Callable[[], Contestant]], rounds: int) -> dict[str, list[Turn]]:
     """What each contestant's turns returned: a first one, which warms up, and one per round; all take turns."""
     contestants = {name: make() for name, make in makers.items()}
-    turns = {name: [] for name in makers}
+    turns: dict[str, list[Turn]] = {name: [] for name in makers}
     for past in range(rounds + 1):
         print(f"{', '.join(makers)}: {f'round {past} of {rounds}' if past else 'warming up'}", flush=True)
         for name, contestant in contestants.items():
@@ -114,4 +115,4 @@ def take_turns(makers: Mapping[str, Callable[[], Contestant]], rounds: int) -> d
 
 
 def _with_arm(config: DictConfig, arm: str) -> ExperimentSettings:
-    return read_settings(ExperimentSettings, OmegaConf.merge(config, {"augment": {"arm": arm}}))
+    return read_settings(ExperimentSettings, cast(DictConfig, OmegaConf.merge(config, {"augment": {"arm": arm}})))

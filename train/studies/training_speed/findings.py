@@ -1,9 +1,10 @@
 """What a run found out, from the seconds that turns took; and the targets."""
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import median
+from typing import Any
 
 from train.epoch import PHASES, batch_count
 from train.studies.targets import Target
@@ -15,7 +16,7 @@ PLAIN, ADVERSARIAL, BASELINE, PRODUCTS = "augment=none", "augment=adversarial", 
 REST = "everything else"
 RUN = 150  # epochs, of the paper
 
-Turn = Mapping[Hashable, float]  # what one took, by phase
+Turn = Mapping[Any, float]  # what one took, by phase
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class Findings:
             "training": work.batches(name) / batch_count(work.trained, work.batch_size),
             "evaluation": work.validation / work.validated,
         }
-        middle = {phase: median(turn[phase] for turn in self.turns[PLAIN][1:]) for phase in scales}
+        middle: Turn = {phase: median(turn[phase] for turn in self.turns[PLAIN][1:]) for phase in scales}
         measured = turns if name == PLAIN else [middle] * len(turns)
         return [
             _by_phase(turn) | {phase: scale * seconds[phase] for phase, scale in scales.items()}

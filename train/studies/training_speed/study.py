@@ -22,7 +22,7 @@ def run(config: DictConfig) -> None:
     settings = read_settings(BenchmarkSettings, OmegaConf.masked_copy(config, own))
     out = writable_file(settings.out, "out")
     figure = writable_file(out.with_suffix(".png"), "out")
-    config = OmegaConf.masked_copy(config, [key for key in config if key not in own])
+    config = OmegaConf.masked_copy(config, [str(key) for key in config if key not in own])
     read_settings(ExperimentSettings, config)
     device = choose_device(config.train.device)
     set_threads(config.train.threads)
@@ -35,7 +35,7 @@ def run(config: DictConfig) -> None:
         "network": model_title(**config.model),
         "data": f"`data={config.data.name}`" if config.data.path else "random images like CIFAR-100's",
         "compiled": "compiled" if compiles(config.train.compile, device) else "not compiled",
-        "workers": settings.workers,
+        "workers": str(settings.workers),
     }
     write(out, page(findings, facts, figure.name))
     draw(figure, findings)
