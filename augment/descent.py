@@ -176,7 +176,8 @@ def descend_in_parts(
     parts = torch.arange(len(problem.start), device=problem.start.device).split(at_once)
     if len(parts) <= 1:
         return descend_repeatedly(model, problem, goal, settings, phases, starts)
-    starts, whole = list(starts), {}
+    starts = list(starts)
+    whole: dict[str, Tensor] = {}
     for rows in progress(parts, "attack"):
         part, begin = Part(problem, rows, problem.start[rows]), (start[rows] for start in starts)
         result = descend_repeatedly(model, part, goal.of(rows), settings, phases, begin)
