@@ -27,7 +27,7 @@ class TransformationSettings:
     noise: float = 0.02
     jpeg: int = 75
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require_range("attack.expectation.draws", self.draws, 0, 1000)
         for name, most in (("jitter", 0.5), ("exposure", 5), ("noise", 1)):
             require_range(f"attack.expectation.{name}", getattr(self, name), 0, most)
