@@ -12,6 +12,7 @@ from augment.parameters import KINDS
 from renderer.errors import InputError
 from renderer.visibility import choose
 from train.attacks.experiment import attacks
+from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack, format_reloaded
 from train.cli import one_sentence_errors, script
@@ -38,7 +39,9 @@ def main(config: DictConfig) -> None:
             return
     out = writable_folder(settings.out, "out")
     with sole_writer("out", out):
-        for index, (name, attacked) in enumerate(attacks(settings, classifier, device, adversary)):
+        for index, (name, scene, attacked) in enumerate(attacks(settings, classifier, device, adversary)):
+            if scene != settings.scene:
+                print(f"{name} is not recognised in the scene as it is, but is with {overrides(scene)}")
             checks = attacked.check() if settings.attack.checks else None
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
             verdicts = attacked.save(folder, checks, settings.attack.renderers)

@@ -1,18 +1,20 @@
 """An attack from its configuration: scene, criterion, and what is changed."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 
 from augment.attacks.adversary import Adversary
 from augment.attacks.criteria import Criterion, LeastLikely, Misclassification, Targeted
 from augment.attacks.run import Attacked, attack
-from augment.build import build_scene
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
 from renderer.errors import InputError
 from renderer.visibility import choose
-from train.attacks.settings import AttackExperimentSettings
+from train.attacks.scene import scene_of
+from train.attacks.search import search
+from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 from train.settings import read_object
 
 LEAST_LIKELY = "least_likely"
@@ -20,14 +22,17 @@ LEAST_LIKELY = "least_likely"
 
 def attacks(
     settings: AttackExperimentSettings, classifier: Classifier, device: torch.device, adversary: Adversary | None = None
-) -> Iterator[tuple[str, Attacked]]:
-    """(name, what came of it) for an adversary to go on from or, without one, for each mesh."""
+) -> Iterator[tuple[str, AttackSceneSettings, Attacked]]:
+    """(name, the scene that was attacked, what came of it) for an adversary to go on from or, without one, for each
+    mesh, in a scene that was searched for where `scene.search` says so."""
     if adversary is not None:
-        yield adversary.shown.name, attack_adversary(adversary, settings, classifier, device)
+        yield adversary.shown.name, settings.scene, attack_adversary(adversary, settings, classifier, device)
         return
     for index, item in enumerate(settings.scene.meshes):
         named = read_object(item, settings.label, index)
-        yield named.mesh, attack_mesh(named, settings, classifier, device)
+        sought = settings.scene.search and not settings.attack.force
+        scene = search(named, settings, classifier, device) if sought else settings.scene
+        yield named.mesh, scene, attack_mesh(named, replace(settings, scene=scene), classifier, device)
 
 
 def attack_mesh(
@@ -37,15 +42,7 @@ def attack_mesh(
 
     InputError also where the classifier does not recognise it to begin with.
     """
-    scene = build_scene(
-        [item],
-        classifier.size,
-        settings.scene.views,
-        shared=settings.attack.shared,
-        **settings.scene.choices,
-        **settings.renderer.choices,
-        device=device,
-    )
+    scene = scene_of(item, settings, classifier.size, device)
     wanted, force = criterion(settings.target), settings.attack.force
     return attack(classifier, scene, wanted, settings.attack, seed=settings.seed, force=force)
 

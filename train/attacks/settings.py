@@ -6,7 +6,7 @@ from typing import Any
 from augment.attacks.settings import AttackSettings
 from augment.attacks.verification import require_renderers
 from renderer.errors import InputError, require_range
-from train.settings import LARGEST_SEED, RendererSettings, SceneSettings
+from train.settings import LARGEST_SEED, MOST_VIEWS, RendererSettings, SceneSettings
 
 
 @dataclass
@@ -35,15 +35,18 @@ class AttackCommandSettings(AttackSettings):
 
 @dataclass
 class AttackSceneSettings(SceneSettings):
-    """One view of a solid orange before grey, unless told otherwise."""
+    """One view of a solid orange before grey, unless told otherwise. search: how many cameras to try where the
+    classifier does not recognise the mesh; see `train.attacks.search`."""
 
     meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
     backgrounds: list[Any] = field(default_factory=lambda: [0.5])
     views: int = 1
+    search: int = 0
 
     def __post_init__(self) -> None:
         if not self.meshes or not self.backgrounds:
             raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
+        require_range("scene.search", self.search, 0, MOST_VIEWS)
         super().__post_init__()
 
 

@@ -1,0 +1,73 @@
+"""Where a classifier does not recognise a mesh, a scene is found in which it does."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from torch import Tensor
+
+from augment.classifiers import Classifier
+from renderer.errors import InputError
+from train.attacks.experiment import attacks
+from train.attacks.search import overrides, search
+from train.attacks.settings import AttackExperimentSettings
+from train.settings import read_object, read_settings
+
+CPU = torch.device("cpu")
+CHANGED = ("polar", "azimuth", "field_of_view", "light", "exposure")
+
+
+def configured(*more: str) -> AttackExperimentSettings:
+    small = ["renderer.visibility=software", "renderer.cache=null", "attack.checks=false", "attack.max_steps=1"]
+    with initialize_config_module("conf", version_base="1.3"):
+        return read_settings(AttackExperimentSettings, compose("attack", [*small, "attack.light=signed", *more]))
+
+
+def bright_and_small(images: Tensor) -> Tensor:
+    """An orange is bright in the middle, on a wide border of the background's grey."""
+    middle, border = images[..., 6:10, 6:10].mean((1, 2, 3)), images[..., :2, :].mean((1, 2, 3))
+    score = torch.minimum(60 * (middle - 0.5), 200 * (0.02 - (border - 0.5).abs()))
+    return torch.stack([score, -score], dim=1)
+
+
+def by_size() -> Classifier:
+    return Classifier(bright_and_small, 16, ("orange", "other"), "by_size")
+
+
+def found(*more: str, classifier: Classifier | None = None):
+    settings = configured(*more)
+    item = read_object(settings.scene.meshes[0], settings.label, 0)
+    return settings, search(item, settings, classifier or by_size(), CPU)
+
+
+def test_a_scene_that_is_recognised_stays_as_it_is():
+    always = Classifier(lambda images: torch.stack([images.mean((1, 2, 3)) + 1, images.mean((1, 2, 3))], 1), 16, "ab")
+    settings, chosen = found("label=a", classifier=always)
+    assert chosen == settings.scene
+
+
+@pytest.mark.parametrize("more", [[], ["scene.views=2"], ["scene.views=2", "attack.shared=true"]])
+def test_a_camera_and_a_light_are_found_under_which_all_views_are_recognised(more):
+    settings, chosen = found("scene.search=40", *more)
+    assert chosen != settings.scene
+    assert replace(chosen, **{name: getattr(settings.scene, name) for name in CHANGED}) == settings.scene
+    settings = replace(settings, scene=replace(chosen, search=0))
+    ((_, _, attacked),) = attacks(settings, by_size(), CPU)
+    assert attacked.recognised.all()
+
+
+def test_what_was_found_is_told_as_overrides_and_follows_from_the_seed():
+    _, chosen = found("scene.search=40")
+    _, again = found("scene.search=40")
+    assert again == chosen
+    _, told = found("scene.search=0", *overrides(chosen).split())
+    assert replace(told, search=40) == chosen
+    assert math.isclose(told.exposure, chosen.exposure)
+
+
+def test_where_nothing_is_found_the_mesh_is_refused_with_the_classifiers_answers():
+    never = Classifier(lambda images: torch.stack([0 * images.sum((1, 2, 3)), images.mean((1, 2, 3)) + 1], 1), 16, "ab")
+    with pytest.raises(InputError, match="1 of 1 images of solid:orange:0 are not recognised as 'a' before any attack"):
+        list(attacks(configured("scene.search=2", "label=a"), never, CPU))

@@ -1,0 +1,83 @@
+"""A scene in which a classifier recognises a mesh, so that there is something to attack."""
+
+from dataclasses import replace
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from augment.attacks.run import logits_of
+from augment.classifiers import Classifier
+from augment.objects import ObjectSettings
+from augment.scene import Scene
+from augment.seeding import generator
+from renderer.lights import PROBES, load_light
+from train.attacks.scene import scene_of
+from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
+
+POLAR, FIELD_OF_VIEW = (40.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
+EXPOSURES = (1.0, 1.5, 2.5, 4.0)  # times the scene's own
+SURE = 0.5  # confidence, in every image, at which the search ends
+
+
+def search(
+    item: ObjectSettings, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
+) -> AttackSceneSettings:
+    """The settings as they are, where every image is recognised, or else the ones most surely recognised among
+    `scene.search` cameras, the first of them the scene's own, each under the scene's light and the probes at several
+    exposures; the settings as they are, where none is recognised."""
+    scene, draws = settings.scene, generator(settings.seed, item.mesh, "search")
+    if _confidence(scene_of(item, settings, classifier.size, device), settings, classifier).item() > 0:
+        return scene
+    best, chosen, camera = 0.0, scene, scene
+    for _ in range(scene.search):
+        found, candidate = _brightest(item, replace(settings, scene=camera), classifier, device)
+        if found > best:
+            best, chosen = found, candidate
+        if best >= SURE:
+            break
+        camera = _drawn(scene, draws)
+    return chosen
+
+
+def _brightest(
+    item: ObjectSettings, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
+) -> tuple[float, AttackSceneSettings]:
+    """Of lights and exposures, what is recognised most surely, with its confidence; 0 where none is."""
+    scene = scene_of(item, settings, classifier.size, device)
+    lights = list(product(dict.fromkeys([settings.scene.light, *PROBES]), EXPOSURES))
+    exposures = [settings.scene.exposure * factor for _, factor in lights]
+    coefficients = [load_light(name) * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
+    lit = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(device)
+    rows = scene.with_rows([*scene.examples] * len(lights), light=lit)
+    confidence, index = _confidence(rows, settings, classifier, len(lights)).max(0)
+    return float(confidence), replace(settings.scene, light=lights[index][0], exposure=exposures[index])
+
+
+@torch.no_grad()
+def _confidence(scene: Scene, settings: AttackExperimentSettings, classifier: Classifier, groups: int = 1) -> Tensor:
+    """(groups,) the least confidence in the label where an attack would begin, over each group of a scene's rows; 0
+    where an image is taken for something else."""
+    problem = settings.attack.problem(scene)
+    images = problem.images(problem.start)
+    shares = logits_of(settings.attack.judge(classifier), images, settings.attack.batch_size).softmax(2)
+    labels = torch.tensor([classifier.label(label) for label in scene.labels], device=shares.device)[:, None]
+    right = shares.gather(2, labels[..., None].expand(-1, scene.views, 1))[..., 0] * (shares.argmax(2) == labels)
+    return right.view(groups, -1).amin(1)
+
+
+def _drawn(scene: AttackSceneSettings, draws: torch.Generator) -> AttackSceneSettings:
+    """The scene from another side and another distance."""
+    polar, azimuth, field = torch.rand(3, generator=draws).tolist()
+    return replace(
+        scene,
+        polar=round(POLAR[0] + (POLAR[1] - POLAR[0]) * polar, 1),
+        azimuth=round(360 * azimuth, 1),
+        field_of_view=round(FIELD_OF_VIEW[0] + (FIELD_OF_VIEW[1] - FIELD_OF_VIEW[0]) * field, 2),
+    )
+
+
+def overrides(found: AttackSceneSettings) -> str:
+    """What the command line would say for this camera and this light."""
+    names = ("polar", "azimuth", "field_of_view", "light", "exposure")
+    return " ".join(f"scene.{name}={getattr(found, name)}" for name in names)
