@@ -15,9 +15,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, cuda, get_rng_state, nn, set_rng_state
 
 from renderer.errors import InputError
-from renderer.image import ENCODINGS
+from renderer.image import ENCODINGS, LARGEST_SIZE
 from train.networks import PYTHON, WIDERESNET, build_network
-from train.settings import LARGEST_SIZE
 
 LAST, PREVIOUS, BEST, PUBLISHED = "last.pt", "previous.pt", "best.pt", "model.safetensors"
 HASH = "sha256"

@@ -22,6 +22,7 @@ from augment.service import AugmentationService
 from renderer.cache import OperatorCache, TensorCache, cache_folder
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
+from renderer.image import LARGEST_SIZE
 from renderer.transfer import COEFFICIENTS, DEGREE
 from train import checkpoint
 from train.classes import class_index
@@ -50,7 +51,6 @@ from train.photographs import (
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
 from train.settings import (
-    LARGEST_SIZE,
     OTHER,
     SMALLEST_SIZE,
     ExperimentSettings,

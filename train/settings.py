@@ -213,7 +213,7 @@ def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") ->
     try:
         return cast(Settings, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), config)))
     except OmegaConfBaseException as error:
-        at_fault = error.full_key or next(key for key in config if not _merges(kind, config, key))
+        at_fault = error.full_key or next(str(key) for key in config if not _merges(kind, config, str(key)))
         key = ".".join(filter(None, (parent, at_fault)))
         said = "give a list, as in [a,b]" if "is not a ListConfig" in str(error.msg) else str(error.msg).splitlines()[0]
         raise InputError(f"{key}: {said}") from error

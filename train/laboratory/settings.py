@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from renderer.errors import FACTOR, InputError, require_range
+from renderer.image import LARGEST_SIZE
 from train.laboratory.patterns import FAMILIES
-from train.settings import LARGEST_SEED, LARGEST_SIZE
+from train.settings import LARGEST_SEED
 
 MOST_LIGHTS = 10**6
 

@@ -7,17 +7,17 @@ from typing import Any
 
 from train.photographs import format_interval
 from train.report import RunSummary, group_by_settings, name_among, varied_settings
-from train.showcase.folders import Run
+from train.showcase.folders import FinishedRun, Run
 from train.tables import Table
 
 MOST_ARMS, MOST_SEEDS = 6, 5  # that are drawn and compared
 MOST_NAMED, LONGEST_NAME = 30, 36  # arms by their settings, and characters of such a name
-Arms = Mapping[str, Sequence[Run]]
+Arms = Mapping[str, Sequence[FinishedRun]]
 
 
-def arms_of(runs: Sequence[Run]) -> dict[str, list[Run]]:
+def arms_of(runs: Sequence[Run]) -> dict[str, list[FinishedRun]]:
     """The finished runs by arm and the settings that tell it apart; by number where those are many or long."""
-    by_folder = {run.folder: run for run in runs if run.summary}
+    by_folder = {run.folder: run for run in runs if isinstance(run, FinishedRun)}
     groups = group_by_settings([run.summary for run in by_folder.values()])
     names = _names([group[0] for group in groups])
     return {name: [by_folder[run.folder] for run in group] for name, group in zip(names, groups, strict=True)}
@@ -31,7 +31,7 @@ def _names(heads: Sequence[RunSummary]) -> list[str]:
     return [f"{number}: {head.arm}" for number, head in enumerate(heads, 1)]
 
 
-def drawn(arms: Arms) -> dict[str, Sequence[Run]]:
+def drawn(arms: Arms) -> dict[str, Sequence[FinishedRun]]:
     """The first MOST_ARMS, MOST_SEEDS of each."""
     return {name: runs[:MOST_SEEDS] for name, runs in [*arms.items()][:MOST_ARMS]}
 

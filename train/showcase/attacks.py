@@ -71,7 +71,7 @@ def read_attack(folder: Path) -> Attack:
             raise ValueError("it is too large")
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         examples = [_read_example(line) for line in lines if "example" in line]
-        checks = next((line["checks"] for line in lines if "checks" in line), {})
+        checks: object = next((line["checks"] for line in lines if "checks" in line), {})
         if not isinstance(checks, dict):
             raise ValueError("the checks are no object")
         return Attack(folder, examples, checks)

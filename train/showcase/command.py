@@ -9,11 +9,11 @@ from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from augment.parameters import KINDS
 from train.cli import quoted
-from train.settings import dotted
+from train.settings import as_dict, dotted
 
 CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "out", "train.resume", "data.images")
 DATA = ("cifar100", "npz", "folder")  # besides the default
@@ -35,8 +35,8 @@ def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapp
     if config.get("data", {}).get("name") in DATA:
         chosen.append(f"data={config.data.name}")
     with _no_other_hydra(), initialize_config_module("conf", version_base="1.3"):
-        defaults = dict(dotted(OmegaConf.to_container(compose(name, chosen))))
-    own = dict(dotted(OmegaConf.to_container(config)))
+        defaults = dict(dotted(as_dict(compose(name, chosen))))
+    own = dict(dotted(as_dict(config)))
     if own.get("evaluate.photos") and own.get("evaluate.photos") == own.get("data.images"):
         del own["evaluate.photos"]  # the run's own renders, which it makes again
     changed = {key: value for key, value in own.items() if key in defaults and value != defaults[key]}

@@ -19,12 +19,19 @@ DEPTH = 4  # folders below the one that is named
 
 @dataclass(frozen=True)
 class Run:
-    """A run's folder. summary: of a finished one; else state says what became of it. epochs: its lines of metrics."""
+    """A run's folder. summary: of a `FinishedRun`; else state says what became of it. epochs: its lines of metrics."""
 
     folder: Path
     state: str
     summary: RunSummary | None = None
     epochs: list[dict[str, float]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class FinishedRun(Run):
+    """One that has its final scores."""
+
+    summary: RunSummary
 
 
 def find(folders: Sequence[Path]) -> tuple[list[Run], list[Attack], list[str]]:
@@ -70,7 +77,7 @@ def _read_run(folder: Path) -> Run:
     try:
         epochs = [line for line in read_metrics(folder) if "epoch" in line]
         if is_finished(folder):
-            return Run(folder, "finished", summarise(folder), epochs)
+            return FinishedRun(folder, "finished", summarise(folder), epochs)
         return Run(folder, state(folder), None, epochs)
     except InputError as error:
         return Run(folder, f"cannot be read: {error}")

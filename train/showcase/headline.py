@@ -3,6 +3,7 @@
 import io
 import textwrap
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from train.showcase.arms import Arms, Score
 from train.showcase.blocks import Illustration
@@ -10,6 +11,10 @@ from train.showcase.images import turned
 from train.showcase.photographs import scored, scored_on, scores_of
 from train.showcase.plots import COLOURS
 from train.specimens import Side
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
 
 EXAMPLES = 3
 FIGURES = {"recall": "Recall", "false_alarms": "False alarms", "auc": "AUC"}
@@ -27,7 +32,7 @@ def headline(arms: Arms, name: str) -> Illustration | None:
 
     None where no arm's first run keeps an example that was right before and wrong after.
     """
-    pairs = next((found for group in reversed(arms.values()) if (found := turned(group[0].folder, EXAMPLES))), [])
+    pairs = next((found for group in reversed([*arms.values()]) if (found := turned(group[0].folder, EXAMPLES))), [])
     if not pairs:
         return None
     first = next(iter(arms.values()))[0].summary
@@ -47,7 +52,7 @@ def _drawn(pairs: Pairs, scores: Scores, label: str, where: str) -> bytes:
 
     lines = sum(len(textwrap.wrap(arm, LONGEST_LINE)) for found in scores.values() for arm in found)
     file = io.BytesIO()
-    with mpl.rc_context(LOOK):
+    with mpl.rc_context(LOOK):  # type: ignore[arg-type]  # which wants its keys as literals
         size = WIDTH if scores else WIDTH / 2, max(4.0, TOP + lines * LINE)
         figure = Figure(figsize=size, layout="constrained", dpi=DPI)
         panels = figure.subfigures(1, 2 if scores else 1, squeeze=False)[0]
@@ -58,7 +63,7 @@ def _drawn(pairs: Pairs, scores: Scores, label: str, where: str) -> bytes:
     return file.getvalue()
 
 
-def _draw_pairs(figure, pairs: Pairs, label: str) -> None:
+def _draw_pairs(figure: "SubFigure", pairs: Pairs, label: str) -> None:
     _draw_title(figure, f"One {label}, another light")
     grid = figure.subplots(2, len(pairs), squeeze=False)
     grid[0, 0].set_ylabel("before")
@@ -72,7 +77,7 @@ def _draw_pairs(figure, pairs: Pairs, label: str) -> None:
             axes.spines[:].set(visible=True, color="0.8")
 
 
-def _draw_scores(figure, scores: Scores, where: str) -> None:
+def _draw_scores(figure: "SubFigure", scores: Scores, where: str) -> None:
     _draw_title(figure, where.capitalize())
     most = max(score.seeds for found in scores.values() for score in found.values())
     note = "one seed, 95 % intervals" if most == 1 else f"means of {most} seeds, lowest to highest"
@@ -89,12 +94,12 @@ def _draw_scores(figure, scores: Scores, where: str) -> None:
         axes.tick_params(left=False)
 
 
-def _draw_title(figure, text: str) -> None:
+def _draw_title(figure: "SubFigure", text: str) -> None:
     size = (FONT + 1) * min(1, LONGEST_TITLE / len(text))
     figure.suptitle(text, x=0.02, ha="left", weight="bold", fontsize=size)
 
 
-def _draw_bar(axes, row: int, score: Score) -> None:
+def _draw_bar(axes: "Axes", row: int, score: Score) -> None:
     axes.barh(row, score.value, 0.75, color=COLOURS[row % len(COLOURS)])
     axes.hlines(row, score.low, score.high, color="0.1", linewidth=2)
     axes.annotate(f" {score.value:.2f}", (max(score.high, score.value), row), va="center")

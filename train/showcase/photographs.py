@@ -4,8 +4,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from renderer.errors import InputError
 from train.comparison import difference_tables, read_evaluations
 from train.photographs import figure_title, find_figure, format_interval
@@ -13,7 +11,7 @@ from train.photographs.answers_table import ANSWERS, read_answers
 from train.photographs.figures import pool_all
 from train.photographs.ranking import Ranking
 from train.report import RunSummary, complete
-from train.settings import PHOTOGRAPHS
+from train.settings import PHOTOGRAPHS, as_dict
 from train.showcase import images, plots
 from train.showcase.arms import Arms, Score, score
 from train.showcase.blocks import Block, Gallery, Illustration, Section
@@ -124,12 +122,12 @@ def _tiles(arm: str, run: RunSummary, name: str) -> Iterator[Block]:
 
 def photographs_folder(run: RunSummary, name: str) -> Path | None:
     """Where the images were that a run was scored on, as its configuration has it."""
-    photos = OmegaConf.to_container(run.config).get("evaluate", {}).get("photos")
+    photos = as_dict(run.config).get("evaluate", {}).get("photos")
     found = photos.get(name) if isinstance(photos, dict) else photos
     return Path(found) if isinstance(found, str) else None
 
 
 def scored_on(run: RunSummary, name: str) -> str:
     """What the images are that a run was scored on, in the sub-folder `name`."""
-    own = OmegaConf.to_container(run.config).get("data", {}).get("images")
+    own = as_dict(run.config).get("data", {}).get("images")
     return "held-out renders" if own and photographs_folder(run, name) == Path(own) else name

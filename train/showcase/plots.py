@@ -1,7 +1,7 @@
 """Plots as SVG that can be read on light and on dark paper, in colours that colour-blind readers tell apart."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from train.showcase.blocks import Illustration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from train.showcase.arms import Score
 
@@ -108,11 +109,11 @@ def bars(scores: Mapping[str, Mapping[str, "Score | None"]], title: str) -> Illu
     return _figure(draw, title, f"{title}. {'; '.join(told)}", height)
 
 
-def _figure(draw, title: str, alt: str, height: float = SIZE[1]) -> Illustration:
+def _figure(draw: Callable[["Axes"], None], title: str, alt: str, height: float = SIZE[1]) -> Illustration:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(RC):
+    with mpl.rc_context(RC):  # type: ignore[arg-type]  # which wants its keys as literals
         figure = Figure(figsize=(SIZE[0], height), layout="constrained")
         axes = figure.subplots()
         draw(axes)
@@ -122,7 +123,7 @@ def _figure(draw, title: str, alt: str, height: float = SIZE[1]) -> Illustration
         return Illustration(svg(figure), "svg", alt, WIDTH, title)
 
 
-def svg(figure) -> bytes:
+def svg(figure: "Figure") -> bytes:
     """A figure's SVG, transparent, in which INK is the colour scheme's."""
     file = io.StringIO()
     figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})

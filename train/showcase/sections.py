@@ -1,6 +1,6 @@
 """What is told of runs, in order."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 
 from omegaconf import OmegaConf
@@ -15,6 +15,7 @@ from train.showcase.folders import Run
 from train.tables import Table
 
 MOST_ROWS = 30
+Lines = Mapping[str, Sequence[Run]]  # by arm, and those that are under way
 
 
 def of_runs(runs: Sequence[Run], arms: Arms) -> Iterator[Section]:
@@ -65,7 +66,7 @@ def _states(runs: Sequence[Run]) -> Section:
 
 def _training(runs: Sequence[Run], arms: Arms) -> Section:
     under_way = {run.folder.name: [run] for run in islice((run for run in runs if not run.summary and run.epochs), 3)}
-    lines = {**arms, **under_way}
+    lines: Lines = {**arms, **under_way}
     drawn = [
         plots.curves(_series(lines, "train/accuracy"), "accuracy, training", "epoch"),
         plots.curves(_series(lines, "validation/accuracy"), "accuracy, validation", "epoch"),
@@ -86,7 +87,7 @@ def _rounded(seconds: float | None) -> str:
     return "-" if seconds is None else f"{seconds:.2f}"
 
 
-def _series(lines: Arms, name: str) -> plots.Series:
+def _series(lines: Lines, name: str) -> plots.Series:
     return {arm: [_line(run, name) for run in group] for arm, group in lines.items()}
 
 
@@ -95,7 +96,7 @@ def _line(run: Run, name: str) -> tuple[list[float], list[float]]:
     return [x for x, _ in points], [y for _, y in points]
 
 
-def _recall(lines: Arms) -> plots.Series:
+def _recall(lines: Lines) -> plots.Series:
     """The share of an epoch's renders that the network got right as they were made."""
     fooled = _series(lines, "augment/fooled")
     return {arm: [(x, [1 - share for share in y]) for x, y in group] for arm, group in fooled.items()}

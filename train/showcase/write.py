@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from train.cli import one_sentence
@@ -63,7 +63,7 @@ def _holds_something(block: Block) -> bool:
     return bool(block)
 
 
-def _rendered(template: str, parts: Sequence[Section], about: str, source) -> str:
+def _rendered(template: str, parts: Sequence[Section], about: str, source: Callable[[Illustration], str]) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

@@ -9,7 +9,7 @@ from PIL import Image
 from augment.specimens import Specimens
 from train.photographs.shares import share
 from train.report import summarise
-from train.showcase.folders import Run
+from train.showcase.folders import FinishedRun
 from train.showcase.headline import headline
 from train.specimens import write_specimens
 
@@ -29,13 +29,13 @@ def keep_specimens(folder: Path, epoch: int, before: list[float], after: list[fl
 def arm(made_up_run, tmp_path):
     """The runs of an arm, a seed for each pair of hits and false alarms among ten."""
 
-    def make(name: str, *counts: tuple[int, int], overrides: Sequence[str] = ()) -> list[Run]:
+    def make(name: str, *counts: tuple[int, int], overrides: Sequence[str] = ()) -> list[FinishedRun]:
         runs = []
         for seed, (hits, alarms) in enumerate(counts):
             scores = {"recall": share(hits, 10), "false_alarms": share(alarms, 10), "auc": AUC}
             folder, settings = tmp_path / f"{name}{seed}", [f"seed={seed}", "evaluate.photos=/data/a", *overrides]
             made_up_run(folder, name, {"photographs": scores}, *settings)
-            runs.append(Run(folder, "finished", summarise(folder)))
+            runs.append(FinishedRun(folder, "finished", summarise(folder)))
         return runs
 
     return make

@@ -1,6 +1,7 @@
 """What it costs an attack to find only light that something can emit."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -100,8 +101,12 @@ def _outcome(scene: Scene, study: Study, radius: float | None, steps: int) -> tu
 
 def _without_negative(lights: Tensor) -> Tensor:
     """Lights (E, 49, 3) as environment maps hold them, from which what is negative is left out."""
-    clipped = [project(lambda at, light=light: _radiance(at, light).clamp(min=0), DEGREE) for light in lights]
+    clipped = [project(partial(_positive_radiance, light), DEGREE) for light in lights]
     return torch.stack(clipped).to(lights)
+
+
+def _positive_radiance(light: Tensor, directions: Tensor) -> Tensor:
+    return _radiance(directions, light).clamp(min=0)
 
 
 def _radiance(directions: Tensor, light: Tensor) -> Tensor:

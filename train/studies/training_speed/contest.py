@@ -68,7 +68,7 @@ def measure(settings: BenchmarkSettings, config: DictConfig, data: DataSet, devi
     recipe = plain.train
     train, validation = stratified_split(data.train, plain.data.validation, seed=0)
     work = Workload(
-        len(train), len(validation), adversarial.augment.examples, recipe.batch_size, settings.steps or None
+        len(train), len(validation), adversarial.augment.examples or 0, recipe.batch_size, settings.steps or None
     )
     validation = validation[: work.validated].to(device)
     mean, std = channel_statistics(data.train.images)
