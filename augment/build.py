@@ -9,7 +9,9 @@ from torch import Tensor
 
 from augment.backgrounds import load_backgrounds
 from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Scene
+from renderer.basis import HARMONICS, Sum
 from renderer.cache import OperatorCache
 from renderer.camera import ring
 from renderer.image import ImageSettings
@@ -31,6 +33,8 @@ def build_scene(
     backgrounds: Sequence[float | str | Path] = (0.5,),
     light: str | Tensor = "grace",
     exposure: float = 1.0,
+    projector: ProjectorSettings | None = None,
+    lamps: LampsSettings | None = None,
     polar: float = 60.0,
     azimuth: float = 0.0,
     field_of_view: float = 2.0,
@@ -47,20 +51,23 @@ def build_scene(
 
     meshes: (file, solid:NAME or `Mesh`; the name of its class) each, or `ObjectSettings`. shared: the views of an
     example share one light, shape or colour; otherwise each is an example. backgrounds: grey values or image files.
-    light: coefficients or what `renderer.load_light` takes; exposure multiplies it. polar: degrees off +z; azimuth: of
+    light: coefficients or what `renderer.load_light` takes; exposure multiplies it. projector,
+    lamps: that shine as well. polar: degrees off +z; azimuth: of
     the first view, off +x. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility:
     as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
-    coefficients = load_light(light) if isinstance(light, str) else light
+    sky = (load_light(light) if isinstance(light, str) else light) * exposure
+    placed = [each.build() for each in (projector, lamps) if each is not None]
     return Scene.grid(
         [_object(member, vertices) for member in meshes],
         ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
         load_backgrounds(backgrounds, size),
-        (coefficients * exposure).to(device),
+        torch.cat([sky, *(start.to(sky) for _, start in placed)]).to(device),
         ImageSettings(size, samples, encoding, normals, transport),
         choose(visibility) if isinstance(visibility, str) else visibility,
         operators,
         shared=shared,
+        basis=Sum((HARMONICS, *(basis for basis, _ in placed))) if placed else HARMONICS,
     )
 
 

@@ -1,4 +1,4 @@
-"""What an attack may change: lighting, skylight, geometry, albedo, pixels.
+"""What an attack may change: lighting, skylight, a projector's pattern, lamps, geometry, albedo, pixels.
 
 A kind of parameter turns flat values (A, D) into a part of the conditions that a mesh is rendered under; any of them
 can be attacked at once.
@@ -14,9 +14,11 @@ from torch import Tensor
 
 from augment.norm_ball import NormBall, anywhere
 from augment.scene import Conditions, Scene
-from renderer.basis import Ends
+from renderer.basis import Distant, Ends, Placed, parts_of
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
+from renderer.lamps import Lamps
 from renderer.lights import mean_luminance
+from renderer.projector import Projector
 from renderer.skylight import TURBIDITY, ZENITH, coefficients
 
 STEPS = ("unit", "raw", "sign")
@@ -115,25 +117,58 @@ class OfMesh(Kind):
         super().__init__(scene, start, settings, None if used.all() else used)
 
 
-class Lighting(Kind):
-    """Every coefficient of the light. The start is the examples' own; or, where light is to be physical, what is
-    nearest to it that something can emit, and so is every light from there on."""
+class OfLight(Kind):
+    """Every coefficient of one of the bases that a scene's light is of. The start is the examples' own; or, where light
+    is to be physical, what is nearest to it that something can emit, and so is every light from there on."""
 
-    name = "lighting"
-
-    def __init__(self, scene: Scene, settings: StepSettings, physical: bool = False):
-        self.physical = physical or not scene.basis.signed
-        start = scene.basis.nearest_physical(scene.lights) if self.physical else scene.lights
-        super().__init__(scene, start.flatten(1), settings)
+    def __init__(self, scene: Scene, settings: StepSettings, where: slice, basis: Distant | Placed, physical: bool):
+        """where: the coefficients of the basis among the scene's."""
+        self.basis, self.physical, self._where = basis, physical or not basis.signed, where
+        start = scene.lights[:, where]
+        super().__init__(scene, (basis.nearest_physical(start) if self.physical else start).flatten(1), settings)
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        return replace(conditions, light=values.unflatten(1, (-1, 3)))
+        light, own = conditions.light, values.unflatten(1, (-1, 3))
+        if own.shape[1] < light.shape[1]:
+            own = torch.cat([light[:, : self._where.start], own, light[:, self._where.stop :]], dim=1)
+        return replace(conditions, light=own)
 
     def within_domain(self, values: Tensor, ends: Ends | None = None) -> Tensor:
         if not self.physical:
             return super().within_domain(values, ends)
         of_lights = None if ends is None else (ends[0].unflatten(1, (-1, 3)), ends[1].unflatten(1, (-1, 3)))
-        return self.scene.basis.nearest_physical(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
+        return self.basis.nearest_physical(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
+
+
+class Lighting(OfLight):
+    """The light of the scene, or the first of several: that of the sky."""
+
+    name = "lighting"
+
+    def __init__(self, scene: Scene, settings: StepSettings, physical: bool = False):
+        super().__init__(scene, settings, *parts_of(scene.basis)[0], physical)
+
+
+class OfPlace(OfLight):
+    """The light from places, of which a scene has one kind each. InputError where it has none."""
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        found = [part for part in parts_of(scene.basis) if part[1].name == self.name]
+        if not found:
+            raise InputError(f"attack={self.name}: the scene has no {self.name}: set scene.{self.name}")
+        super().__init__(scene, settings, *found[0], physical=True)
+
+
+class ProjectorPattern(OfPlace):
+    """What a projector throws: each pixel's three channels, from 0 to its power."""
+
+    name = Projector.name
+
+
+class LampPowers(OfPlace):
+    """What each lamp emits, three channels from 0 to the largest power."""
+
+    name = Lamps.name
 
 
 class Skylight(Kind):
@@ -204,4 +239,6 @@ class Pixels(Kind):
         return replace(conditions, pixels=values.unflatten(1, (self.scene.views, 3, size, size)))
 
 
-KINDS: dict[str, Callable[..., Kind]] = {kind.name: kind for kind in (Lighting, Skylight, Geometry, Albedo, Pixels)}
+KINDS: dict[str, Callable[..., Kind]] = {
+    kind.name: kind for kind in (Lighting, Skylight, ProjectorPattern, LampPowers, Geometry, Albedo, Pixels)
+}

@@ -19,7 +19,7 @@ from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
 from augment.progress import progress
 from renderer.albedo import painted_albedo, surface_albedo
-from renderer.basis import HARMONICS, Basis
+from renderer.basis import HARMONICS, Basis, Sum
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
@@ -246,6 +246,8 @@ class Scene:
         light = conditions.light * self._exposure[examples]
         if conditions.vertices is None and conditions.albedo is None:
             return self._relit(light, examples)
+        if isinstance(self.basis, Sum):
+            raise InputError(f"light of {self.basis} falls on one shape in its colours: attack the light alone")
         return self._reshaded(light, conditions, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[_Layer]:

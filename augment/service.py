@@ -276,7 +276,7 @@ class AugmentationService:
         random, draws = self.settings.random, generator(self._seed, number, "lights")
         for kind, start in zip(problem.kinds, problem.split(problem.start), strict=True):
             if isinstance(kind, Lighting):
-                none = torch.zeros_like(problem.scene.lights[0], device="cpu")
+                none = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
                 offsets = perturb(none, len(start), random.amplitude, random.radius, draws)
                 yield start + offsets.flatten(1).to(start)
             else:

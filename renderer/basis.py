@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from renderer.harmonics import basis, irradiance_basis, live_coefficients
@@ -65,7 +66,47 @@ class Placed(Functions, Protocol):
         """All ways to surface points (S, 3) of unit normals (S, 3), were nothing in between."""
 
 
-Basis = Distant | Placed
+@dataclass(frozen=True)
+class Sum:
+    """Lights of several bases at once: the coefficients of one after the other."""
+
+    parts: tuple[Distant | Placed, ...]
+
+    def __str__(self) -> str:
+        return " and ".join(map(str, self.parts))
+
+    @property
+    def name(self) -> str:
+        return "+".join(part.name for part in self.parts)
+
+    @property
+    def signed(self) -> bool:
+        return any(part.signed for part in self.parts)
+
+    @property
+    def size(self) -> int:
+        return sum(part.size for part in self.parts)
+
+    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
+        whole = (coefficients, *(ends or ()))
+        split = zip(*(each.split([part.size for part in self.parts], dim=-2) for each in whole), strict=True)
+        nearest = [
+            part.nearest_physical(own, (its_ends[0], its_ends[1]) if its_ends else None)
+            for part, (own, *its_ends) in zip(self.parts, split, strict=True)
+        ]
+        return torch.cat(nearest, dim=-2)
+
+
+Basis = Distant | Placed | Sum
+
+
+def parts_of(basis: Basis) -> list[tuple[slice, Distant | Placed]]:
+    """(the coefficients of, each) basis that is no sum, in order."""
+    found, first = [], 0
+    for part in basis.parts if isinstance(basis, Sum) else (basis,):
+        found.append((slice(first, first + part.size), part))
+        first += part.size
+    return found
 
 
 @dataclass(frozen=True)

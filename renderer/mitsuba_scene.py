@@ -18,11 +18,15 @@ import torch
 from PIL import Image
 
 from renderer.albedo_bake import with_added_albedo
+from renderer.basis import Distant, Placed
 from renderer.camera import OrthographicCamera
+from renderer.environment import write_map
 from renderer.errors import InputError
 from renderer.image import ImageSettings, bounces, decode
+from renderer.lamps import Lamps
 from renderer.mesh import Mesh
 from renderer.mesh_export import DISTANCE, corner_normals
+from renderer.projector import Projector
 
 SCENE = "scene.xml"
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
@@ -34,20 +38,37 @@ _XML = """<scene version="3.0.0">
     <emitter type="envmap">
         <string name="filename" value="{light}"/>
         <float name="scale" value="{scale}"/>
+        <float name="sampling_weight" value="{sky_weight}"/>
         <transform name="to_world"><matrix value="{to_z_up}"/></transform>
     </emitter>
+{placed}
 {sensors}
 {shapes}
 </scene>
 """
 _DIRECT = (
-    '<integrator type="direct"><integer name="emitter_samples" value="0"/><integer name="bsdf_samples" value="1"/>'
+    '<integrator type="direct"><integer name="emitter_samples" value="{emitter_samples}"/><integer name="bsdf_samples" value="1"/>'
     '<boolean name="hide_emitters" value="true"/></integrator>'
 )
 _PATH = (
     '<integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="{depth}"/>'
     '<boolean name="hide_emitters" value="true"/></integrator>'
 )
+_PROJECTOR = """    <emitter type="projector">
+        <texture name="irradiance" type="bitmap">
+            <string name="filename" value="{file}"/>
+            <boolean name="raw" value="true"/>
+            <string name="filter_type" value="nearest"/>
+            <string name="wrap_mode" value="clamp"/>
+        </texture>
+        <float name="fov" value="{degrees}"/>
+        <float name="scale" value="{scale}"/>
+        <transform name="to_world"><matrix value="{pose}"/></transform>
+    </emitter>"""
+_LAMP = """    <emitter type="point">
+        <point name="position" x="{}" y="{}" z="{}"/>
+        <rgb name="intensity" value="{} {} {}"/>
+    </emitter>"""
 _SENSOR = """    <sensor type="orthographic">
         <transform name="to_world"><matrix value="{pose}"/></transform>
         <film type="hdrfilm">
@@ -71,17 +92,26 @@ _BITMAP = (
 
 
 def write_mitsuba_scene(
-    folder: Path, mesh: Mesh, gain: float, cameras: Sequence[OrthographicCamera], settings: ImageSettings, light: str
+    folder: Path,
+    mesh: Mesh,
+    gain: float,
+    cameras: Sequence[OrthographicCamera],
+    settings: ImageSettings,
+    light: str,
+    placed: Sequence[tuple[Distant | Placed, torch.Tensor]] = (),
 ) -> None:
     """Write a folder whose scene.xml shows a mesh to each camera, a sensor each. light: the map's file, as seen from
-    there. Where a texture is on corners of other colours it is painted anew, since Mitsuba has no product of the two.
+    there. placed: projectors and lamps, with their coefficients. Where a texture is on corners of other colours it is
+    painted anew, since Mitsuba has no product of the two.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), settings.encoding)
     count = bounces(settings.transport)
     scene = _XML.format(
-        integrator=_PATH.format(depth=count + 2) if count else _DIRECT,
+        integrator=_PATH.format(depth=count + 2) if count else _DIRECT.format(emitter_samples=1 if placed else 0),
+        sky_weight=0 if placed else 1,  # surfaces find the sky by themselves, with less noise
+        placed="\n".join(emitter for lit in placed for emitter in _emitters(folder, *lit, gain)),
         light=escape(light),
         scale=math.pi * gain,
         to_z_up=_TO_Z_UP,
@@ -121,13 +151,34 @@ def mitsuba() -> Iterator[Any]:
             module.set_variant(before)
 
 
-def _sensor(camera: OrthographicCamera, size: int) -> str:
-    """Mitsuba's orthographic camera looks along +z, has x to the left, and sees [-1, 1] in x and y."""
+def _emitters(folder: Path, basis: Distant | Placed, coefficients: torch.Tensor, gain: float) -> Iterator[str]:
+    """The scales make up for what `write_mitsuba_scene` says of the sky's; a projector's radiance is over π already."""
+    if isinstance(basis, Lamps):
+        for place, power in zip(basis.places, (math.pi * gain * coefficients).tolist(), strict=True):
+            yield _LAMP.format(*place, *power)
+    elif isinstance(basis, Projector):
+        write_map(folder / "pattern.exr", coefficients.view(basis.pixels, basis.pixels, 3))
+        camera = OrthographicCamera(basis.polar, basis.azimuth, 2.0)
+        yield _PROJECTOR.format(
+            file="pattern.exr",
+            degrees=math.degrees(basis.field_of_view),
+            scale=gain * basis.distance**2,
+            pose=_pose(camera, basis.distance),
+        )
+
+
+def _pose(camera: OrthographicCamera, distance: float) -> str:
+    """Mitsuba's cameras and projectors look along +z and have x to the left."""
     right, up, back = camera.axes()
     half, pose = camera.field_of_view / 2, np.eye(4)
     pose[:3, :3] = np.stack([-half * right, half * up, -back], axis=1)
-    pose[:3, 3] = DISTANCE * back - camera.right * right - camera.up * up
-    return _SENSOR.format(pose=" ".join(f"{value:.17g}" for value in pose.ravel()), size=size, samples=SAMPLES)
+    pose[:3, 3] = distance * back - camera.right * right - camera.up * up
+    return " ".join(f"{value:.17g}" for value in pose.ravel())
+
+
+def _sensor(camera: OrthographicCamera, size: int) -> str:
+    """Mitsuba's orthographic camera sees [-1, 1] in x and y."""
+    return _SENSOR.format(pose=_pose(camera, DISTANCE), size=size, samples=SAMPLES)
 
 
 def _write_parts(folder: Path, mesh: Mesh, settings: ImageSettings) -> Iterator[str]:

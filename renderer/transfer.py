@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer.albedo import surface_albedo
-from renderer.basis import HARMONICS, Basis, Distant, Placed
+from renderer.basis import HARMONICS, Basis, Distant, Placed, parts_of
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
@@ -176,23 +176,40 @@ def build_operator(
         factor = torch.ones(len(fragments.pixels), 3)
     else:
         albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
-    if isinstance(basis, Placed):
-        transfer, kept = placed_transfer(mesh, fragments, albedo, settings, basis)
-    else:
-        transfer = _box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype)
-        kept = basis.live
-        change = transport.change(fragments, albedo) if transport else None
-        if change is not None:
-            transfer, kept = change.index_add_(1, kept, transfer.double()), torch.arange(basis.size)
+    transfers, kept = [], []
+    for where, part in parts_of(basis):
+        if isinstance(part, Placed):
+            transfer, reaching = placed_transfer(mesh, fragments, albedo, settings, part)
+        else:
+            transfer, reaching = _distant_transfer(mesh, fragments, albedo, settings, part, dtype, transport)
+        transfers.append(transfer.to(dtype))
+        kept.append(where.start + reaching)
     return Operator(
-        transfer=transfer.to(dtype),
+        transfer=torch.cat(transfers, dim=1),
         albedo=factor.T.to(dtype).contiguous(),
         coverage=fragments.coverage.to(dtype),
         pixels=fragments.pixels,
-        kept=kept,
+        kept=torch.cat(kept),
         settings=settings,
         basis=basis,
     )
+
+
+def _distant_transfer(
+    mesh: Mesh,
+    fragments: Fragments,
+    albedo: Tensor,
+    settings: ImageSettings,
+    basis: Distant,
+    dtype: torch.dtype,
+    transport: Transport | None,
+) -> tuple[Tensor, Tensor]:
+    """((C, K, P), the K coefficients that reach a pixel (K,)); albedo: (S, C), at the samples."""
+    transfer = _box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype)
+    change = transport.change(fragments, albedo) if transport else None
+    if change is None:
+        return transfer, basis.live
+    return change.index_add_(1, basis.live, transfer.double()), torch.arange(basis.size)
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:

@@ -7,7 +7,7 @@ what the surface there sends instead (`renderer.radiosity`).
 import torch
 from torch import Tensor
 
-from renderer.basis import Basis, Distant, Placed
+from renderer.basis import Basis, Distant, Placed, parts_of
 from renderer.errors import InputError
 from renderer.fragments import Fragments
 from renderer.image import ImageSettings, bounces
@@ -58,8 +58,8 @@ class Transport:
 def build_transport(mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis) -> Transport | None:
     """None where light goes from the sky to a surface and from there to the camera only, and where it comes from
     places: that throws shadows anyway. InputError: bounces of such light."""
-    if isinstance(basis, Placed):
-        if bounces(settings.transport):
-            raise InputError(f"renderer.transport={settings.transport}: light of {basis} does not bounce; set shadows")
-        return None
-    return None if settings.transport == "direct" else Transport(mesh, settings, gain, basis)
+    parts = [part for _, part in parts_of(basis)]
+    distant = [part for part in parts if not isinstance(part, Placed)]
+    if len(distant) < len(parts) and bounces(settings.transport):
+        raise InputError(f"renderer.transport={settings.transport}: light of {basis} does not bounce; set shadows")
+    return Transport(mesh, settings, gain, distant[0]) if distant and settings.transport != "direct" else None

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from augment.objects import ObjectSettings
+from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import count_views
 from augment.service import AugmentationSettings
 from renderer.cache import OperatorCache, cache_folder
@@ -71,6 +72,8 @@ class SceneSettings:
     vertices: int = 0
     light: str = "grace"
     exposure: float = 1.0
+    projector: ProjectorSettings | None = None
+    lamps: LampsSettings | None = None
 
     def __post_init__(self) -> None:
         require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)

@@ -1,7 +1,8 @@
 """An adversary as a folder: adversary.json, which describes it, and the files that it names.
 
-mesh.glb has normals, albedo and cameras; light.json all coefficients; light.hdr and light.exr are there where a lamp
-could shine so, which is where radiance is negative nowhere. Images are before_0.png, after_0.png, ... by view, and
+mesh.glb has normals, albedo and cameras; light.json all coefficients of the sky, projector.json (whose pattern is
+projector.png, too) and lamps.json those of lights in the scene; light.hdr and light.exr are there where a lamp could
+shine so, which is where radiance is negative nowhere. Images are before_0.png, after_0.png, ... by view, and
 before.npy, after.npy (V, 3, size, size) unrounded. mitsuba/scene.xml shows it in Mitsuba 3.
 """
 
@@ -17,7 +18,7 @@ from torch import Tensor
 from augment.attacks.adversary import Adversary
 from augment.backgrounds import load_background
 from augment.objects import SceneObject
-from renderer.basis import HARMONICS
+from renderer.basis import HARMONICS, Sum, parts_of
 from renderer.camera import OrthographicCamera
 from renderer.environment import negative_share, to_map, write_map
 from renderer.errors import FACTOR, InputError, require_bounded, require_range
@@ -26,6 +27,7 @@ from renderer.lights import load_light, save_light
 from renderer.mesh import load_mesh
 from renderer.mesh_export import export_mesh
 from renderer.mitsuba_scene import write_mitsuba_scene
+from renderer.placed_files import load_placed, save_placed
 
 DESCRIPTION, MESH, LIGHT, BACKGROUND, PIXELS = (
     "adversary.json",
@@ -44,13 +46,17 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     folder.mkdir(parents=True, exist_ok=True)
     shown, settings = adversary.shown, adversary.settings
     export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras)
-    save_light(folder / LIGHT, adversary.light, adversary.basis)
+    (where, sky), *placed = parts_of(adversary.basis)
+    save_light(folder / LIGHT, adversary.light[where], sky)
+    for own, basis in placed:
+        save_placed(folder / f"{basis.name}.json", adversary.light[own], basis)
     description = {
         "label": shown.label,
         "name": Path(shown.name).name,
         "mesh": MESH,
         "gain": shown.gain,
         "light": LIGHT,
+        "placed_lights": [f"{basis.name}.json" for _, basis in placed],
         "background": _write_background(adversary.background, folder),
         "cameras": [asdict(camera) for camera in adversary.cameras],
         "image": asdict(settings),
@@ -68,12 +74,14 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
 
 def _write_radiance(adversary: Adversary, folder: Path) -> dict[str, float]:
     """The light's maps, and the Mitsuba scene, in which what is negative of the light is left out."""
-    radiance = to_map(adversary.light, MAP_HEIGHT)
+    where, _ = parts_of(adversary.basis)[0]
+    radiance = to_map(adversary.light[where], MAP_HEIGHT)
     if radiance.min() >= -NOWHERE * radiance.max():
         for suffix in (".hdr", ".exr"):
             write_map(folder / f"light{suffix}", radiance)
-    shown = adversary.shown
-    write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.gain, adversary.cameras, adversary.settings, "light.exr")
+    shown, placed = adversary.shown, [(basis, adversary.light[own]) for own, basis in parts_of(adversary.basis)[1:]]
+    cameras, settings = adversary.cameras, adversary.settings
+    write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.gain, cameras, settings, "light.exr", placed)
     write_map(folder / MITSUBA / "light.exr", radiance.clamp(min=0))
     return {"negative_light": negative_share(radiance)}
 
@@ -90,6 +98,7 @@ def read_adversary(folder: Path) -> Adversary:
         label, name, gain = str(description["label"]), str(description["name"]), float(description["gain"])
         mesh, light, pixels = (folder / str(description.get(key)) for key in ("mesh", "light", "pixels"))
         background = description["background"]
+        placed = [load_placed(folder / str(file)) for file in description.get("placed_lights", [])]
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
@@ -101,8 +110,8 @@ def read_adversary(folder: Path) -> Adversary:
     return Adversary(
         shown=SceneObject(label, load_mesh(mesh), gain, name),
         cameras=cameras,
-        light=load_light(str(light)),
-        basis=HARMONICS,
+        light=torch.cat([load_light(str(light)), *(coefficients for _, coefficients in placed)]),
+        basis=Sum((HARMONICS, *(basis for basis, _ in placed))) if placed else HARMONICS,
         background=load_background(folder / background if isinstance(background, str) else background, settings.size),
         settings=settings,
         images_before=_read_images(folder / f"{BEFORE}.npy", shape),

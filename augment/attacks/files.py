@@ -16,6 +16,7 @@ from augment.attacks.figure import Exhibit, answer_caption, save_figure
 from augment.attacks.run import Attacked
 from augment.attacks.verification import Verdict, verify
 from augment.scene import Conditions
+from renderer.basis import parts_of
 from renderer.light_sphere import light_sphere
 from renderer.mesh_damage import mesh_damage
 
@@ -67,7 +68,8 @@ def _exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Con
         answer_caption(view.softmax(0), classes, classes[label])
         for view, label in zip(logits[example], labels, strict=True)
     ]
-    spheres = [light_sphere(conditions.light[example], SPHERE, camera) for camera in scene.cameras[example]]
+    sky, _ = parts_of(scene.basis)[0]
+    spheres = [light_sphere(conditions.light[example, sky], SPHERE, camera) for camera in scene.cameras[example]]
     return Exhibit(images[example], captions, torch.stack(spheres))
 
 

@@ -38,6 +38,8 @@ class AttackSettings:
 
     lighting: StepSettings | None = None
     skylight: SkylightSettings | None = None
+    projector: StepSettings | None = None
+    lamps: StepSettings | None = None
     geometry: StepSettings | None = None
     albedo: StepSettings | None = None
     pixels: StepSettings | None = None

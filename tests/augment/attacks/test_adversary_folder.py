@@ -18,6 +18,7 @@ from renderer.mesh import Mesh
 from renderer.shapes import solid
 from renderer.visibility import choose
 
+OTHER_LIGHTS = {"skylight", "projector", "lamps"}
 CLASSES = ("orange", "lime", "sky")
 SOFTWARE = choose("software")
 
@@ -50,7 +51,9 @@ def adversary_of(done: augment.Attacked) -> Adversary:
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 @pytest.mark.parametrize(
-    "kinds", [{"lighting"}, {"geometry"}, {"albedo"}, {"pixels"}, set(KINDS) - {"skylight"}], ids=str
+    "kinds",
+    [{"lighting"}, {"geometry"}, {"albedo"}, {"pixels"}, set(KINDS) - OTHER_LIGHTS],
+    ids=str,
 )
 def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, kinds, encoding):
     """And exactly but for rounding to float32 where no texture is painted."""

@@ -1,0 +1,117 @@
+import math
+
+import pytest
+import torch
+from PIL import Image
+
+import augment
+from augment.attacks.adversary import Adversary
+from augment.attacks.adversary_folder import read_adversary, write_adversary
+from augment.parameters import LampPowers, Lighting, ProjectorPattern, StepSettings
+from augment.perturbation import Perturbation
+from augment.placed_lights import LampsSettings, ProjectorSettings
+from augment.scene import Conditions, Scene
+from renderer.errors import InputError
+from renderer.visibility import choose
+
+SIZE, EVERY = 16, torch.arange(2)
+PROJECTOR = ProjectorSettings(pixels=6, polar=50, azimuth=10, power=2.0, pattern=0.1)
+LAMPS = LampsSettings([[2, 0, 2], [0, 2, 2]], start=[[0.5, 0.4, 0.3], [0.1, 0.2, 0.3]])
+CLASSES = ("orange", "lime", "sky")
+
+
+def scene(**choices) -> Scene:
+    """Two views of an orange before grey."""
+    lights = {"projector": PROJECTOR, "lamps": LAMPS, "light": "st_peters"} | choices
+    return augment.build_scene([("solid:orange", "orange")], SIZE, 2, visibility="software", **lights)
+
+
+def test_the_image_under_several_lights_is_the_sum_of_those_under_each():
+    """Where nothing is clamped, over black."""
+    dark = {"backgrounds": [0.0], "exposure": 0.2}
+    both, sky = scene(**dark), scene(**dark, projector=None, lamps=None)
+    thrown, lamps = (scene(**dark | {"exposure": 1e-9, other: None}) for other in ("lamps", "projector"))
+    images = [each.render(each.conditions(EVERY), EVERY) for each in (both, sky, thrown, lamps)]
+    assert images[0].max() < 1 and all(image.max() > 0.05 for image in images)
+    torch.testing.assert_close(images[0], sum(images[1:]), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [Lighting, ProjectorPattern, LampPowers])
+def test_each_light_is_attacked_alone_and_by_the_gradient_of_its_image(kind):
+    shown = scene(exposure=0.3)
+    problem = Perturbation(shown, [kind(shown, StepSettings())])
+    draws = torch.Generator().manual_seed(0)
+    values = problem.start.clone().requires_grad_(True)
+    images = problem.render(values, EVERY)
+    weights, offset = torch.rand(images.shape, generator=draws), torch.rand(values.shape, generator=draws)
+    (gradient,) = torch.autograd.grad((images * weights).sum(), values)
+    moved = problem.render(problem.start + 1e-2 * offset, EVERY)
+    slope = (weights.double() * (moved - images.detach()).double()).sum() / 1e-2
+    torch.testing.assert_close((gradient * offset).double().sum(), slope, rtol=1e-3, atol=0)
+    light, before = problem.conditions(problem.start + offset, EVERY).light, shown.lights
+    assert int((light != before).any(2).any(0).sum()) == values.shape[1] // 3
+
+
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_patterns_and_powers_keep_to_what_is_possible_and_to_their_ball(norm):
+    shown = scene()
+    for kind, most in ((ProjectorPattern, 2.0), (LampPowers, 10.0)):
+        changed = kind(shown, StepSettings(norm, 0.4))
+        wanted = changed.start + 9 * torch.randn(changed.start.shape, generator=torch.Generator().manual_seed(1))
+        for values in (changed.project(wanted, EVERY), changed.sample(torch.Generator().manual_seed(2), EVERY)):
+            assert values.min() >= 0 and values.max() <= most
+            reach = (values - changed.start).norm(dim=1) if norm == "l2" else (values - changed.start).abs()
+            assert reach.max() <= 0.4 * (1 + 1e-5)
+
+
+def test_an_adversary_with_lights_in_the_scene_is_read_back_and_seen_by_mitsuba(tmp_path):
+    """Within 2/255 at the median: Mitsuba draws one of the lights for each ray, and outlines have four samples here."""
+    classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
+    steps = StepSettings("linf", None, "unit", 0.5)
+    settings = augment.AttackSettings(projector=steps, lamps=steps, max_steps=3)
+    done = augment.attack(classifier, scene(exposure=0.3), settings=settings, force=True)
+    assert (done.images - done.images_before).abs().max() > 0.05
+    written = Adversary.of(done.problem.scene, 0, done.conditions, done.images_before[0], done.images[0])
+    write_adversary(written, tmp_path)
+    found = read_adversary(tmp_path)
+    assert torch.equal(found.light, written.light) and found.basis == written.basis
+    torch.testing.assert_close(found.render(choose("software")), done.images[0], rtol=0, atol=1e-6)
+    thrown, pattern = ProjectorSettings(6, power=2.0, pattern=str(tmp_path / "projector.png")).build()
+    torch.testing.assert_close(pattern, written.light[49:85], rtol=0, atol=thrown.power / 255)
+
+    pytest.importorskip("mitsuba")
+    from augment.attacks.verification import rendered
+
+    seen = rendered(tmp_path, "mitsuba", choose("software"))
+    assert (seen - done.images[0]).abs().median() < 2 / 255
+
+
+def test_a_pattern_is_read_from_an_image(tmp_path):
+    pixels = torch.randint(256, (6, 6, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    Image.fromarray(pixels.numpy()).save(tmp_path / "pattern.png")
+    basis, pattern = ProjectorSettings(pixels=6, power=2.0, pattern=str(tmp_path / "pattern.png")).build()
+    torch.testing.assert_close(pattern, 2 * pixels.flatten(0, 1).float() / 255)
+    assert basis.field_of_view == math.radians(30)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ProjectorSettings(pixels=0).build(), r"projector\.pixels=0 must be"),
+        (lambda: ProjectorSettings(distance=1.0).build(), r"projector\.distance=1\.0 must be"),
+        (lambda: ProjectorSettings(field_of_view=180).build(), r"scene\.projector\.field_of_view=180"),
+        (lambda: LampsSettings([[0, 0, 0]]).build(), r"none at the origin"),
+        (lambda: LampsSettings([[1, 0]]).build(), r"scene\.lamps: give places"),
+        (lambda: LampsSettings(start=[[1], [2]]).build(), r"scene\.lamps: give places"),
+        (lambda: ProjectorPattern(scene(projector=None), StepSettings()), r"no projector: set scene\.projector"),
+    ],
+)
+def test_lights_that_make_no_sense_are_refused_by_name(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_shapes_and_colours_are_not_attacked_under_lights_in_the_scene():
+    shown = scene()
+    with pytest.raises(InputError, match="attack the light alone"):
+        shown.render(Conditions(shown.lights, vertices=shown.vertices.expand(2, -1, -1)), EVERY)
