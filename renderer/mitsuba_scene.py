@@ -47,8 +47,8 @@ _XML = """<scene version="3.0.0">
 </scene>
 """
 _DIRECT = (
-    '<integrator type="direct"><integer name="emitter_samples" value="{emitter_samples}"/><integer name="bsdf_samples" value="1"/>'
-    '<boolean name="hide_emitters" value="true"/></integrator>'
+    '<integrator type="direct"><integer name="emitter_samples" value="{emitter_samples}"/>'
+    '<integer name="bsdf_samples" value="1"/><boolean name="hide_emitters" value="true"/></integrator>'
 )
 _PATH = (
     '<integrator type="path"><integer name="max_depth" value="{depth}"/><integer name="rr_depth" value="{depth}"/>'

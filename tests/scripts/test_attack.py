@@ -107,7 +107,7 @@ def test_an_adversary_is_rendered_again_and_gone_on_from(run, tmp_path, capsys):
 
 
 REFUSED = [
-    (["attack=lihgting"], "attack=lihgting is not known: choose from lighting, skylight, geometry, albedo, pixels"),
+    (["attack=lihgting"], "attack=lihgting is not known: choose from lighting, skylight, projector, lamps, geometry"),
     (["attack=null"], "attack=null is not known: choose from lighting"),
     (["attack=[]"], "attack: name what to change"),
     (["attack=lighting+skylight"], "attack: lighting and skylight both set the light: choose one of them"),

@@ -48,7 +48,8 @@ def _brightest(
     lights = list(product(dict.fromkeys([settings.scene.light, *PROBES]), EXPOSURES))
     exposures = [settings.scene.exposure * factor for _, factor in lights]
     coefficients = [load_light(name) * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
-    lit = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(device)
+    sky = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(device)
+    lit = torch.cat([sky, scene.lights.repeat(len(lights), 1, 1)[:, sky.shape[1] :]], dim=1)  # projector and lamps stay
     rows = scene.with_rows([*scene.examples] * len(lights), light=lit)
     confidence, index = _confidence(rows, settings, classifier, len(lights)).max(0)
     return float(confidence), replace(settings.scene, light=lights[index][0], exposure=exposures[index])
