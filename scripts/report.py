@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +26,8 @@ class Settings:
 
 def main(settings: Settings) -> None:
     out = settings.out or os.path.commonpath([Path(run).absolute() for run in settings.runs])
-    print(f"report: {write_report([Path(run) for run in settings.runs], writable_folder(out, 'out'))}")
+    page = write_report([Path(run) for run in settings.runs], writable_folder(out, "out"))
+    print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB; {time.process_time():.0f} s of one core)")
 
 
 def _as_overrides(arguments: list[str]) -> list[str]:

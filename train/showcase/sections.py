@@ -14,7 +14,8 @@ from train.showcase.command import training_command
 from train.showcase.folders import Run
 from train.tables import Table
 
-MOST_ROWS = 30
+MOST_ROWS, MOST_UNFINISHED = 30, 3  # rows of a table, and lines in plots
+LONGEST_NAME = 24  # characters of an unfinished run's folder in a legend
 Lines = Mapping[str, Sequence[Run]]  # by arm, and those that are under way
 
 
@@ -65,7 +66,8 @@ def _states(runs: Sequence[Run]) -> Section:
 
 
 def _training(runs: Sequence[Run], arms: Arms) -> Section:
-    under_way = {run.folder.name: [run] for run in islice((run for run in runs if not run.summary and run.epochs), 3)}
+    unfinished = islice((run for run in runs if not run.summary and run.epochs), MOST_UNFINISHED)
+    under_way = {f"unfinished: {run.folder.name[-LONGEST_NAME:]}": [run] for run in unfinished}
     lines: Lines = {**arms, **under_way}
     drawn = [
         plots.curves(_series(lines, "train/accuracy"), "accuracy, training", "epoch"),

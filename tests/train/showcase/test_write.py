@@ -80,6 +80,7 @@ def test_runs_in_every_state_are_shown_or_named(page):
     for name in ("damaged", "old"):
         assert re.search(rf"/{name}</td><td[^>]*>cannot be read: [^<]*/{name}", text)
     assert "2 of 8 runs finished" in text
+    assert re.search(r'alt="accuracy, training over epochs, at the end: [^"]*unfinished: going 0.50"', text)
     assert "1 attacks" in text and "in 1 of 2, 1 more being wrong before any step" in text
 
 
