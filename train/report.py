@@ -5,9 +5,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
@@ -204,7 +205,10 @@ def _values(group: Sequence[RunSummary], folder: str) -> list[tuple[float | None
 
 def _spread(values: Sequence[float | None]) -> str:
     known = [value for value in values if value is not None]
-    return f"{fmean(known):.3f} ± {stdev(known):.3f}" if len(known) == len(values) else "-"
+    if len(known) < len(values):
+        return "-"
+    with np.errstate(invalid="ignore"):  # where a damaged file has no finite number
+        return f"{np.mean(known):.3f} ± {np.std(known, ddof=1):.3f}"
 
 
 def _card(run: RunSummary, name: str) -> str:

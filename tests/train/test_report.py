@@ -1,4 +1,5 @@
 import json
+import math
 
 import pytest
 from scipy.stats import binomtest
@@ -104,6 +105,16 @@ def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_
         ],
     }
     assert format_spread(runs[2:]) == ""
+
+
+def test_a_number_that_is_none_in_a_file_spreads_to_none(tmp_path, made_up_run):
+    """JSON has no NaN and no infinity, but Python reads them."""
+    recalled = [share(2, 10), share(2, 10) | {"value": math.nan}, share(2, 10) | {"value": math.inf}]
+    runs = [
+        summarise(made_up_run(tmp_path / f"{seed}", "none", {"lab": {"recall": recall}}, f"seed={seed}"))
+        for seed, recall in enumerate(recalled)
+    ]
+    assert "nan ± nan" in format_spread(runs[:2]) and "inf ± nan" in format_spread([runs[0], runs[2]])
 
 
 def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_machine(
