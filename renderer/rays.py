@@ -24,6 +24,7 @@ from renderer.shading import smooth_normals
 
 DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
 OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32
+COMPARISONS = 2**30  # of faces with vertices: about a second
 BLOCK = 2**17  # directions of pixels at a time: bounds the memory
 
 
@@ -91,8 +92,12 @@ class Rays:
             yield Looks(some, directions, sample, cosine * of_pixel * solid_angle, met)
 
     def _overlooked(self, fragments: Fragments, planes: Tensor, corners: Tensor) -> Tensor:
-        """The pixels with a sample on a face above whose plane, through a corner, the mesh rises. (G, 3) each."""
-        reach = torch.cat([(part @ self._outermost.T).amax(1) for part in planes.split(BLOCK // 2**7)])
+        """The pixels with a sample on a face above whose plane, through a corner, the mesh rises; all of them, where to
+        find out would take longer than to cast the rays. planes, corners: (G, 3)."""
+        if len(planes) * len(self._outermost) > COMPARISONS:
+            return torch.arange(len(fragments.pixels))
+        parts = planes.split(max(1, 8 * BLOCK // len(self._outermost)))
+        reach = torch.cat([(part @ self._outermost.T).amax(1) for part in parts])
         rises = reach - (planes * corners).sum(1) > self.offset
         return fragments.pixel[rises[fragments.face]].unique()
 

@@ -37,9 +37,11 @@ class Transport:
         """
         change, weights = None, albedo.T / fragments.samples**2
         for looks in self._rays.looks(fragments):
+            blocked = looks.blocked()
+            if not blocked.any():
+                continue
             if change is None:
                 change = self._sky.new_zeros(len(weights), self._sky.shape[1], len(fragments.pixels))
-            blocked = looks.blocked()
             for channel, (added, weight) in enumerate(zip(change, weights, strict=True)):
                 lost = blocked * weight[looks.sample]
                 added[:, looks.pixels] = -(lost @ self._sky).T

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from renderer import radiosity, reference
+from renderer import radiosity, rays, reference
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
@@ -90,6 +90,21 @@ def test_a_convex_mesh_keeps_the_operator_of_direct_light_to_the_bit(mesh, norma
         shaped = operator_of(mesh, camera, transport, normals=normals)
         assert torch.equal(shaped.transfer, direct.transfer)
         assert torch.equal(shaped.kept, live_coefficients(6))
+
+
+def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monkeypatch):
+    monkeypatch.setattr(rays, "COMPARISONS", 0)
+    assert torch.equal(operator_of(CONVEX["a ball"]).kept, live_coefficients(6))
+    assert len(operator_of(dented()).kept) == 49
+
+
+@pytest.mark.parametrize("transport", ["shadows", "bounces:1"])
+def test_a_mesh_outside_the_image_has_no_pixels_and_faces_without_area_do_no_harm(transport, monkeypatch):
+    monkeypatch.setattr(radiosity, "PATCHES", 2**7)
+    outside = OrthographicCamera(0, 0, 1.0, right=20.0)
+    assert not operator_of(dented(), outside, transport).transfer.numel()
+    thin = replace(parts(), faces=np.concatenate([parts().faces[:-1], [[0, 0, 1]]]))
+    assert operator_of(thin, transport=transport).transfer.isfinite().all()
 
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])

@@ -1,0 +1,10 @@
+"""What shadows and bounces cost, and how right they are: python scripts/benchmark_transport.py
+
+Writes docs/transport.md. Takes a few minutes on one CPU thread, and needs the extras `shadows` and `lab`.
+"""
+
+from train.cli import script
+from train.studies.transport.study import TransportSettings, run
+
+if __name__ == "__main__":
+    script(run, TransportSettings)

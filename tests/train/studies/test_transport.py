@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from renderer import rays
+from renderer.image import ImageSettings
+from renderer.mesh import Mesh
+from renderer.shapes import solid
+from train.studies.transport import beside_mitsuba, cost, held
+
+
+@pytest.fixture
+def few_rays(monkeypatch):
+    monkeypatch.setattr(rays, "DIRECTIONS", 64)
+    monkeypatch.setattr(cost, "VIEWS", 1)
+    monkeypatch.setattr(cost, "CONVERGED", 1024)
+
+
+def pit() -> tuple[list, list]:
+    """A square hole of width and depth 1: floor and walls, facing inward."""
+    corners = [[x, y, z] for z in (0, 1) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
+    walls = [face for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)) for face in ([a, 4 + a, b], [b, 4 + a, 4 + b])]
+    return corners, [[0, 1, 2], [0, 2, 3], *walls]
+
+
+def cells(table: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+
+
+@pytest.mark.slow
+def test_costs_are_of_each_transport_against_direct_light(few_rays):
+    clock = cost.Clock(torch.device("cpu"), rounds=1)
+    mesh = Mesh.plain(*pit(), np.eye(3)[[0, 1, 2, 0, 1, 2, 0, 1]])
+    rows = cells(cost.costs({"grey": cost.grey(mesh), "coloured": mesh}, [8], clock))
+    assert [row[:2] for row in rows] == [[name, each] for name in ("grey", "coloured") for each in cost.TRANSPORTS]
+    assert [row[3] for row in rows] == ["1 × 31", "1 × 49", "1 × 49", "3 × 31", "3 × 49", "3 × 49"]
+    assert rows[0][5].endswith("1.00 ×") and rows[3][5].endswith("1.00 ×")
+
+
+@pytest.mark.slow
+def test_more_rays_err_less_and_the_number_is_put_back(few_rays, monkeypatch):
+    monkeypatch.setattr(cost, "DIRECTIONS", (32, 512))
+    errors = [float(row[2].rstrip("%")) for row in cells(cost.errors_by_rays(solid("cup", 0), 12))]
+    assert errors[0] > 2 * errors[1] > 0
+    assert rays.DIRECTIONS == 64
+
+
+def test_held_shadows_err_less_than_the_image_changes():
+    for _, error, change in cells(held.table(solid("cup", 0)))[:2]:
+        assert float(error.rstrip("%")) < float(change.rstrip("%")) < 5
+
+
+def test_mitsubas_image_is_in_the_place_of_ours(monkeypatch):
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(beside_mitsuba, "SEEDS", 2)
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    mesh, settings = Mesh.plain(ball.vertices, ball.faces, (0.9, 0.5, 0.2)), ImageSettings(12)
+    theirs, noise = beside_mitsuba.mitsuba_image(mesh, settings)
+    off, inside = beside_mitsuba.ours(mesh, settings) - theirs, theirs[3] > 0.999
+    assert inside.sum() > 20 and noise[:3, inside].mean() > 0
+    assert off[:3, inside].abs().max() < 0.05 * theirs[:3].max()

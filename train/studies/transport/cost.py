@@ -1,0 +1,100 @@
+"""Time and memory of operators with shadows and bounces, beside those of direct light."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer import rays
+from renderer.camera import OrthographicCamera, ring
+from renderer.image import ImageSettings
+from renderer.lights import load_light
+from renderer.mesh import Mesh
+from renderer.transfer import Operator, build_operators
+from renderer.visibility import choose
+from train.studies.renderer_speed.measure import Clock
+from train.tables import markdown
+
+TRANSPORTS = ("direct", "shadows", "bounces:3")
+VIEWS, FIELD_OF_VIEW = 20, 2.2
+CONVERGED = 2**13  # directions
+RESOLUTION = 256  # of a depth map
+EACH = 8  # of them is timed
+DIRECTIONS = (128, 256, 512, 1024)
+
+
+def grey(mesh: Mesh) -> Mesh:
+    """Of one grey, which needs one channel where several colours need three."""
+    return replace(mesh, corner_colors=np.full_like(mesh.corner_colors, 0.5), texture_ids=np.full(len(mesh.faces), -1))
+
+
+def operators(mesh: Mesh, transport: str, size: int, views: int = VIEWS) -> list[Operator]:
+    settings = ImageSettings(size, transport=transport)
+    return build_operators(mesh, ring(views, FIELD_OF_VIEW), settings, choose("software"))
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """The process's own, the lesser of two calls."""
+    times = []
+    for _ in range(2):
+        start = time.process_time()
+        call()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+def light_step(operator: Operator, light: Tensor) -> None:
+    """An image, clamped, and the gradient of a loss by the light, which requires it."""
+    torch.autograd.grad(operator.image(light).square().sum(), light)
+
+
+def costs(meshes: dict[str, Mesh], sizes: Sequence[int], clock: Clock) -> str:
+    """A row per mesh and transport; all transports of a mesh take turns on the clock."""
+    rows, light = [], load_light("grace").requires_grad_()
+    for name, mesh in meshes.items():
+        builds = {each: seconds(lambda each=each, mesh=mesh: operators(mesh, each, sizes[0])) for each in TRANSPORTS}
+        steps = {}
+        for size in sizes:
+            views = {each: operators(mesh, each, size, 1)[0] for each in TRANSPORTS}
+            calls = {each: lambda view=view: light_step(view, light) for each, view in views.items()}
+            steps[size] = clock.medians(calls)
+        for each in TRANSPORTS:
+            views = operators(mesh, each, sizes[0])
+            channels, kept = views[0].transfer.shape[:2]
+            size = sum(view.transfer.numel() * view.transfer.element_size() for view in views) / 1e6
+            of_direct = [f"{by[each]:.3g} ms, {by[each] / by['direct']:.2f} ×" for by in steps.values()]
+            rows.append([name, each, f"{builds[each]:.2f}", f"{channels} × {kept}", f"{size:.1f}", *of_direct])
+    head = ["mesh", "transport", f"s for {VIEWS} views", "channels × coefficients", "MB"]
+    return markdown([*head, *(f"light step, {size}²" for size in sizes)], rows)
+
+
+def depth_maps(mesh: Mesh) -> float:
+    """Seconds to rasterise the mesh from as many directions as rays are cast in."""
+    some = rays.sphere(rays.DIRECTIONS)[::EACH]
+    z, azimuth = some[:, 2], torch.atan2(some[:, 1], some[:, 0])
+    cameras = [
+        OrthographicCamera(*angles, 2 * 3**0.5) for angles in zip(z.acos().tolist(), azimuth.tolist(), strict=True)
+    ]
+    points, backend = np.stack([camera.project(mesh.vertices) for camera in cameras]), choose("software")
+    return EACH * seconds(lambda: backend.rasterise(points, mesh.faces, RESOLUTION, closed=mesh.closed))
+
+
+def errors_by_rays(mesh: Mesh, size: int) -> str:
+    """Time for 20 views, and the root mean square error of two of them, by the number of directions."""
+    light, chosen, rows = load_light("grace"), rays.DIRECTIONS, []
+    try:
+        rays.DIRECTIONS = CONVERGED
+        exact = [view.radiance(light) for view in operators(mesh, "shadows", size, 2)]
+        for count in DIRECTIONS:
+            rays.DIRECTIONS = count
+            taken = seconds(lambda: operators(mesh, "shadows", size))
+            seen = operators(mesh, "shadows", size, 2)
+            off = [view.radiance(light) - true for view, true in zip(seen, exact, strict=True)]
+            error = torch.cat(off, dim=1).square().mean().sqrt() / torch.cat(exact, dim=1).max()
+            rows.append([str(count), f"{taken:.2f}", f"{error:.2%}", "default" if count == chosen else ""])
+    finally:
+        rays.DIRECTIONS = chosen
+    return markdown(["directions", f"s for {VIEWS} views", "error", ""], rows)

@@ -1,0 +1,101 @@
+"""docs/transport.md: what shadows and bounces cost and how right they are."""
+
+from dataclasses import dataclass
+
+import torch
+
+from renderer.mesh import normalise
+from renderer.rays import DIRECTIONS
+from renderer.shapes import solid
+from renderer.subdivision import subdivide
+from train.cli import command_line
+from train.outputs import writable_file
+from train.studies.page import joined, machine, wrapped, write
+from train.studies.renderer_speed.measure import Clock
+from train.studies.transport import beside_mitsuba, cost, held
+
+SIZES = (32, 224)
+
+TEXT = """
+# Shadows and bounces
+
+`{command}` measures everything on this page in one run and writes it; do not edit.
+
+{machine}
+
+`renderer.transport=shadows` folds the shadows that a mesh casts on itself into its operators, and `bounces:N` also the
+light that its surfaces send each other N times, by precomputed radiance transfer (Sloan, Kautz and Snyder 2002). A step
+of an attack remains one product.
+
+## Cost
+
+A cup of {faces:,} faces ({vertices:,} vertices), 8² samples per pixel, {views} views around it; time is the process's
+own, on one thread: of operators the lesser of two, of steps the median of rounds in which the transports take turns.
+*MB* is all views' operators. A light step is image, clamp and the gradient of a loss by the light, of one view.
+
+{costs}
+
+## Time against error
+
+Shadows by the number of directions over the sphere, of which a pixel casts rays in the half above it: root mean square
+error of the radiance of two views at {size}² in the Grace light against {converged:,} directions, over the brightest.
+
+{by_rays}
+
+Rays are cast by Embree (embreex, which trimesh uses, too). The other way, the mesh's depth maps as seen from each
+direction, would take {maps:.1f} s for {directions} maps of {resolution}² alone, on the software rasteriser, and is only
+as sharp as they are; rays are exact to their offset of 1e-5 of the mesh's extent. A face that no surface rises above,
+any of a convex mesh, casts none and keeps its closed form to the bit.
+
+## Shadows held while vertices move
+
+An attack on the shape or on the albedo differentiates shading, and takes from the mesh's own shape what transport adds
+to each pixel; operators that are built of the result, as an adversary's files are rendered, have it anew. How far the
+two are apart at {size}², root mean square over the brightest, with each coordinate of each vertex moved up or down at
+random, and how much the move changes the image:
+
+{held}
+
+## Beside Mitsuba's path tracer
+
+The same mesh at {size}² in the same environment map (St. Peter's, positive all round), with {directions} directions
+and 8² samples here, and {seeds} × 256 paths per pixel of depth N + 2 there. Errors are root mean squares over the
+brightest value, inside the outline; what is left beside Mitsuba's noise is the quadrature over directions, and for
+bounces the size of the patches.
+
+{beside}
+"""
+
+
+@dataclass
+class TransportSettings:
+    """conf/benchmark_transport.yaml. out: the page. vertices: the cup has more. rounds: of the clock."""
+
+    out: str
+    vertices: int
+    rounds: int
+
+
+def run(settings: TransportSettings) -> None:
+    """Measure on one thread, and write the page."""
+    out = writable_file(settings.out, "out")
+    torch.set_num_threads(1)
+    cup, clock = normalise(subdivide(solid("cup", 0), settings.vertices)), Clock(torch.device("cpu"), settings.rounds)
+    text = TEXT.format(
+        command=command_line(),
+        machine=machine(clock.device),
+        faces=len(cup.faces),
+        vertices=len(cup.vertices),
+        views=cost.VIEWS,
+        costs=cost.costs({"several colours": cup, "one grey": cost.grey(cup)}, SIZES, clock),
+        size=SIZES[0],
+        converged=cost.CONVERGED,
+        by_rays=cost.errors_by_rays(cup, SIZES[0]),
+        maps=cost.depth_maps(cup),
+        resolution=cost.RESOLUTION,
+        directions=DIRECTIONS,
+        held=held.table(cup),
+        seeds=beside_mitsuba.SEEDS,
+        beside=beside_mitsuba.table(),
+    )
+    write(out, joined([wrapped(text.strip())]))
