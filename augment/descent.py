@@ -1,8 +1,10 @@
 """Descent on the adversarial cost over anything that renders differentiably, until the classifier is fooled."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +16,9 @@ from augment.model_state import as_found
 from augment.phases import Phases
 from augment.progress import progress
 from renderer.errors import FACTOR, require_range
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
 
 NO_CLASS = -1  # in place of a class that does not count
 
@@ -43,41 +48,41 @@ class Problem(Protocol):
     """What is attacked: E examples of V views each, whose images follow from values (E, D)."""
 
     @property
-    def start(self) -> Tensor:
-        """The values (E, D) where they begin."""
+    def start(self) -> Float[Tensor, "E D"]:
+        """The values where they begin."""
 
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Images (A, V, 3, H, W) in [0, 1] of the values (A, D) of examples (A,)."""
+    def render(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 H W"]:
+        """Images in [0, 1] of some examples under values of theirs."""
 
-    def step(self, gradient: Tensor) -> Tensor:
-        """How far to go down a gradient (A, D)."""
+    def step(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
+        """How far to go down a gradient."""
 
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        """Values (A, D) moved to where they may be."""
+    def project(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
+        """Values moved to where they may be."""
 
 
 @dataclass(frozen=True)
 class Goal:
     """Per example and view, the class whose confidence falls and, where there is a target, the one whose rises.
 
-    decrease: (E, V) int64, NO_CLASS where the target alone counts. increase: the same, or None for an attack that takes
+    decrease: NO_CLASS where the target alone counts. increase: the same, or None for an attack that takes
     any error, as it does where it is NO_CLASS. An example is fooled where every view is given its target, or without
     one, anything but `decrease`.
     """
 
-    decrease: Tensor
-    increase: Tensor | None = None
+    decrease: Int[Tensor, "E V"]
+    increase: Int[Tensor, "E V"] | None = None
 
-    def of(self, examples: Tensor) -> "Goal":
+    def of(self, examples: Tensor) -> Goal:
         """The same for some of the examples."""
         return Goal(self.decrease[examples], None if self.increase is None else self.increase[examples])
 
-    def reached(self, predicted: Tensor) -> Tensor:
-        """(E,) bool, for predicted classes (E, V)."""
+    def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
+        """Whether all views of an example are, for predicted classes."""
         return self.reached_in_views(predicted).all(1)
 
-    def reached_in_views(self, predicted: Tensor) -> Tensor:
-        """(E, V) bool, for predicted classes (E, V)."""
+    def reached_in_views(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, "E V"]:
+        """Whether each view is, for predicted classes."""
         erred = predicted != self.decrease
         if self.increase is None:
             return erred
@@ -86,25 +91,24 @@ class Goal:
 
 @dataclass(frozen=True)
 class AttackResult:
-    """What an attack did, per example; all tensors have E rows and lie on the values' device.
+    """What an attack did, per example; all tensors lie on the values' device.
 
-    values, images (E, V, 3, H, W): where the descent ended, or of those that fool the one of the lowest cost. steps:
-    int64, taken. fooled_before, fooled: bool.
-    cost_before, cost: the paper's cost, summed over views. predicted: (E, V) int64, the classes there. zero_gradient:
-    bool, the first gradient was exactly zero.
+    values, images: where the descent ended, or of those that fool the one of the lowest cost. steps: taken.
+    cost_before, cost: the paper's cost, summed over views. predicted: the classes there. zero_gradient: the first
+    gradient was exactly zero.
     """
 
-    values: Tensor
-    images: Tensor
-    steps: Tensor
-    fooled_before: Tensor
-    fooled: Tensor
-    cost_before: Tensor
-    cost: Tensor
-    predicted: Tensor
-    zero_gradient: Tensor
+    values: Float[Tensor, "E D"]
+    images: Float[Tensor, "E V 3 H W"]
+    steps: Int[Tensor, " E"]
+    fooled_before: Bool[Tensor, " E"]
+    fooled: Bool[Tensor, " E"]
+    cost_before: Float[Tensor, " E"]
+    cost: Float[Tensor, " E"]
+    predicted: Int[Tensor, "E V"]
+    zero_gradient: Bool[Tensor, " E"]
 
-    def merged(self, examples: Tensor, total: int) -> "AttackResult":
+    def merged(self, examples: Tensor, total: int) -> AttackResult:
         """The result of all `total` examples, where this one is of the process's own (A,); see `processes.merged`."""
         rows = {item.name: processes.merged(getattr(self, item.name), examples, total) for item in fields(self)}
         return AttackResult(**rows)
@@ -139,11 +143,13 @@ class Part:
         return self.problem.project(values, self.examples[examples])
 
 
-def adversarial_cost(logits: Tensor, decrease: Tensor, increase: Tensor | None = None) -> Tensor:
-    """-CE(f, L_d) + CE(f, L_i) per example, the paper's equation 1, which an attack decreases. (E,)
+def adversarial_cost(
+    logits: Float[Tensor, "E classes"], decrease: Int[Tensor, " E"], increase: Int[Tensor, " E"] | None = None
+) -> Float[Tensor, " E"]:
+    """-CE(f, L_d) + CE(f, L_i) per example, the paper's equation 1, which an attack decreases.
 
-    logits: (E, classes). decrease: (E,) int64, the classes whose confidence falls. increase: (E,) int64, those whose
-    confidence rises; None attacks without a target. NO_CLASS in either leaves its term out.
+    decrease: the classes whose confidence falls. increase: those whose confidence rises; None attacks without a target.
+    NO_CLASS in either leaves its term out.
     """
     cost = -F.cross_entropy(logits, decrease, reduction="none", ignore_index=NO_CLASS)
     if increase is not None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -29,6 +29,9 @@ from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.visibility import Backend
 
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
 AT_ONCE = 2**24  # pixels of the images that are rendered at once: some 2 GB, with what a gradient needs of them
 STACKED = 2**16  # pixels of the images whose operators are multiplied at once; more would only be copied about
 
@@ -50,15 +53,15 @@ class Example:
 class Conditions:
     """What A examples are rendered under.
 
-    light: (A, size, 3), of the scene's basis. vertices: (A, N, 3), None where they are the meshes'. albedo: (A, F, 3),
-    added to each face's linear albedo. pixels: (A, V, 3, size, size), added to the images' values. Where meshes differ
-    in size, N and F are the largest's, and a smaller mesh has the first of them.
+    light: of the scene's basis. vertices: None where they are the meshes'. albedo: added to each face's linear albedo.
+    pixels: added to the values of the V images. Where meshes differ in size, N and F are the largest's, and a smaller
+    mesh has the first of them.
     """
 
-    light: Tensor
-    vertices: Tensor | None = None
-    albedo: Tensor | None = None
-    pixels: Tensor | None = None
+    light: Float[Tensor, "A coefficients 3"]
+    vertices: Float[Tensor, "A N 3"] | None = None
+    albedo: Float[Tensor, "A F 3"] | None = None
+    pixels: Float[Tensor, "A V 3 size size"] | None = None
 
 
 @dataclass(frozen=True)
@@ -212,12 +215,12 @@ class Scene:
         """What an example shows."""
         return self.objects[self.examples[example].object].mesh
 
-    def conditions(self, examples: Tensor) -> Conditions:
-        """The scene's own, for examples (A,)."""
+    def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
+        """The scene's own, for some examples."""
         return Conditions(self.lights[examples])
 
-    def render(self, conditions: Conditions, examples: Tensor) -> Tensor:
-        """Images (A, V, 3, size, size) in [0, 1] of examples (A,), differentiable in the conditions.
+    def render(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 size size"]:
+        """Images in [0, 1] of examples from their V views, differentiable in the conditions.
 
         InputError: NaN.
         """
@@ -231,8 +234,8 @@ class Scene:
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
 
     @torch.no_grad()
-    def clamped_share(self, conditions: Conditions, examples: Tensor) -> Tensor:
-        """Per example (A,), the share of its covered pixels' values that the clamp changes."""
+    def clamped_share(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, " A"]:
+        """Per example, the share of its covered pixels' values that the clamp changes."""
         shares = self.lights.new_zeros(2, len(examples) * self.views)
         for layer in self._layers(conditions, examples):
             covered = (layer.coverage[layer.shown] > 0).expand_as(layer.composite)

@@ -1,9 +1,11 @@
 """The augmentation service: fresh labelled renders, made against the current weights whenever they are asked for."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +27,9 @@ from augment.specimens import Specimens, choose_specimens
 from augment.variation import VariationSettings, vary
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.lights import perturb
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 ARMS = ("none", "random", "adversarial")
 STARTS = ("light", "random")
@@ -117,14 +122,14 @@ class AugmentationSettings:
 
 @dataclass(frozen=True)
 class Renders(Dataset[tuple[Tensor, int]]):
-    """Labelled examples: images (E, 3, H, W) in [0, 1], labels (E,) int64, and diagnostics as plain numbers.
+    """Labelled examples: images in [0, 1], labels, and diagnostics as plain numbers.
 
     specimens: a few of those that fool, with what they were before; None where that is not known any more.
     As a data set, pairs of an image on the CPU and its label as a number: `data + renders` is both.
     """
 
-    images: Tensor
-    labels: Tensor
+    images: Float[Tensor, "E 3 H W"]
+    labels: Int[Tensor, " E"]
     diagnostics: Mapping[str, float]
     specimens: Specimens | None = None
 
@@ -177,7 +182,7 @@ class AugmentationService:
         seed: int = 0,
         device: torch.device | str = "cpu",
         **of_scene: Any,
-    ) -> "AugmentationService":
+    ) -> AugmentationService:
         """For any training loop: meshes × views × backgrounds renders, as the paper has them unless told otherwise.
 
         meshes: (file, solid:NAME or `Mesh`; the index of its class) each. size: pixels per side. of_scene: further

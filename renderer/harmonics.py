@@ -4,16 +4,21 @@ Index l² + l + m, m = -l..l. No Condon-Shortley sign: Y₁ = √(3/4π) (y, z, 
 angles, so it stays exact at the poles, where the paper's (appendix B.1) derivatives are not finite.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from renderer.errors import InputError, require_finite
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float64, Int
 
 MAX_DEGREE = 20
 Constant = TypeVar("Constant")
@@ -25,12 +30,12 @@ def per_degree(function: Callable[..., Constant]) -> Callable[..., Constant]:
     return cache(torch.inference_mode(False)(function))
 
 
-def basis(directions: Tensor, degree: int) -> Tensor:
+def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch coefficients"]:
     """Real spherical harmonics of directions. Differentiable, by `basis_gradient`.
 
-    directions: (..., 3), finite and of any length, since only the direction counts; a zero vector, which has none,
-    gives finite values and a gradient of zero.
-    Returns (..., (degree + 1)²) in the same dtype, computed in float64 and rounded once. InputError: NaN.
+    directions: finite and of any length, since only the direction counts; a zero vector, which has none, gives finite
+    values and a gradient of zero.
+    Returns (degree + 1)² values each in the same dtype, computed in float64 and rounded once. InputError: NaN.
     Source: the Legendre recurrences of the paper's appendix B.1 with sin^m θ taken out of P_l^m and put into
     Re and Im of (x + iy)^m.
     """
@@ -39,9 +44,9 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     return _Basis.apply(directions, degree)
 
 
-def basis_gradient(directions: Tensor, degree: int) -> Tensor:
-    """∂Y/∂n for vectors n of any length, (..., (degree + 1)², 3): tangent to the sphere, as in the paper's
-    appendix D, divided by |n|; finite at the poles, zero for a zero vector.
+def basis_gradient(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch coefficients 3"]:
+    """∂Y/∂n for vectors n of any length: tangent to the sphere, as in the paper's appendix D, divided by |n|; finite at
+    the poles, zero for a zero vector.
 
     Source: r^l Y_lm is a polynomial whose derivatives lie in band l - 1 (`gradient_matrices`); the radial part,
     l Y_lm n, is taken off.
@@ -194,14 +199,14 @@ def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @per_degree
-def bands(degree: int) -> Tensor:
-    """The band l of each coefficient, ((degree + 1)²,)."""
+def bands(degree: int) -> Int[Tensor, " coefficients"]:
+    """The band l of each coefficient."""
     return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
 
 
 @per_degree
-def lambertian_factors(degree: int) -> Tensor:
-    """What a diffuse surface keeps of each band: irradiance = Σ A_l U_lm Y_lm(n). (degree + 1,) float64.
+def lambertian_factors(degree: int) -> Float64[Tensor, " bands"]:
+    """What a diffuse surface keeps of each of degree + 1 bands: irradiance = Σ A_l U_lm Y_lm(n).
 
     A_l = π, 2π/3, π/4, 0, -π/24, 0, π/64, ...: the clamped cosine (Ramamoorthi and Hanrahan 2001, equation 8).
     """
@@ -215,25 +220,22 @@ def lambertian_factors(degree: int) -> Tensor:
 
 
 @per_degree
-def live_coefficients(degree: int) -> Tensor:
+def live_coefficients(degree: int) -> Int[Tensor, " K"]:
     """Indices of the coefficients that can reach a diffuse surface: 31 of the 49 at degree 6."""
     return torch.nonzero(lambertian_factors(degree)[bands(degree)]).squeeze(1)
 
 
-def irradiance_basis(normals: Tensor, degree: int) -> Tensor:
-    """A_l Y_lm(n) of the live coefficients: irradiance at unit normals per unit coefficient.
-
-    normals: (..., 3). Returns (..., K), K = len(live_coefficients(degree)).
-    """
+def irradiance_basis(normals: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch K"]:
+    """A_l Y_lm(n) of the K live coefficients: irradiance at unit normals per unit coefficient."""
     live = live_coefficients(degree)
     factors = lambertian_factors(degree)[bands(degree)[live]].to(normals)
     return basis(normals, degree)[..., live.to(normals.device)] * factors
 
 
-def quadrature(degree: int) -> tuple[Tensor, Tensor]:
-    """Directions (N, 3) and weights (N,) that integrate polynomials of this degree exactly over the sphere.
+def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:
+    """Directions and weights that integrate polynomials of this degree exactly over the sphere.
 
-    Gauss-Legendre in z and equal steps in azimuth, float64; the weights sum to 4π.
+    Gauss-Legendre in z and equal steps in azimuth; the weights sum to 4π.
     """
     z, weight = np.polynomial.legendre.leggauss(degree // 2 + 1)
     azimuth = 2 * np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
@@ -243,8 +245,10 @@ def quadrature(degree: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(np.stack(grid, -1).reshape(-1, 3)), torch.from_numpy(weights)
 
 
-def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Directions (H, W, 3) and solid angles (H, W) of an environment map's texels, float64.
+def equirectangular(
+    height: int, width: int
+) -> tuple[Float64[Tensor, "height width 3"], Float64[Tensor, "height width"]]:
+    """Directions and solid angles of an environment map's texels.
 
     Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
     """
@@ -257,11 +261,15 @@ def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
     return torch.stack(directions, dim=-1), solid_angles[:, None].expand(height, width)
 
 
-def project(radiance: Callable[[Tensor], Tensor] | Tensor, degree: int, quadrature_degree: int = 128) -> Tensor:
-    """Coefficients ((degree + 1)², C) float64 of light on the sphere.
+def project(
+    radiance: Callable[[Tensor], Tensor] | Float[Tensor, "height width channels"],
+    degree: int,
+    quadrature_degree: int = 128,
+) -> Float64[Tensor, "coefficients channels"]:
+    """Coefficients of light on the sphere.
 
-    radiance: a function of directions (N, 3) float64 → (N, C), integrated by `quadrature`, exactly where it is a
-    polynomial of degree `quadrature_degree - degree`; or an environment map (H, W, C) laid out by `equirectangular`.
+    radiance: a function of directions (N, 3) float64 → (N, channels), integrated by `quadrature`, exactly where it is a
+    polynomial of degree `quadrature_degree - degree`; or an environment map laid out by `equirectangular`.
     """
     if not callable(radiance):
         return _project_map(torch.as_tensor(radiance), degree)
@@ -277,10 +285,12 @@ def _project_map(radiance: Tensor, degree: int) -> Tensor:
     return sum(basis(row, degree).T @ (weights[:, None] * texels.to(row)) for row, weights, texels in grid)
 
 
-def rotate(coefficients: Tensor, rotation: Tensor) -> Tensor:
+def rotate(
+    coefficients: Float[Tensor, "coefficients channels"], rotation: Float[Tensor, "3 3"]
+) -> Float[Tensor, "coefficients channels"]:
     """Coefficients of the light turned by a rotation: u'(ω) = u(Rᵀω).
 
-    coefficients: ((degree + 1)², C). rotation: (3, 3) orthonormal. Exact: the integrand is a polynomial.
+    rotation: orthonormal. Exact: the integrand is a polynomial.
     InputError: NaN.
     """
     require_finite(coefficients=coefficients, rotation=rotation)

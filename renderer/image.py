@@ -1,14 +1,19 @@
 """Radiance to image: background, clamp and encoding, in one place and last, since clamping is not linear."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, require_bounded, require_range
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float32, Int, UInt8
 
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
@@ -61,21 +66,31 @@ def bounces(transport: str) -> int:
     )
 
 
-def develop(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
+def develop(
+    radiance: Float[Tensor, "*batch 3 P"],
+    coverage: Float[Tensor, "*#batch 1 P"],
+    background: Float[Tensor, "*#batch channels #P"],
+    encoding: str = "linear",
+) -> Float[Tensor, "*batch 3 P"]:
     """Image values in [0, 1] as a classifier sees them.
 
-    radiance: (..., 3, P) linear, already weighted with coverage. coverage: (..., 1, P) in [0, 1].
-    background: (..., 3 or 1, 1 or P) image values behind the surface. Returns (..., 3, P). InputError: NaN.
+    radiance: linear, already weighted with coverage. coverage: in [0, 1].
+    background: image values behind the surface, of three channels or one. InputError: NaN.
     """
     require_bounded(radiance=radiance)
     return develop_composite(radiance + behind(coverage, background, encoding), encoding)
 
 
-def compose(radiance: Tensor, coverage: Tensor, pixels: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
-    """Whole images (..., 3, size, size): `develop` at the covered pixels, the background elsewhere.
+def compose(
+    radiance: Float[Tensor, "*batch 3 P"],
+    coverage: Float[Tensor, " P"],
+    pixels: Int[Tensor, " P"],
+    background: Float[Tensor, "*#batch 3 size size"],
+    encoding: str = "linear",
+) -> Float[Tensor, "*batch 3 size size"]:
+    """Whole images: `develop` at the covered pixels, the background elsewhere.
 
-    radiance: (..., 3, P). coverage: (P,). pixels: (P,), row-major. background: (..., 3, size, size), or without the
-    leading axes.
+    pixels: row-major.
     """
     behind_all = background.expand(*radiance.shape[:-2], *background.shape[-3:]).flatten(-2)
     covered = develop(radiance, coverage[None], behind_all.index_select(-1, pixels), encoding)
@@ -166,11 +181,11 @@ def check_encoding(encoding: str) -> None:
         raise InputError(f"renderer.encoding={encoding}: choose one of {', '.join(ENCODINGS)}")
 
 
-def to_bytes(image: Tensor) -> Tensor:
-    """Image values in [0, 1] to uint8, rounded."""
+def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
+    """Image values in [0, 1] to 8 bits, rounded."""
     return (image * 255).round().to(torch.uint8)
 
 
-def to_unit(images: Tensor) -> Tensor:
-    """uint8 images to float32 RGB in [0, 1]."""
+def to_unit(images: UInt8[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:
+    """8-bit images to RGB in [0, 1]."""
     return images.float() / 255

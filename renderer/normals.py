@@ -4,7 +4,9 @@ Computed in float64 and, for slivers, with the rounding errors of differences an
 normal of a face of height 1e-6 is off by 0.01 rad, and a plain float64 one of height 1e-12 by 1e-4.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -13,14 +15,17 @@ from torch.autograd.function import once_differentiable
 from renderer.errors import require_finite
 from renderer.harmonics import unit_vectors
 
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float64, Int
+
 ROUNDING = 64 * torch.finfo(torch.float64).eps  # of a sum of areas
 SLIVER = 1 / 16  # sine of a corner's angle below which plain float64 would lose more than some 64 of its ulps
 
 
-def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """(F, 3) unit normals, outward for counter-clockwise faces, in the dtype of `vertices`.
+def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+    """Unit normals, outward for counter-clockwise faces, in the dtype of `vertices`.
 
-    vertices: (V, 3). faces: (F, 3) int64. A face without area has the zero vector and a gradient of zero.
+    A face without area has the zero vector and a gradient of zero.
     InputError: NaN.
     Source: the paper's Section 3, ∂n/∂v = -h nᵀ/|h|² with h from the opposite edge to the corner v; the sign in print
     is the wrong way round.
@@ -28,10 +33,10 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     return _Unit.apply(area_vectors(vertices, faces)).T.to(vertices.dtype)
 
 
-def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """(V, 3) unit normals: those of the faces around a vertex, weighted with their areas.
+def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
+    """Unit normals: those of the faces around a vertex, weighted with their areas.
 
-    Vertices of no face, or whose faces cancel, have the zero vector. Shapes and errors as in `face_normals`.
+    Vertices of no face, or whose faces cancel, have the zero vector. Errors as in `face_normals`.
     """
     weighted, corners = area_vectors(vertices, faces).repeat(1, 3), faces.T.flatten()
     summed = weighted.new_zeros(3, len(vertices)).index_add(1, corners, weighted)
@@ -40,10 +45,10 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     return _Unit.apply(summed.masked_fill(cancelled, 0)).T.to(vertices.dtype)
 
 
-def area_vectors(vertices: Tensor, faces: Tensor) -> Tensor:
-    """(3, F) float64 normals with the faces' areas as their lengths, up to one factor for all of them.
+def area_vectors(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float64[Tensor, "3 F"]:
+    """Normals with the faces' areas as their lengths, up to one factor for all of them.
 
-    Shapes and errors as in `face_normals`.
+    Errors as in `face_normals`.
     """
     require_finite(vertices=vertices)
     return _AreaVectors.apply(vertices, faces)

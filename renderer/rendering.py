@@ -1,9 +1,12 @@
 """Meshes to images in one call: `render` by all that can be differentiated, `operators` for many lights."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -20,31 +23,34 @@ from renderer.transfer import Operator, build_operators
 from renderer.transport import build_transport
 from renderer.visibility import choose
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 _choose = cache(choose)  # "auto" asks the driver, which takes longer than an image
 
 
 def render(
     mesh: Mesh,
     cameras: OrthographicCamera | Sequence[OrthographicCamera],
-    light: Tensor,
+    light: Float[Tensor, "coefficients 3"],
     size: int = 224,
-    background: float | Tensor = 0.5,
+    background: float | Float[Tensor, "*views channels size size"] | Float[Tensor, " 3"] = 0.5,
     *,
-    vertices: Tensor | None = None,
-    albedo: Tensor | None = None,
+    vertices: Float[Tensor, "N 3"] | None = None,
+    albedo: Float[Tensor, "F 3"] | Float[Tensor, "height width 3"] | None = None,
     gain: float = 1.0,
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
     transport: str = "direct",
     visibility: str = "auto",
-) -> Tensor:
-    """Images (V, 3, size, size) in [0, 1] of a mesh from V cameras; differentiable in light, vertices and albedo.
+) -> Float[Tensor, "V 3 size size"]:
+    """Images in [0, 1] of a mesh from V cameras; differentiable in light, vertices and albedo.
 
-    light: ((degree + 1)², 3) coefficients (`load_light`), whose dtype and device the images have. background: see
-    `renderer.image.as_background`; an image per view with (V, 3, size, size). vertices: (N, 3) in place of the mesh's;
-    the gradient holds fixed which face covers each sample. albedo: linear, in place of the mesh's colours, (F, 3) per
-    face, or (H, W, 3) in place of the texture of a mesh that has one. gain multiplies the albedo. samples: per pixel
+    light: (degree + 1)² coefficients (`load_light`), whose dtype and device the images have. background: see
+    `renderer.image.as_background`; one for all views or an image for each. vertices: in place of the mesh's; the
+    gradient holds fixed which face covers each sample. albedo: linear, in place of the mesh's colours per face, or in
+    place of the texture of a mesh that has one. gain multiplies the albedo. samples: per pixel
     side. encoding: linear or srgb. normals: flat or smooth. transport: direct; shadows, that a mesh casts on itself; or
     bounces:N, with light that its own colours send on N times; the gradient by vertices and albedo holds both fixed.
     visibility: auto, opengl or software.

@@ -4,9 +4,11 @@ Visibility and texture coordinates are held fixed (the paper's Section 3 and app
 sees how normals turn and not how outlines move. For the light alone, `renderer.transfer` is faster.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn.functional as F
@@ -28,17 +30,24 @@ from renderer.harmonics import (
 )
 from renderer.normals import area_vectors, vertex_normals
 
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
 BLOCK = 2**14  # normals at a time
 
 
 def radiance(
-    fragments: Fragments, vertices: Tensor, light: Tensor, albedo: Tensor, smooth_faces: Tensor | None = None
-) -> Tensor:
-    """Linear radiance (3, P) of the covered pixels, weighted with coverage, in the dtype of `vertices`.
+    fragments: Fragments,
+    vertices: Float[Tensor, "V 3"],
+    light: Float[Tensor, "coefficients 3"],
+    albedo: Float[Tensor, "S 3"],
+    smooth_faces: Int[Tensor, "F 3"] | None = None,
+) -> Float[Tensor, "3 P"]:
+    """Linear radiance of the P covered pixels, weighted with coverage, in the dtype of `vertices`.
 
-    vertices: (V, 3). light: ((degree + 1)², 3) coefficients, any degree. albedo: (S, 3) linear, at the samples
-    (`renderer.albedo`). smooth_faces: all faces (F, 3) of the mesh, to shade with interpolated vertex normals; without
-    them each face has its own normal. InputError: NaN in any of them.
+    light: (degree + 1)² coefficients, any degree. albedo: linear, at the S samples (`renderer.albedo`). smooth_faces:
+    all faces of the mesh, to shade with interpolated vertex normals; without them each face has its own normal.
+    InputError: NaN in any of them.
     """
     require_bounded(albedo=albedo)  # the normals and the irradiance check the rest
     wide = _computed_in(vertices.dtype)
@@ -57,8 +66,8 @@ def radiance(
     return seen.to(vertices.dtype)
 
 
-def irradiance(normals: Tensor, light: Tensor) -> Tensor:
-    """(3, N) irradiance on surfaces with normals (N, 3), of any length, under light ((degree + 1)², 3).
+def irradiance(normals: Float[Tensor, "N 3"], light: Float[Tensor, "coefficients 3"]) -> Float[Tensor, "3 N"]:
+    """Irradiance on surfaces with normals of any length under a light of (degree + 1)² coefficients.
 
     Differentiable in both, in the dtype of `normals`; half precision is computed in float32. The coefficients of
     bands that cannot reach a diffuse surface have a gradient of exactly zero.
@@ -124,7 +133,7 @@ class _Polynomial:
     constant: Tensor
 
     @staticmethod
-    def of(light: Tensor) -> "_Polynomial":
+    def of(light: Tensor) -> _Polynomial:
         """light: ((degree + 1)², 3)."""
         degree = math.isqrt(len(light)) - 1
         per_light = _slopes_per_light(degree, light.dtype, light.device)
@@ -183,8 +192,10 @@ def _computed_in(dtype: torch.dtype) -> torch.dtype:
     return torch.promote_types(dtype, torch.float32)
 
 
-def smooth_normals(fragments: Fragments, vertices: Tensor, faces: Tensor) -> Tensor:
-    """(S, 3) vertex normals interpolated to the samples, on the side that the camera sees; not of unit length."""
+def smooth_normals(
+    fragments: Fragments, vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "S 3"]:
+    """Vertex normals interpolated to the S samples, on the side that the camera sees; not of unit length."""
     corners = fragments.corners.T.flatten()
     near = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
     near[corners] = True

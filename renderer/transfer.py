@@ -5,10 +5,12 @@ radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactl
 and bounces (`renderer.transport`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -28,6 +30,9 @@ from renderer.shading import smooth_normals
 from renderer.transport import Transport, build_transport
 from renderer.visibility import Backend
 
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
 DEGREE = HARMONICS.degree
 COEFFICIENTS = HARMONICS.size
 TENSORS = ("transfer", "albedo", "coverage", "pixels", "kept")  # of an operator
@@ -38,26 +43,28 @@ BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 class Operator:
     """What is kept of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
 
-    transfer: (3, K, P), K kept coefficients and P covered pixels; or (1, K, P), a third of the size and the time, where
-    no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
-    albedo: (3, P), what the one channel is multiplied with; ones where there are three.
-    coverage: (P,) in (0, 1], the share of a pixel's samples that the mesh covers.
-    pixels: (P,) int64, row-major indices of the covered pixels; row 0 is the top of the image.
-    kept: (K,) int64, ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
+    transfer: three channels of K kept coefficients and P covered pixels; or one, a third of the size and the time,
+    where no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
+    albedo: what the one channel is multiplied with; ones where there are three.
+    coverage: in (0, 1], the share of a pixel's samples that the mesh covers.
+    pixels: row-major indices of the covered pixels; row 0 is the top of the image.
+    kept: ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
     under an open sky (`Basis.live`), and all in a view with shadows.
     settings: of the image that they are pixels of. basis: of the lights.
     """
 
-    transfer: Tensor
-    albedo: Tensor
-    coverage: Tensor
-    pixels: Tensor
-    kept: Tensor
+    transfer: Float[Tensor, "channels K P"]
+    albedo: Float[Tensor, "3 P"]
+    coverage: Float[Tensor, " P"]
+    pixels: Int[Tensor, " P"]
+    kept: Int[Tensor, " K"]
     settings: ImageSettings
     basis: Basis = HARMONICS
 
-    def image(self, lights: Tensor, background: float | Tensor = 0.5) -> Tensor:
-        """Images (..., 3, size, size) in [0, 1] under lights (..., size, 3); differentiable in them.
+    def image(
+        self, lights: Float[Tensor, "*lights coefficients 3"], background: float | Tensor = 0.5
+    ) -> Float[Tensor, "*lights 3 size size"]:
+        """Images in [0, 1], differentiable in the lights.
 
         background: see `renderer.image.as_background`. InputError: as `radiance`, and for a background that is none.
         """
@@ -65,8 +72,8 @@ class Operator:
         coverage = self.coverage.to(lights)
         return compose(self.radiance(lights), coverage, self.pixels, behind, self.settings.encoding)
 
-    def radiance(self, lights: Tensor) -> Tensor:
-        """Linear radiance (..., 3, P) under lights (..., size, 3); differentiable, by `light_gradient`.
+    def radiance(self, lights: Float[Tensor, "*lights coefficients 3"]) -> Float[Tensor, "*lights 3 P"]:
+        """Linear radiance; differentiable, by `light_gradient`.
 
         Computed in the operator's dtype, returned in the lights'. InputError: NaN, or lights of another basis' size.
         """
@@ -80,8 +87,10 @@ class Operator:
             return _Radiance.apply(lights, self)
         return _radiance(self, lights)
 
-    def light_gradient(self, radiance_gradient: Tensor) -> Tensor:
-        """∂C/∂U (..., size, 3) = T ∂C/∂radiance (..., 3, P), without a graph.
+    def light_gradient(
+        self, radiance_gradient: Float[Tensor, "*lights 3 P"]
+    ) -> Float[Tensor, "*lights coefficients 3"]:
+        """∂C/∂U = T ∂C/∂radiance, without a graph.
 
         Exactly zero for the coefficients that reach no pixel. InputError: NaN.
         """
@@ -93,7 +102,7 @@ class Operator:
             product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
         return (self._places @ product.mT).to(radiance_gradient.dtype)
 
-    def to(self, device: torch.device | str) -> "Operator":
+    def to(self, device: torch.device | str) -> Operator:
         """The same on another device."""
         return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS})
 

@@ -1,9 +1,11 @@
 """What makes a network attackable: one module that takes images as the renderer makes them, and names its classes."""
 
+from __future__ import annotations
+
 import difflib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor, nn
@@ -11,9 +13,12 @@ from torch import Tensor, nn
 from renderer.errors import InputError, is_out_of_memory, require_range
 from renderer.image import LARGEST_SIZE
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 
 class Classifier(nn.Module):
-    """A frozen classifier: images (N, 3, size, size), RGB in [0, 1], to logits (N, C); differentiable in the pixels.
+    """A frozen classifier: images, RGB in [0, 1], to logits of C classes; differentiable in the pixels.
 
     name: for messages. size: pixels per side; images are to be rendered at it, nothing is resized here. classes:
     the C names, each once. The parameters need no gradient and the mode is eval, whatever `train` is told.
@@ -32,7 +37,7 @@ class Classifier(nn.Module):
             raise InputError(f"classifier={name} has several classes {repeated[0]!r}: make their names differ")
         self.requires_grad_(False).eval()
 
-    def forward(self, images: Tensor) -> Tensor:
+    def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
         """InputError for images of another size, and for a callable that fails or gives no logits, such that are not
         finite or none with a gradient."""
         if images.shape[1:] != (3, self.size, self.size):
