@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from augment.backgrounds import load_backgrounds
-from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Scene
 from renderer.basis import HARMONICS, Sum
@@ -35,6 +35,7 @@ def build_scene(
     exposure: float = 1.0,
     projector: ProjectorSettings | None = None,
     lamps: LampsSettings | None = None,
+    ground: Sequence[float] | None = None,
     polar: float = 60.0,
     azimuth: float = 0.0,
     field_of_view: float = 2.0,
@@ -51,15 +52,16 @@ def build_scene(
 
     meshes: (file, solid:NAME or `Mesh`; the name of its class) each, or `ObjectSettings`. shared: the views of an
     example share one light, shape or colour; otherwise each is an example. backgrounds: grey values or image files.
-    light: coefficients or what `renderer.load_light` takes; exposure multiplies it. projector,
-    lamps: that shine as well. polar: degrees off +z; azimuth: of
-    the first view, off +x. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility:
-    as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
+    light: coefficients or what `renderer.load_light` takes; exposure multiplies it. projector, lamps: that shine as
+    well. ground: the colour of a table under each mesh (`on_ground`). polar: degrees off +z; azimuth: of the first
+    view, off +x. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility: as for
+    `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
     placed = [each.build() for each in (projector, lamps) if each is not None]
+    objects = [_object(member, vertices) for member in meshes]
     return Scene.grid(
-        [_object(member, vertices) for member in meshes],
+        objects if ground is None else [on_ground(item, ground) for item in objects],
         ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
         load_backgrounds(backgrounds, size),
         torch.cat([sky, *(start.to(sky) for _, start in placed)]).to(device),

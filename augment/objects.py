@@ -1,13 +1,16 @@
 """What a scene shows: meshes from files or solids, each with the name of its class."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.mesh import Mesh, load_mesh, normalise
+from renderer.mesh import Mesh, concatenate, load_mesh, normalise
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
+
+GROUND = 1.2  # half a table's width: its corners are within what cameras see in depth
 
 
 @dataclass
@@ -52,6 +55,19 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
     if item.color is not None:
         mesh = _colored(mesh, item)
     return SceneObject(item.label, normalise(subdivide(mesh, vertices)), item.gain, item.mesh)
+
+
+def on_ground(item: SceneObject, color: Sequence[float]) -> SceneObject:
+    """The object on a square table, as one mesh; color: RGB, sRGB-encoded in [0, 1], multiplied with the gain, too.
+
+    InputError: no colour.
+    """
+    if len(color) != 3 or not all(0 <= each <= 1 for each in color):
+        raise InputError(f"scene.ground={color} must be red, green and blue from 0 to 1")
+    lowest = item.mesh.vertices[np.unique(item.mesh.faces), 2].min()
+    corners = [[x * GROUND, y * GROUND, lowest] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    table = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.array(color))
+    return replace(item, mesh=concatenate([item.mesh, table]))
 
 
 def another_individual(item: SceneObject, seed: int) -> SceneObject:

@@ -74,6 +74,7 @@ class SceneSettings:
     exposure: float = 1.0
     projector: ProjectorSettings | None = None
     lamps: LampsSettings | None = None
+    ground: list[float] | None = None
 
     def __post_init__(self) -> None:
         require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)

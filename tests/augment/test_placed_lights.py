@@ -11,6 +11,7 @@ from augment.parameters import LampPowers, Lighting, ProjectorPattern, StepSetti
 from augment.perturbation import Perturbation
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
+from augment.service import TrainingAttackSettings
 from renderer.errors import InputError
 from renderer.visibility import choose
 
@@ -20,10 +21,10 @@ LAMPS = LampsSettings([[2, 0, 2], [0, 2, 2]], start=[[0.5, 0.4, 0.3], [0.1, 0.2,
 CLASSES = ("orange", "lime", "sky")
 
 
-def scene(**choices) -> Scene:
+def scene(size: int = SIZE, **choices) -> Scene:
     """Two views of an orange before grey."""
     lights = {"projector": PROJECTOR, "lamps": LAMPS, "light": "st_peters"} | choices
-    return augment.build_scene([("solid:orange", "orange")], SIZE, 2, visibility="software", **lights)
+    return augment.build_scene([("solid:orange", "orange")], size, 2, visibility="software", **lights)
 
 
 def test_the_image_under_several_lights_is_the_sum_of_those_under_each():
@@ -94,6 +95,34 @@ def test_a_pattern_is_read_from_an_image(tmp_path):
     assert basis.field_of_view == math.radians(30)
 
 
+def test_a_table_receives_the_pattern_and_the_shadow():
+    """Lit from straight above, from where a screen through the origin, at 4, would be white: but for the shadow of the
+    orange, the table below it is even, and darker by the squares of the distances."""
+    above = ProjectorSettings(pixels=1, polar=0, pattern=1.0, field_of_view=60)
+    alone = {"exposure": 1e-9, "projector": above, "lamps": None, "backgrounds": [0.0], "field_of_view": 4.0}
+    shown, bare = (scene(48, **alone, polar=0, ground=color, samples=4) for color in ([0.2, 0.5, 0.7], None))
+    table, orange = (each.render(each.conditions(EVERY), EVERY)[0, 0] for each in (shown, bare))
+    beside = table[:, (orange.sum(0) == 0) & (table.sum(0) > 0)]
+    below = -shown.mesh(0).vertices[:, 2].min()
+    expected = torch.tensor([0.2, 0.5, 0.7]) * (4 / (4 + below)) ** 2
+    torch.testing.assert_close(beside.amax(1), expected.float(), rtol=1e-5, atol=0)
+    assert 4 <= (beside[1] > 0.9 * expected[1]).sum() < beside.shape[1]
+
+
+@pytest.mark.parametrize("arm", ["random", "adversarial"])
+def test_training_draws_and_attacks_patterns_beside_the_light(arm):
+    step = StepSettings("linf", 0.5, "sign", 0.2)
+    attack = TrainingAttackSettings(lighting=step, projector=step, max_steps=2)
+    settings = augment.AugmentationSettings(arm=arm, attack=attack)
+    service = augment.AugmentationService.from_meshes(
+        [("solid:orange", 0)], SIZE, settings, views=2, backgrounds=[0.5], visibility="software", projector=PROJECTOR
+    )
+    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * SIZE**2, 3))
+    torch.nn.init.normal_(network[1].weight, std=0.01, generator=torch.Generator().manual_seed(0))
+    renders = service.regenerate(network, 0)
+    assert renders.images.shape == (2, 3, SIZE, SIZE) and renders.diagnostics["light_change"] > 0.5
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -103,6 +132,7 @@ def test_a_pattern_is_read_from_an_image(tmp_path):
         (lambda: LampsSettings([[0, 0, 0]]).build(), r"none at the origin"),
         (lambda: LampsSettings([[1, 0]]).build(), r"scene\.lamps: give places"),
         (lambda: LampsSettings(start=[[1], [2]]).build(), r"scene\.lamps: give places"),
+        (lambda: scene(ground=[0.5, 2.0, 0.5]), r"scene\.ground=.* must be red, green and blue"),
         (lambda: ProjectorPattern(scene(projector=None), StepSettings()), r"no projector: set scene\.projector"),
     ],
 )
