@@ -1,0 +1,10 @@
+"""How the cost of adversarial renders grows with their number, size, meshes and processes: docs/performance_growth.md
+
+python scripts/benchmark_growth.py; a quarter of an hour on one free core.
+"""
+
+from train.cli import script
+from train.studies.growth.study import GrowthSettings, run
+
+if __name__ == "__main__":
+    script(run, GrowthSettings)

@@ -1,0 +1,1 @@
+"""How the cost of adversarial renders grows with their number, size, meshes and processes."""
