@@ -20,9 +20,9 @@ INTRODUCTION = """\
 Made by `{command}`. {machine}
 
 - One round of adversarial renders: oranges before five greys, 2 × 2 samples per pixel, {steps} steps of the light, one
-  thread, against a WideResNet-10-1 that is sure of the label, so that every attack takes all its steps. Each
-  row is measured in a process of its own, {rounds} times, of which medians count; **other work shared the cores, so that the ratios say more than the
-  seconds**.
+  thread, against a WideResNet-10-1 that is sure of the label, so that every attack takes all its steps. Each row is
+  measured in a process of its own, {rounds} times, of which medians count; **other work shared the cores, so that the
+  ratios say more than the seconds**.
 - *Memory* is the peak beyond what Python and the libraries take. Images are rendered 16.8 million pixels at a time, so
   that it grows by the renders themselves and by the operators of distinct views; what would not fit is refused before
   it is made, with the number that would.
@@ -43,9 +43,9 @@ IMAGENET = """\
 ## ImageNet on eight GPUs, on paper
 
 Of ResNet-50 at 224², an attack's pass takes {attack:.2f} and a relit image with its gradient {render:.3f} of a training
-step's time (medians over {rounds} turns on the CPU; on a GPU the network's ratio is that of the same products). An epoch
-has {images:,} images. On eight GPUs the attack is shared like the batches, so that the share stays. The minutes take
-{rate:,} images per second on all eight, **a number that was assumed and not measured**.
+step's time (medians over {rounds} turns on the CPU; on a GPU the network's ratio is that of the same products). An
+epoch has {images:,} images. On eight GPUs the attack is shared like the batches, so that the share stays. The minutes
+take {rate:,} images per second on all eight, **a number that was assumed and not measured**.
 """
 
 
