@@ -87,6 +87,9 @@ DOORS = [
 ]
 
 
+ALLOWED = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]  # which is another process on the machine
+
+
 @pytest.mark.filterwarnings("ignore")  # of a library, on what it then refuses or reads
 @pytest.mark.parametrize("door", DOORS, ids=[door.name for door in DOORS])
 def test_a_damaged_file_is_used_or_refused_by_name(tmp_path, door):
@@ -95,7 +98,7 @@ def test_a_damaged_file_is_used_or_refused_by_name(tmp_path, door):
     door.read(path)
     whole = path.read_bytes()
 
-    @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+    @settings(max_examples=25, deadline=None, suppress_health_check=ALLOWED)
     @given(
         st.integers(0, len(whole) - 1) | st.integers(0, 130), st.binary(max_size=6), st.integers(0, 9) | st.just(10**9)
     )

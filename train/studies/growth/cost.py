@@ -50,7 +50,8 @@ class Cost:
 
 def measure(load: Load) -> Cost:
     """In as many processes as it has, on one thread each. RuntimeError where one of them fails."""
-    context = get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([__name__])
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
