@@ -325,6 +325,18 @@ def test_a_folder_that_cannot_be_made_stops_no_run(place, tmp_path):
     assert str(tmp_path / "file") in cache.problem
 
 
+def test_a_folder_that_is_deleted_between_two_views_or_while_one_is_written_stops_no_run(tmp_path, monkeypatch):
+    cache, expected = OperatorCache(tmp_path / "cache"), build_operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND)
+    cache.operators(PLATE, ring(3, 2.0)[:1], SETTINGS, BACKEND)
+    shutil.rmtree(cache.folder)
+    assert same(cache.operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND), expected) and cache.problem is None
+    shutil.rmtree(cache.folder)
+    whole = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", lambda path, content: shutil.rmtree(cache.folder) or whole(path, content))
+    assert same(cache.operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND), expected)
+    assert "No such file" in cache.problem and not cache.folder.exists()
+
+
 def test_runs_may_share_a_folder_at_once(tmp_path):
     cameras = ring(3, 2.0)
 

@@ -74,6 +74,15 @@ def test_tensorboard_reads_the_scalars_and_the_renders(tmp_path):
         np.testing.assert_allclose(shown / 255, render.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
 
 
+def test_a_clock_that_steps_back_loses_no_epoch(tmp_path, monkeypatch):
+    hours = iter(range(10**6, 0, -3600))
+    monkeypatch.setattr("train.logs.time.time", lambda: float(next(hours)))
+    write_epochs(tmp_path, range(1, 4))
+    board = EventAccumulator(str(tmp_path)).Reload()
+    assert [event.step for event in board.Scalars("train/loss")] == [1, 2, 3]
+    assert [line["epoch"] for line in read_metrics(tmp_path)] == [1, 2, 3]
+
+
 def test_tensorboard_shows_each_epoch_of_a_resumed_run_once(tmp_path):
     write_epochs(tmp_path, range(1, 4))
     write_epochs(tmp_path, range(2, 5), read_metrics(tmp_path)[:1])
