@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -55,18 +56,17 @@ def costs(meshes: dict[str, Mesh], sizes: Sequence[int], clock: Clock) -> str:
     """A row per mesh and transport; all transports of a mesh take turns on the clock."""
     rows, light = [], load_light("grace").requires_grad_()
     for name, mesh in meshes.items():
-        builds = {each: seconds(lambda each=each, mesh=mesh: operators(mesh, each, sizes[0])) for each in TRANSPORTS}
+        builds = {each: seconds(partial(operators, mesh, each, sizes[0])) for each in TRANSPORTS}
         steps = {}
         for size in sizes:
-            views = {each: operators(mesh, each, size, 1)[0] for each in TRANSPORTS}
-            calls = {each: lambda view=view: light_step(view, light) for each, view in views.items()}
+            calls = {each: partial(light_step, operators(mesh, each, size, 1)[0], light) for each in TRANSPORTS}
             steps[size] = clock.medians(calls)
         for each in TRANSPORTS:
             views = operators(mesh, each, sizes[0])
             channels, kept = views[0].transfer.shape[:2]
-            size = sum(view.transfer.numel() * view.transfer.element_size() for view in views) / 1e6
+            megabytes = sum(view.transfer.numel() * view.transfer.element_size() for view in views) / 1e6
             of_direct = [f"{by[each]:.3g} ms, {by[each] / by['direct']:.2f} ×" for by in steps.values()]
-            rows.append([name, each, f"{builds[each]:.2f}", f"{channels} × {kept}", f"{size:.1f}", *of_direct])
+            rows.append([name, each, f"{builds[each]:.2f}", f"{channels} × {kept}", f"{megabytes:.1f}", *of_direct])
     head = ["mesh", "transport", f"s for {VIEWS} views", "channels × coefficients", "MB"]
     return markdown([*head, *(f"light step, {size}²" for size in sizes)], rows)
 
