@@ -57,7 +57,7 @@ def _by_source(runs: Scored, name: str) -> Iterator[Block]:
     try:
         scores = _scores(runs, name)
         yield Gallery("", [image for image in _plots(runs, scores, name, label) if image])
-        yield "Lines on bars, and brackets: of one seed its 95 % interval, of several the lowest and the highest of them."
+        yield "Lines on bars, and brackets: of one seed its 95 % interval, of several the lowest and the highest."
         for figure, by_source in scores.items():
             rows = [[source, *(found or "-" for found in by_arm.values())] for source, by_arm in by_source.items()]
             yield Table(figure_title(figure, label), ["source", *runs], rows)
