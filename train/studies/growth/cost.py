@@ -4,9 +4,11 @@ import os
 import resource
 import socket
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from typing import Any
 
 import torch
 
@@ -76,7 +78,7 @@ def _attack(load: Load, rank: int, port: int, sent: Connection) -> None:
             sent.send(Cost(**cost))
 
 
-def _cost(load: Load) -> dict[str, float]:
+def _cost(load: Load) -> dict[str, Any]:
     before, phases = _peak(), Phases()
     meshes = [(f"solid:orange:{seed}", "orange") for seed in range(load.meshes)]
     with phases("operators"):
@@ -117,7 +119,7 @@ def described(load: Load) -> str:
     return ", ".join(f"{name} {value:,}" for name, value in asdict(load).items() if value != default[name]) or "default"
 
 
-def timed(function) -> float:
+def timed(function: Callable[[], object]) -> float:
     """Seconds."""
     start = time.perf_counter()
     function()
