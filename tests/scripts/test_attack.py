@@ -120,7 +120,10 @@ REFUSED = [
     (["classifier=alexnet"], "classifier=alexnet is not known: choose one of "),
     (["attack.verify=blender"], "attack.verify=blender: choose from reload, mitsuba, or null"),
     (["reload=absent"], "absent/adversary.json does not exist: give a folder that an attack wrote"),
-    (["label=apple", "attack.force=false"], "of solid:orange:0 are not recognised as 'apple' before any attack"),
+    (
+        ["label=apple", "attack.force=false", "scene.search=0"],
+        "of solid:orange:0 are not recognised as 'apple' before any attack",
+    ),
 ]
 
 

@@ -19,7 +19,7 @@ class AttackCommandSettings(AttackSettings):
     shared: bool = False
     force: bool = False
     checks: bool = True
-    margin: float = 1.0
+    margin: float = 2.0
     rounded: bool = True
     verify: str | None = "reload"
 

@@ -17,7 +17,16 @@ from train.run_classifier import load_classifier
 from train.settings import SceneSettings, read_object, read_settings
 from train.studies.figures import pyplot
 from train.studies.page import joined, versions, wrapped, write
-from train.studies.paper import gallery, norm_balls, physical_light, rendering_quality, run_time, transfer, unseen_views
+from train.studies.paper import (
+    gallery,
+    norm_balls,
+    physical_light,
+    rendering_quality,
+    run_time,
+    survival,
+    transfer,
+    unseen_views,
+)
 from train.studies.paper.section import Section, SectionSettings, Study
 
 Measure = Callable[[Study, Any], Section]
@@ -28,6 +37,7 @@ SECTIONS: dict[str, tuple[str, type[SectionSettings], Measure]] = {  # by their 
         physical_light.PhysicalLightSettings,
         physical_light.measure,
     ),
+    "survival": ("What survives outside", survival.SurvivalSettings, survival.measure),
     "transfer": ("Transfer to unseen networks", transfer.TransferSettings, transfer.measure),
     "unseen_views": ("Unseen views", unseen_views.UnseenViewSettings, unseen_views.measure),
     "rendering_quality": ("Rendering quality", rendering_quality.QualitySettings, rendering_quality.measure),
