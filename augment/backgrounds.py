@@ -13,6 +13,8 @@ from renderer.image_files import read_image
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
     """(B, 3, size, size) of grey values or image files, or (B, 1, size, size) where all are grey; in [0, 1]."""
+    if not choices:
+        raise InputError("scene.backgrounds is empty: give grey values in [0, 1] or image files")
     images = [load_background(choice, size) for choice in choices]
     channels = max((len(image) for image in images), default=1)
     return torch.stack([image.expand(channels, -1, -1) for image in images])

@@ -102,6 +102,8 @@ class Scene:
         basis: Basis = HARMONICS,
         taken: Callable[[Tensor, Tensor], Tensor] | None = None,
     ):
+        if not examples:
+            raise InputError("nothing is to be rendered: name one mesh, one view and one background or more")
         if light.shape[-2:] != (basis.size, 3):
             raise InputError(f"light of shape {tuple(light.shape)} is not of {basis}: give {basis.size} rows")
         if not (backgrounds.min() >= 0 and backgrounds.max() <= 1):

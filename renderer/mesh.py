@@ -50,6 +50,8 @@ class Mesh:
     def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
         """An untextured mesh. `color` is one RGB (3,) or one per vertex (V, 3), sRGB-encoded in [0, 1]."""
         vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
+        if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
+            raise InputError(f"faces name vertices that are not there: give indices from 0 to {len(vertices) - 1}")
         vertex_colors = np.broadcast_to(np.asarray(color, dtype=np.float32), vertices.shape)
         return Mesh(
             vertices=vertices,
@@ -163,8 +165,10 @@ def normalise(mesh: Mesh) -> Mesh:
     float32: so files hold the vertices exactly, and what is read back covers the same pixels.
 
     The same point is the average of the vertices weighted with the areas around them (the paper's appendix).
-    Needs a positive area, as `load_mesh` ensures.
+    InputError where there is no positive area, which `load_mesh` ensures.
     """
+    if not mesh.face_areas().sum() > 0:
+        raise InputError("the mesh has a surface of zero area: give one with faces of some extent")
     centroids = mesh.vertices[mesh.faces].mean(axis=1)
     centred = mesh.vertices - np.average(centroids, axis=0, weights=mesh.face_areas())
     scaled = centred / np.abs(centred).max()

@@ -9,6 +9,7 @@ import trimesh
 import renderer
 from augment import scene as scene_module
 from augment.backgrounds import load_backgrounds
+from augment.build import build_scene
 from augment.descent import DescentSettings, Goal, descend
 from augment.norm_ball import anywhere
 from augment.objects import ObjectSettings, SceneObject, load_object
@@ -469,3 +470,9 @@ def test_a_shadow_goes_with_the_colour_of_its_pixel():
     conditions, examples = scene.conditions(torch.arange(1)), torch.arange(1)
     halved = scene.render(replace(conditions, albedo=half), examples)
     torch.testing.assert_close(halved, scene.render(conditions, examples) / 2, rtol=0, atol=100 * EPS32)
+
+
+@pytest.mark.parametrize("nothing", [{"meshes": []}, {"views": 0}, {"backgrounds": ()}])
+def test_a_scene_of_nothing_is_refused(nothing):
+    with pytest.raises(InputError, match=r"nothing is to be rendered|backgrounds is empty"):
+        build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "visibility": "software"} | nothing)

@@ -472,3 +472,14 @@ def test_the_shared_leaf_is_green():
     red, green, blue = np.unique(mesh.corner_colors.reshape(-1, 3), axis=0)[0]
     assert green > 1.5 * blue
     assert green > 0.9 * red
+
+
+@pytest.mark.parametrize("faces", [[[0, 1, 9]], [[0, 1, -1]]])
+def test_faces_of_vertices_that_are_not_there_are_refused(faces):
+    with pytest.raises(InputError, match="faces name vertices that are not there: give indices from 0 to 2"):
+        Mesh.plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], faces)
+
+
+def test_a_surface_of_zero_area_has_no_size_to_scale():
+    with pytest.raises(InputError, match="the mesh has a surface of zero area"):
+        normalise(Mesh.plain(np.zeros((3, 3)), [[0, 1, 2]]))
