@@ -22,7 +22,7 @@ from train.studies.paper.subjects import Subject, recognised_scene
 from train.tables import markdown
 
 ALBEDO = StepSettings("linf", 0.1, "sign", 0.02)
-ATTACKS: dict[str, dict[str, StepSettings]] = {
+ATTACKS: dict[str, dict[str, Any]] = {
     "light": {"lighting": LIGHT},
     "shape": {"geometry": SHAPE},
     "albedo": {"albedo": ALBEDO},
