@@ -139,11 +139,13 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
 def mitsuba() -> Iterator[Any]:
     """The module under our variant; that of before, if any, comes back. InputError: it is not installed."""
     try:
+        import drjit
         import mitsuba as module
     except ImportError as error:
         raise InputError("Mitsuba is not installed: pip install '.[lab]'") from error
     before = module.variant()
     module.set_variant(_VARIANT)
+    drjit.set_thread_count(max(2, drjit.thread_count()))  # with one, of one core, its reader of .exr waits forever
     try:
         yield module
     finally:

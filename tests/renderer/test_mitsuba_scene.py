@@ -1,5 +1,8 @@
 """A scene's files, rendered by Mitsuba, against our image of the same."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -77,3 +80,22 @@ def test_a_file_that_mitsuba_refuses_is_named_in_one_sentence(tmp_path):
     with pytest.raises(InputError, match=SCENE) as refused:
         render_mitsuba_scene(tmp_path / SCENE, 1)
     assert "\n" not in str(refused.value)
+
+
+ON_ONE_CORE = """
+import os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from pathlib import Path
+from renderer.mitsuba_scene import render_mitsuba_scene
+print(tuple(render_mitsuba_scene(Path(sys.argv[1]), 1).shape))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+def test_a_scene_is_rendered_on_a_single_core_too(tmp_path):
+    """Mitsuba then has one thread, which would wait for its own reader of .exr."""
+    write_mitsuba_scene(tmp_path, ball(), 1.0, [OrthographicCamera(1.0, 0.0, 2.0)], ImageSettings(8), "light.exr")
+    write_map(tmp_path / "light.exr", torch.ones(8, 16, 3))
+    command = [sys.executable, "-c", ON_ONE_CORE, str(tmp_path / SCENE)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "(1, 4, 8, 8)\n"), done.stderr
