@@ -1,5 +1,6 @@
 """Tables and model cards of finished runs, from the files in their folders."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -215,10 +216,11 @@ def _card(run: RunSummary, name: str) -> str:
     config, scores = run.config, run.scores
     architecture = model_title(**config.model)
     data = Path(config.data.path).name if config.data.name in ("npz", "folder") else config.data.name
-    meshes = [Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in config.scene.meshes]
+    meshes = Counter(Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in config.scene.meshes)
+    shown = ", ".join(f"{count} × {name}" if count > 1 else name for name, count in meshes.items())
     often = f"every {config.augment.every} training images" if config.augment.get("every") else "each epoch"
     count = config.augment.examples or f"{config.scene.views} × {len(config.scene.backgrounds)}"
-    renders = f"{count} renders of {', '.join(meshes)}" if run.arm != "none" else "none"
+    renders = f"{count} renders of {shown}" if run.arm != "none" else "none"
     start = config.train.get("init_from")
     rows = [
         ("network", architecture),
