@@ -52,7 +52,7 @@ def test_a_gpu_without_a_compiler_trains_all_the_same(monkeypatch, caplog):
 
 
 def test_several_processes_do_not_compile_unless_told(monkeypatch):
-    monkeypatch.setattr(compute.processes, "count", lambda: 2)
+    monkeypatch.setattr(compute.processes, "world_size", lambda: 2)
     assert not compiles("auto", GPU) and compiles("always", GPU)
 
 

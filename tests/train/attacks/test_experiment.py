@@ -11,7 +11,7 @@ from augment.attacks import run
 from augment.attacks.checks import Checks, check
 from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings, adversarial_cost, descend_repeatedly
+from augment.descent import DescentSettings, adversarial_cost, descend_in_parts
 from augment.parameters import KINDS
 from renderer.camera import ring
 from renderer.errors import InputError
@@ -48,6 +48,17 @@ def configured(*overrides: str) -> AttackExperimentSettings:
         return read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
 
 
+STANDING = {  # the light of a kind that is placed in the scene, a little of it from the start
+    "projector": "scene.projector={pixels: 4, pattern: 0.2}",
+    "lamps": "scene.lamps={places: [[2, 2, 2], [-2, 2, 2]], start: 0.5}",
+}
+
+
+def standing(kinds: str) -> list[str]:
+    """What the scene needs for the kinds."""
+    return [STANDING[kind] for kind in kinds.split(",") if kind in STANDING]
+
+
 def attacked(*overrides: str, classifier: Classifier | None = None, device: torch.device = CPU) -> Attacked:
     settings = configured(*overrides)
     (mesh,) = settings.scene.meshes
@@ -60,7 +71,7 @@ def attacked(*overrides: str, classifier: Classifier | None = None, device: torc
 @pytest.mark.parametrize("kinds", [*KINDS, "lighting,geometry,pixels"])
 def test_every_kind_alone_and_with_others_lowers_the_cost_of_its_own_images(kinds):
     """The numbers are those of the images: the cost and the answers follow from the logits."""
-    done = attacked(f"attack=[{kinds}]", "attack.max_steps=3", "scene.backgrounds=[0.4,0.5]")
+    done = attacked(f"attack=[{kinds}]", "attack.max_steps=3", "scene.backgrounds=[0.4,0.5]", *standing(kinds))
     assert [kind.name for kind in done.problem.kinds] == kinds.split(",")
     assert done.result.images.shape == (2, 1, 3, SIZE, SIZE)
     assert (done.result.cost < done.result.cost_before).all() and (done.result.steps > 0).all()
@@ -81,7 +92,7 @@ def test_every_kind_alone_and_with_others_lowers_the_cost_of_its_own_images(kind
 @pytest.mark.parametrize("kinds", [*KINDS, "lighting,geometry,albedo,pixels"])
 def test_a_gpu_attacks_as_a_cpu_does_to_rounding(kinds):
     """After one step; a gradient's sign may differ where it is nearly zero, hence not every pixel is compared."""
-    overrides = (f"attack=[{kinds}]", "attack.max_steps=1", "scene.views=2")
+    overrides = (f"attack=[{kinds}]", "attack.max_steps=1", "scene.views=2", *standing(kinds))
     expected, found = (attacked(*overrides, device=device).result for device in (CPU, torch.device("cuda")))
     torch.testing.assert_close(found.cost_before.cpu(), expected.cost_before, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(found.cost.cpu(), expected.cost, rtol=1e-2, atol=1e-2)
@@ -133,11 +144,11 @@ def test_restarts_are_within_the_ball_and_follow_from_the_seed(monkeypatch):
         drawn = []
 
         def recorded(*arguments):
-            *rest, each = arguments
+            *rest, each, at_once = arguments
             drawn.extend(each)
-            return descend_repeatedly(*rest, drawn)
+            return descend_in_parts(*rest, drawn, at_once)
 
-        monkeypatch.setattr(run, "descend_repeatedly", recorded)
+        monkeypatch.setattr(run, "descend_in_parts", recorded)
         done = attacked(f"seed={seed}", "attack.restarts=2", "attack.lighting.radius=0.02", "attack.max_steps=0")
         return torch.stack(drawn) - done.problem.start
 
