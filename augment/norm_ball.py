@@ -10,7 +10,7 @@ from renderer.basis import Ends
 from renderer.errors import FACTOR, InputError, require_range
 
 NORMS = ("linf", "l2")
-SECANTS = 20  # four are usual; what they end with is within the ball, at most that much short of the nearest
+SECANTS = 6  # four are usual; what they end with is within the ball, at most that much short of the nearest
 
 
 class Domain(Protocol):
