@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from augment.patterns import draw_patterns
-from renderer.errors import InputError, require_range
+from renderer.errors import require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
 
 REACH = 3  # pixels to either side that a blur takes in
@@ -30,8 +30,7 @@ class SnapshotSettings:
     def __post_init__(self) -> None:
         for name, most in (("patterns", 1), ("white_balance", 5), ("blur", REACH / 2), ("noise", 1)):
             require_range(f"augment.vary.snapshot.{name}", getattr(self, name), 0, most)
-        if len(self.ambient) != 2 or not 0 <= self.ambient[0] <= self.ambient[1] <= 1:
-            raise InputError(f"augment.vary.snapshot.ambient={list(self.ambient)}: give [least, most], from 0 to 1")
+        require_limits("augment.vary.snapshot.ambient", self.ambient, 0, 1)
 
     @property
     def changes(self) -> bool:

@@ -15,7 +15,7 @@ from augment.scene import Example, Scene
 from augment.snapshot import SnapshotSettings, draw_snapshot
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.harmonics import irradiance_basis, live_coefficients
 from renderer.image import clamp, decode, encode
 from renderer.image_files import SUFFIXES, read_image
@@ -57,14 +57,9 @@ class VariationSettings:
             raise InputError(f"augment.vary.place={self.place} must be a share of the frame's width, from 0 to 1")
         require_range("augment.vary.turn", self.turn, 0, 180)
         require_range("augment.vary.lamps", self.lamps, 0, 1)
-        if len(self.ambient) != 2 or not 0 <= self.ambient[0] <= self.ambient[1] <= 1:
-            raise InputError(f"augment.vary.ambient={list(self.ambient)}: give [least, most], from 0 to 1")
-        for name in ("scale", "exposure"):
-            limits = getattr(self, name)
-            if len(limits) != 2 or not 1 / FACTOR <= limits[0] <= limits[1] <= FACTOR:
-                raise InputError(
-                    f"augment.vary.{name}={list(limits)}: give [least, most], both from {1 / FACTOR:g} to {FACTOR:g}"
-                )
+        require_limits("augment.vary.ambient", self.ambient, 0, 1)
+        require_limits("augment.vary.scale", self.scale, 1 / FACTOR, FACTOR)
+        require_limits("augment.vary.exposure", self.exposure, 1 / FACTOR, FACTOR)
 
     @property
     def moves(self) -> bool:

@@ -1,4 +1,6 @@
-"""The one exception for what a user can mend, and the check that keeps NaN out."""
+"""The one exception for what a user can mend, and the checks that keep NaN and the absurd out."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -23,6 +25,12 @@ def require_range(name: str, value: float | None, least: float, most: float) -> 
     """InputError naming a setting that lies outside of what can be meant, NaN included; None is not set."""
     if value is not None and not least <= value <= most:
         raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}")
+
+
+def require_limits(name: str, limits: Sequence[float], least: float, most: float) -> None:
+    """InputError naming a setting that is not [low, high] with both inside of what can be meant."""
+    if len(limits) != 2 or not least <= limits[0] <= limits[1] <= most:
+        raise InputError(f"{name}={list(limits)}: give [least, most], both from {least:g} to {most:g}")
 
 
 def require_finite(**tensors: Tensor) -> None:

@@ -31,7 +31,7 @@ from renderer.projector import Projector
 SCENE = "scene.xml"
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
 _VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
-_TO_Z_UP = "0 0 1 0 1 0 0 0 0 1 0 0 0 0 0 1"  # see `renderer.environment`
+TO_Z_UP = ((0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1))  # its maps have y up and +z in the middle
 
 _XML = """<scene version="3.0.0">
     {integrator}
@@ -114,7 +114,7 @@ def write_mitsuba_scene(
         placed="\n".join(emitter for lit in placed for emitter in _emitters(folder, *lit, gain)),
         light=escape(light),
         scale=math.pi * gain,
-        to_z_up=_TO_Z_UP,
+        to_z_up=" ".join(str(entry) for row in TO_Z_UP for entry in row),
         sensors="\n".join(_sensor(camera, settings.size) for camera in cameras),
         shapes="\n".join(_write_parts(folder, mesh, settings)),
     )

@@ -74,7 +74,7 @@ def test_images_are_differentiable_in_the_render():
         ({"noise": float("nan")}, r"augment\.vary\.snapshot\.noise"),
         (
             {"ambient": [0.5, 0.2]},
-            r"augment\.vary\.snapshot\.ambient=\[0\.5, 0\.2\]: give \[least, most\], from 0 to 1",
+            r"augment\.vary\.snapshot\.ambient=\[0\.5, 0\.2\]: give \[least, most\], both from 0 to 1",
         ),
     ],
 )

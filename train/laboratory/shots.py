@@ -53,27 +53,29 @@ def draw_shots(
     environments: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> Iterator[Shot]:
     """`lights` shots, equally many of each family of patterns and each environment by its name, in this order and
-    evenly (by ratios) from dim to bright."""
+    evenly (by ratios) from dim to bright. A map is turned about the vertical by any angle."""
     dimmest, brightest = brightness
     kinds = [*families, *environments]
     of_each = lights // len(kinds)
+    on_white = {name: _on_white(environment) for name, environment in environments.items()}
     for kind in kinds:
         for rank in range(of_each):
             rng = np.random.default_rng(stream_seed(seed, "shot", kind, rank))
             light = dimmest * (brightest / dimmest) ** ((rank + rng.uniform()) / of_each)
             if kind in environments:
-                yield _under(kind, environments[kind], draw_shot("solid", light, rng), rng)
+                shot = draw_shot("solid", light, rng)
+                turned = np.roll(environments[kind], rng.integers(environments[kind].shape[1]), axis=1)
+                radiance = (light / on_white[kind] * turned).astype(np.float32)
+                yield replace(shot, family=kind, environment=radiance)
             else:
                 yield draw_shot(kind, light, rng)
 
 
-def _under(name: str, environment: np.ndarray, shot: Shot, rng: np.random.Generator) -> Shot:
-    """The shot under a map, turned about the vertical by any angle."""
-    turned = np.roll(environment, rng.integers(environment.shape[1]), axis=1)
+def _on_white(environment: np.ndarray) -> float:
+    """The mean radiance of a white surface that faces up, whichever way the map is turned about the vertical."""
     directions, solid_angles = equirectangular(*environment.shape[:2])
     falling = directions[..., 2].clamp(min=0) * solid_angles
-    on_white = float((falling[..., None] * torch.from_numpy(turned)).sum((0, 1)).mean()) / math.pi
-    return replace(shot, family=name, environment=(shot.brightness / on_white * turned).astype(np.float32))
+    return float((falling[..., None] * torch.from_numpy(environment)).sum((0, 1)).mean()) / math.pi
 
 
 def draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:

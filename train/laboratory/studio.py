@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from renderer.mitsuba_scene import mitsuba
+from renderer.mitsuba_scene import TO_Z_UP, mitsuba
 from train.laboratory.props import Part
 from train.laboratory.shots import FIELD_OF_VIEW, Shot
 
@@ -45,8 +45,8 @@ def _sensor(mi: ModuleType, shot: Shot, size: int) -> dict[str, Any]:
 
 
 def _lights(mi: ModuleType, shot: Shot) -> list[dict[str, Any]]:
-    if shot.environment is not None:  # Mitsuba's maps have y up and +z in the middle column, ours z up and +x there
-        turn = mi.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    if shot.environment is not None:
+        turn = mi.ScalarTransform4f([list(row) for row in TO_Z_UP])
         return [{"type": "envmap", "bitmap": mi.Bitmap(shot.environment), "to_world": turn}]
     return [_projector(mi, shot), {"type": "constant", "radiance": _rgb(shot.ambient)}]
 
