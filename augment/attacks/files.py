@@ -33,8 +33,7 @@ def write_files(
     """
     folder.mkdir(parents=True, exist_ok=True)
     everything = attacked.problem.everything
-    before = attacked.problem.conditions(attacked.problem.start, everything)
-    after = attacked.problem.conditions(attacked.result.values, everything)
+    before, after = attacked.problem.conditions(attacked.problem.start, everything), attacked.conditions
     stems = [folder / f"example_{example:03d}" for example in everything.tolist()]
     lines = []
     for example, stem in enumerate(stems):
