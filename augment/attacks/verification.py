@@ -64,16 +64,19 @@ def verify(attacked: Attacked, folders: Sequence[Path], renderers: Sequence[str]
     images = attacked.images.cpu()
     rounded = to_unit(to_bytes(images))
     versions = {"float": images, "8 bits": rounded, f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY)}
-    for name in renderers:
-        backend = attacked.problem.scene.backend
-        versions[name] = torch.stack([rendered(folder, name, backend) for folder in folders])
+    anew = [rendered(folder, renderers, attacked.problem.scene.backend) for folder in folders if renderers]
+    versions |= {name: torch.stack([each[name] for each in anew]) for name in renderers}
     return [_verdict(attacked, name, seen.to(attacked.images)) for name, seen in versions.items()]
 
 
-def rendered(folder: Path, renderer: str, backend: Backend) -> Tensor:
-    """(V, 3, size, size) from an adversary's files alone."""
+def rendered(folder: Path, renderers: Sequence[str], backend: Backend) -> dict[str, Tensor]:
+    """(V, 3, size, size) by each renderer, from an adversary's files alone, which are read once."""
     adversary = read_adversary(folder)
-    return adversary.render(backend) if renderer == "reload" else _by_mitsuba(adversary, folder / MITSUBA / SCENE)
+    by = {
+        "reload": lambda: adversary.render(backend),
+        "mitsuba": lambda: _by_mitsuba(adversary, folder / MITSUBA / SCENE),
+    }
+    return {name: by[name]() for name in renderers}
 
 
 def _by_mitsuba(adversary: Adversary, scene: Path) -> Tensor:

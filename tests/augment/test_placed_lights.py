@@ -83,7 +83,7 @@ def test_an_adversary_with_lights_in_the_scene_is_read_back_and_seen_by_mitsuba(
     pytest.importorskip("mitsuba")
     from augment.attacks.verification import rendered
 
-    seen = rendered(tmp_path, "mitsuba", choose("software"))
+    seen = rendered(tmp_path, ["mitsuba"], choose("software"))["mitsuba"]
     assert (seen - done.images[0]).abs().median() < 2 / 255
 
 
