@@ -11,7 +11,7 @@ from augment.backgrounds import load_backgrounds
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Scene
-from renderer.basis import HARMONICS, Sum
+from renderer.basis import with_placed
 from renderer.cache import OperatorCache
 from renderer.camera import ring
 from renderer.image import ImageSettings
@@ -58,18 +58,18 @@ def build_scene(
     `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
-    placed = [each.build() for each in (projector, lamps) if each is not None]
+    basis, lights = with_placed(sky, [each.build() for each in (projector, lamps) if each is not None])
     objects = [_object(member, vertices) for member in meshes]
     return Scene.grid(
         objects if ground is None else [on_ground(item, ground) for item in objects],
         ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
         load_backgrounds(backgrounds, size),
-        torch.cat([sky, *(start.to(sky) for _, start in placed)]).to(device),
+        lights.to(device),
         ImageSettings(size, samples, encoding, normals, transport),
         choose(visibility) if isinstance(visibility, str) else visibility,
         operators,
         shared=shared,
-        basis=Sum((HARMONICS, *(basis for basis, _ in placed))) if placed else HARMONICS,
+        basis=basis,
     )
 
 

@@ -1,5 +1,6 @@
 """What lights are made of. An image is linear in any light of fixed place, so that each of these has operators."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -64,6 +65,12 @@ class Placed(Functions, Protocol):
 
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
         """All ways to surface points (S, 3) of unit normals (S, 3), were nothing in between."""
+
+
+def within_power(coefficients: Tensor, power: float, ends: Ends | None = None) -> Tensor:
+    """The coefficients nearest to these from 0 to a power, and between ends, as `Functions.nearest_physical` has it."""
+    possible = coefficients.clamp(0, power)
+    return possible if ends is None else possible.clamp(*ends)
 
 
 @dataclass(frozen=True)
@@ -143,3 +150,11 @@ class Harmonics:
 
 
 HARMONICS = Harmonics()
+
+
+def with_placed(sky: Tensor, placed: Sequence[tuple[Placed, Tensor]]) -> tuple[Basis, Tensor]:
+    """(basis, coefficients (size, 3)) of the sky in harmonics and of lights in the scene, each with its own."""
+    if not placed:
+        return HARMONICS, sky
+    coefficients = [own.to(sky) for _, own in placed]
+    return Sum((HARMONICS, *(basis for basis, _ in placed))), torch.cat([sky, *coefficients])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from renderer.basis import Ends, Reach
+from renderer.basis import Ends, Reach, within_power
 from renderer.errors import FACTOR, InputError, require_range
 
 
@@ -36,8 +36,7 @@ class Lamps:
         return len(self.places)
 
     def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
-        possible = coefficients.clamp(0, self.power)
-        return possible if ends is None else possible.clamp(*ends)
+        return within_power(coefficients, self.power, ends)
 
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
         toward = points.new_tensor(self.places) - points[:, None]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from renderer.basis import Ends, Reach
+from renderer.basis import Ends, Reach, within_power
 from renderer.camera import OrthographicCamera
 from renderer.errors import FACTOR, require_range
 
@@ -48,8 +48,7 @@ class Projector:
         return self.pixels**2
 
     def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
-        possible = coefficients.clamp(0, self.power)
-        return possible if ends is None else possible.clamp(*ends)
+        return within_power(coefficients, self.power, ends)
 
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
         """One pixel reaches a point."""

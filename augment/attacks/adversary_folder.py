@@ -18,7 +18,7 @@ from torch import Tensor
 from augment.attacks.adversary import Adversary
 from augment.backgrounds import load_background
 from augment.objects import SceneObject
-from renderer.basis import HARMONICS, Sum, parts_of
+from renderer.basis import parts_of, with_placed
 from renderer.camera import OrthographicCamera
 from renderer.environment import negative_share, to_map, write_map
 from renderer.errors import FACTOR, InputError, require_bounded, require_range
@@ -107,11 +107,12 @@ def read_adversary(folder: Path) -> Adversary:
     if not cameras:
         raise InputError(f"{path} has no cameras: write it again")
     shape = len(cameras), 3, settings.size, settings.size
+    basis, coefficients = with_placed(load_light(str(light)), placed)
     return Adversary(
         shown=SceneObject(label, load_mesh(mesh), gain, name),
         cameras=cameras,
-        light=torch.cat([load_light(str(light)), *(coefficients for _, coefficients in placed)]),
-        basis=Sum((HARMONICS, *(basis for basis, _ in placed))) if placed else HARMONICS,
+        light=coefficients,
+        basis=basis,
         background=load_background(folder / background if isinstance(background, str) else background, settings.size),
         settings=settings,
         images_before=_read_images(folder / f"{BEFORE}.npy", shape),
