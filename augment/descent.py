@@ -93,7 +93,8 @@ class Goal:
 class AttackResult:
     """What an attack did, per example; all tensors lie on the values' device.
 
-    values, images: where the descent ended, or of those that fool the one of the lowest cost. steps: taken.
+    values, images: where the descent ended, or of those that fool the one of the lowest cost. steps: taken. fooled_at:
+    the step that first fooled, of no meaning where none did; with a margin, a descent goes on from there.
     cost_before, cost: the paper's cost, summed over views. predicted: the classes there. zero_gradient: the first
     gradient was exactly zero.
     """
@@ -103,6 +104,7 @@ class AttackResult:
     steps: Int[Tensor, " E"]
     fooled_before: Bool[Tensor, " E"]
     fooled: Bool[Tensor, " E"]
+    fooled_at: Int[Tensor, " E"]
     cost_before: Float[Tensor, " E"]
     cost: Float[Tensor, " E"]
     predicted: Int[Tensor, "E V"]
@@ -206,8 +208,9 @@ def descend_repeatedly(
         if not len(left):
             break
         again = descend(model, Part(problem, left, start[left]), goal.of(left), settings, phases)
-        best.steps[left] += again.steps
         better = left[again.fooled]
+        best.fooled_at[better] = (best.steps[left] + again.fooled_at)[again.fooled]
+        best.steps[left] += again.steps
         for name in ("values", "images", "fooled", "cost", "predicted"):
             getattr(best, name)[better] = getattr(again, name)[again.fooled]
     return best
@@ -222,7 +225,7 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
     """
     values = problem.start.detach().clone()
     active = torch.arange(len(values), device=values.device)
-    steps, fooled = torch.zeros_like(active), torch.zeros_like(active, dtype=torch.bool)
+    steps, fooled_at, fooled = torch.zeros_like(active), torch.zeros_like(active), torch.zeros_like(active).bool()
     cost, length = values.new_full((len(values),), torch.inf), values.new_ones(len(values), 1)
     candidate, place, slope = values.clone(), values.clone(), torch.zeros_like(values)
     predicted, batch_size = torch.zeros_like(goal.decrease), BatchSize(settings.batch_size)
@@ -239,6 +242,7 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
                 images, cost_before, fooled_before = rendered.detach().clone(), seen.cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
             done = reached & (seen.gap >= settings.margin)
+            fooled_at[active[reached & ~fooled[active]]] = step
             fell = seen.cost < cost[active]
             taken = done | fell if settings.shorten else torch.ones_like(done)
             best = done | torch.where(fooled[active], reached & fell, reached | taken)
@@ -254,7 +258,9 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
             moved = place[active] - length[active] * problem.step(slope[active])
             candidate[active] = problem.project(moved, active)
             steps[active] += 1
-    return AttackResult(values, images, steps, fooled_before, fooled, cost_before, cost, predicted, zero_gradient)
+    return AttackResult(
+        values, images, steps, fooled_before, fooled, fooled_at, cost_before, cost, predicted, zero_gradient
+    )
 
 
 def _classifier_pass(model: nn.Module, images: Tensor, goal: Goal, batch_size: BatchSize) -> _Pass:

@@ -79,7 +79,7 @@ def _success_by_steps(attacked: Attacked, descent: DescentSettings, seed: int) -
     seen, phases = attacked.settings.observed(attacked.classifier, seed), Phases(attacked.problem.start.device)
     result = descend(seen, attacked.problem, attacked.goal, longest, phases)
     limits = [descent.max_steps * factor for factor in GROWTH]
-    return {limit: _share((result.fooled & (result.steps <= limit))[attacked.recognised]) for limit in limits}
+    return {limit: _share((result.fooled & (result.fooled_at <= limit))[attacked.recognised]) for limit in limits}
 
 
 def _share(values: Tensor) -> float:

@@ -290,11 +290,13 @@ def small_network() -> nn.Sequential:
         ).double()
 
 
-def small_attack(views: int, batch_size: int = 128, shorten: bool = False) -> tuple[LinearScene, AttackResult]:
+def small_attack(
+    views: int, batch_size: int = 128, shorten: bool = False, margin: float = 0.0
+) -> tuple[LinearScene, AttackResult]:
     """Nine examples, of which some are fooled at once, on the way and never."""
     problem = LinearScene(3 * random(9, DIMENSIONS, seed=3), size=0.3, views=views)
     classes = (torch.arange(9) % 4)[:, None].expand(9, views)
-    settings = DescentSettings(8, shorten, batch_size)
+    settings = DescentSettings(8, shorten, batch_size, margin)
     return problem, descend(small_network(), problem, Goal(classes), settings, Phases())
 
 
@@ -350,12 +352,21 @@ def test_restarts_go_on_with_those_that_are_left_and_keep_what_fools():
         last = chosen if result.fooled[row] else 2
         assert int(result.steps[row]) == sum(int(each.steps[row]) for each in single[: last + 1])
         assert int(counted[row]) == int(result.steps[row]) + last + 1
+        assert not result.fooled[row] or result.fooled_at[row] == result.steps[row]
         for name in ("values", "images", "cost", "predicted"):
             torch.testing.assert_close(
                 getattr(result, name)[row], getattr(single[chosen], name)[row], rtol=0, atol=64 * EPS
             )
         for name in ("cost_before", "fooled_before", "zero_gradient"):
             assert torch.equal(getattr(result, name)[row], getattr(single[0], name)[row])
+
+
+@pytest.mark.parametrize("shorten", [False, True])
+def test_a_margin_does_not_change_when_an_example_is_first_fooled(shorten):
+    (_, border), (_, beyond) = small_attack(2, shorten=shorten), small_attack(2, shorten=shorten, margin=0.5)
+    assert torch.equal(beyond.fooled, border.fooled) and (beyond.steps > border.steps)[border.fooled].any()
+    for result in (border, beyond):
+        assert torch.equal(result.fooled_at[border.fooled], border.steps[border.fooled])
 
 
 class Watched(nn.Module):

@@ -310,6 +310,12 @@ def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
     assert found == check(done, settings, 0)
 
 
+def test_checks_count_what_fools_within_the_steps_also_where_a_margin_sends_it_on():
+    done = attacked("attack.max_steps=3", "attack.margin=100", "attack.light=signed", "attack.lighting.step_size=0.2")
+    found = check(done, done.settings.descent(), 0)
+    assert found.success == 1 and found.success_by_steps == {3: 1, 9: 1, 30: 1}
+
+
 def test_random_search_that_does_as_well_is_a_warning():
     """Any change fools a classifier that knows no image but one of almost exactly this brightness."""
     brightness, width = attacked("attack.max_steps=0").images_before.mean(), 1e-4
