@@ -5,6 +5,7 @@ from typing import Any
 
 from augment.attacks.settings import AttackSettings
 from augment.attacks.verification import require_renderers
+from augment.placed_lights import LampsSettings, ProjectorSettings
 from renderer.errors import InputError, require_range
 from train.settings import LARGEST_SEED, MOST_VIEWS, RendererSettings, SceneSettings
 
@@ -53,7 +54,8 @@ class AttackSceneSettings(SceneSettings):
 @dataclass
 class AttackExperimentSettings:
     """One attack on one classifier. target: None, a class, least_likely, or a class per view. reload: an adversary's
-    folder, to render or to attack instead of the scene."""
+    folder, to render or to attack instead of the scene. A projector or lamps that are attacked stand in the scene,
+    where it names none with their defaults."""
 
     classifier: str = "efficientnet_lite0"
     weights: str | None = None
@@ -69,3 +71,7 @@ class AttackExperimentSettings:
 
     def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)
+        if self.attack.projector is not None and self.scene.projector is None:
+            self.scene.projector = ProjectorSettings()
+        if self.attack.lamps is not None and self.scene.lamps is None:
+            self.scene.lamps = LampsSettings()

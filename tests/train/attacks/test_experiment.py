@@ -293,6 +293,13 @@ def test_the_ring_of_views_begins_at_the_azimuth():
     assert [camera.azimuth for (camera,) in done.problem.scene.cameras] == pytest.approx([math.pi / 6, 7 * math.pi / 6])
 
 
+@pytest.mark.parametrize("kind", ["projector", "lamps"])
+def test_what_is_attacked_stands_in_the_scene_without_being_named(kind):
+    alone, bare = attacked(f"attack={kind}"), attacked("attack=lighting")
+    assert len(alone.problem.scene.lights[0]) > len(bare.problem.scene.lights[0])
+    assert torch.equal(alone.images, attacked(f"attack={kind}", f"scene.{kind}={{}}").images)
+
+
 # ---------------------------------------------------------------------------------------- checks
 
 
