@@ -212,6 +212,8 @@ def load_network(run: Path, size: int | None = None, model: str | None = None) -
         )
     try:
         classes = tuple(map(str, shape.pop("classes")))
+        if not classes:
+            raise ValueError("it has no classes")
         network = build_network(classes, stored_size or size or SIZE, **shape)
     except (TypeError, ValueError, KeyError, AttributeError, RuntimeError) as error:
         raise InputError(f"checkpoint {path} is from another architecture than can be built: {error}") from error

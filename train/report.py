@@ -17,7 +17,7 @@ from renderer.errors import InputError
 from train import checkpoint
 from train.epoch import PHASES
 from train.logs import METRICS, read_metrics
-from train.networks import model_title
+from train.networks import PYTHON, model_title
 from train.photographs import FIGURES, SUMMARY, figure_title, find_figure, format_interval
 from train.run_folder import CONFIG, read_config, read_json
 from train.settings import decisive_settings
@@ -162,8 +162,11 @@ def publish_run(folder: Path, out: Path) -> None:
     run = summarise(folder)
     with complete(folder):
         card = _card(run, out.name)
+    state = checkpoint.load(folder / checkpoint.BEST)
+    if not str(state["architecture"].get("name")).startswith(PYTHON):  # whose code only its user runs
+        checkpoint.load_network(folder / checkpoint.BEST)  # or raises: nobody could use it
     out.mkdir(parents=True, exist_ok=True)
-    checkpoint.publish(out / checkpoint.PUBLISHED, checkpoint.load(folder / checkpoint.BEST))
+    checkpoint.publish(out / checkpoint.PUBLISHED, state)
     (out / "README.md").write_text(card, encoding="utf-8")
 
 

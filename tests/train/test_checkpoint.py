@@ -281,6 +281,7 @@ def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, cha
         {"classes": ["fig", "lime"], "depth": 10, "heads": 3},
         {"depth": 10},
         {"classes": None},
+        {"classes": [], "depth": 10, "width": 1},
         {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1},
         {"classes": ["fig", "lime"], "depth": 10, "width": 2},
         {"classes": ["fig", "lime"], "depth": 6 * 10**9 + 4, "width": 1},

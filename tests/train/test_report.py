@@ -1,11 +1,13 @@
 import json
 import math
+from shutil import copytree
 
 import pytest
 from scipy.stats import binomtest
 
 from renderer.errors import InputError
-from train.checkpoint import PUBLISHED, load_network
+from train import checkpoint
+from train.checkpoint import BEST, PUBLISHED, load_network
 from train.photographs import share
 from train.report import format_spread, format_table, publish_run, summarise
 
@@ -140,6 +142,15 @@ def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_ma
     assert [name for name in rows if name.startswith("photographs: ")] == [f"photographs: {name}" for name in FIGURES]
     assert "run=pretrained/tiny-adversarial photos=" in card
     assert str(finished.parent) not in card and str(tmp_path) not in card
+
+
+def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
+    run = copytree(finished, tmp_path / "run")
+    state = checkpoint.load(run / BEST)
+    checkpoint.save(run / BEST, state | {"architecture": state["architecture"] | {"width": "wide"}})
+    with pytest.raises(InputError, match=r"best\.pt is from another architecture"):
+        publish_run(run, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_run_without_its_selected_network_is_not_published(tmp_path, made_up_run):
