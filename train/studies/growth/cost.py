@@ -7,12 +7,11 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
-from multiprocessing.connection import Connection
-from typing import Any
+from multiprocessing.queues import SimpleQueue
+from operator import attrgetter
 
 import torch
 
-from augment import processes
 from augment.build import build_scene
 from augment.phases import Phases
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
@@ -40,64 +39,67 @@ class Load:
 
 @dataclass(frozen=True)
 class Cost:
-    """operators, attack, classifier: seconds to build what is kept of the views, to attack, and of that in the network.
-    memory: bytes at the peak beyond those before, of the first process.
+    """operators, attack: seconds of one core to build what is kept of the views and to attack. elapsed: seconds of the
+    attack by the clock. network: the share of those in the network. kept: bytes of the views' operators. memory: bytes
+    at the peak beyond those before.
     """
 
     operators: float
     attack: float
-    classifier: float
+    elapsed: float
+    network: float
+    kept: int
     memory: int
 
 
 def measure(load: Load) -> Cost:
-    """In as many processes as it has, on one thread each. RuntimeError where one of them fails."""
+    """Of the slowest process, of as many as it has, on one thread each. RuntimeError where one of them fails."""
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    received, sent = context.Pipe(duplex=False)
-    started = [context.Process(target=_attack, args=(load, rank, port, sent)) for rank in range(load.processes)]
+    costs = context.SimpleQueue()
+    started = [context.Process(target=_attack, args=(load, rank, port, costs)) for rank in range(load.processes)]
     for process in started:
         process.start()
     for process in started:
         process.join()
     if any(process.exitcode for process in started):
         raise RuntimeError(f"{load} ended with {[process.exitcode for process in started]}")
-    return received.recv()
+    return max((costs.get() for _ in started), key=attrgetter("attack"))
 
 
-def _attack(load: Load, rank: int, port: int, sent: Connection) -> None:
+def _attack(load: Load, rank: int, port: int, costs: "SimpleQueue[Cost]") -> None:
     torch.set_num_threads(1)
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(load.processes)}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     with process_group():
-        cost = _cost(load)
-        if processes.rank() == 0:
-            sent.send(Cost(**cost))
+        costs.put(_cost(load))
 
 
-def _cost(load: Load) -> dict[str, Any]:
-    before, phases = _peak(), Phases()
+def _cost(load: Load) -> Cost:
+    before, phases, start = _peak(), Phases(), time.process_time()
     meshes = [(f"solid:orange:{seed}", "orange") for seed in range(load.meshes)]
-    with phases("operators"):
-        scene = build_scene(
-            meshes, load.size, load.views, backgrounds=GREYS, samples=2, normals="flat", visibility="software"
-        )
-        assert scene.stacks
-    attack = TrainingAttackSettings(max_steps=load.steps)
+    scene = build_scene(
+        meshes, load.size, load.views, backgrounds=GREYS, samples=2, normals="flat", visibility="software"
+    )
+    kept = sum(stack.transfer.nbytes + stack.albedo.nbytes for stack in scene.stacks)
+    built = time.process_time()
     labels = torch.zeros(len(scene), dtype=torch.int64)
-    service = AugmentationService(AugmentationSettings(attack=attack), scene, labels, 0, phases)
+    attack = AugmentationSettings(attack=TrainingAttackSettings(max_steps=load.steps))
+    service = AugmentationService(attack, scene, labels, 0, phases)
     with phases("attack"):
         service.regenerate(sure_network(), 0)
-    seconds = phases.take()
-    return {
-        "operators": seconds["operators"],
-        "attack": seconds["attack"],
-        "classifier": seconds["attack_classifier"],
-        "memory": _peak() - before,
-    }
+    attacked, seconds = time.process_time(), phases.take()
+    return Cost(
+        operators=built - start,
+        attack=attacked - built,
+        elapsed=seconds["attack"],
+        network=seconds["attack_classifier"] / seconds["attack"],
+        kept=kept,
+        memory=_peak() - before,
+    )
 
 
 def sure_network() -> WideResNet:
@@ -113,14 +115,14 @@ def _peak() -> int:
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def described(load: Load) -> str:
-    """What differs from the default."""
-    default = asdict(Load())
-    return ", ".join(f"{name} {value:,}" for name, value in asdict(load).items() if value != default[name]) or "default"
+def described(load: Load, usual: Load = Load(0, 0, 0, 0, 0)) -> str:
+    """What differs from the usual."""
+    changed = {name: value for name, value in asdict(load).items() if value != getattr(usual, name)}
+    return ", ".join(f"{name} {value:,}" for name, value in changed.items()) or "as it is"
 
 
 def timed(function: Callable[[], object]) -> float:
-    """Seconds."""
-    start = time.perf_counter()
+    """Seconds of one core."""
+    start = time.process_time()
     function()
-    return time.perf_counter() - start
+    return time.process_time() - start
