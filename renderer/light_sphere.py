@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from renderer.basis import HARMONICS, Basis, Placed, parts_of
 from renderer.camera import OrthographicCamera
 from renderer.image import develop
 from renderer.shading import irradiance
@@ -14,13 +15,14 @@ _SAMPLES = 2  # per pixel side
 _OBLIQUE = OrthographicCamera(math.pi / 3, 0.0, 2.0)  # the first of `renderer.camera.ring`
 
 
-def light_sphere(light: Tensor, size: int, camera: OrthographicCamera = _OBLIQUE) -> Tensor:
-    """A diffuse white ball in a light ((degree + 1)², 3), which fills a square image as the camera sees it, on white.
+def light_sphere(light: Tensor, size: int, camera: OrthographicCamera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:
+    """A diffuse white ball in a light (basis.size, 3), which fills a square image as the camera sees it, on white.
 
-    Returns (3, size, size) float32, sRGB-encoded in [0, 1]. The pixel's value before encoding is irradiance / π, so
-    that even light of radiance 1 is white; what is darker than black or brighter than white is clamped. A diffuse ball
-    rather than a mirror, which would show the series ringing and the coefficients that reach no surface.
-    InputError: NaN.
+    The ball is that of radius 1 about the origin, which says how far lights in the scene are. A light in harmonics may
+    have any degree. Returns (3, size, size) float32, sRGB-encoded in [0, 1]. The pixel's value before encoding is the
+    ball's radiance, so that even light of radiance 1 is white; what is darker than black or brighter than white is
+    clamped. A diffuse ball rather than a mirror, which would show the series ringing and the coefficients that reach no
+    surface. InputError: NaN.
     """
     side = size * _SAMPLES
     across = (2 * torch.arange(side, dtype=torch.float64) + 1) / side - 1
@@ -29,6 +31,18 @@ def light_sphere(light: Tensor, size: int, camera: OrthographicCamera = _OBLIQUE
     inside = back > 0
     normals = torch.stack([right, up, back.sqrt()], dim=-1)[inside] @ torch.from_numpy(camera.axes())
     radiance = torch.zeros(3, side, side, dtype=torch.float64)
-    radiance[:, inside] = irradiance(normals, light.detach().cpu()) / math.pi
+    light = light.detach().cpu()
+    for rows, part in parts_of(basis):
+        if isinstance(part, Placed):
+            radiance[:, inside] += _placed_radiance(normals, light[rows], part)
+        else:
+            radiance[:, inside] += irradiance(normals, light if part is basis else light[rows]) / math.pi
     radiance, coverage = (avg_pool2d(layer, _SAMPLES).flatten(1) for layer in (radiance, inside[None].double()))
     return develop(radiance, coverage, background=torch.ones(1, 1), encoding="srgb").unflatten(1, (size, size)).float()
+
+
+def _placed_radiance(normals: Tensor, light: Tensor, basis: Placed) -> Tensor:
+    """(3, N) at the ball's points, which are its normals (N, 3)."""
+    reach = basis.reach(normals, normals)
+    arriving = reach.irradiance[:, None] * light.to(normals)[reach.function]
+    return torch.zeros_like(normals).index_add_(0, reach.point, arriving).T

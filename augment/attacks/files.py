@@ -15,8 +15,7 @@ from augment.attacks.checks import Checks
 from augment.attacks.figure import Exhibit, answer_caption, save_figure
 from augment.attacks.run import Attacked
 from augment.attacks.verification import Verdict, verify
-from augment.scene import Conditions
-from renderer.basis import parts_of
+from augment.scene import Conditions, Scene
 from renderer.light_sphere import light_sphere
 from renderer.mesh_damage import mesh_damage
 
@@ -33,11 +32,11 @@ def write_files(
     """
     folder.mkdir(parents=True, exist_ok=True)
     everything = attacked.problem.everything
-    before, after = attacked.problem.conditions(attacked.problem.start, everything), attacked.conditions
+    after = attacked.conditions
     stems = [folder / f"example_{example:03d}" for example in everything.tolist()]
     lines = []
     for example, stem in enumerate(stems):
-        _write_image(attacked, before, after, example, stem.with_suffix(".png"))
+        save_figure(*exhibits(attacked, example), stem.with_suffix(".png"))
         images = attacked.images_before[example], attacked.images[example]
         light = write_adversary(Adversary.of(attacked.problem.scene, example, after, *images), stem)
         lines.append({"example": example, **_numbers(attacked, example), **light, **_damage(attacked, after, example)})
@@ -51,25 +50,27 @@ def write_files(
     return verdicts
 
 
-def _write_image(attacked: Attacked, before: Conditions, after: Conditions, example: int, path: Path) -> None:
-    sides = [
-        (attacked.images_before, attacked.logits_before, before),
-        (attacked.result.images, attacked.logits, after),
-    ]
-    initial, adversarial = (_exhibit(attacked, *side, example) for side in sides)
-    save_figure(initial, adversarial, path)
+def exhibits(attacked: Attacked, example: int) -> tuple[Exhibit, Exhibit]:
+    """What an example shows before and after; its light only where the attack has changed it."""
+    problem, result = attacked.problem, attacked.result
+    one = problem.everything[example : example + 1]
+    before, after = (problem.conditions(values[one], one).light[0] for values in (problem.start, result.values))
+    changed = not torch.equal(before, after)
+    spheres = [_spheres(problem.scene, light, example) if changed else None for light in (before, after)]
+    labels = [attacked.classifier.classes[label] for label in attacked.goal.decrease[example].tolist()]
+
+    def captions(logits: Tensor) -> list[tuple[str, ...]]:
+        answers = zip(logits[example].softmax(1), labels, strict=True)
+        return [answer_caption(view, attacked.classifier.classes, label) for view, label in answers]
+
+    return (
+        Exhibit(attacked.images_before[example], captions(attacked.logits_before), spheres[0]),
+        Exhibit(attacked.images[example], captions(attacked.logits), spheres[1]),
+    )
 
 
-def _exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Conditions, example: int) -> Exhibit:
-    scene, classes = attacked.problem.scene, attacked.classifier.classes
-    labels = attacked.goal.decrease[example].tolist()
-    captions = [
-        answer_caption(view.softmax(0), classes, classes[label])
-        for view, label in zip(logits[example], labels, strict=True)
-    ]
-    sky, _ = parts_of(scene.basis)[0]
-    spheres = [light_sphere(conditions.light[example, sky], SPHERE, camera) for camera in scene.cameras[example]]
-    return Exhibit(images[example], captions, torch.stack(spheres))
+def _spheres(scene: Scene, light: Tensor, example: int) -> Tensor:
+    return torch.stack([light_sphere(light, SPHERE, camera, scene.basis) for camera in scene.cameras[example]])
 
 
 def _numbers(attacked: Attacked, example: int) -> dict[str, object]:

@@ -7,10 +7,12 @@ import pytest
 import torch
 import trimesh
 
+from renderer.basis import HARMONICS, Sum
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings, encode
+from renderer.lamps import Lamps
 from renderer.light_sphere import light_sphere
 from renderer.lights import ambient, directional, probe
 from renderer.shading import radiance
@@ -94,6 +96,25 @@ def test_it_is_what_the_renderer_makes_of_a_white_ball(name):
     expected = encode(linear, "srgb").unflatten(1, (size, size))[:, inside].float()
     assert expected.min() > encode(torch.tensor(0.02), "srgb")
     torch.testing.assert_close(light_sphere(light, size, camera)[:, inside], expected, rtol=0, atol=2.5 * 1.5e-4)
+
+
+def test_lamps_add_their_inverse_squares_to_the_light_from_afar():
+    """c · cos / d² at each of a pixel's four samples, which are averaged before the encoding."""
+    place, power, size = torch.tensor([0.3, -0.4, 2.5]).double(), torch.tensor([0.5, 1.0, 2.0]).double(), 32
+    light = torch.cat([ambient(torch.full((3,), 0.1)), power[None].float()])
+    image = light_sphere(light, size, TOP, Sum((HARMONICS, Lamps((tuple(place.tolist()),)))))
+    at = (torch.arange(2 * size).double() + 0.5) / size - 1
+    right, up = at.expand(2 * size, -1), -at[:, None].expand(-1, 2 * size)
+    back = (1 - right**2 - up**2).clamp(min=0).sqrt()
+    normal = torch.stack([-up, right, back])  # from above, +y is to the right and -x is up
+    toward = place[:, None, None] - normal
+    arriving = ((toward * normal).sum(0) / toward.norm(dim=0) ** 3).clamp(min=0)
+    expected = 0.1 + power[:, None, None] * torch.nn.functional.avg_pool2d(arriving[None, None], 2)[0]
+    inside = disc(size)
+    assert expected[:, inside].std() > 0.05
+    torch.testing.assert_close(
+        image[:, inside], encode(expected.clamp(max=1), "srgb").float()[:, inside], rtol=0, atol=1e-6
+    )
 
 
 def test_too_bright_is_white_and_below_zero_is_black():

@@ -10,6 +10,7 @@ from hydra import compose, initialize_config_module
 
 from augment.attacks.adversary_folder import MAP_HEIGHT
 from augment.attacks.checks import check
+from augment.attacks.figure import read_figure
 from augment.attacks.files import LINES, write_files
 from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
@@ -66,6 +67,19 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(tmp_path):
         assert line["recognised"] is (before.argmax().item() == 0)
         change = (done.result.values[example] - done.problem.start[example]).abs().max().item()
         assert line["largest_change"] == {"lighting": change} and change > 0
+
+
+@pytest.mark.parametrize("kind", ["projector", "geometry"])
+def test_the_image_shows_the_light_that_the_attack_has_changed(tmp_path, kind):
+    """All of it, a pattern included."""
+    done = attacked(f"attack={kind}")
+    write_files(done, None, tmp_path)
+    columns = dict(read_figure(tmp_path / "example_000.png"))
+    lights = [columns[title][0].image for title in ("initial light", "adversarial light") if title in columns]
+    if kind == "geometry":
+        assert not lights
+    else:
+        assert (lights[0] != lights[1]).any()
 
 
 def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_physical(tmp_path):

@@ -10,14 +10,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.attacks.figure import Exhibit, answer_caption, save_figure
+from augment.attacks.figure import save_figure
+from augment.attacks.files import exhibits
 from augment.attacks.run import Attacked
 from augment.attacks.settings import SIGNED, SkylightSettings
 from augment.objects import ObjectSettings
 from augment.parameters import StepSettings
-from augment.scene import Conditions
 from renderer.errors import InputError
-from renderer.light_sphere import light_sphere
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackCommandSettings, AttackExperimentSettings, AttackSceneSettings
 from train.settings import RendererSettings
@@ -26,8 +25,6 @@ from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.subjects import VERTICES
 from train.tables import markdown
 
-SPHERE = 224
-LIGHTS = {"lighting", "skylight"}
 LIMIT = 150_000  # bytes of a committed image; above it the colours are reduced
 WIDER_SHAPE = StepSettings("linf", 0.01, "sign", 0.001)
 FREE_SHAPE = StepSettings("linf", None, "sign", 0.001)
@@ -153,29 +150,9 @@ def cases(lamp: ObjectSettings, orange: ObjectSettings, targets: Sequence[str], 
     ]
 
 
-def exhibits(attacked: Attacked) -> tuple[Exhibit, Exhibit]:
-    """The first example before and after."""
-    problem, first = attacked.problem, torch.arange(1)
-    return (
-        exhibit(attacked, attacked.images_before, attacked.logits_before, problem.conditions(problem.start[:1], first)),
-        exhibit(
-            attacked, attacked.result.images, attacked.logits, problem.conditions(attacked.result.values[:1], first)
-        ),
-    )
-
-
-def exhibit(attacked: Attacked, images: Tensor, logits: Tensor, conditions: Conditions) -> Exhibit:
-    classes, (label, *_) = attacked.classifier.classes, attacked.goal.decrease[0].tolist()
-    captions = [answer_caption(view.softmax(0), classes, classes[label]) for view in logits[0]]
-    if not LIGHTS & {kind.name for kind in attacked.problem.kinds}:
-        return Exhibit(images[0], captions)
-    spheres = [light_sphere(conditions.light[0], SPHERE, camera) for camera in attacked.problem.scene.cameras[0]]
-    return Exhibit(images[0], captions, torch.stack(spheres))
-
-
 def save_small(attacked: Attacked, path: Path) -> None:
     """The image of an attack, in 256 colours where it would be large."""
-    save_figure(*exhibits(attacked), path)
+    save_figure(*exhibits(attacked, 0), path)
     if path.stat().st_size > LIMIT:
         with Image.open(path) as image:
             reduced = image.quantize(256)

@@ -11,6 +11,7 @@ import trimesh
 from PIL import Image
 from torch import nn
 
+from augment.attacks import files
 from augment.classifiers import Classifier
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
@@ -199,7 +200,7 @@ def test_the_gallery_has_a_small_image_and_a_row_for_each_case(tmp_path, monkeyp
     BALL.export(tmp_path / "ball.ply")
     meshes = f"scene.meshes=[{tmp_path}/ball.ply,{tmp_path}/ball.ply]"
     monkeypatch.setattr(gallery, "VERTICES", 100)
-    monkeypatch.setattr(gallery, "SPHERE", 16)
+    monkeypatch.setattr(files, "SPHERE", 16)
     settings = ["section.targets=[candle,joystick]", "section.steps=2", f"out={tmp_path}/docs"]
     reproduce(bright(), "section=gallery", meshes, *settings)
     folder = tmp_path / "docs" / "paper"
