@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from augment.model_state import as_found
 from augment.perturbation import Perturbation
+from renderer.basis import HARMONICS, Basis
 
 MOST = 4
 
@@ -15,8 +16,8 @@ MOST = 4
 class Specimens:
     """S of the examples that a model errs on, as the scene had them before and under the conditions that fool.
 
-    images_before, images: (S, 3, H, W) in [0, 1]. lights_before, lights: (S, 49, 3). answers_before, answers: (S, C)
-    probabilities. labels: (S,) int64.
+    images_before, images: (S, 3, H, W) in [0, 1]. lights_before, lights: (S, basis.size, 3). answers_before, answers:
+    (S, C) probabilities. labels: (S,) int64.
     """
 
     images_before: Tensor
@@ -26,6 +27,7 @@ class Specimens:
     answers_before: Tensor
     answers: Tensor
     labels: Tensor
+    basis: Basis = HARMONICS
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -45,4 +47,6 @@ def choose_specimens(
     with as_found(model), torch.no_grad():
         images = [problem.scene.render(conditions, rows)[:, 0] for conditions in (before, after)]
         answers = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
-    return Specimens(images[0], images[1], before.light, after.light, answers[0], answers[1], labels[rows])
+    return Specimens(
+        images[0], images[1], before.light, after.light, answers[0], answers[1], labels[rows], problem.scene.basis
+    )

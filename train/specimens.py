@@ -15,33 +15,35 @@ from torch.nn.functional import interpolate
 from augment.specimens import MOST, Specimens
 from renderer.errors import InputError
 from renderer.image import to_bytes
+from renderer.light_sphere import light_sphere
 
 SUFFIX = ".safetensors"
 LARGEST_SIDE = 128  # pixels; larger images are reduced
 OTHER = "other things"  # whose label is anything but a class
-KINDS, NAMES = ("images", "lights"), ("before", "after")
-DEGREES = 50  # more than any light has bands
+KINDS, NAMES = ("images", "spheres"), ("before", "after")
+SPHERE = 64  # pixels
 
 
 @dataclass(frozen=True)
 class Side:
-    """A specimen, before or after: image (3, H, W) uint8, light ((degree + 1)², 3), the model's answer."""
+    """A specimen, before or after: its image and a white ball in its light, (3, H, W) uint8, and the model's answer."""
 
     image: Tensor
-    light: Tensor
+    sphere: Tensor
     answer: str
     confidence: float
 
 
 def write_specimens(path: Path, specimens: Specimens, classes: Sequence[str]) -> None:
-    """Images as bytes and lights as float32, in the safetensors format; labels and answers in its metadata."""
+    """Images as bytes, in the safetensors format; labels and answers in its metadata."""
     tensors, answers = {}, {"label": [classes[index] if index >= 0 else OTHER for index in specimens.labels.tolist()]}
     for name, images, lights, probabilities in [
         ("before", specimens.images_before, specimens.lights_before, specimens.answers_before),
         ("after", specimens.images, specimens.lights, specimens.answers),
     ]:
         tensors[f"images_{name}"] = to_bytes(_reduced(images.detach().cpu())).contiguous()
-        tensors[f"lights_{name}"] = lights.detach().float().cpu().contiguous()
+        spheres = [to_bytes(light_sphere(light, SPHERE, basis=specimens.basis)) for light in lights]
+        tensors[f"spheres_{name}"] = torch.stack(spheres)
         best = probabilities.max(1)
         answers[name] = [classes[index] for index in best.indices.tolist()]
         answers[f"confidence_{name}"] = best.values.tolist()
@@ -64,16 +66,14 @@ def read_specimens(path: Path) -> list[tuple[str, Side, Side]]:
 
 
 def _sides(tensors: dict[str, Tensor], answers: dict[str, Any], name: str, count: int) -> list[Side]:
-    images, lights = tensors[f"images_{name}"], tensors[f"lights_{name}"]
-    if not (len(images) == len(lights) == count <= MOST and images.dtype == torch.uint8):
-        raise ValueError(f"{len(images)} images and {len(lights)} lights for {count} answers")
-    if images.shape[1] != 3 or images.shape[2] > LARGEST_SIDE or images.shape[2] != images.shape[3]:
-        raise ValueError(f"images of shape {tuple(images.shape)}")
-    if lights.shape[1] not in {(degree + 1) ** 2 for degree in range(DEGREES)} or not lights.isfinite().all():
-        raise ValueError(f"lights of shape {tuple(lights.shape)}, or infinite ones")
+    for images in (shown := [tensors[f"{kind}_{name}"] for kind in KINDS]):
+        if not (len(images) == count <= MOST and images.dtype == torch.uint8):
+            raise ValueError(f"{len(images)} images for {count} answers")
+        if images.shape[1] != 3 or images.shape[2] > LARGEST_SIDE or images.shape[2] != images.shape[3]:
+            raise ValueError(f"images of shape {tuple(images.shape)}")
     told = zip(answers[name], answers[f"confidence_{name}"], strict=True)
-    rows = zip(images, lights, told, strict=True)
-    return [Side(image, light, str(answer), float(share)) for image, light, (answer, share) in rows]
+    rows = zip(*shown, told, strict=True)
+    return [Side(image, sphere, str(answer), float(share)) for image, sphere, (answer, share) in rows]
 
 
 def _reduced(images: Tensor) -> Tensor:

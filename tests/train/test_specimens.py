@@ -4,19 +4,23 @@ import pytest
 import torch
 
 from augment.specimens import MOST, Specimens
+from renderer.basis import HARMONICS, Sum
 from renderer.errors import InputError
 from renderer.image import to_bytes
-from train.specimens import LARGEST_SIDE, read_specimens, write_specimens
+from renderer.light_sphere import light_sphere
+from renderer.projector import Projector
+from train.specimens import LARGEST_SIDE, SPHERE, read_specimens, write_specimens
 
 CLASSES = ["apple", "orange"]
+BASIS = Sum((HARMONICS, Projector(pixels=2)))
 
 
 def specimens(side: int, count: int = 2) -> Specimens:
     draws = torch.Generator().manual_seed(0)
     images, lights = (torch.rand(2, count, 3, *rest, generator=draws) for rest in ((side, side), (1,)))
-    lights = lights.expand(2, count, 3, 49).transpose(2, 3)
+    lights = lights.expand(2, count, 3, BASIS.size).transpose(2, 3)
     answers = torch.tensor([[0.25, 0.75], [0.875, 0.125]])[:, None].expand(2, count, 2)
-    return Specimens(*images, *lights, *answers, torch.ones(count, dtype=torch.int64))
+    return Specimens(*images, *lights, *answers, torch.ones(count, dtype=torch.int64), BASIS)
 
 
 def test_specimens_are_read_as_they_were_written(tmp_path):
@@ -31,7 +35,8 @@ def test_specimens_are_read_as_they_were_written(tmp_path):
             (before, written.images_before, written.lights_before),
             (after, written.images, written.lights),
         ]:
-            assert torch.equal(side.image, to_bytes(images[row])) and torch.equal(side.light, lights[row])
+            sphere = light_sphere(lights[row], SPHERE, basis=BASIS)
+            assert torch.equal(side.image, to_bytes(images[row])) and torch.equal(side.sphere, to_bytes(sphere))
 
 
 def test_a_file_stays_small_whatever_the_images_size(tmp_path):

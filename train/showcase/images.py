@@ -8,14 +8,12 @@ from PIL import Image
 
 from renderer.errors import InputError
 from renderer.image_files import read_square
-from renderer.light_sphere import light_sphere
-from renderer.tiles import Tile
 from train.photographs.answers import Answer
 from train.photographs.contact_sheet import caption, evenly
 from train.showcase.blocks import Gallery, Illustration
 from train.specimens import SUFFIX, Side, read_specimens
 
-TILE, SPHERE = 96, 64  # pixels
+TILE = 96  # pixels
 TILES = 8  # photographs of each kind
 WIDEST = 720  # pixels of a grid of renders
 
@@ -71,11 +69,10 @@ def specimens(folder: Path, arm: str) -> Iterator[Gallery]:
 
 def _sides(label: str, sides: Sequence[Side]) -> Iterator[Illustration]:
     for when, side in zip(("before", "after"), sides, strict=True):
-        image = Image.fromarray(side.image.permute(1, 2, 0).numpy()).resize((TILE, TILE), Image.Resampling.NEAREST)
-        sphere = Image.fromarray(Tile.of(light_sphere(side.light, SPHERE), ()).image)
-        pair = Image.new("RGB", (TILE + SPHERE, TILE), "white")
-        pair.paste(image)
-        pair.paste(sphere, (TILE, (TILE - SPHERE) // 2))
+        image, sphere = (Image.fromarray(shown.permute(1, 2, 0).numpy()) for shown in (side.image, side.sphere))
+        pair = Image.new("RGB", (TILE + sphere.width, TILE), "white")
+        pair.paste(image.resize((TILE, TILE), Image.Resampling.NEAREST))
+        pair.paste(sphere, (TILE, (TILE - sphere.height) // 2))
         said = f"{side.confidence:.0%} {side.answer}"
         yield encoded(pair, f"{label} {when}: called {said}; a ball in its light", pair.width, f"{when}: {said}")
 
