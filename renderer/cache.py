@@ -23,8 +23,7 @@ from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
-from renderer.transfer import TENSORS, Operator, build_operator
-from renderer.transport import build_transport
+from renderer.transfer import TENSORS, Operator, OperatorBuilder
 from renderer.visibility import Backend
 
 
@@ -168,9 +167,9 @@ class OperatorCache(TensorCache):
         missing = [camera for camera in keys if camera not in views]
         if missing:
             fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, backend, closed=mesh.closed)
-            transport = build_transport(mesh, settings, gain, basis)
+            builder = OperatorBuilder(mesh, settings, gain, basis, dtype)
             for camera, seen in zip(missing, fragments, strict=True):
-                operator = build_operator(mesh, seen, settings, gain, basis, dtype, transport)
+                operator = builder.operator(seen)
                 views[camera] = _pack(mesh, seen, operator)
                 self.write(keys[camera], views[camera])
         self.tally.add(built=len(missing), views=views.values())

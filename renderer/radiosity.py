@@ -17,9 +17,9 @@ from renderer.albedo import surface_albedo
 from renderer.basis import Distant
 from renderer.fragments import Fragments
 from renderer.mesh import Mesh
-from renderer.normals import face_normals
 from renderer.rays import Looks, Rays
 from renderer.subdivision import refine
+from renderer.surface import Surface
 
 PATCHES = 2**11  # the mesh's area over that is about the area of a patch
 MIDDLE = [[-1.0, -1.0], [1.0, -1.0], [0.0, 2.0]]  # a triangle around the only sample of an image
@@ -91,13 +91,13 @@ class Radiosity:
     colors: whether any patch is not grey.
     """
 
-    def __init__(self, mesh: Mesh, encoding: str, gain: float, basis: Distant, bounces: int):
-        """gain multiplies the mesh's albedo."""
-        self.patches = patches = Patches.of(mesh)
+    def __init__(self, patches: Patches, rays: Rays, encoding: str, gain: float, basis: Distant, bounces: int):
+        """rays: among the patches' pieces. gain multiplies the mesh's albedo."""
+        self.patches = patches
         albedo = patches.mean(surface_albedo(patches.pieces, patches.view, encoding)) * gain
         self.colors = bool((albedo != albedo[:, :1]).any())
         reflected = albedo[:, None, : 3 if self.colors else 1] / math.pi
-        from_sky, receiving, links = _first_bounce(patches, basis)
+        from_sky, receiving, links = _first_bounce(patches, rays, basis)
         self._sent = from_sky * reflected
         for _ in range(bounces - 1):
             arriving = torch.from_numpy(links @ self._sent.flatten(1).numpy()).view(-1, *self._sent.shape[1:])
@@ -109,15 +109,14 @@ class Radiosity:
         return torch.from_numpy(self.patches.seen(looks, weights) @ sent)
 
 
-def _first_bounce(patches: Patches, basis: Distant) -> tuple[Tensor, Tensor, csr_matrix]:
+def _first_bounce(patches: Patches, rays: Rays, basis: Distant) -> tuple[Tensor, Tensor, csr_matrix]:
     """(N, size, 1) irradiance of the patches from the sky alone; those (M,) that see others, and how much of the
     radiance of each (M, N) is their irradiance."""
-    view, rays = patches.view, Rays(patches.pieces)
-    normals = face_normals(torch.from_numpy(patches.pieces.vertices), view.corners) * view.facing
-    from_sky = normals.new_zeros(len(view.pixels), basis.size)
-    from_sky[:, basis.live] = patches.mean(basis.irradiance(normals))
+    surface = Surface(patches.view, torch.from_numpy(patches.pieces.vertices))
+    from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
+    from_sky[:, basis.live] = patches.mean(basis.irradiance(surface.planes))
     receiving, links, radiance = [], [], basis.radiance(rays.directions)
-    for looks in rays.looks(view):
+    for looks in rays.looks(surface):
         weights = looks.blocked() * patches.shares[looks.sample, 0]
         from_sky[looks.pixels] -= weights @ radiance
         receiving.append(looks.pixels)

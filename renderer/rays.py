@@ -8,6 +8,7 @@ no other surface is to be seen, all of a convex mesh, cast none.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,9 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.fragments import Fragments
-from renderer.harmonics import per_degree, unit_vectors
+from renderer.harmonics import per_degree
 from renderer.mesh import Mesh
-from renderer.normals import face_normals
-from renderer.shading import smooth_normals
+from renderer.surface import Surface
 
 DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
 OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32
@@ -49,35 +48,26 @@ class Looks:
 
 
 class Rays:
-    """Rays among the faces of one mesh. InputError where Embree is not installed.
+    """Rays among the faces of one mesh. InputError, when a ray is cast, where Embree is not installed.
 
-    directions: (D, 3), equally far apart. offset: of where a ray starts above its surface. smooth_faces: (F, 3), all
-    faces of the views, whose vertices are the mesh's, to shade with interpolated vertex normals.
+    directions: (D, 3), equally far apart. offset: of where a ray starts above its surface.
     """
 
-    def __init__(self, mesh: Mesh, smooth_faces: np.ndarray | None = None):
+    def __init__(self, mesh: Mesh):
         self.directions = sphere(DIRECTIONS)
-        self._vertices = torch.from_numpy(mesh.vertices).double()
-        self._smooth_faces = None if smooth_faces is None else torch.from_numpy(smooth_faces)
         self.offset = OFFSET * float(np.abs(mesh.vertices).max())
-        self._outermost = torch.from_numpy(_outermost(mesh.vertices[np.unique(mesh.faces)])).double()
-        self._scene = _embree_scene(mesh)
+        self._mesh = mesh
 
-    def looks(self, fragments: Fragments) -> Iterator[Looks]:
-        """Those of the view's pixels that see any other surface, some at a time.
+    def looks(self, surface: Surface) -> Iterator[Looks]:
+        """Those of a view's pixels that see any other surface, some at a time.
 
         No ray is cast into a sample's own face, on which smooth normals shade the light nevertheless.
         """
-        corners = self._vertices[fragments.corners]
-        planes = face_normals(self._vertices, fragments.corners) * fragments.facing
-        pixels = self._overlooked(fragments, planes, corners[:, 0])
+        fragments = surface.fragments
+        pixels = self._overlooked(surface)
         if not len(pixels):
             return
-        planes = planes.index_select(0, fragments.face)
-        origins = fragments.interpolate(corners) + planes * self.offset
-        normals = planes
-        if self._smooth_faces is not None:
-            normals = unit_vectors(smooth_normals(fragments, self._vertices, self._smooth_faces).T)[0].T
+        planes, normals = surface.planes, surface.normals
         count = fragments.pixel.bincount(minlength=len(fragments.pixels))
         first = count.cumsum(0) - count
         directions, solid_angle = self.directions, 4 * math.pi / len(self.directions)
@@ -87,17 +77,27 @@ class Rays:
             cosine = torch.einsum("bdi,di->bd", normals[sample], directions).clamp(min=0)
             above = torch.einsum("bdi,di->bd", planes[sample], directions)
             cast = torch.nonzero((cosine > 0) & (above > 0), as_tuple=True)
-            met = self.meet(origins[sample[cast]], directions[cast[1]])
+            met = self.meet(surface.points[sample[cast]] + self.offset * planes[sample[cast]], directions[cast[1]])
             met = torch.full_like(sample, -1).index_put_(cast, met)
             yield Looks(some, directions, sample, cosine * of_pixel * solid_angle, met)
 
-    def _overlooked(self, fragments: Fragments, planes: Tensor, corners: Tensor) -> Tensor:
-        """The pixels with a sample on a face above whose plane, through a corner, the mesh rises; all of them, where to
-        find out would take longer than to cast the rays. planes, corners: (G, 3)."""
+    @cached_property
+    def _scene(self) -> Any:
+        return _embree_scene(self._mesh)
+
+    @cached_property
+    def _outermost(self) -> Tensor:
+        return torch.from_numpy(_outermost(self._mesh.vertices[np.unique(self._mesh.faces)])).double()
+
+    def _overlooked(self, surface: Surface) -> Tensor:
+        """The pixels with a sample on a face above whose plane the mesh rises; all of them, where to find out would
+        take longer than to cast the rays."""
+        fragments, planes = surface.fragments, surface.face_planes
         if len(planes) * len(self._outermost) > COMPARISONS:
             return torch.arange(len(fragments.pixels))
         parts = planes.split(max(1, 8 * BLOCK // len(self._outermost)))
         reach = torch.cat([(part @ self._outermost.T).amax(1) for part in parts])
+        corners = surface.vertices[fragments.corners[:, 0]]
         rises = reach - (planes * corners).sum(1) > self.offset
         return fragments.pixel[rises[fragments.face]].unique()
 

@@ -19,6 +19,7 @@ from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.shading import radiance
+from renderer.surface import Surface
 from renderer.transfer import Operator, build_operators
 from renderer.transport import build_transport
 from renderer.visibility import choose
@@ -62,14 +63,16 @@ def render(
     views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(visibility), closed=mesh.closed)
     backgrounds = as_background(background, size, light).expand(len(views), -1, -1, -1)
     smooth_faces = torch.from_numpy(mesh.faces).to(light.device) if normals == "smooth" else None
-    indirect = build_transport(replace(mesh, vertices=positions), settings, gain, Harmonics(math.isqrt(len(light)) - 1))
+    moved = replace(mesh, vertices=positions)
+    indirect = build_transport(moved, settings, gain, Harmonics(math.isqrt(len(light)) - 1))
     images = []
     for view, behind in zip(views, backgrounds, strict=True):
         seen = view.to(light.device)
-        surface = _albedo(mesh, seen, albedo, encoding).to(light) * gain
-        shade = radiance(seen, vertices, light, surface, smooth_faces)
+        colors = _albedo(mesh, seen, albedo, encoding).to(light) * gain
+        shade = radiance(seen, vertices, light, colors, smooth_faces)
         if indirect is not None:
-            shade = shade + indirect.radiance(view, surface.detach().cpu().double(), light)
+            surface = Surface.of(moved, view, settings)
+            shade = shade + indirect.radiance(surface, colors.detach().cpu().double(), light)
         images.append(compose(shade, seen.coverage.to(light), seen.pixels, behind, encoding))
     return torch.stack(images)
 

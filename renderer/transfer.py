@@ -24,10 +24,10 @@ from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
-from renderer.normals import face_normals
 from renderer.placed import placed_transfer
-from renderer.shading import smooth_normals
-from renderer.transport import Transport, build_transport
+from renderer.rays import Rays
+from renderer.surface import Surface
+from renderer.transport import build_transport
 from renderer.visibility import Backend
 
 if TYPE_CHECKING:
@@ -164,61 +164,53 @@ def build_operators(
     camera sees, with normals as the settings say. InputError: `renderer.transport`.
     """
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, backend, closed=mesh.closed)
-    transport = build_transport(mesh, settings, gain, basis)
-    return [build_operator(mesh, view, settings, gain, basis, dtype, transport) for view in views]
+    builder = OperatorBuilder(mesh, settings, gain, basis, dtype)
+    return [builder.operator(view) for view in views]
 
 
-def build_operator(
-    mesh: Mesh,
-    fragments: Fragments,
-    settings: ImageSettings,
-    gain: float,
-    basis: Basis,
-    dtype: torch.dtype,
-    transport: Transport | None,
-) -> Operator:
-    """The operator of one view that has been rasterised; see `build_operators`. transport: `build_transport`'s."""
-    require_bounded(gain=torch.tensor(gain))
-    albedo = surface_albedo(mesh, fragments, settings.encoding) * gain
-    factor = None if transport and transport.colors else _pixel_albedo(fragments, albedo, dtype)
-    if factor is None:
-        factor = torch.ones(len(fragments.pixels), 3)
-    else:
-        albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
-    transfers, kept = [], []
-    for where, part in parts_of(basis):
-        if isinstance(part, Placed):
-            transfer, reaching = placed_transfer(mesh, fragments, albedo, settings, part)
+class OperatorBuilder:
+    """Operators of one mesh in lights of one basis; see `build_operators`. What the views share is made once."""
+
+    def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis, dtype: torch.dtype):
+        require_bounded(gain=torch.tensor(gain))
+        self._mesh, self._settings, self._gain, self._basis, self._dtype = mesh, settings, gain, basis, dtype
+        self._transport = build_transport(mesh, settings, gain, basis)
+        self._rays = self._transport.rays if self._transport else Rays(mesh)
+
+    def operator(self, fragments: Fragments) -> Operator:
+        """Of one view that has been rasterised."""
+        albedo = surface_albedo(self._mesh, fragments, self._settings.encoding) * self._gain
+        colors = self._transport and self._transport.colors
+        factor = None if colors else _pixel_albedo(fragments, albedo, self._dtype)
+        if factor is None:
+            factor = torch.ones(len(fragments.pixels), 3)
         else:
-            transfer, reaching = _distant_transfer(mesh, fragments, albedo, settings, part, dtype, transport)
-        transfers.append(transfer.to(dtype))
-        kept.append(where.start + reaching)
-    return Operator(
-        transfer=torch.cat(transfers, dim=1),
-        albedo=factor.T.to(dtype).contiguous(),
-        coverage=fragments.coverage.to(dtype),
-        pixels=fragments.pixels,
-        kept=torch.cat(kept),
-        settings=settings,
-        basis=basis,
-    )
+            albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
+        surface, transfers, kept = Surface.of(self._mesh, fragments, self._settings), [], []
+        for where, part in parts_of(self._basis):
+            if isinstance(part, Placed):
+                transfer, reaching = placed_transfer(self._rays, surface, albedo, part)
+            else:
+                transfer, reaching = self._distant_transfer(surface, albedo, part)
+            transfers.append(transfer.to(self._dtype))
+            kept.append(where.start + reaching)
+        return Operator(
+            transfer=torch.cat(transfers, dim=1),
+            albedo=factor.T.to(self._dtype).contiguous(),
+            coverage=fragments.coverage.to(self._dtype),
+            pixels=fragments.pixels,
+            kept=torch.cat(kept),
+            settings=self._settings,
+            basis=self._basis,
+        )
 
-
-def _distant_transfer(
-    mesh: Mesh,
-    fragments: Fragments,
-    albedo: Tensor,
-    settings: ImageSettings,
-    basis: Distant,
-    dtype: torch.dtype,
-    transport: Transport | None,
-) -> tuple[Tensor, Tensor]:
-    """((C, K, P), the K coefficients that reach a pixel (K,)); albedo: (S, C), at the samples."""
-    transfer = _box_filter(_shades(mesh, fragments, albedo, settings, basis), len(fragments.pixels), dtype)
-    change = transport.change(fragments, albedo) if transport else None
-    if change is None:
-        return transfer, basis.live
-    return change.index_add_(1, basis.live, transfer.double()), torch.arange(basis.size)
+    def _distant_transfer(self, surface: Surface, albedo: Tensor, basis: Distant) -> tuple[Tensor, Tensor]:
+        """((C, K, P), the K coefficients that reach a pixel (K,)); albedo: (S, C), at the samples."""
+        transfer = _box_filter(_shades(surface, albedo, basis), len(surface.fragments.pixels), self._dtype)
+        change = self._transport.change(surface, albedo) if self._transport else None
+        if change is None:
+            return transfer, basis.live
+        return change.index_add_(1, basis.live, transfer.double()), torch.arange(basis.size)
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:
@@ -237,13 +229,12 @@ class _Shades:
     basis: Callable[[slice], Tensor]
 
 
-def _shades(mesh: Mesh, fragments: Fragments, albedo: Tensor, settings: ImageSettings, basis: Distant) -> _Shades:
-    vertices = torch.from_numpy(mesh.vertices)
-    if settings.normals == "smooth":
-        normals = smooth_normals(fragments, vertices, torch.from_numpy(mesh.faces))
+def _shades(surface: Surface, albedo: Tensor, basis: Distant) -> _Shades:
+    fragments = surface.fragments
+    if surface.smooth_faces is not None:
         weights = albedo / fragments.samples**2
-        return _Shades(fragments.pixel, weights, lambda some: basis.irradiance(normals[some]))
-    shading = basis.irradiance(face_normals(vertices, fragments.corners) * fragments.facing)
+        return _Shades(fragments.pixel, weights, lambda some: basis.irradiance(surface.normals[some]))
+    shading = basis.irradiance(surface.face_planes)
     pixel, face, weights = fragments.merge(albedo)
     return _Shades(pixel, weights, lambda some: shading.index_select(0, face[some]))
 

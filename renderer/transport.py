@@ -9,34 +9,35 @@ from torch import Tensor
 
 from renderer.basis import Basis, Distant, Placed, parts_of
 from renderer.errors import InputError
-from renderer.fragments import Fragments
 from renderer.image import ImageSettings, bounces
 from renderer.mesh import Mesh
-from renderer.radiosity import Radiosity
+from renderer.radiosity import Patches, Radiosity
 from renderer.rays import Rays
+from renderer.surface import Surface
 
 
 class Transport:
     """The shadows that a mesh casts on itself and the light that it sends itself, per unit of a basis.
 
-    colors: whether that light is of other colours than the sky's. InputError where Embree is not installed.
+    colors: whether that light is of other colours than the sky's. rays: among the mesh's surfaces.
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Distant):
         """gain multiplies the albedo of what sends light."""
         count = bounces(settings.transport)
-        self._radiosity = Radiosity(mesh, settings.encoding, gain, basis, count) if count else None
-        met = self._radiosity.patches.pieces if self._radiosity else mesh
-        self._rays = Rays(met, mesh.faces if settings.normals == "smooth" else None)
-        self._sky = basis.radiance(self._rays.directions)
+        patches = Patches.of(mesh) if count else None
+        self.rays = Rays(patches.pieces if patches else mesh)
+        self._radiosity = Radiosity(patches, self.rays, settings.encoding, gain, basis, count) if patches else None
+        self._sky = basis.radiance(self.rays.directions)
         self.colors = self._radiosity is not None and self._radiosity.colors
 
-    def change(self, fragments: Fragments, albedo: Tensor) -> Tensor | None:
+    def change(self, surface: Surface, albedo: Tensor) -> Tensor | None:
         """(C, size, P) float64: what is added to the radiance of a view's pixels per unit coefficient, weighted with
         coverage; None where nothing is. albedo: (S, C) linear, at the samples; C is 3 where the light has `colors`.
         """
-        change, weights = None, albedo.T / fragments.samples**2
-        for looks in self._rays.looks(fragments):
+        change, fragments = None, surface.fragments
+        weights = albedo.T / fragments.samples**2
+        for looks in self.rays.looks(surface):
             blocked = looks.blocked()
             if not blocked.any():
                 continue
@@ -49,11 +50,11 @@ class Transport:
                     added[:, looks.pixels] += self._radiosity.gather(looks, lost, channel).T
         return change
 
-    def radiance(self, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
+    def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
         """(3, P) in the light's dtype: what `change` makes of a light (size, 3); differentiable in it."""
-        change = self.change(fragments, albedo)
+        change = self.change(surface, albedo)
         if change is None:
-            return light.new_zeros(3, len(fragments.pixels))
+            return light.new_zeros(3, len(surface.fragments.pixels))
         return torch.einsum("ckp,kc->cp", change.to(light), light)
 
 

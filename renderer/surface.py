@@ -1,0 +1,53 @@
+"""The surface that a view shows."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from renderer.fragments import Fragments
+from renderer.harmonics import unit_vectors
+from renderer.image import ImageSettings
+from renderer.mesh import Mesh
+from renderer.normals import face_normals
+from renderer.shading import smooth_normals
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What the S samples of a view lie on, in float64; found when asked for.
+
+    smooth_faces: (F, 3), all faces of the mesh, to shade with interpolated vertex normals.
+    """
+
+    fragments: Fragments
+    vertices: Tensor
+    smooth_faces: Tensor | None = None
+
+    @staticmethod
+    def of(mesh: Mesh, fragments: Fragments, settings: ImageSettings) -> "Surface":
+        smooth_faces = torch.from_numpy(mesh.faces) if settings.normals == "smooth" else None
+        return Surface(fragments, torch.from_numpy(mesh.vertices).double(), smooth_faces)
+
+    @cached_property
+    def planes(self) -> Tensor:
+        """(S, 3) unit normals of their faces, on the side that the camera sees."""
+        return self.face_planes[self.fragments.face]
+
+    @cached_property
+    def face_planes(self) -> Tensor:
+        """(G, 3) the same of each face in sight."""
+        return face_normals(self.vertices, self.fragments.corners) * self.fragments.facing
+
+    @cached_property
+    def normals(self) -> Tensor:
+        """(S, 3) unit normals to shade with."""
+        if self.smooth_faces is None:
+            return self.planes
+        return unit_vectors(smooth_normals(self.fragments, self.vertices, self.smooth_faces).T)[0].T
+
+    @cached_property
+    def points(self) -> Tensor:
+        """(S, 3)"""
+        return self.fragments.interpolate(self.vertices[self.fragments.corners])
