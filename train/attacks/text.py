@@ -39,7 +39,7 @@ def _survival(verdict: Verdict, fooled: Tensor) -> str:
     largest, mean = 255 * verdict.largest[fooled].max(), 255 * verdict.mean[fooled].mean()
     return (
         f"{verdict.version}: {int(verdict.fooled[fooled].sum())} of {int(fooled.sum())} still fool; "
-        f"values differ by {mean:.2g}/255 on average, {largest:.2g}/255 at most"
+        f"values differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
     )
 
 
@@ -63,7 +63,7 @@ def format_reloaded(adversary: Adversary, images: Tensor, logits: Tensor, classe
     off = 255 * (images - adversary.images.to(images)).abs().flatten(1).amax(1)
     return "\n".join(
         f"view {view}: {adversary.shown.label} is taken for {classes[index]} ({confidence:.1%}); "
-        f"values differ from the saved image's by {largest:.2g}/255 at most"
+        f"values differ from the saved image's by {largest:.3g}/255 at most"
         for view, (index, confidence, largest) in enumerate(
             zip(best.indices.tolist(), best.values.tolist(), off.tolist(), strict=True)
         )
