@@ -3,6 +3,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,9 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
-from train import fit, sweep
+from train import checkpoint, fit, sweep
 from train.__main__ import main
-from train.checkpoint import LAST
+from train.checkpoint import LAST, content_hash
 from train.cli import USER_ERROR
 from train.logs import read_metrics
 from train.run_folder import FAILURE, LOCK, locked
@@ -358,12 +359,19 @@ def test_torchrun_starts_no_sweep(monkeypatch):
 
 def command(folder: Path, *overrides: str) -> subprocess.CompletedProcess:
     """`python -m train --multirun` with a small network in processes of its own."""
+    with started(folder, *overrides) as process:
+        out, errors = process.communicate()
+    return subprocess.CompletedProcess(process.args, process.returncode, out, errors)
+
+
+def started(folder: Path, *overrides: str) -> subprocess.Popen:
     environment = {name: value for name, value in os.environ.items() if name != "SUBMITIT_EXECUTOR"}
-    return subprocess.run(
+    return subprocess.Popen(
         [sys.executable, "-m", "train", "--multirun", *SMALL, "train.epochs=1", f"sweep={folder}", *overrides],
         cwd=folder.parent,
         env=environment | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
     )
 
@@ -416,3 +424,40 @@ def test_submitits_executor_trains_cells_in_jobs(tiny_npz, cell, tmp_path):
     assert [row[:2] for row in rows(done.stdout)] == [["augment", "seed"], ["none", "0"]]
     (log,) = (folder / ".submitit").glob("*/*_log.out")
     assert "epoch 1/1" in log.read_text() and "epoch 1/1" not in done.stdout
+
+
+@pytest.mark.slow
+def test_a_preempted_job_queues_itself_again_and_ends_with_the_same_bits(tiny_npz, cell, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    long = [f"data.path={tiny_npz}", "train.epochs=20"]
+    undisturbed = command(tmp_path / "undisturbed", *long)
+    assert undisturbed.returncode == 0, undisturbed.stderr
+    folder = tmp_path / "preempted"
+    with started(folder, *long, "launcher=submitit_local") as process:
+        (log,) = wait_for(lambda: [file for file in folder.glob(".submitit/*/*.out") if "epoch 2/" in file.read_text()])
+        (job,) = (int(each.parent.name) for each in Path("/proc").glob("[0-9]*/cmdline") if is_job(each, folder))
+        os.kill(job, signal.SIGUSR2)  # as Slurm does where the job is preempted
+        assert process.wait(300) == 0
+    assert "Requeued job" in log.read_text() and "resumed" in log.read_text()
+    states = [checkpoint.load(cell(each, *long) / LAST) for each in (tmp_path / "undisturbed", folder)]
+    assert states[0]["epoch"] == states[1]["epoch"] and content_hash(states[0]["model"]) == content_hash(
+        states[1]["model"]
+    )
+
+
+def wait_for(found, seconds=120):
+    """What is found in the end."""
+    end = time.monotonic() + seconds
+    while not (result := found()):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return result
+
+
+def is_job(command_line: Path, folder: Path) -> bool:
+    """Whether a process is a job of submitit's with logs in the folder."""
+    try:
+        words = command_line.read_bytes().decode(errors="replace").split("\0")
+    except OSError:  # it has ended
+        return False
+    return "submitit.core._submit" in words and any(word.startswith(str(folder)) for word in words)
