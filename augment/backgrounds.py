@@ -20,23 +20,23 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
     return torch.stack([image.expand(channels, -1, -1) for image in images])
 
 
-def load_background(choice: float | str | Path, size: int) -> Tensor:
-    """A grey value (1, size, size), or an image's centre square (3, size, size), in [0, 1]."""
+def load_background(choice: float | str | Path, size: int, key: str = "scene.backgrounds") -> Tensor:
+    """A grey value (1, size, size), or an image's centre square (3, size, size), in [0, 1]. key: errors name it."""
     if isinstance(choice, Path):
-        return _image(choice, size)
+        return _image(choice, size, key)
     try:
         grey = float(choice)
     except ValueError:
-        return _image(Path(str(choice)), size)
+        return _image(Path(str(choice)), size, key)
     except TypeError:
         grey = math.nan
     if not 0 <= grey <= 1:
-        raise InputError(f"scene.backgrounds={choice}: give grey values in [0, 1] or image files")
+        raise InputError(f"{key}={choice}: give grey values in [0, 1] or image files")
     return torch.full((1, size, size), grey)
 
 
-def _image(path: Path, size: int) -> Tensor:
+def _image(path: Path, size: int, key: str) -> Tensor:
     try:
         return read_image(path, size)
     except InputError as error:
-        raise InputError(f"scene.backgrounds: {error} or a grey value") from error
+        raise InputError(f"{key}: {error} or a grey value") from error

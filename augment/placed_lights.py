@@ -28,10 +28,12 @@ class ProjectorSettings:
 
     def build(self) -> tuple[Projector, Tensor]:
         """The basis, and the pattern (pixels², 3)."""
+        require_range("scene.projector.polar", self.polar, 0, 180)
+        require_range("scene.projector.azimuth", self.azimuth, -360, 360)
         require_range("scene.projector.field_of_view", self.field_of_view, 0.1, 170)
         polar, azimuth, field_of_view = map(math.radians, (self.polar, self.azimuth, self.field_of_view))
         basis = Projector(self.pixels, polar, azimuth, self.distance, field_of_view, self.power)
-        pattern = load_background(self.pattern, self.pixels).expand(3, -1, -1)
+        pattern = load_background(self.pattern, self.pixels, "scene.projector.pattern").expand(3, -1, -1)
         return basis, self.power * pattern.flatten(1).T
 
 

@@ -1,6 +1,7 @@
 """Point lamps at given places."""
 
 from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -26,6 +27,8 @@ class Lamps:
     def __post_init__(self) -> None:
         if not self.places or not all(len(place) == 3 and any(place) for place in self.places):
             raise InputError(f"lamps.places={self.places}: give [x, y, z] of at least one lamp, none at the origin")
+        for value in chain(*self.places):
+            require_range("a coordinate of lamps.places", value, -FACTOR, FACTOR)
         require_range("lamps.power", self.power, 1 / FACTOR, FACTOR)
 
     def __str__(self) -> str:

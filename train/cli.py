@@ -31,7 +31,7 @@ LONGEST_NAME = 200  # characters
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 TEXTS = {  # keys of names and folders
     *("run", "sweep", "init_from", "out", "keep", "photos", "photographs", "path", "images", "cache"),
-    *("weights", "light", "label", "classifier"),
+    *("weights", "light", "label", "classifier", "reload"),
 }
 NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false", re.IGNORECASE)
 HYDRAS_ADVICE = re.compile(r"\n(?:To append|See https:|Config search path:)")  # begins what serves nobody here

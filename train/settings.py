@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from augment.objects import ObjectSettings
@@ -215,12 +215,26 @@ def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") ->
     if unset := OmegaConf.missing_keys(config):
         raise InputError(f"{min(unset)} is not set: give {min(unset)}=...")
     try:
-        return cast(Settings, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), config)))
+        merged = OmegaConf.merge(OmegaConf.structured(kind), config)
+        for nested in _nested(merged):
+            raise InputError(f"{'.'.join(filter(None, (parent, nested)))}: give a plain value, no list or mapping")
+        return cast(Settings, OmegaConf.to_object(merged))
     except OmegaConfBaseException as error:
         at_fault = error.full_key or next(str(key) for key in config if not _merges(kind, config, str(key)))
         key = ".".join(filter(None, (parent, at_fault)))
         said = "give a list, as in [a,b]" if "is not a ListConfig" in str(error.msg) else str(error.msg).splitlines()[0]
         raise InputError(f"{key}: {said}") from error
+
+
+def _nested(node: Any) -> Iterator[str]:
+    """The keys of lists and mappings that stand where plain values are declared, which OmegaConf lets pass."""
+    if isinstance(node, ListConfig | DictConfig) and not (node._is_none() or node._is_missing()):
+        plain = node._metadata.element_type in (str, int, float, bool)
+        for key in range(len(node)) if isinstance(node, ListConfig) else node:
+            child = node._get_node(key)
+            if plain and OmegaConf.is_config(child):
+                yield node._get_full_key(key)
+            yield from _nested(child)
 
 
 def _merges(kind: type, config: DictConfig, key: str) -> bool:

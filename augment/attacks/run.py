@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.criteria import Criterion, Misclassification
+from augment.attacks.criteria import Criterion, Misclassification, Targeted
 from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier
 from augment.descent import AttackResult, Goal, descend_in_parts
@@ -113,7 +113,7 @@ def attack(
     criterion: `Misclassification` (the default), `Targeted`, `LeastLikely`. settings: what is changed, within which
     norm-balls; by default the light, without a limit. seed: of the restarts. force: also where the classifier is wrong
     to begin with. The scene lies on the classifier's device.
-    InputError where an example is not recognised before, or the classifier lacks a class.
+    InputError where an example is not recognised before, the classifier lacks a class, or a target is the right one.
     """
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_kinds()
@@ -123,7 +123,10 @@ def attack(
     labels = torch.tensor([classifier.label(label) for label in scene.labels], device=before.device)
     if not force:
         require_recognised(scene, before, labels, classifier)
-    targets = (criterion or Misclassification()).targets(before, classifier)
+    criterion = criterion or Misclassification()
+    targets = criterion.targets(before, classifier)
+    if isinstance(criterion, Targeted) and (targets == labels[:, None]).any():
+        raise InputError(f"target={criterion.classes} is the right class of an example: name one to mistake it for")
     goal = Goal(labels[:, None].expand(-1, scene.views), targets)
     phases = Phases(problem.start.device)
     starts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))

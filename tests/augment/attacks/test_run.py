@@ -71,5 +71,7 @@ def test_what_is_not_recognised_or_no_class_is_refused_in_one_sentence(classifie
         augment.attack(classifier, augment.build_scene([("solid:orange", "mango")], 8, **SMALL))
     with pytest.raises(InputError, match="names 2 classes for 1 views"):
         augment.attack(classifier, scene, augment.Targeted(["lime", "sky"]), force=True)
+    with pytest.raises(InputError, match="target=lime is the right class of an example"):
+        augment.attack(classifier, scene, augment.Targeted("lime"), force=True)
     with pytest.raises(InputError, match="attack: name what to change"):
         augment.attack(classifier, scene, settings=augment.AttackSettings(), force=True)
