@@ -8,9 +8,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from augment.attacks.adversary_folder import read_adversary
 from augment.attacks.run import logits_of
+from augment.attacks.sweep import Sweep
 from augment.parameters import KINDS
 from renderer.errors import InputError
 from renderer.visibility import choose
+from train.attacks.curve import FIGURE, TABLE, curve, format_curve, write_curve
 from train.attacks.experiment import attacks
 from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings
@@ -38,6 +40,7 @@ def main(config: DictConfig) -> None:
         if not settings.attack.kinds:
             return
     out = writable_folder(settings.out, "out")
+    sweeps: dict[str, Sweep] = {}
     with sole_writer("out", out):
         for index, (name, scene, attacked) in enumerate(attacks(settings, classifier, device, adversary)):
             if scene != settings.scene:
@@ -47,6 +50,12 @@ def main(config: DictConfig) -> None:
             verdicts = attacked.save(folder, checks, settings.attack.renderers)
             print(format_attack(name, attacked, checks, verdicts))
             print(f"images, adversaries and numbers: {folder}\n")
+            if settings.attack.sweep:
+                sweeps[folder.name] = attacked.sweep(settings.attack.sweep)
+                print(f"{format_curve(sweeps[folder.name])}\n")
+        if sweeps:
+            write_curve(curve(sweeps), {kind: each.norm for kind, each in settings.attack.kinds.items()}, out)
+            print(f"success against radius: {out / TABLE} and {out / FIGURE}")
         OmegaConf.save(config, out / "config.yaml")
 
 

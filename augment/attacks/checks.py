@@ -1,5 +1,6 @@
 """Guards against fooling oneself: does the cost fall, does random search do as well, do more steps fool more?"""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -47,29 +48,32 @@ def check(attacked: Attacked, descent: DescentSettings, seed: int) -> Checks:
     result = attacked.result
     open_cases = ~result.fooled_before
     fell = (result.cost < result.cost_before) | result.fooled
+    draws = generator(seed, "random search")
+    random = fooled_by_draws(
+        attacked, result.fooled_before, descent.max_steps, lambda: attacked.problem.sample_as_far(result.values, draws)
+    )
     return Checks(
         cost_before=float(result.cost_before.mean()),
         cost=float(result.cost.mean()),
         cost_fell=_share(fell[open_cases]) if open_cases.any() else 1.0,
         zero_gradient=_share(result.zero_gradient),
         success=_share(attacked.success[attacked.recognised]),
-        random_search=_share(_random_search(attacked, descent, seed)[attacked.recognised]),
+        random_search=_share(random[attacked.recognised]),
         success_by_steps=_success_by_steps(attacked, descent, seed),
     )
 
 
-def _random_search(attacked: Attacked, descent: DescentSettings, seed: int) -> Tensor:
-    """(E,) whether any draw fools."""
-    problem, result = attacked.problem, attacked.result
-    draws, fooled = generator(seed, "random search"), result.fooled_before.clone()
-    for _ in range(descent.max_steps):
+def fooled_by_draws(attacked: Attacked, fooled: Tensor, tries: int, draw: Callable[[], Tensor]) -> Tensor:
+    """(E,) bool: whether `fooled` (E,) says so, or any of so many draws (E, D) fools."""
+    fooled = fooled.clone()
+    for _ in range(tries):
         left = torch.nonzero(~fooled).squeeze(1)
         if not len(left):
             break
-        drawn = problem.sample_as_far(result.values, draws)
+        drawn = draw()[left]
         with torch.no_grad():
-            images = problem.render(drawn[left], left)
-        predicted = logits_of(attacked.judge, images, descent.batch_size).argmax(2)
+            images = attacked.problem.render(drawn, left)
+        predicted = logits_of(attacked.judge, images, attacked.settings.batch_size).argmax(2)
         fooled[left] = attacked.goal.of(left).reached(predicted)
     return fooled
 

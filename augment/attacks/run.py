@@ -24,6 +24,7 @@ from renderer.errors import InputError
 
 if TYPE_CHECKING:
     from augment.attacks.checks import Checks
+    from augment.attacks.sweep import Sweep
     from augment.attacks.verification import Verdict
 
 
@@ -86,6 +87,12 @@ class Attacked:
         from augment.attacks.checks import check
 
         return check(self, self.settings.descent(), self.seed)
+
+    def sweep(self, scales: Sequence[float]) -> Sweep:
+        """Success against the radius of the norm-balls: see `augment.attacks.sweep.sweep`."""
+        from augment.attacks.sweep import sweep
+
+        return sweep(self, scales)
 
     def save(
         self, folder: str | Path, checks: Checks | None = None, verify: Sequence[str] = ("reload",)

@@ -1,12 +1,15 @@
+import csv
 import json
 import runpy
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
 from omegaconf import OmegaConf
+from PIL import Image
 
 from renderer.lights import load_light
 from renderer.mesh import load_mesh
@@ -106,7 +109,25 @@ def test_an_adversary_is_rendered_again_and_gone_on_from(run, tmp_path, capsys):
     assert again["cost_before"] == pytest.approx(line["cost"], abs=0.05)
 
 
+def test_success_against_radius_is_a_table_and_a_figure(run, tmp_path, capsys):
+    two = "scene.meshes=[solid:orange:0,solid:orange:0]"
+    assert run("attack=lighting", "attack.checks=false", "scene.views=2", two, "attack.sweep=[1,0.01,0.2]") == 0
+    assert capsys.readouterr().out.count("| lighting 0.2 ") == 2
+    with open(tmp_path / "out" / "sweep.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    meshes = ("0_solid_orange_0", "1_solid_orange_0", "all")
+    found = {(row["mesh"], row["method"], row["lighting"]): row for row in rows}
+    assert [*found] == [*product(meshes, ("adversarial", "random"), ("0.01", "0.2", "1.0"))]
+    for (mesh, method, radius), row in found.items():
+        assert 0 <= float(row["low"]) <= float(row["value"]) <= float(row["high"]) <= 1
+        if mesh == "all":
+            assert int(row["hits"]) == sum(int(found[one, method, radius]["hits"]) for one in meshes[:2])
+    with Image.open(tmp_path / "out" / "sweep.png") as figure:
+        assert figure.size == (750, 570)
+
+
 REFUSED = [
+    (["attack.sweep=[0.1,-1]"], "attack.sweep=-1.0 must be at least 1e-05"),
     (["attack=lihgting"], "attack=lihgting is not known: choose from lighting, skylight, projector, lamps, geometry"),
     (["attack=null"], "attack=null is not known: choose from lighting"),
     (["attack=[]"], "attack: name what to change"),

@@ -6,20 +6,24 @@ from typing import Any
 from augment.attacks.settings import AttackSettings
 from augment.attacks.verification import require_renderers
 from augment.placed_lights import LampsSettings, ProjectorSettings
-from renderer.errors import InputError, require_range
+from renderer.errors import FACTOR, InputError, require_range
 from train.settings import LARGEST_SEED, MOST_VIEWS, RendererSettings, SceneSettings
+
+MOST_RADII = 100
 
 
 @dataclass
 class AttackCommandSettings(AttackSettings):
     """shared: the views share what is attacked. force: go on where nothing is recognised. checks: see `Checks`.
 
+    sweep: radii to draw success against; see `augment.attacks.sweep`.
     verify: what renders the adversaries anew from their files, "reload" or "mitsuba" or both joined by +; or None.
     """
 
     shared: bool = False
     force: bool = False
     checks: bool = True
+    sweep: list[float] = field(default_factory=list)
     margin: float = 2.0
     rounded: bool = True
     verify: str | None = "reload"
@@ -27,6 +31,9 @@ class AttackCommandSettings(AttackSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_renderers(self.renderers)
+        require_range("attack.sweep: radii", len(self.sweep), 0, MOST_RADII)
+        for scale in self.sweep:
+            require_range("attack.sweep", scale, 1 / FACTOR, FACTOR)
 
     @property
     def renderers(self) -> list[str]:
