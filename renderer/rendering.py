@@ -54,7 +54,7 @@ def render(
     place of the texture of a mesh that has one. gain multiplies the albedo. samples: per pixel
     side. encoding: linear or srgb. normals: flat or smooth. transport: direct; shadows, that a mesh casts on itself; or
     bounces:N, with light that its own colours send on N times; the gradient by vertices and albedo holds both fixed.
-    visibility: auto, opengl or software.
+    visibility: auto, opengl, compiled or software.
     InputError: NaN, shapes that do not fit, unknown choices.
     """
     settings = ImageSettings(size, samples, encoding, normals, transport)

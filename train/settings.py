@@ -98,7 +98,8 @@ class TrainingSceneSettings(SceneSettings):
 
 @dataclass
 class RendererSettings:
-    """visibility: auto, opengl or software. samples per pixel side. encoding: linear or srgb. normals: flat or smooth.
+    """visibility: auto, opengl, compiled or software. samples per pixel side. encoding: linear or srgb. normals: flat
+    or smooth.
 
     transport: direct, shadows or bounces:N; see `renderer.render`. cache: the folder of what is rendered once, auto or
     None; see `renderer.cache.cache_folder`.

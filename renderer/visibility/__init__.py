@@ -1,4 +1,4 @@
-"""Which face covers each sample: two back ends, OpenGL and NumPy, under one contract.
+"""Which face covers each sample: three back ends, OpenGL, NumPy and numba, under one contract.
 
 rasterise(points, faces, resolution, closed) -> ids
 
@@ -11,26 +11,28 @@ closed      promises a watertight mesh within the range of depths, its faces cou
             but where a face turned away is as near as the nearest within rounding, as along outlines
 ids         (N, R, R) int32, row 0 at the top: the nearest face's index, the lower one where depths tie, or -1
 
-Both back ends snap vertices to 1/256 of a sample, so faces that share an edge cover each sample once.
+All snap vertices to 1/256 of a sample, so faces that share an edge cover each sample once. NumPy and numba agree to the
+bit; OpenGL rounds depths otherwise.
 """
 
 import re
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 
 from renderer.errors import InputError
-from renderer.visibility import opengl, software
+from renderer.visibility import opengl
 
-NAMES = ("auto", "opengl", "software")
+NAMES = ("auto", "opengl", "compiled", "software")
 SPAN = 2**21  # samples; vertices outside are pulled in, so that fixed-point edge functions fit in int64
-_RASTERISERS = {"opengl": opengl.rasterise, "software": software.rasterise}
 _SOFTWARE_OPENGL = re.compile("llvmpipe|softpipe|swrast|swiftshader|software rasterizer", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Backend:
-    """One way to rasterise. `description` names it, and the device, for the line logged at the start."""
+    """One way to rasterise. `name` is its module, `description` names it, and the device, for the line logged at the
+    start."""
 
     name: str
     description: str
@@ -40,28 +42,44 @@ class Backend:
         if not np.isfinite(points).all():
             raise ValueError("points hold NaN or infinity")
         reach = SPAN / resolution
-        return _RASTERISERS[self.name](np.clip(points, -reach, reach), faces, resolution, closed)
+        module = import_module(f"renderer.visibility.{self.name}")
+        return module.rasterise(np.clip(points, -reach, reach), faces, resolution, closed)
 
 
 def choose(backend: str = "auto") -> Backend:
     """Settle on a back end, once at the start.
 
-    "auto" takes OpenGL where a GPU drives it and software otherwise. InputError: unknown name, or "opengl"
-    on a machine that cannot.
+    "auto" takes OpenGL where a GPU drives it, else compiled where numba is installed, else software. InputError:
+    unknown name, "opengl" on a machine that cannot, or "compiled" without numba.
     """
     if backend not in NAMES:
         raise InputError(f"renderer.visibility={backend}: choose one of {', '.join(NAMES)}")
     if backend == "software":
         return Backend("software", "software (NumPy)")
+    if backend == "compiled":
+        return _compiled()
     try:
         device = opengl.device()
     except InputError as error:
         if backend == "opengl":
             raise
-        return Backend("software", f"software ({error})")
+        return _on_cpu(str(error))
     if backend == "auto" and _SOFTWARE_OPENGL.search(device):
-        return Backend("software", "software (no GPU drives OpenGL)")
+        return _on_cpu("no GPU drives OpenGL")
     return Backend("opengl", f"opengl ({device})")
+
+
+def _on_cpu(reason: str) -> Backend:
+    try:
+        return _compiled()
+    except InputError:
+        return Backend("software", f"software ({reason})")
+
+
+def _compiled() -> Backend:
+    from renderer.visibility import compiled  # numba takes half a second to import
+
+    return Backend("compiled", f"compiled (numba {compiled.VERSION})")
 
 
 def rasterise(

@@ -26,7 +26,7 @@ def rasterise(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
 
 def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """(R²,) the least key of each sample."""
-    positions, depths = _snap(points[:, :2], resolution), (points[:, 2] + 1) / 2 * FAR
+    positions, depths = to_fixed_point(points, resolution)
     keys = np.full(resolution * resolution, EMPTY)
     for begin in range(0, len(faces), FACES):
         block = np.ascontiguousarray(faces[begin : begin + FACES].T)
@@ -46,14 +46,16 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
     return keys
 
 
-def _snap(points: np.ndarray, resolution: int) -> np.ndarray:
-    """(2, V) int64 of x right, y down from the centre of the first sample, in 1/256 sample.
+def to_fixed_point(points: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (V, 3) as positions (2, V) int64, x right and y down from the centre of the first sample in 1/256 sample,
+    and depths (V,) float64 between 0 and FAR.
 
-    Before that they are float32 numbers, from a multiply-add that rounds once, as GPUs have it.
+    Before they are snapped, positions are float32 numbers, from a multiply-add that rounds once, as GPUs have it.
     """
     half = resolution / 2
-    window = points.T.astype(np.float32, order="C") * np.array([[half], [-half]]) + half
-    return np.rint(window.astype(np.float32) * SUBSAMPLES).astype(np.int64) - SUBSAMPLES // 2
+    window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half], [-half]]) + half
+    positions = np.rint(window.astype(np.float32) * SUBSAMPLES).astype(np.int64) - SUBSAMPLES // 2
+    return positions, (points[:, 2] + 1) / 2 * FAR
 
 
 def _cull(corners: np.ndarray, resolution: int, closed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

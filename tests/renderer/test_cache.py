@@ -2,6 +2,7 @@
 
 import errno
 import shutil
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import safetensors.torch
 import torch
 
 from renderer import cache as cache_module
-from renderer import transfer, visibility
+from renderer import transfer
 from renderer.basis import Harmonics
 from renderer.cache import OperatorCache, TensorCache, cache_folder, content_key, source_key
 from renderer.camera import OrthographicCamera, ring
@@ -20,7 +21,7 @@ from renderer.image import ImageSettings
 from renderer.mesh import Mesh, normalise
 from renderer.shapes import solid
 from renderer.transfer import Operator, build_operators
-from renderer.visibility import Backend, choose
+from renderer.visibility import Backend, choose, software
 
 BACKEND = choose("software")
 SETTINGS = ImageSettings(size=8, samples=2)
@@ -156,7 +157,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, tmp_path, monkeypatch):
-    monkeypatch.setitem(visibility._RASTERISERS, "other", visibility._RASTERISERS["software"])
+    monkeypatch.setitem(sys.modules, "renderer.visibility.other", software)
 
     def built(mesh=TEXTURED, camera=CAMERA, settings=SETTINGS, backend=BACKEND, code=cache_module.RENDERER, **options):
         monkeypatch.setattr(cache_module, "RENDERER", code)

@@ -1,12 +1,16 @@
-"""Both rasterisers against one contract, a brute-force oracle and each other."""
+"""All rasterisers against one contract, a brute-force oracle and each other."""
 
+import errno
 import math
 import subprocess
 import sys
 import threading
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from ctypes.util import find_library
 from fractions import Fraction
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import moderngl
@@ -18,17 +22,22 @@ from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
+from renderer import visibility
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.visibility import SPAN, Backend, choose, opengl, rasterise, software
 
 needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
+needs_numba = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
 SNAP = 1 / 256  # of a sample: no corner moves further than that
 FAR = 2**24 - 1  # depth is a 24-bit key
 DEPTH_STEP = 2.0**-22  # of z in [-1, 1]: a 24-bit step is half that, and OpenGL interpolates in float32
 
 
-@pytest.fixture(params=["software", pytest.param("opengl", marks=needs_egl)])
+COMPILED = pytest.param("compiled", marks=needs_numba)
+
+
+@pytest.fixture(params=["software", COMPILED, pytest.param("opengl", marks=needs_egl)])
 def backend(request) -> Backend:
     return choose(request.param)
 
@@ -329,27 +338,33 @@ def test_a_labelled_box_with_a_bump_looks_from_each_side_as_drawn_by_hand(backen
     assert image == [rows.get(row, "." * 10) for row in range(10)]
 
 
+on_the_cpu = pytest.mark.parametrize("name", ["software", COMPILED])
+
+
+@on_the_cpu
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(scene=scenes(), closed=st.booleans())
-def test_software_equals_the_reference_on_any_triangles(scene, closed):
+def test_the_cpu_equals_the_reference_on_any_triangles(name, scene, closed):
     points, faces, resolution = scene
-    ids = Backend("software", "").rasterise(points, faces, resolution, closed)
+    ids = Backend(name, "").rasterise(points, faces, resolution, closed)
     np.testing.assert_array_equal(ids[0], reference(points[0], faces, resolution, closed))
 
 
+@on_the_cpu
 @pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
 @pytest.mark.parametrize("resolution", [1, 2, 7, 33])
-def test_software_equals_the_reference_on_spheres(resolution, closed):
+def test_the_cpu_equals_the_reference_on_spheres(name, resolution, closed):
     points, faces = rotated_spheres(views=1, subdivisions=1)
-    ids = rasterise(points, faces, resolution, "software", closed)
+    ids = rasterise(points, faces, resolution, name, closed)
     np.testing.assert_array_equal(ids[0], reference(points[0], faces, resolution, closed))
 
 
-def test_software_equals_the_reference_where_the_rounding_of_float64_decides():
+@on_the_cpu
+def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides(name):
     """Huge faces, whose edge functions have more than 53 bits, at a depth halfway between two keys."""
     points, faces = random_triangles(seed=5, count=40, reach=1e5, depth=0)
     faces = np.concatenate([faces, np.roll(faces, 1, axis=1)[::-1]])
-    ids = rasterise(points, faces, 16, "software")
+    ids = rasterise(points, faces, 16, name)
     np.testing.assert_array_equal(ids[0], reference(points[0], faces, 16, closed=False))
 
 
@@ -360,6 +375,69 @@ def test_software_draws_the_same_however_little_at_a_time(monkeypatch, parts, fa
     monkeypatch.setattr(software, "PARTS", parts)
     monkeypatch.setattr(software, "FACES", faces_at_a_time)
     np.testing.assert_array_equal(rasterise(points, faces, 16, "software"), at_once)
+
+
+@needs_numba
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    shape=st.tuples(st.integers(0, 3), st.integers(1, 60), st.integers(0, 500)),
+    resolution=st.integers(1, 300),
+    lattice=st.sampled_from([None, 2, 16, 150]),
+    scales=st.tuples(*[st.sampled_from([0, 1e-6, 1e-2, 1, 1.5, 30, 1e5, 1e300])] * 3),
+    order=st.sampled_from("CF"),
+    closed=st.booleans(),
+)
+def test_compiled_equals_software_to_the_bit(seed, shape, resolution, lattice, scales, order, closed):
+    """Soups of triangles in several views: huge, thin, degenerate, on samples, out of range, as near as one another."""
+    views, vertices, faces = shape
+    rng = np.random.default_rng(seed)
+    points = np.asarray(rng.uniform(-1, 1, (views, vertices, 3)), order=order)
+    if lattice:
+        points = np.round(points * lattice) / lattice
+    points, triangles = points * scales, np.asarray(rng.integers(0, vertices, (faces, 3)), order=order)
+    compiled, plain = (rasterise(points, triangles, resolution, name, closed) for name in ("compiled", "software"))
+    assert compiled.dtype == plain.dtype
+    np.testing.assert_array_equal(compiled, plain)
+
+
+@needs_numba
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize("resolution", [32, 224, 1000])
+def test_compiled_equals_software_to_the_bit_on_solids(resolution, closed):
+    for mesh in (trimesh.creation.icosphere(5), trimesh.creation.torus(0.6, 0.3), trimesh.creation.box([1.9, 0.01, 1])):
+        points, faces = turned(mesh, views=2)
+        compiled, plain = (rasterise(points, faces, resolution, name, closed) for name in ("compiled", "software"))
+        np.testing.assert_array_equal(compiled, plain)
+
+
+@needs_numba
+def test_compiled_draws_in_many_threads_at_once():
+    points, faces = rotated_spheres(views=8)
+    backend = choose("compiled")
+    with ThreadPoolExecutor(8) as pool:
+        drawn = list(pool.map(lambda view: backend.rasterise(view[None], faces, 100)[0], points))
+    np.testing.assert_array_equal(drawn, rasterise(points, faces, 100, "software"))
+
+
+@needs_numba
+@pytest.mark.parametrize("corner", [-1, 3])
+def test_compiled_reads_no_memory_that_is_not_the_points(corner):
+    with pytest.raises(IndexError, match="not among the 3"):
+        rasterise(np.zeros((1, 3, 3)), np.array([[0, 1, corner]]), 4, "compiled")
+
+
+@needs_numba
+def test_what_cannot_be_kept_is_compiled_all_the_same(monkeypatch):
+    from renderer.visibility import compiled
+
+    def njit(types, cache=False):
+        if cache:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return lambda function: (types, function)
+
+    monkeypatch.setattr(compiled, "_njit", njit)
+    assert compiled._compiled(len) == (compiled.TYPES, len)
 
 
 def outline_distance(mesh: trimesh.Trimesh, corners: np.ndarray, samples: np.ndarray) -> np.ndarray:
@@ -487,6 +565,13 @@ def test_a_million_faces_take_bounded_memory():
     assert peak < faces.nbytes
 
 
+@pytest.fixture
+def no_numba(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.delitem(sys.modules, "renderer.visibility.compiled", raising=False)
+    monkeypatch.delattr(visibility, "compiled", raising=False)
+
+
 @pytest.mark.parametrize(
     ("asked", "device", "name", "description"),
     [
@@ -498,9 +583,28 @@ def test_a_million_faces_take_bounded_memory():
         ("software", "NVIDIA H200/PCIe/SSE2", "software", "software (NumPy)"),
     ],
 )
-def test_opengl_is_chosen_where_a_gpu_drives_it(monkeypatch, asked, device, name, description):
+def test_opengl_is_chosen_where_a_gpu_drives_it(no_numba, monkeypatch, asked, device, name, description):
     monkeypatch.setattr(opengl, "device", lambda: device)
     assert choose(asked) == Backend(name, description)
+
+
+@needs_numba
+@pytest.mark.parametrize("device", ["llvmpipe", None])
+def test_compiled_is_chosen_where_no_gpu_drives_opengl_and_numba_is_installed(monkeypatch, device):
+    def find():
+        if device is None:
+            raise InputError("no EGL device")
+        return device
+
+    monkeypatch.setattr(opengl, "device", find)
+    assert choose("auto") == choose("compiled") == Backend("compiled", f"compiled (numba {version('numba')})")
+
+
+def test_without_numba_compiled_is_refused(no_numba):
+    with pytest.raises(
+        InputError, match=r"numba does not start .*: pip install numba, or renderer\.visibility=software"
+    ):
+        choose("compiled")
 
 
 @pytest.fixture
@@ -511,7 +615,7 @@ def no_egl(monkeypatch):
     monkeypatch.setattr(moderngl, "create_context", fail)
 
 
-def test_without_egl_auto_takes_software_and_says_why(no_egl):
+def test_without_egl_and_numba_auto_takes_software_and_says_why(no_egl, no_numba):
     backend = choose("auto")
     assert backend.name == "software"
     assert backend.description.startswith("software (no EGL device")
@@ -541,7 +645,7 @@ def test_a_driver_that_goes_away_while_it_draws_is_one_sentence_and_its_context_
 
 
 def test_an_unknown_back_end_is_refused():
-    with pytest.raises(InputError, match=r"renderer\.visibility=vulkan: choose one of auto, opengl, software"):
+    with pytest.raises(InputError, match=r"\.visibility=vulkan: choose one of auto, opengl, compiled, software"):
         choose("vulkan")
 
 
