@@ -1,12 +1,58 @@
-"""What tests of several packages look at."""
+"""What tests of several packages use."""
 
+import logging
+import runpy
 import socket
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from ipaddress import ip_address
+from pathlib import Path
 
 import pytest
+import torch
 
 from renderer.visibility import Backend
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> Iterator[None]:
+    """Here and in the processes that tests start: images and networks are so small that threads would wait for each
+    other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def cache_home(tmp_path_factory) -> Iterator[None]:
+    """Not the user's; commands that tests start inherit it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("caches")))
+        yield
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
+    """`python scripts/NAME.py`, or `python -m train`, within this process, from another folder: the exit status."""
+    handlers = logging.root.handlers[:]
+
+    def command(name: str, *arguments: str) -> int:
+        path = ROOT / "train" / "__main__.py" if name == "train" else ROOT / "scripts" / f"{name}.py"
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [str(path), *arguments])
+        try:
+            runpy.run_path(str(path), run_name="__main__")
+        except SystemExit as stop:
+            return stop.code
+        return 0
+
+    yield command
+    logging.root.handlers[:] = handlers  # Hydra's write to what was the output here
 
 
 @pytest.fixture

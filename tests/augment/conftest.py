@@ -1,6 +1,6 @@
 """What tests attack: a small scene of the mesh that has few faces and no symmetry, and linear classifiers."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -18,15 +18,6 @@ from renderer.visibility import choose
 
 SIZE = 6
 FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth in ((0.9, 0.3), (1.3, 1.9), (1.1, 3.5)))
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Images and networks are so small that threads would wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 import io
 import math
 import re
-import runpy
 import struct
 import sys
 from pathlib import Path
@@ -411,19 +410,9 @@ def test_a_map_of_few_texels_is_the_light_of_its_mean(tmp_path, size):
 
 
 @pytest.fixture
-def export(monkeypatch, capsys):
-    """`python scripts/export_light.py ...` in this process: its exit status, output and errors."""
-    path = str(ROOT / "scripts" / "export_light.py")
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", [path, *arguments])
-        try:
-            runpy.run_path(path, run_name="__main__")
-        except SystemExit as stop:
-            return stop.code, *capsys.readouterr()
-        return 0, *capsys.readouterr()
-
-    return run
+def export(call, capsys):
+    """`python scripts/export_light.py ...`: its exit status, output and errors."""
+    return lambda *arguments: (call("export_light", *arguments), *capsys.readouterr())
 
 
 @pytest.mark.parametrize(("suffix", "fate"), [(".hdr", "stored as 0"), (".exr", "kept"), (".npy", "kept")])

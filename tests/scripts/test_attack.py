@@ -1,13 +1,11 @@
 import csv
 import json
-import runpy
-import sys
 from collections.abc import Callable
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 import pytest
-import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -22,29 +20,10 @@ SMALL = [
 ]  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """The network is so small that threads would wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture
-def run(monkeypatch, tmp_path) -> Callable[..., int]:
-    """`python scripts/attack.py` within this process, from another folder: the exit status."""
-
-    def command(*arguments: str) -> int:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["attack.py", "out=out", *SMALL, *arguments])
-        try:
-            runpy.run_path(str(ROOT / "scripts" / "attack.py"), run_name="__main__")
-        except SystemExit as stop:
-            return stop.code
-        return 0
-
-    return command
+def run(call) -> Callable[..., int]:
+    """`python scripts/attack.py` with small settings: the exit status."""
+    return partial(call, "attack", "out=out", *SMALL)
 
 
 ALWAYS = {

@@ -1,9 +1,8 @@
 """The command itself, on networks that it finds in files."""
 
 import json
-import os
-import subprocess
-import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,9 @@ import torch
 from PIL import Image
 
 from train.checkpoint import BEST, describe, load_network, save
+from train.cli import USER_ERROR
 from train.wideresnet import WideResNet
 
-ROOT = Path(__file__).parents[2]
 CLASSES = ["lime", "orange"]
 
 
@@ -40,19 +39,13 @@ def run(tmp_path) -> Path:
     return tmp_path / "run"
 
 
-def command(folder: Path, *overrides: str) -> subprocess.CompletedProcess:
-    script = [sys.executable, ROOT / "scripts" / "evaluate_photos.py", "out=out", "device=cpu", "precision=float32"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run([*script, *overrides], env=environment, cwd=folder, capture_output=True, text=True)
+@pytest.fixture
+def evaluate(call, photos) -> Callable[..., int]:
+    return partial(call, "evaluate_photos", "out=out", "device=cpu", "precision=float32", f"photos={photos}")
 
 
-def evaluate(run: Path, photos: Path, *overrides: str) -> subprocess.CompletedProcess:
-    return command(run.parent, f"run={run}", f"photos={photos}", *overrides)
-
-
-def test_a_network_is_scored_at_the_size_that_it_was_trained_at(run, photos):
-    done = evaluate(run, photos)
-    assert done.returncode == 0, done.stderr
+def test_a_network_is_scored_at_the_size_that_it_was_trained_at(evaluate, run, photos):
+    assert evaluate(f"run={run}") == 0
     assert json.loads((run.parent / "out" / "summary.json").read_text())["size"] == 64
     rows = (run.parent / "out" / "photographs.csv").read_text().splitlines()
     header, first = (row.split(",") for row in rows[:2])
@@ -62,10 +55,10 @@ def test_a_network_is_scored_at_the_size_that_it_was_trained_at(run, photos):
     assert float(first[header.index("orange_log_odds")]) == pytest.approx(float(logits[1] - logits[0]), abs=1e-4)
 
 
-def test_another_size_than_the_networks_is_one_sentence(run, photos):
-    done = evaluate(run, photos, "size=32")
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: size=32: ") and "trained on images of 64 pixels per side" in done.stderr
+def test_another_size_than_the_networks_is_one_sentence(evaluate, run, capsys):
+    assert evaluate(f"run={run}", "size=32") == USER_ERROR
+    told = capsys.readouterr().err
+    assert told.startswith("error: size=32: ") and "trained on images of 64 pixels per side" in told
     assert not (run.parent / "out").exists()
 
 
@@ -82,13 +75,12 @@ def build():
 """
 
 
-def test_any_network_of_ones_own_is_scored_at_its_size_and_on_its_classes(tmp_path):
+def test_any_network_of_ones_own_is_scored_at_its_size_and_on_its_classes(evaluate, tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     for name, colour in {"lime": (0, 255, 0), "orange": (255, 128, 0)}.items():
-        (tmp_path / "photos" / name).mkdir(parents=True)
-        Image.new("RGB", (40, 30), colour).save(tmp_path / "photos" / name / "one.png")
-    done = command(tmp_path, "classifier=python:own:build", f"photos={tmp_path / 'photos'}")
-    assert done.returncode == 0, done.stderr
+        (tmp_path / "lit" / name).mkdir(parents=True)
+        Image.new("RGB", (40, 30), colour).save(tmp_path / "lit" / name / "one.png")
+    assert evaluate("classifier=python:own:build", f"photos={tmp_path / 'lit'}") == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["size"], summary["recall"]["value"], summary["false_alarms"]["value"]) == (16, 1, 0)
 
@@ -104,7 +96,7 @@ def test_any_network_of_ones_own_is_scored_at_its_size_and_on_its_classes(tmp_pa
     ],
     ids=["none", "two", "size", "unknown", "weights"],
 )
-def test_a_network_that_cannot_be_meant_is_one_sentence(tmp_path, overrides, said):
-    done = command(tmp_path, f"photos={tmp_path}", *overrides)
-    assert done.returncode == 2
-    assert said in done.stderr and done.stderr.count("\n") == 1
+def test_a_network_that_cannot_be_meant_is_one_sentence(evaluate, capsys, overrides, said):
+    assert evaluate(*overrides) == USER_ERROR
+    told = capsys.readouterr().err
+    assert said in told and told.count("\n") == 1

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hydra import compose, initialize_config_module
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
@@ -41,23 +40,6 @@ def coloured_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
     images = rng.integers(0, 200, (len(labels), 3, 16, 16))
     images[np.arange(len(labels)), labels] += 30
     return images.astype(np.uint8)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_thread():
-    """The networks are so small that threads would wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def cache_home(tmp_path_factory):
-    """Not the user's; commands that tests start inherit it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("caches")))
-        yield
 
 
 @pytest.fixture(scope="session")
