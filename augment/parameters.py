@@ -4,6 +4,7 @@ A kind of parameter turns flat values (A, D) into a part of the conditions that 
 can be attacked at once.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +15,8 @@ from torch import Tensor
 
 from augment.norm_ball import NormBall, anywhere
 from augment.scene import Conditions, Scene
-from renderer.basis import Distant, Ends, Placed, parts_of
+from renderer.basis import Distant, Placed, parts_of
+from renderer.convex import Ball, nearest_in_box
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
 from renderer.lamps import Lamps
 from renderer.lights import mean_luminance
@@ -97,9 +99,9 @@ class Kind(ABC):
         reach = (values - start).norm(dim=1, keepdim=True)
         return self.within_domain(start + offset * reach / offset.norm(dim=1, keepdim=True))
 
-    def within_domain(self, values: Tensor, ends: Ends | None = None) -> Tensor:
+    def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
         """See `augment.norm_ball.Domain`; by default there is no bound."""
-        return anywhere(values, ends)
+        return anywhere(values, within)
 
     def step(self, gradient: Tensor) -> Tensor:
         """How far to go down a gradient (A, D)."""
@@ -133,10 +135,10 @@ class OfLight(Kind):
             own = torch.cat([light[:, : self._where.start], own, light[:, self._where.stop :]], dim=1)
         return replace(conditions, light=own)
 
-    def within_domain(self, values: Tensor, ends: Ends | None = None) -> Tensor:
+    def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
         if not self.physical:
-            return super().within_domain(values, ends)
-        of_lights = None if ends is None else (ends[0].unflatten(1, (-1, 3)), ends[1].unflatten(1, (-1, 3)))
+            return super().within_domain(values, within)
+        of_lights = None if within is None else within.unflatten(-1, 3)
         return self.basis.nearest_physical(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
 
 
@@ -189,11 +191,10 @@ class Skylight(Kind):
         sky = coefficients(zenith, azimuth, turbidity * TURBIDITY_UNIT) * self._scale[examples]
         return replace(conditions, light=sky.to(conditions.light))
 
-    def within_domain(self, values: Tensor, ends: Ends | None = None) -> Tensor:
-        zenith, azimuth, turbidity = values.unbind(1)
+    def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
         clear, hazy = (limit / TURBIDITY_UNIT for limit in TURBIDITY)
-        possible = torch.stack([zenith.clamp(*ZENITH), azimuth, turbidity.clamp(clear, hazy)], dim=1)
-        return super().within_domain(possible, ends)
+        low, high = values.new_tensor([[ZENITH[0], -math.inf, clear], [ZENITH[1], math.inf, hazy]])
+        return nearest_in_box(values, low, high, within)
 
 
 class Geometry(OfMesh):

@@ -7,9 +7,8 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from renderer.convex import Ball
 from renderer.harmonics import basis, irradiance_basis, live_coefficients
-
-Ends = tuple[Tensor, Tensor]  # the lowest and the highest values
 
 
 class Functions(Protocol):
@@ -27,10 +26,10 @@ class Functions(Protocol):
     def size(self) -> int:
         """How many functions there are."""
 
-    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
+    def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
         """The light (..., size, 3) nearest to the coefficients that something can emit.
 
-        ends: of the same shape, which it stays between; some such light does.
+        within: for coefficients (A, size, 3), a ball that it is to lie in; its centres are such lights.
         """
 
 
@@ -67,12 +66,6 @@ class Placed(Functions, Protocol):
         """All ways to surface points (S, 3) of unit normals (S, 3), were nothing in between."""
 
 
-def within_power(coefficients: Tensor, power: float, ends: Ends | None = None) -> Tensor:
-    """The coefficients nearest to these from 0 to a power, and between ends, as `Functions.nearest_physical` has it."""
-    possible = coefficients.clamp(0, power)
-    return possible if ends is None else possible.clamp(*ends)
-
-
 @dataclass(frozen=True)
 class Sum:
     """Lights of several bases at once: the coefficients of one after the other."""
@@ -94,14 +87,10 @@ class Sum:
     def size(self) -> int:
         return sum(part.size for part in self.parts)
 
-    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
-        whole = (coefficients, *(ends or ()))
-        split = zip(*(each.split([part.size for part in self.parts], dim=-2) for each in whole), strict=True)
-        nearest = [
-            part.nearest_physical(own, (its_ends[0], its_ends[1]) if its_ends else None)
-            for part, (own, *its_ends) in zip(self.parts, split, strict=True)
-        ]
-        return torch.cat(nearest, dim=-2)
+    def nearest_physical(self, coefficients: Tensor) -> Tensor:
+        """That of each."""
+        own = coefficients.split([part.size for part in self.parts], dim=-2)
+        return torch.cat([part.nearest_physical(each) for part, each in zip(self.parts, own, strict=True)], dim=-2)
 
 
 Basis = Distant | Placed | Sum
@@ -143,10 +132,10 @@ class Harmonics:
     def radiance(self, directions: Tensor) -> Tensor:
         return basis(directions, self.degree)
 
-    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
+    def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
         from renderer.nonnegative import nearest_nonnegative  # scipy's optimisers take long to import
 
-        return nearest_nonnegative(coefficients, ends)
+        return nearest_nonnegative(coefficients, within)
 
 
 HARMONICS = Harmonics()

@@ -6,7 +6,8 @@ from itertools import chain
 import torch
 from torch import Tensor
 
-from renderer.basis import Ends, Reach, within_power
+from renderer.basis import Reach
+from renderer.convex import Ball, nearest_in_box
 from renderer.errors import FACTOR, InputError, require_range
 
 
@@ -38,8 +39,8 @@ class Lamps:
     def size(self) -> int:
         return len(self.places)
 
-    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
-        return within_power(coefficients, self.power, ends)
+    def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
+        return nearest_in_box(coefficients, 0, self.power, within)
 
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
         toward = points.new_tensor(self.places) - points[:, None]

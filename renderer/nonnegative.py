@@ -6,57 +6,138 @@ nowhere (Hettich and Kortanek 1993, "Semi-infinite programming: theory, methods,
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-import trimesh
 from scipy.optimize import nnls
 from torch import Tensor
 
-from renderer.basis import Ends
-from renderer.harmonics import gradient_matrices, per_degree, select_rows
+from renderer.convex import Ball
+from renderer.radiance_dips import Array, dips
 
 TOLERANCE = 1e-4  # of a light's largest radiance, that it may dip below zero
 _FOUND = TOLERANCE / 10  # dips that are looked for: in a flat valley, a deeper one may lie between two that are found
-_ROUNDS = 50  # eight are usual
-_NEWTON_STEPS = 4
-_REACH = 0.1  # of a step, in radians; nodes are half as far apart
-_NEARLY = 0.1, 1e-3  # of the largest radiance, above zero and above the neighbours: nodes that a dip may be near to
+_ROUNDS = 50  # seven are usual
+_ON_SPHERE = 1e-7  # of the radius
+_STEPS = 10  # to come as near to a sphere; two are usual
+_TINY = 1e-300
 
 
-def nearest_nonnegative(lights: Tensor, ends: Ends | None = None) -> Tensor:
+def nearest_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
     """The lights (..., (degree + 1)², C) of nowhere negative radiance that are nearest in coefficients.
 
-    ends: of the same shape each, between which some such light lies. The radiance of each channel is nowhere below
-    -`TOLERANCE` of its largest; channels that were in order stay to the bit. Computed in float64, without a graph.
+    within: for lights (A, (degree + 1)², C), a ball to lie in, whose centres are such lights. The radiance of each
+    channel is nowhere below -`TOLERANCE` of its largest; channels that were in order stay to the bit. Computed in
+    float64, without a graph.
     """
-    wanted = _by_channel(lights)
-    low, high = map(_by_channel, ends) if ends else (np.full_like(wanted, -np.inf), np.full_like(wanted, np.inf))
-    nearest = wanted.clip(low, high)
-    held = [_nodes(math.isqrt(wanted.shape[1]) - 1, 2)[1].numpy()] * len(wanted)  # harmonics where each is held
-    dim = 1e-6 * torch.from_numpy(wanted).norm(dim=1)  # radiance of which a share is but the rounding of what is given
-    unsettled = np.arange(len(wanted))
-    for _ in range(_ROUNDS):
-        owner, rows = _dips(torch.from_numpy(nearest[unsettled]), dim[unsettled])
-        dipping = np.unique(owner)
-        for index in dipping:
-            light = unsettled[index]
-            constraints = np.concatenate([held[light], rows[owner == index]])
-            nearest[light], held[light] = _nearest_held(wanted[light], constraints, low[light], high[light])
-        unsettled = unsettled[dipping]
-        if not len(unsettled):
-            break
+    programmes = _programmes(lights, within)
+    _exchange(programmes)
+    nearest = np.concatenate([programme.nearest for programme in programmes])
     return torch.from_numpy(nearest).view(lights.mT.shape).to(lights).mT
 
 
-def _by_channel(lights: Tensor) -> np.ndarray:
-    return lights.detach().mT.flatten(0, -2).cpu().double().numpy()
+def _programmes(lights: Tensor, within: Ball | None) -> "Sequence[_Programme]":
+    """One of each light, if a sphere holds its channels together, and else one of each channel."""
+    wanted = _by_channel(lights)
+    if within is None:
+        return [_Programme(light, np.full_like(light, -np.inf), np.full_like(light, np.inf)) for light in wanted]
+    if within.norm == "linf":
+        return [_Programme(*each) for each in zip(wanted, *map(_by_channel, within.ends), strict=True)]
+    shape = len(lights), lights.shape[2], lights.shape[1]
+    of_lights = zip(wanted.reshape(shape), _by_channel(within.centre).reshape(shape), strict=True)
+    return [_InSphere(light, centre, within.radius) for light, centre in of_lights]
 
 
-def _nearest_held(
-    wanted: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _by_channel(lights: Tensor) -> Array:
+    """(channels, 1, K) of lights (..., K, C)."""
+    return lights.detach().mT.flatten(0, -2)[:, None].cpu().double().numpy()
+
+
+class _Programme:
+    """The lights (C, K) nearest to those wanted, between ends, and non-negative in the directions that are held."""
+
+    def __init__(self, wanted: Array, low: Array, high: Array):
+        self.wanted, self.low, self.high = wanted, low, high
+        self.nearest = wanted.clip(low, high)
+        self._held = [wanted[:0]] * len(wanted)  # harmonics (M, K) in the directions, of each light
+
+    def hold(self, rows: Sequence[Array]) -> None:
+        """Solve it with further directions (M, K) of each light; those that turn out to hold nothing are let go."""
+        self._held = [np.concatenate(pair) for pair in zip(self._held, rows, strict=True)]
+        self.nearest, self._held = self._solved()
+
+    def _solved(self) -> tuple[Array, list[Array]]:
+        return self._nearest_to(self.wanted)
+
+    def _nearest_to(self, lights: Array) -> tuple[Array, list[Array]]:
+        each = zip(lights, self._held, self.low, self.high, strict=True)
+        nearest, held = zip(*(_nearest_held(*light) if len(light[1]) else light[:2] for light in each), strict=True)
+        return np.stack(nearest), list(held)
+
+
+class _InSphere(_Programme):
+    """The same, of lights that together lie within an L2 distance of a centre.
+
+    With a multiplier λ for the sphere, what is nearest to lights v is nearest, without it, to c + (v - c) / (1 + λ). As
+    long as the same directions hold, that is straight in the share 1 / (1 + λ) of the way: hence Newton's steps.
+    """
+
+    def __init__(self, wanted: Array, centre: Array, radius: float):
+        super().__init__(wanted, np.full_like(wanted, -np.inf), np.full_like(wanted, np.inf))
+        self._centre, self._radius, self._offset = centre, radius, wanted - centre
+        self._least = self._share = min(radius / max(float(np.linalg.norm(self._offset)), _TINY), 1.0)
+        self.nearest = self._place()
+
+    def _place(self) -> Array:
+        return self.wanted if self._share == 1 else self._centre + self._share * self._offset
+
+    def _solved(self) -> tuple[Array, list[Array]]:
+        for _ in range(_STEPS):
+            place = self._place()
+            nearest, held = self._nearest_to(place)
+            gone = nearest - self._centre
+            distance = float(np.linalg.norm(gone))
+            left = self._radius - distance
+            if abs(left) <= _ON_SPHERE * self._radius or (self._share == 1 and left > 0):
+                break
+            courses, forces, changes = zip(*map(_course, self._offset, nearest - place, held), strict=True)
+            along = np.stack(courses)
+            speed, slope = float((along * along).sum()), float((along * gone).sum())
+            root = math.sqrt(max(slope**2 + speed * left * (self._radius + distance), 0))
+            step = min(max((root - slope) / max(speed, _TINY), self._least - self._share), 1 - self._share)
+            self._share += step
+            if np.all(np.concatenate(forces) + step * np.concatenate(changes) >= 0):  # the same directions hold there
+                gone = gone + step * along
+                break
+        return self._centre + gone * min(1, self._radius / max(float(np.linalg.norm(gone)), _TINY)), held
+
+
+def _course(offset: Array, added: Array, rows: Array) -> tuple[Array, Array, Array]:
+    """Where the nearest light (K,) goes as what is wanted goes along an offset (K,), as long as the same directions
+    (M, K) hold it; and with which multipliers (M,), whose sum with the rows is added, it is held, and their change."""
+    change, forces = np.linalg.lstsq(rows.T, np.stack([-offset, added], axis=1))[0].T
+    return offset + rows.T @ change, forces, change
+
+
+def _exchange(programmes: Sequence[_Programme]) -> None:
+    """Hold them where they dip, until they dip nowhere."""
+    for _ in range(_ROUNDS):
+        lights = np.concatenate([programme.nearest for programme in programmes])
+        wanted = np.concatenate([programme.wanted for programme in programmes])
+        dim = 1e-6 * np.linalg.norm(wanted, axis=1)  # radiance of which a share is but the rounding of what is given
+        owner, rows = dips(lights, dim, _FOUND)
+        channels = len(lights) // len(programmes)
+        dipping = np.unique(owner // channels)
+        for index in dipping:
+            own = range(index * channels, (index + 1) * channels)
+            programmes[index].hold([rows[owner == light] for light in own])
+        programmes = [programmes[index] for index in dipping]
+        if not programmes:
+            break
+
+
+def _nearest_held(wanted: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """The x (K,) nearest to `wanted` with rows · x ≥ 0 between the ends, and those of the rows that hold it.
 
     Least distance programming by non-negative least squares (Lawson and Hanson 1974, chapter 23), in units of `wanted`.
@@ -73,73 +154,3 @@ def _nearest_held(
         return wanted.clip(low, high), rows
     nearest = wanted - residual[:size] / residual[size] * unit
     return nearest.clip(low, high), rows[multipliers[: len(rows)] > 0]
-
-
-def _dips(lights: Tensor, dim: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """(which of lights (R, K) dips, the harmonics (K,) in a direction to hold it), for each of D directions: the
-    bottoms of all dips and, since bottoms move, four places around each. dim: (R,) radiance that is taken for none."""
-    directions, harmonics, around = _nodes(math.isqrt(lights.shape[1]) - 1, 4)
-    radiance = harmonics @ lights.T
-    largest = radiance.abs().amax(0)
-    near_zero, near_lowest = _NEARLY[0] * largest, _NEARLY[1] * largest
-    candidate = (radiance < near_zero) & (largest > dim)
-    for neighbour in around:
-        candidate &= radiance <= radiance.index_select(0, neighbour) + near_lowest
-    node, owner = torch.nonzero(candidate, as_tuple=True)
-    local = _Local(lights, owner)
-    bottom = directions[node]
-    for _ in range(_NEWTON_STEPS):
-        _, slope, curvature, axes = local(bottom)
-        steepest = torch.maximum(curvature.abs(), slope.norm(dim=1, keepdim=True) / _REACH)
-        bottom = _moved(bottom, -slope / steepest.clamp(min=1e-300), axes)
-    depth, _, curvature, axes = local(bottom)
-    found = -depth > _FOUND * largest[owner]
-    owner, bottom, depth, curvature, axes = (part[found] for part in (owner, bottom, -depth, curvature, axes))
-    reach = 0.7 * (2 * depth[:, None] / curvature.clamp(min=1e-300)).sqrt().clamp(max=_REACH)
-    ring = [_moved(bottom, reach * torch.tensor(side), axes) for side in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    places = torch.cat([bottom, *ring])
-    return owner.repeat(5).numpy(), _harmonics(places, lights.shape[1]).numpy()
-
-
-class _Local:
-    """Lights (D, K) as parabolas around directions (D, 3)."""
-
-    def __init__(self, lights: Tensor, owner: Tensor):
-        matrices = gradient_matrices(math.isqrt(lights.shape[1]) - 1)
-        first = torch.einsum("djk,nk->ndj", matrices, lights)
-        second = torch.einsum("djk,nek->ndej", matrices, first).flatten(1, 2)
-        self.expansion = torch.cat([lights[:, None], first, second], dim=1)[owner]  # (D, 1 + 3 + 9, K)
-
-    def __call__(self, directions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(radiance (D,), slopes (D, 2) and curvatures (D, 2) along the principal axes, these (D, 2, 3))."""
-        harmonics = _harmonics(directions, self.expansion.shape[2])
-        radiance, gradient, hessian = (self.expansion @ harmonics[..., None]).squeeze(2).split([1, 3, 9], dim=1)
-        tangents = _tangents(directions)
-        radial = (gradient * directions).sum(1)[:, None, None] * torch.eye(2).to(gradient)
-        curvature, turn = torch.linalg.eigh(tangents @ hessian.unflatten(1, (3, 3)) @ tangents.mT - radial)
-        axes = turn.mT @ tangents
-        return radiance.squeeze(1), (axes @ gradient[..., None]).squeeze(2), curvature, axes
-
-
-def _moved(directions: Tensor, steps: Tensor, axes: Tensor) -> Tensor:
-    return F.normalize(directions + (steps[:, None] @ axes).squeeze(1))
-
-
-def _tangents(directions: Tensor) -> Tensor:
-    """(D, 2, 3): two orthonormal tangents at directions (D, 3)."""
-    axis = torch.eye(3).to(directions)[directions.abs().argmin(1)]
-    first = F.normalize(torch.linalg.cross(directions, axis))
-    return torch.stack([first, torch.linalg.cross(directions, first)], dim=1)
-
-
-def _harmonics(directions: Tensor, size: int) -> Tensor:
-    return torch.stack(select_rows(directions.T, range(size)), dim=1)
-
-
-@per_degree
-def _nodes(degree: int, subdivisions: int) -> tuple[Tensor, Tensor, Tensor]:
-    """(directions (N, 3), harmonics (N, K), indices (6, N) of the neighbours) of an icosphere's vertices."""
-    sphere = trimesh.creation.icosphere(subdivisions)
-    around = [[*near, *near[:1]][:6] for near in sphere.vertex_neighbors]  # twelve vertices have five
-    directions = torch.from_numpy(np.array(sphere.vertices))
-    return directions, _harmonics(directions, (degree + 1) ** 2), torch.tensor(around).T.contiguous()

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from renderer.basis import Ends, Reach, within_power
+from renderer.basis import Reach
 from renderer.camera import OrthographicCamera
+from renderer.convex import Ball, nearest_in_box
 from renderer.errors import FACTOR, require_range
 
 LARGEST = 256  # pixels per side
@@ -47,8 +48,8 @@ class Projector:
     def size(self) -> int:
         return self.pixels**2
 
-    def nearest_physical(self, coefficients: Tensor, ends: Ends | None = None) -> Tensor:
-        return within_power(coefficients, self.power, ends)
+    def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
+        return nearest_in_box(coefficients, 0, self.power, within)
 
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
         """One pixel reaches a point."""

@@ -1,4 +1,5 @@
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
 from torch import Tensor
 
-from augment.norm_ball import NORMS, NormBall, anywhere
+from augment.norm_ball import NORMS, NormBall
+from renderer.convex import nearest_in_box
 from renderer.errors import InputError
 
 DTYPES = [torch.float32, torch.float64]
@@ -20,13 +22,6 @@ DRAWS = 4000
 
 def norm(offset: Tensor, name: str) -> Tensor:
     return offset.norm(dim=1) if name == "l2" else offset.abs().amax(1)
-
-
-def box_of(low: Tensor, high: Tensor):
-    def nearest(values: Tensor, ends: tuple[Tensor, Tensor] | None = None) -> Tensor:
-        return anywhere(values.clamp(low, high), ends)
-
-    return nearest
 
 
 def dual_norm(offset: Tensor, name: str) -> Tensor:
@@ -77,7 +72,7 @@ def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with
     """The ends are distances from the centre, downwards and upwards. No descent by scipy gets nearer."""
     (values, centre), (down, up) = torch.from_numpy(pair).to(dtype), torch.from_numpy(ends).to(dtype)
     low, high = centre - down, centre + up
-    nearest = NormBall(name, radius).project(values[None], centre[None], box_of(low, high))[0]
+    nearest = NormBall(name, radius).project(values[None], centre[None], partial(nearest_in_box, low=low, high=high))[0]
     rounding = 64 * torch.finfo(dtype).eps
     assert nearest.dtype == dtype and (low <= nearest).all() and (nearest <= high).all()
     offset = (nearest - centre).double()[None]

@@ -11,7 +11,6 @@ from augment import scene as scene_module
 from augment.backgrounds import load_backgrounds
 from augment.build import build_scene
 from augment.descent import DescentSettings, Goal, descend
-from augment.norm_ball import anywhere
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
@@ -20,6 +19,7 @@ from augment.scene import STACKED, Conditions, Example, Scene, count_views
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera, ring
+from renderer.convex import nearest_in_box
 from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
 from renderer.image import ENCODINGS, ImageSettings, develop
@@ -390,8 +390,8 @@ class Lamps:
     def irradiance(self, normals: torch.Tensor) -> torch.Tensor:
         return normals.clamp(min=0)
 
-    def nearest_physical(self, coefficients: torch.Tensor, ends=None) -> torch.Tensor:
-        return anywhere(coefficients.clamp(0, 1), ends)
+    def nearest_physical(self, coefficients: torch.Tensor, within=None) -> torch.Tensor:
+        return nearest_in_box(coefficients, 0, 1, within)
 
 
 def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its_own():

@@ -5,10 +5,12 @@ import trimesh
 from scipy import optimize
 from torch import Tensor
 
+from renderer.convex import Ball
 from renderer.harmonics import basis, project
 from renderer.lights import PROBES, ambient, load_light
 from renderer.nonnegative import TOLERANCE, nearest_nonnegative
 
+ORDERS = {"linf": torch.inf, "l2": 2}
 DENSE = torch.from_numpy(np.array(trimesh.creation.icosphere(subdivisions=6).vertices))  # 40,962 directions
 
 
@@ -41,20 +43,22 @@ def test_in_degree_1_it_is_the_projection_into_a_second_order_cone():
     torch.testing.assert_close(nearest, expected, rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("radius", [None, 0.1])
-def test_no_light_that_is_nowhere_negative_on_a_grid_is_nearer_as_scipy_finds_it(radius):
+@pytest.mark.parametrize(("norm", "radius"), [("linf", None), ("linf", 0.1), ("l2", 0.3)])
+def test_no_light_that_is_nowhere_negative_on_a_grid_is_nearer_as_scipy_finds_it(norm, radius):
     """A grid's programme lacks the directions between, so that its light is nearer, by the grid's width squared."""
     wanted = random_lights(1, 0.1)[0, :, 0]
     centre = nearest_nonnegative(load_light("grace").double())[:, 0]
-    low, high = centre - (radius or 99), centre + (radius or 99)
-    nearest = nearest_nonnegative(wanted[:, None], radius and (low[:, None], high[:, None]))
+    nearest = nearest_nonnegative(wanted[None, :, None], radius and Ball(centre[None, :, None], radius, norm))[0]
     grid = basis(torch.from_numpy(np.array(trimesh.creation.icosphere(subdivisions=3).vertices)), 6).numpy()
+    c = centre.numpy()
+    bright = {"type": "ineq", "fun": lambda x: grid @ x, "jac": lambda x: grid}
+    ball = {"type": "ineq", "fun": lambda x: radius**2 - ((x - c) ** 2).sum(), "jac": lambda x: 2 * (c - x)}
     found = optimize.minimize(
         lambda x: ((x - wanted.numpy()) ** 2).sum(),
         nearest[:, 0].numpy(),
         jac=lambda x: 2 * (x - wanted.numpy()),
-        bounds=list(zip(low.tolist(), high.tolist(), strict=True)),
-        constraints=[{"type": "ineq", "fun": lambda x: grid @ x, "jac": lambda x: grid}],
+        bounds=[(value - radius, value + radius) for value in c] if radius and norm == "linf" else None,
+        constraints=[bright, ball] if norm == "l2" else bright,
         method="SLSQP",
         options={"ftol": 1e-12},
     )
@@ -77,15 +81,14 @@ def test_what_is_added_is_light_and_is_added_where_there_is_none():
         assert residual <= 1e-3 * added.norm()
 
 
-@pytest.mark.parametrize("radius", [None, 0.1])
+@pytest.mark.parametrize(("norm", "radius"), [("linf", None), ("linf", 0.1), ("l2", 0.01), ("l2", 1.0), ("l2", 100.0)])
 @pytest.mark.parametrize("amplitude", [0.02, 0.3, 3.0])
-def test_radiance_is_nowhere_negative(amplitude, radius):
+def test_radiance_is_nowhere_negative(amplitude, norm, radius):
     wanted = random_lights(5, amplitude)
     centre = nearest_nonnegative(load_light("grace").double()).expand_as(wanted)
-    ends = radius and (centre - radius, centre + radius)
-    nearest = nearest_nonnegative(wanted, ends)
+    nearest = nearest_nonnegative(wanted, radius and Ball(centre, radius, norm))
     assert lowest(nearest) >= -TOLERANCE
-    assert not ends or ((ends[0] <= nearest) & (nearest <= ends[1])).all()
+    assert not radius or ((nearest - centre).flatten(1).norm(ORDERS[norm], dim=1) <= radius * (1 + 1e-12)).all()
 
 
 def test_light_that_was_in_order_stays_to_the_bit():
@@ -108,6 +111,21 @@ def test_no_light_and_light_taken_away_everywhere_are_dark():
     dark = torch.zeros(49, 3)
     assert torch.equal(nearest_nonnegative(dark), dark)
     torch.testing.assert_close(nearest_nonnegative(ambient(-torch.ones(3))), dark, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("radius", [0.3, 0.6, 3.0])
+def test_in_a_sphere_it_is_what_is_nearest_to_a_place_on_the_way_as_far_as_the_sphere_goes(radius):
+    """x is nearest to v in the sphere about c if it is nearest to c + (v - c) / (1 + λ) without it; what is added to
+    that is orthogonal to x, so that x·(v - x) = λ x·(x - c)."""
+    wanted = random_lights(3, 0.1)
+    centre = nearest_nonnegative(load_light("grace").double()).expand_as(wanted)
+    nearest = nearest_nonnegative(wanted, Ball(centre, radius, "l2"))
+    distance = (nearest - centre).flatten(1).norm(dim=1)
+    assert (distance <= radius * (1 + 1e-12)).all() and (radius > 1 or (distance >= radius * (1 - 1e-6)).all())
+    products = [(nearest * offset).sum((1, 2), keepdim=True) for offset in (wanted - nearest, nearest - centre)]
+    multiplier = (products[0] / products[1]).clamp(min=0)
+    expected = nearest_nonnegative(centre + (wanted - centre) / (1 + multiplier))
+    assert ((nearest - expected).flatten(1).norm(dim=1) <= 0.01 * distance).all()  # dips within the tolerance are left
 
 
 @pytest.mark.parametrize("name", PROBES)

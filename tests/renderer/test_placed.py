@@ -9,6 +9,7 @@ import trimesh
 
 from renderer.basis import Placed
 from renderer.camera import OrthographicCamera
+from renderer.convex import Ball
 from renderer.image import ImageSettings
 from renderer.lamps import Lamps
 from renderer.mesh import Mesh, concatenate
@@ -160,8 +161,8 @@ def test_pixels_that_reach_nothing_are_left_out_and_have_a_gradient_of_zero():
 
 @pytest.mark.parametrize("basis", [PROJECTOR, LAMPS], ids=["projector", "lamps"])
 def test_nothing_emits_less_than_nothing_or_more_than_its_power(basis):
-    light = torch.tensor([-1.0, 0.5, 99.0]).expand(basis.size, 3)
+    light = torch.tensor([-1.0, 0.5, 99.0]).expand(1, basis.size, 3)
     expected = torch.tensor([0.0, 0.5, basis.power]).expand_as(light)
     assert torch.equal(basis.nearest_physical(light), expected)
-    ends = torch.full_like(light, 0.1), torch.full_like(light, 0.3)
-    assert torch.equal(basis.nearest_physical(light, ends), torch.tensor([0.1, 0.3, 0.3]).expand_as(light))
+    within = Ball(torch.full_like(light, 0.2), 0.1, "linf")
+    assert torch.equal(basis.nearest_physical(light, within), torch.tensor([0.1, 0.3, 0.3]).expand_as(light))
