@@ -17,6 +17,7 @@ from train.attacks.experiment import attacks
 from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack, format_reloaded
+from train.attacks.transfers import format_transfers, load_others, write_transfers
 from train.cli import one_sentence_errors, script
 from train.device import choose_device
 from train.outputs import writable_folder
@@ -39,6 +40,7 @@ def main(config: DictConfig) -> None:
         print(format_reloaded(adversary, images, logits, classifier.classes))
         if not settings.attack.kinds:
             return
+    others = load_others(settings, device)
     out = writable_folder(settings.out, "out")
     sweeps: dict[str, Sweep] = {}
     with sole_writer("out", out):
@@ -50,6 +52,10 @@ def main(config: DictConfig) -> None:
             verdicts = attacked.save(folder, checks, settings.attack.renderers)
             print(format_attack(name, attacked, checks, verdicts))
             print(f"images, adversaries and numbers: {folder}\n")
+            if others:
+                found = [*attacked.transfer(**others)]
+                write_transfers(found, folder)
+                print(f"{format_transfers(found)}\n")
             if settings.attack.sweep:
                 sweeps[folder.name] = attacked.sweep(settings.attack.sweep)
                 print(f"{format_curve(sweeps[folder.name])}\n")

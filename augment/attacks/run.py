@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier
 from augment.descent import AttackResult, Goal, descend_in_parts
 from augment.memory import BatchSize
+from augment.objects import SceneObject
 from augment.parameters import StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
@@ -25,6 +26,7 @@ from renderer.errors import InputError
 if TYPE_CHECKING:
     from augment.attacks.checks import Checks
     from augment.attacks.sweep import Sweep
+    from augment.attacks.transfer import Transfer
     from augment.attacks.verification import Verdict
 
 
@@ -93,6 +95,17 @@ class Attacked:
         from augment.attacks.sweep import sweep
 
         return sweep(self, scales)
+
+    def transfer(
+        self,
+        classifiers: Sequence[Classifier] = (),
+        azimuths: Sequence[float] = (),
+        objects: Sequence[SceneObject] = (),
+    ) -> Iterator[Transfer]:
+        """What the adversaries do elsewhere: see `augment.attacks.transfer.transfer`."""
+        from augment.attacks.transfer import transfer
+
+        return transfer(self, classifiers, azimuths, objects)
 
     def save(
         self, folder: str | Path, checks: Checks | None = None, verify: Sequence[str] = ("reload",)

@@ -105,7 +105,30 @@ def test_success_against_radius_is_a_table_and_a_figure(run, tmp_path, capsys):
         assert figure.size == (750, 570)
 
 
+def test_what_fools_is_shown_to_other_networks_from_other_sides_and_on_other_meshes(run, tmp_path, capsys):
+    networks = f"transfer.classifiers=[run:{ROOT / 'pretrained' / 'none'},run:{ROOT / 'pretrained' / 'best'}]"
+    elsewhere = [
+        "transfer.azimuths=[-20,0]",
+        "transfer.meshes=['solid:orange:0',{mesh: 'solid:apple:0', label: apple}]",
+    ]
+    assert run("attack=lighting", "attack.checks=false", "scene.views=2", networks, *elsewhere) == 0
+    folder = tmp_path / "out" / "0_solid_orange_0"
+    lines = [json.loads(line) for line in (folder / "transfer.jsonl").read_text().splitlines()]
+    attacked = [json.loads(line) for line in (folder / "attack.jsonl").read_text().splitlines()]
+    adversaries = [line for line in attacked if line["recognised"] and line["fooled"]]
+    own, other, turned, still, same, apple = lines
+    assert other["network"].endswith("best") and turned["azimuth"] == "-20°" and apple["mesh"] == "solid:apple:0"
+    for line in (own, still, same):  # where nothing is another
+        assert line["answer"] == [each["answer"] for each in adversaries]
+        assert line["hits"] == line["n"] == len(adversaries) > 0
+    assert "| network run:" in capsys.readouterr().out
+
+
 REFUSED = [
+    (["transfer.classifiers=[{network: x}]"], "transfer.classifiers: network is not known: give names"),
+    (["transfer.classifiers=[squeezenet]"], "classifier=squeezenet is not known"),
+    (["attack=geometry", "transfer.meshes=[a.glb]"], "transfer.meshes: attack=geometry belongs to what was attacked"),
+    (["attack=pixels", "transfer.azimuths=[3]"], "transfer.azimuths: attack=pixels belongs to what was attacked"),
     (["attack.sweep=[0.1,-1]"], "attack.sweep=-1.0 must be at least 1e-05"),
     (["attack=lihgting"], "attack=lihgting is not known: choose from lighting, skylight, projector, lamps, geometry"),
     (["attack=null"], "attack=null is not known: choose from lighting"),

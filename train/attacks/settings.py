@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from augment.attacks.settings import AttackSettings
+from augment.attacks.transfer import require_transferable
 from augment.attacks.verification import require_renderers
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from renderer.errors import FACTOR, InputError, require_range
@@ -59,6 +60,20 @@ class AttackSceneSettings(SceneSettings):
 
 
 @dataclass
+class TransferSettings:
+    """Where else what fools is shown. classifiers: as `classifier`, or {classifier, weights}. azimuths: degrees by
+    which cameras are turned. meshes: as those of a scene."""
+
+    classifiers: list[Any] = field(default_factory=list)
+    azimuths: list[float] = field(default_factory=list)
+    meshes: list[Any] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for angle in self.azimuths:
+            require_range("transfer.azimuths", angle, -360, 360)
+
+
+@dataclass
 class AttackExperimentSettings:
     """One attack on one classifier. target: None, a class, least_likely, or a class per view. reload: an adversary's
     folder, to render or to attack instead of the scene. A projector or lamps that are attacked stand in the scene,
@@ -73,11 +88,13 @@ class AttackExperimentSettings:
     reload: str | None = None
     device: str = "auto"
     attack: AttackCommandSettings = field(default_factory=AttackCommandSettings)
+    transfer: TransferSettings = field(default_factory=TransferSettings)
     scene: AttackSceneSettings = field(default_factory=AttackSceneSettings)
     renderer: RendererSettings = field(default_factory=RendererSettings)
 
     def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)
+        require_transferable(self.attack.kinds, self.transfer.azimuths, self.transfer.meshes)
         if self.attack.projector is not None and self.scene.projector is None:
             self.scene.projector = ProjectorSettings()
         if self.attack.lamps is not None and self.scene.lamps is None:

@@ -1,0 +1,76 @@
+"""Where else an attack's adversaries are shown, and what became of them there, as lines of a file and as a table."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from augment.attacks.transfer import Transfer
+from augment.objects import load_object, on_ground
+from renderer.errors import InputError
+from train.attacks.settings import AttackExperimentSettings
+from train.photographs.shares import share
+from train.run_classifier import load_classifier
+from train.settings import read_object
+from train.tables import aligned
+
+FILE = "transfer.jsonl"
+
+
+def load_others(settings: AttackExperimentSettings, device: torch.device) -> dict[str, Any]:
+    """The arguments of `Attacked.transfer`; none where nothing is asked for. InputError: as the loaders."""
+    asked, scene = settings.transfer, settings.scene
+    named = [item if isinstance(item, dict) else {"classifier": item} for item in asked.classifiers]
+    if unknown := next((key for item in named for key in item if key not in ("classifier", "weights")), None):
+        raise InputError(f"transfer.classifiers: {unknown} is not known: give names, or {{classifier, weights}}")
+    classifiers = [load_classifier(str(item.get("classifier")), item.get("weights")).to(device) for item in named]
+    for classifier in classifiers:
+        classifier.label(settings.label)  # before anything is attacked
+    items = [read_object(item, settings.label, index, "transfer.meshes") for index, item in enumerate(asked.meshes)]
+    objects = [load_object(item, scene.vertices) for item in items]
+    if scene.ground is not None:
+        objects = [on_ground(item, scene.ground) for item in objects]
+    others = {"classifiers": classifiers, "azimuths": asked.azimuths, "objects": objects}
+    return {name: each for name, each in others.items() if each}
+
+
+def write_transfers(found: Sequence[Transfer], folder: Path) -> None:
+    """transfer.jsonl: a line for each place, with the share fooled and every adversary's answers by view."""
+    lines = [
+        {
+            each.kind: each.name,
+            **_share(each),
+            "recognised": each.recognised.tolist(),
+            "fooled": each.fooled.tolist(),
+            **{f"{name}_before": answer for name, answer in _answers(each.before, each.classes).items()},
+            **_answers(each.after, each.classes),
+        }
+        for each in found
+    ]
+    (folder / FILE).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+
+
+def format_transfers(found: Sequence[Transfer]) -> str:
+    """The shares as a table."""
+    cells = "{hits} of {n} [{low:.0%}, {high:.0%}]"
+    rows = []
+    for each in found:
+        counted = _share(each)
+        fooled = cells.format(**counted) if counted["n"] else "none of 0"
+        rows.append([f"{each.kind} {each.name}", f"{counted['n']} of {len(each.recognised)}", fooled])
+    return aligned(["what fools, shown to", "recognised before", "fooled"], rows)
+
+
+def _share(found: Transfer) -> dict[str, Any]:
+    return share(int(found.fooled[found.recognised].sum()), int(found.recognised.sum()))
+
+
+def _answers(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
+    best = logits.softmax(2).max(2)
+    return {
+        "answer": [[classes[index] for index in views] for views in best.indices.tolist()],
+        "confidence": best.values.tolist(),
+    }
