@@ -38,12 +38,16 @@ class ObjectSettings:
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A mesh that spans [-1, 1], the name of its class, what multiplies its albedo, and its own name in messages."""
+    """A mesh that spans [-1, 1], the name of its class, what multiplies its albedo, and its own name in messages.
+
+    ground: the colour of the table that the mesh ends in, if it stands on one.
+    """
 
     label: str
     mesh: Mesh
     gain: float = 1.0
     name: str = "the mesh"
+    ground: Sequence[float] | None = None
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
@@ -67,15 +71,17 @@ def on_ground(item: SceneObject, color: Sequence[float]) -> SceneObject:
     lowest = item.mesh.vertices[np.unique(item.mesh.faces), 2].min()
     corners = [[x * GROUND, y * GROUND, lowest] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     table = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.array(color))
-    return replace(item, mesh=concatenate([item.mesh, table]))
+    return replace(item, mesh=concatenate([item.mesh, table]), ground=color)
 
 
 def another_individual(item: SceneObject, seed: int) -> SceneObject:
-    """Another of the same kind, where the object is a solid named without a seed, and otherwise the object itself."""
+    """Another of the same kind, on the same table, where the object is a solid named without a seed, and otherwise the
+    object itself."""
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item
-    return replace(item, mesh=normalise(solid(rest[0], seed)))
+    other = replace(item, mesh=normalise(solid(rest[0], seed)))
+    return other if item.ground is None else on_ground(other, item.ground)
 
 
 def _colored(mesh: Mesh, item: ObjectSettings) -> Mesh:

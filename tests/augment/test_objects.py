@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from augment.objects import ObjectSettings, load_object
+from augment.objects import ObjectSettings, another_individual, load_object, on_ground
 from renderer.errors import InputError
 
 
@@ -31,3 +31,12 @@ def test_a_mesh_that_brings_colours_keeps_them():
 def test_what_is_no_colour_is_refused(plain, color):
     with pytest.raises(InputError, match=r"plain\.stl: color=.* must be red, green and blue from 0 to 1"):
         ObjectSettings(plain, "orange", color=color)
+
+
+def test_another_individual_stands_on_the_same_table():
+    color = [0.2, 0.3, 0.4]
+    item = on_ground(load_object(ObjectSettings("solid:apple", "apple")), color)
+    other = another_individual(item, 5)
+    expected = on_ground(load_object(ObjectSettings("solid:apple:5", "apple")), color)
+    np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
+    np.testing.assert_array_equal(other.mesh.corner_colors, expected.mesh.corner_colors)
