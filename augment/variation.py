@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.objects import another_individual
+from augment.objects import SceneObject, another_individual
 from augment.scene import Example, Scene
 from augment.snapshot import SnapshotSettings, draw_snapshot
 from renderer.cache import OperatorCache
@@ -100,7 +100,7 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> S
         which = torch.randint(len(settings.lights), (len(rows),), generator=draws)
         changed["light"] = torch.stack([load_light(light) for light in settings.lights])[which].to(scene.lights)
     if settings.lamps > 0:
-        changed["light"] = _in_lamplight(changed.get("light", scene.lights), rows, settings, draws)
+        changed["light"] = _in_lamplight(changed.get("light", scene.lights), rows, scene.objects, settings, draws)
     if settings.snapshot.changes:
         snapshot = draw_snapshot(settings.snapshot, len(rows), scene.settings, draws)
         changed["taken"] = snapshot.to(scene.lights.device)
@@ -145,9 +145,16 @@ def _turned(row: Example, polar: float, azimuth: float) -> Example:
 
 
 def _in_lamplight(
-    lights: Tensor, rows: Sequence[Example], settings: VariationSettings, draws: torch.Generator
+    lights: Tensor,
+    rows: Sequence[Example],
+    objects: Sequence[SceneObject],
+    settings: VariationSettings,
+    draws: torch.Generator,
 ) -> Tensor:
-    """The lights (E, 49, 3), some of them dimmed, with a white lamp that gives 1 to a surface facing it."""
+    """The lights (E, 49, 3), some of them dimmed, with a white lamp that gives 1 to a surface facing it.
+
+    What stands on a table has no lamp below: one that were drawn there is mirrored to above.
+    """
     low, high = settings.ambient
     shape = (len(rows), 1, 1)
     ambient = low + (high - low) * torch.rand(shape, generator=draws)
@@ -155,6 +162,9 @@ def _in_lamplight(
     angles = _angles(LAMP_REACH, len(rows), draws)
     cameras = [_turned(row, *each).cameras[0] for row, each in zip(rows, angles, strict=True)]
     towards = [torch.from_numpy(camera.axes()[2]) for camera in cameras]
+    for row, direction in zip(rows, towards, strict=True):
+        if objects[row.object].ground is not None:
+            direction[2].abs_()
     lamps = torch.stack([directional(direction, torch.ones(3)) for direction in towards]).to(lights)
     return torch.where(chosen.to(lights.device), lamps + ambient.to(lights) * lights, lights)
 

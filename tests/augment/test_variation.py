@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from augment.backgrounds import load_background, load_backgrounds
-from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.phases import Phases
 from augment.scene import Scene
 from augment.seeding import generator
@@ -139,6 +139,17 @@ def test_a_lamp_is_white_parallel_light_from_the_cameras_side_over_some_of_the_o
     assert torch.equal(lit.lights[:, :, 0], lit.lights[:, :, 2])
     torch.testing.assert_close(lamps[:, 0], torch.full((12,), 1 / math.sqrt(4 * math.pi)).double(), rtol=1e-6, atol=0)
     assert len(towards.unique(dim=0)) == 12
+
+
+def test_what_stands_on_a_table_has_no_lamp_below_it(scene):
+    """A lamp above the others' table is where it was without one."""
+    height = {}
+    for ground in (None, [0.5, 0.5, 0.5]):
+        objects = [item if ground is None else on_ground(item, ground) for item in scene.objects]
+        lights = drawn(scene.with_rows(scene.examples, objects=objects), lamps=1.0).lights
+        height[ground is None] = lights[:, 2, 0]
+    assert (height[True] < 0).any()
+    assert torch.equal(height[False], height[True].abs())
 
 
 def test_a_share_of_the_examples_stands_in_lamplight_and_the_rest_in_their_own_light(scene):
