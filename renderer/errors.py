@@ -1,6 +1,8 @@
 """The one exception for what a user can mend, and the checks that keep NaN and the absurd out."""
 
 from collections.abc import Sequence
+from numbers import Integral
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,6 +21,18 @@ class InputError(ValueError):
 def is_out_of_memory(error: Exception) -> bool:
     """Whether memory ran out: a GPU's, that of torch's allocator on the CPU, or Python's."""
     return isinstance(error, torch.OutOfMemoryError | MemoryError) or "can't allocate memory" in str(error)
+
+
+def require_file(path: Path, advice: str) -> None:
+    """InputError naming what is no regular file: a pipe would be waited for."""
+    if not path.is_file():
+        raise InputError(f"{path} {'is no file' if path.exists() else 'does not exist'}: {advice}")
+
+
+def require_whole(name: str, value: object) -> None:
+    """InputError naming a setting that is no whole number."""
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        raise InputError(f"{name}={value!r} must be a whole number")
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:

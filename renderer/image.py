@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, require_bounded, require_range
+from renderer.errors import InputError, require_bounded, require_range, require_whole
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
@@ -39,6 +39,8 @@ class ImageSettings:
     transport: str = "direct"
 
     def __post_init__(self) -> None:
+        require_whole("size", self.size)
+        require_whole("renderer.samples", self.samples)
         if self.size < 1:
             raise InputError(f"the size {self.size} must be at least 1 pixel per side")
         require_range("renderer.samples", self.samples, 1, FINEST)

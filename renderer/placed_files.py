@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from renderer.errors import FACTOR, InputError
+from renderer.errors import FACTOR, InputError, require_file
 from renderer.image import to_bytes
 from renderer.lamps import Lamps
 from renderer.projector import Projector
@@ -29,6 +29,7 @@ def save_placed(path: Path, coefficients: Tensor, basis: Any) -> None:
 
 def load_placed(path: Path) -> tuple[Projector | Lamps, Tensor]:
     """(the basis, coefficients (size, 3) float32). InputError: there is no such file, or it describes none."""
+    require_file(path, "give a projector's or lamps' .json")
     try:
         description = json.loads(path.read_text(encoding="utf-8"))
         make = BASES[description.pop("basis")]
@@ -38,7 +39,7 @@ def load_placed(path: Path) -> tuple[Projector | Lamps, Tensor]:
         basis = make(**description)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, OverflowError) as error:
         raise InputError(f"{path} does not describe a projector or lamps ({error}): write it again") from error
     if coefficients.shape != (basis.size, 3) or not (coefficients.abs() <= FACTOR).all():
         raise InputError(f"{path} has coefficients {tuple(coefficients.shape)}: give {basis.size} of [r, g, b]")

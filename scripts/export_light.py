@@ -26,8 +26,8 @@ class Settings:
 
 def main(settings: Settings) -> None:
     light, out = load_light(settings.light), Path(settings.out)
-    check_map_name(out)
     writable_file(out, "out")
+    check_map_name(out)
     radiance = to_map(light, settings.height)
     write_map(out, radiance)
     fate = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"

@@ -31,7 +31,7 @@ LONGEST_NAME = 200  # characters
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 TEXTS = {  # keys of names and folders
     *("run", "sweep", "init_from", "out", "keep", "photos", "photographs", "path", "images", "cache"),
-    *("weights", "light", "label", "classifier", "reload"),
+    *("weights", "light", "label", "target", "classifier", "name", "reload"),
 }
 NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d+)?|[+-]?(inf|nan)|true|false", re.IGNORECASE)
 HYDRAS_ADVICE = re.compile(r"\n(?:To append|See https:|Config search path:)")  # begins what serves nobody here
@@ -124,7 +124,8 @@ def _refusal(error: Exception, arguments: list[str], config_name: str) -> str:
     said = " ".join(HYDRAS_ADVICE.split(str(error))[0].split())
     overrides, nearest = [argument for argument in arguments if not argument.startswith("-")], []
     with initialize_config_module("conf", version_base="1.3"):
-        culprits = [override for override in overrides if not _composes(config_name, override)]
+        others = [overrides[:place] + overrides[place + 1 :] for place in range(len(overrides))]
+        culprits = [override for override, rest in zip(overrides, others, strict=True) if _composes(config_name, rest)]
         with suppress(HydraException, ValueError):  # of a group without such a choice, whose choices Hydra lists
             nearest = list(_suggestions(overrides, config_name))
     unnamed = [override for override in culprits if override.partition("=")[0] not in said]
@@ -132,9 +133,9 @@ def _refusal(error: Exception, arguments: list[str], config_name: str) -> str:
     return "; ".join([named.removesuffix("."), *nearest])
 
 
-def _composes(config_name: str, override: str) -> bool:
+def _composes(config_name: str, overrides: list[str]) -> bool:
     try:
-        compose(config_name, [override], return_hydra_config=True)
+        compose(config_name, overrides, return_hydra_config=True)
     except Exception:  # a HydraException, or one of Python's for a value that Hydra has no rule for
         return False
     return True

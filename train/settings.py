@@ -1,7 +1,7 @@
 """conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -221,8 +221,11 @@ def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") ->
             raise InputError(f"{'.'.join(filter(None, (parent, nested)))}: give a plain value, no list or mapping")
         return cast(Settings, OmegaConf.to_object(merged))
     except OmegaConfBaseException as error:
-        at_fault = error.full_key or next(str(key) for key in config if not _merges(kind, config, str(key)))
-        key = ".".join(filter(None, (parent, at_fault)))
+        within = error.full_key or ""
+        at_fault = (
+            key for key, value in dotted(as_dict(config)) if key.startswith(within) and not _fits(kind, key, value)
+        )
+        key = ".".join(filter(None, (parent, next(at_fault, within))))
         said = "give a list, as in [a,b]" if "is not a ListConfig" in str(error.msg) else str(error.msg).splitlines()[0]
         raise InputError(f"{key}: {said}") from error
 
@@ -231,17 +234,20 @@ def _nested(node: Any) -> Iterator[str]:
     """The keys of lists and mappings that stand where plain values are declared, which OmegaConf lets pass."""
     if isinstance(node, ListConfig | DictConfig) and not (node._is_none() or node._is_missing()):
         plain = node._metadata.element_type in (str, int, float, bool)
-        for key in range(len(node)) if isinstance(node, ListConfig) else node:
+        keys: Iterable[Any] = range(len(node)) if isinstance(node, ListConfig) else node
+        for key in keys:
             child = node._get_node(key)
             if plain and OmegaConf.is_config(child):
                 yield node._get_full_key(key)
             yield from _nested(child)
 
 
-def _merges(kind: type, config: DictConfig, key: str) -> bool:
-    """Whether one of the configuration's groups is no fault by itself, of which OmegaConf names no key."""
+def _fits(kind: type, key: str, value: object) -> bool:
+    """Whether a value is no fault by itself, of which OmegaConf names the group at most."""
+    alone = OmegaConf.create()
+    OmegaConf.update(alone, key, value, force_add=True)
     try:
-        OmegaConf.merge(OmegaConf.structured(kind), OmegaConf.masked_copy(config, key))
+        OmegaConf.merge(OmegaConf.structured(kind), alone)
     except OmegaConfBaseException:
         return False
     return True
@@ -292,10 +298,10 @@ def require_same_settings(folder: Path, config: DictConfig) -> None:
 def dotted(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
     """The values of nested settings by dotted key."""
     for key, value in node.items():
-        if isinstance(value, dict) and prefix + key not in CIRCUMSTANCES:
+        if isinstance(value, dict) and f"{prefix}{key}" not in CIRCUMSTANCES:
             yield from dotted(value, f"{prefix}{key}.")
         else:
-            yield prefix + key, value
+            yield f"{prefix}{key}", value
 
 
 def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:

@@ -21,7 +21,7 @@ from augment.objects import SceneObject
 from renderer.basis import parts_of, with_placed
 from renderer.camera import OrthographicCamera
 from renderer.environment import negative_share, to_map, write_map
-from renderer.errors import FACTOR, InputError, require_bounded, require_range
+from renderer.errors import FACTOR, InputError, require_bounded, require_file, require_range
 from renderer.image import ImageSettings, to_bytes
 from renderer.lights import load_light, save_light
 from renderer.mesh import load_mesh
@@ -131,6 +131,7 @@ def _write_background(background: Tensor, folder: Path) -> float | str:
 
 
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
+    require_file(path, "write the adversary again")
     try:
         images = torch.from_numpy(np.load(path, allow_pickle=False)).float()
         require_bounded(images=images)

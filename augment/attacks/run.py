@@ -145,7 +145,7 @@ def attack(
         require_recognised(scene, before, labels, classifier)
     criterion = criterion or Misclassification()
     targets = criterion.targets(before, classifier)
-    if isinstance(criterion, Targeted) and (targets == labels[:, None]).any():
+    if isinstance(criterion, Targeted) and targets is not None and torch.eq(targets, labels[:, None]).any():
         raise InputError(f"target={criterion.classes} is the right class of an example: name one to mistake it for")
     goal = Goal(labels[:, None].expand(-1, scene.views), targets)
     phases = Phases(problem.start.device)

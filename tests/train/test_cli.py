@@ -48,9 +48,11 @@ REFUSED_BY_HYDRA = [
         "In 'train': Could not find 'data/mnist' Available options in 'data': cifar100 folder npz shapes",
     ),
     (["seed=1", "augment=null"], "augment=null: Config group override must be a string or a list. Got NoneType"),
+    (["data=npz", "data.path=a.npz", "seed=1", "train=[]"], "Error merging override train=[]"),
     (["scene.meshes=[~/a.obj]"], "LexerNoViableAltException: scene.meshes=[~/a.obj] ^"),
     (["~seed"], "~seed: no setting can be taken away: leave this out, or set it to another value"),
     (["run="], "run is empty: give a name, or leave it out"),
+    (["model.name=''"], "model.name is empty: give a name, or leave it out"),
 ]
 
 
@@ -148,6 +150,8 @@ def test_two_commands_do_not_train_in_one_folder(tmp_path, tiny_npz, held):
         (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
         (["label=ornage"], "label of scene.meshes[0]: 'ornage' is not a class of the model: did you mean 'orange'?"),
         (["data.path=???"], "data.path is not set: give data.path=..."),
+        (["scene.projector=[]"], "scene.projector: Cannot merge DictConfig with ListConfig"),
+        (["train=3"], "train: Merge error: int is not a subclass of TrainSettings. value: 3"),
     ],
 )
 def test_what_a_user_can_mend_is_one_line_and_status_2(tiny, tmp_path, capsys, overrides, message):

@@ -1,6 +1,7 @@
 """What an attack leaves behind is read back to the same image, and what is damaged is refused."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,6 +99,14 @@ def described(**changes):
     return change
 
 
+def piped(name):
+    def change(folder: Path) -> None:
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+
+    return change
+
+
 DAMAGES = {
     "no description": (lambda folder: (folder / DESCRIPTION).unlink(), "does not exist: give a folder that an attack"),
     "no JSON": (lambda folder: (folder / DESCRIPTION).write_text("{"), "does not describe an adversary"),
@@ -113,7 +122,10 @@ DAMAGES = {
     "a number for a name": (described(mesh=3), "3 does not exist"),
     "too bright a background": (described(background=3), "give grey values"),
     "images cut short": (lambda folder: (folder / "after.npy").write_bytes(b"\\x93NUMPY"), "after.npy cannot be read"),
-    "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy cannot be read"),
+    "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy does not exist"),
+    "a pipe for images": (piped("after.npy"), "after.npy is no file"),
+    "a size of NaN": (described(image={"size": float("nan")}), "size=nan must be a whole number"),
+    "no such lamps": (described(placed_lights=["lamps.json"]), "lamps.json does not exist"),
 }
 
 
