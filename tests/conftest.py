@@ -52,7 +52,10 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
         return 0
 
     yield command
-    logging.root.handlers[:] = handlers  # Hydra's write to what was the output here
+    for handler in logging.root.handlers:  # Hydra's write to what was the output here
+        if handler not in handlers:
+            handler.close()
+    logging.root.handlers[:] = handlers
 
 
 @pytest.fixture

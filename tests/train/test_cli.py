@@ -26,18 +26,6 @@ SMALL = [
 ]  # fmt: skip
 
 
-def train(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
-    """`python -m train` from another folder than the repository's."""
-    return subprocess.run(
-        [sys.executable, "-m", "train", *arguments],
-        cwd=folder,
-        env={name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
-        | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
-
-
 # ---------------------------------------------------------------------------------------- whole commands
 
 
@@ -74,24 +62,27 @@ def test_an_error_of_the_programs_own_keeps_its_traceback(monkeypatch):
         run_command(broken, "train")
 
 
-def test_a_missing_file_is_one_line(tmp_path):
-    done = train(tmp_path, "data=npz", "data.path=none.npz")
-    assert done.returncode == USER_ERROR
-    assert done.stderr == "error: data.path=none.npz does not exist: give the path of an .npz file\n"
+def test_a_missing_file_is_one_line(call, capsys):
+    assert call("train", "data=npz", "data.path=none.npz") == USER_ERROR
+    assert capsys.readouterr().err == "error: data.path=none.npz does not exist: give the path of an .npz file\n"
 
 
-def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(tmp_path, tiny_npz):
-    done = train(tmp_path, "run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", *SMALL, "scene.views=3")
-    assert done.returncode == USER_ERROR
-    assert done.stderr.startswith("error: augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12")
-    assert len(done.stderr.splitlines()) == 1
+def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(call, capsys, tmp_path, tiny_npz):
+    arms = ["run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]"]
+    assert call("train", *arms, *SMALL, "scene.views=3") == USER_ERROR
+    told = capsys.readouterr().err
+    assert told.startswith("error: augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12")
+    assert len(told.splitlines()) == 1
     assert not list(tmp_path.rglob(LAST))
 
 
 def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz, photos):
-    done = train(
-        tmp_path, "run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", "compare=[none]", *SMALL
-    )
+    """From another folder than the repository's."""
+    overrides = ["run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", "compare=[none]"]
+    environment = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
+    environment["PYTHONPATH"] = str(ROOT)
+    command = [sys.executable, "-m", "train", *overrides, *SMALL]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     rows = [line.split("|")[1].strip() for line in done.stdout.splitlines() if line.startswith("|")]
     assert [row for row in rows if set(row) != {"-"}] == ["augment", "none", "adversarial"] * 2
@@ -101,11 +92,11 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
 
 
-def test_a_run_folder_that_cannot_be_written_is_one_line(tmp_path):
+def test_a_run_folder_that_cannot_be_written_is_one_line(call, capsys, tmp_path):
     (tmp_path / "file").touch()
-    done = train(tmp_path, "run=file/run")
-    assert (done.returncode, done.stdout) == (USER_ERROR, "")
-    assert done.stderr == "error: run=file/run cannot be written to (Not a directory): choose another folder\n"
+    assert call("train", "run=file/run") == USER_ERROR
+    error = "error: run=file/run cannot be written to (Not a directory): choose another folder\n"
+    assert capsys.readouterr() == ("", error)
 
 
 @pytest.mark.parametrize("start", [Folders().on_run_start, Folders().on_multirun_start])
@@ -130,14 +121,13 @@ def test_a_log_that_cannot_be_written_is_one_line(capsys, tmp_path):
 
 
 @pytest.mark.parametrize("held", ["here", "here/none"])
-def test_two_commands_do_not_train_in_one_folder(tmp_path, tiny_npz, held):
+def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_npz, held):
     (tmp_path / held).mkdir(parents=True)
+    arms = ["run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", "train.resume=true"]
     with locked(tmp_path / held):
-        done = train(
-            tmp_path, "run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", *SMALL, "train.resume=true"
-        )
-    assert done.returncode == USER_ERROR
-    assert done.stderr.startswith(f"error: run={tmp_path / held} is being written by another process: let it end")
+        assert call("train", *arms, *SMALL) == USER_ERROR
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: run={tmp_path / held} is being written by another process: let it end")
     assert not list(tmp_path.rglob("config.yaml")) and not list(tmp_path.rglob("metrics.jsonl"))
 
 

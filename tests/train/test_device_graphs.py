@@ -72,8 +72,9 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
     assert [shape[0] for shape in backend.shapes] == [16, 32, 64]
 
 
-def test_no_run_of_a_sweep_is_compiled_less_than_the_first(network):
+def test_no_run_of_a_sweep_is_compiled_less_than_the_first():
     """Torch would stop at a number of graphs, of all the runs of a process together."""
+    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 3)).double()
     found, image = [], torch.zeros(1, 3, 8, 8, dtype=torch.float64)
     for _ in range(RECOMPILE_LIMIT // len(SIZES) + 1):
         backend = Recorded()

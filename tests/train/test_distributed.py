@@ -38,16 +38,15 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-def as_process(index: int, count: int, port: int, task: Callable, arguments: tuple) -> None:
-    torch.set_num_threads(1)
-    os.environ |= {"WORLD_SIZE": str(count), "RANK": str(index), "LOCAL_RANK": str(index)}
+def as_process(index: int, port: int, task: Callable[[Path], None], folder: Path) -> None:
+    os.environ |= {"WORLD_SIZE": "2", "RANK": str(index), "LOCAL_RANK": str(index)}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     with process_group():
-        task(*arguments)
+        task(folder)
 
 
-def in_processes(count: int, task: Callable, *arguments) -> None:
-    multiprocessing.spawn(as_process, (count, free_port(), task, arguments), nprocs=count)
+def in_two_processes(task: Callable[[Path], None], folder: Path) -> None:
+    multiprocessing.spawn(as_process, (free_port(), task, folder), nprocs=2)
 
 
 def network() -> WideResNet:
@@ -78,11 +77,27 @@ def train_two_steps(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def steps(tmp_path_factory) -> list[dict]:
-    """Of one process, and of each of two."""
-    folder = tmp_path_factory.mktemp("steps")
+def folder(tiny, tmp_path_factory) -> Path:
+    """What two processes wrote, one task after the other; for the runs, a configuration at a learning rate so low that
+    rounding does not grow."""
+    folder = tmp_path_factory.mktemp("distributed")
+    for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
+        config = tiny("train.learning_rate=0.001", *overrides)
+        OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / f"{name}.yaml")
+    in_two_processes(all_tasks, folder)
+    return folder
+
+
+def all_tasks(folder: Path) -> None:
     train_two_steps(folder)
-    in_processes(2, train_two_steps, folder)
+    run_from_file(folder / "config.yaml", folder / "two")
+    run_until_a_signal(folder / "config.yaml", folder / "mixed")
+
+
+@pytest.fixture(scope="module")
+def steps(folder) -> list[dict]:
+    """Of one process, and of each of two."""
+    train_two_steps(folder)
     return [torch.load(folder / name, weights_only=True) for name in ("0_of_1.pt", "0_of_2.pt", "1_of_2.pt")]
 
 
@@ -163,18 +178,9 @@ def interrupted_at(epoch: int, step: int, process: int) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def runs(tiny, tmp_path_factory) -> Path:
-    """An adversarial run by one process, by two, and by two until a signal and then by one.
-
-    At a learning rate so low that rounding does not grow.
-    """
-    folder = tmp_path_factory.mktemp("runs")
-    for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
-        config = tiny("train.learning_rate=0.001", *overrides)
-        OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / f"{name}.yaml")
+def runs(folder) -> Path:
+    """An adversarial run by one process, by two, and by two until a signal and then by one."""
     run_from_file(folder / "config.yaml", folder / "one")
-    in_processes(2, run_from_file, folder / "config.yaml", folder / "two")
-    in_processes(2, run_until_a_signal, folder / "config.yaml", folder / "mixed")
     state = checkpoint.load(folder / "mixed" / checkpoint.LAST)
     assert (state["epoch"], state["under_way"]["step"]) == (1, 2)
     run_from_file(folder / "resume.yaml", folder / "mixed")
@@ -208,7 +214,7 @@ def test_a_killed_process_ends_the_run_in_one_sentence_and_its_checkpoint_is_who
     small = ["model.depth=10", "model.width=1", "train.batch_size=16", "augment=none", "train.device=cpu"]
     data = ["data=npz", f"data.path={tiny_npz}", "compare=[]", "train.epochs=10000", "run=here"]
     start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([*start, *small, *data], cwd=tmp_path, env=environment, **pipes) as run:
         next(line for line in run.stdout if line.startswith("epoch 2/"))
@@ -227,7 +233,7 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
     data = ["data=npz", f"data.path={tiny_npz}", "evaluate.photos=null", "compare=[]"]
     overrides = [*small, *data, "train.device=cpu", "train.epochs=200", "train.checkpoint_every=1000"]
     start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
     with subprocess.Popen([*start, *overrides], cwd=tmp_path, env=environment, **pipes) as first:
         for line in first.stdout:

@@ -1,9 +1,10 @@
-from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 import pytest
 
-from train.laboratory.patterns import FAMILIES
+from train.laboratory import shots as laboratory_shots
+from train.laboratory.patterns import FAMILIES, draw_pattern
 from train.laboratory.shots import FIELD_OF_VIEW, draw_shots
 
 FAMILY_NAMES = list(FAMILIES)
@@ -11,7 +12,10 @@ FAMILY_NAMES = list(FAMILIES)
 
 @pytest.fixture(scope="module")
 def shots():
-    return list(draw_shots(120, FAMILY_NAMES, (0.2, 2.5), seed=3))
+    """With coarse patterns."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(laboratory_shots, "draw_pattern", partial(draw_pattern, resolution=8))
+        return list(draw_shots(120, FAMILY_NAMES, (0.2, 2.5), seed=3))
 
 
 def test_every_family_has_as_many_lights_evenly_from_dim_to_bright(shots):
@@ -22,12 +26,12 @@ def test_every_family_has_as_many_lights_evenly_from_dim_to_bright(shots):
         assert (edges[:-1] <= brightness).all() and (brightness <= edges[1:]).all()
 
 
-def test_shots_follow_from_the_seed_and_differ_from_each_other(shots):
-    again, other = (list(draw_shots(120, FAMILY_NAMES, (0.2, 2.5), seed)) for seed in (3, 4))
+def test_shots_follow_from_the_seed_and_differ_from_each_other():
+    shots, again, other = (list(draw_shots(12, FAMILY_NAMES, (0.2, 2.5), seed)) for seed in (3, 3, 4))
     for shot, same in zip(shots, again, strict=True):
-        for name, value in asdict(shot).items():
-            np.testing.assert_array_equal(value, asdict(same)[name], name)
-    assert len({tuple(shot.camera) for shot in shots + other}) == 240
+        for name, value in vars(shot).items():
+            np.testing.assert_array_equal(value, getattr(same, name), name)
+    assert len({tuple(shot.camera) for shot in shots + other}) == 24
 
 
 def test_the_camera_looks_down_at_an_object_that_fits_its_view(shots):

@@ -252,6 +252,7 @@ def test_the_table_has_a_row_for_each_case_and_faults_are_failures(tmp_path):
 # ---------------------------------------------------------------------------------------- real processes
 
 
+@pytest.mark.slow
 def test_a_killed_process_is_resumed_to_the_same_end(tmp_path):
     """As one that was not, in this process."""
     small, reference = write_inputs(tmp_path, epochs=EPOCHS), tmp_path / "reference"
