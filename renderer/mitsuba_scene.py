@@ -30,7 +30,8 @@ from renderer.projector import Projector
 
 SCENE = "scene.xml"
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
-_VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
+VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
+DIFFERENTIABLE = "llvm_ad_rgb"
 TO_Z_UP = ((0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1))  # its maps have y up and +z in the middle
 
 _XML = """<scene version="3.0.0">
@@ -136,15 +137,18 @@ def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
 
 
 @contextmanager
-def mitsuba() -> Iterator[Any]:
-    """The module under our variant; that of before, if any, comes back. InputError: it is not installed."""
+def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
+    """The module under a variant; that of before, if any, comes back. InputError: it, or its LLVM, is not installed."""
     try:
         import drjit
         import mitsuba as module
     except ImportError as error:
         raise InputError("Mitsuba is not installed: pip install '.[lab]'") from error
     before = module.variant()
-    module.set_variant(_VARIANT)
+    try:
+        module.set_variant(variant)
+    except ImportError as error:
+        raise InputError(f"Mitsuba finds no LLVM: install libllvm19, or set DRJIT_LIBLLVM_PATH ({error})") from error
     drjit.set_thread_count(max(2, drjit.thread_count()))  # with one, of one core, its reader of .exr waits forever
     try:
         yield module

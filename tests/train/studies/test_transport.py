@@ -4,8 +4,10 @@ import torch
 import trimesh
 
 from renderer import rays
+from renderer.errors import InputError
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
+from renderer.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.shapes import solid
 from train.studies.transport import beside_mitsuba, cost, held
 
@@ -57,6 +59,25 @@ def test_mitsubas_image_is_in_the_place_of_ours(monkeypatch):
     ball = trimesh.creation.icosphere(subdivisions=2)
     mesh, settings = Mesh.plain(ball.vertices, ball.faces, (0.9, 0.5, 0.2)), ImageSettings(12)
     theirs, noise = beside_mitsuba.mitsuba_image(mesh, settings)
-    off, inside = beside_mitsuba.ours(mesh, settings) - theirs, theirs[3] > 0.999
+    off, inside = beside_mitsuba.image(beside_mitsuba.operator(mesh, settings)) - theirs, theirs[3] > 0.999
     assert inside.sum() > 20 and noise[:3, inside].mean() > 0
     assert off[:3, inside].abs().max() < 0.05 * theirs[:3].max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("transport", ["shadows", "bounces:2"])
+def test_the_gradient_by_the_light_is_mitsubas(transport):
+    pytest.importorskip("mitsuba")
+    try:
+        with mitsuba(DIFFERENTIABLE):
+            pass
+    except InputError as error:
+        pytest.skip(str(error))
+    mesh, settings = beside_mitsuba.meshes()["open: half a ball"], ImageSettings(12, transport=transport)
+    shaped = beside_mitsuba.operator(mesh, settings)
+    upstream, full = torch.zeros(3, 12**2), shaped.pixels[shaped.coverage == 1]
+    upstream[:, full] = torch.rand(3, len(full), generator=torch.Generator().manual_seed(0))
+    theirs, noise = beside_mitsuba.mitsuba_gradient(mesh, settings, upstream)
+    error = shaped.light_gradient(upstream[:, shaped.pixels]) - theirs
+    assert noise.norm() < 0.02 * theirs.norm()
+    assert error.norm() < 0.03 * theirs.norm()

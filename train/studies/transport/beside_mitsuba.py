@@ -1,27 +1,34 @@
 """Shadows and bounces beside Mitsuba's path tracer, on meshes that are hard in one way each."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 from torch import Tensor
 
+from augment.objects import SceneObject, on_ground
 from renderer.camera import OrthographicCamera
 from renderer.environment import to_map, write_map
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, concatenate, normalise
-from renderer.mitsuba_scene import SCENE, mitsuba, write_mitsuba_scene
+from renderer.mitsuba_scene import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, write_mitsuba_scene
 from renderer.shapes import solid
-from renderer.transfer import build_operators
+from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
 from train.tables import markdown
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
 SIZE, SEEDS = 32, 3  # Mitsuba's images, whose spread tells its noise
+MAP_ROWS = 512  # Mitsuba takes the outermost for the poles, which are half a row further out
+PAIR = (("pear", -0.5), ("apple", 0.5))
 TRANSPORTS = ("shadows", "bounces:3")
 
 
@@ -31,43 +38,58 @@ def meshes() -> dict[str, Mesh]:
     dents = np.random.default_rng(0).uniform(0.6, 1, (len(shell.vertices), 1))
     plate = Mesh.plain([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
     box = trimesh.creation.box((0.8, 0.8, 0.02))
+    ring, cup = trimesh.creation.torus(0.45, 0.45), normalise(solid("cup", 0))
+    pair = [replace(solid(name, 0), vertices=0.45 * solid(name, 0).vertices + np.array([0, y, 0])) for name, y in PAIR]
     return {
         "convex: a ball": ball,
-        "concave: solid:cup": normalise(solid("cup", 0)),
+        "concave: solid:cup": cup,
         "concave: solid:table": normalise(solid("table", 0)),
         "rugged: a dented ball": replace(ball, vertices=shell.vertices * dents),
         "open: half a ball": Mesh.plain(shell.vertices, shell.faces[lower], (0.8, 0.7, 0.5)),
+        "self-touching: a ring without a hole": Mesh.plain(ring.vertices, ring.faces, (0.3, 0.8, 0.5)),
         "touching parts: a ball on a plate": concatenate([ball, plate]),
         "thin: boards 0.03 apart": concatenate(
             [Mesh.plain(box.vertices + np.array([0, 0, 0.05 * each]), box.faces, (0.9, 0.6, 0.4)) for each in range(5)]
         ),
+        "scene.ground: solid:cup on a table": on_ground(SceneObject("", cup), (0.9, 0.3, 0.2)).mesh,
+        "two objects: solid:pear by solid:apple, on a table": on_ground(
+            SceneObject("", concatenate(pair)), (0.3, 0.3, 0.9)
+        ).mesh,
     }
 
 
 def table() -> str:
-    rows = []
-    for name, mesh in meshes().items():
-        for transport in TRANSPORTS:
-            settings = ImageSettings(SIZE, transport=transport)
-            theirs, noise = mitsuba_image(mesh, settings)
-            inside, brightest = theirs[3] > 0.999, theirs[:3].max()
-            off = {each: ours(mesh, replace(settings, transport=each)) - theirs for each in (transport, "direct")}
-            error, without = (
-                f"{each[:3, inside].square().mean().sqrt() / brightest:.2%}" for each in (off[transport], off["direct"])
-            )
-            rows.append(
-                [name, transport, error, f"{noise[:3, inside].square().mean().sqrt() / brightest:.2%}", without]
-            )
-    return markdown(["mesh", "transport", "error", "Mitsuba's own noise", "error of direct light"], rows)
+    rows = [[name, transport, *row(mesh, transport)] for name, mesh in meshes().items() for transport in TRANSPORTS]
+    errors = (f"{what}: {whose}" for what in ("image", "gradient") for whose in ("error", "noise", "direct"))
+    return markdown(["mesh", "transport", *errors], rows)
 
 
-def ours(mesh: Mesh, settings: ImageSettings) -> Tensor:
+def row(mesh: Mesh, transport: str) -> list[str]:
+    """Of the image, and of the gradient by the light of its sum with random weights: the error, Mitsuba's own noise,
+    and the error of direct light."""
+    shaped, direct = (operator(mesh, ImageSettings(SIZE, transport=each)) for each in (transport, "direct"))
+    theirs, noise = mitsuba_image(mesh, shaped.settings)
+    inside, brightest = theirs[3] > 0.999, theirs[:3].max()
+    off = (seen - theirs for seen in (image(shaped), image(direct)))
+    errors = (each[:3, inside].square().mean().sqrt() / brightest for each in (next(off), noise, next(off)))
+    upstream = inside * torch.rand(3, SIZE**2, generator=torch.Generator().manual_seed(0))
+    slope, its_noise = mitsuba_gradient(mesh, shaped.settings, upstream)
+    ours, without = (each.light_gradient(upstream[:, each.pixels]) for each in (shaped, direct))
+    gradients = (each.norm() / slope.norm() for each in (ours - slope, its_noise, without - slope))
+    return [f"{each:.2%}" for each in (*errors, *gradients)]
+
+
+def operator(mesh: Mesh, settings: ImageSettings) -> Operator:
+    [built] = build_operators(mesh, [CAMERA], settings, choose("software"))
+    return built
+
+
+def image(seen: Operator) -> Tensor:
     """(4, size²): radiance and coverage."""
-    [operator] = build_operators(mesh, [CAMERA], settings, choose("software"))
-    image = torch.zeros(4, settings.size**2, dtype=torch.float64)
-    image[:3, operator.pixels] = operator.radiance(light()).double()
-    image[3, operator.pixels] = operator.coverage.double()
-    return image
+    canvas = torch.zeros(4, seen.settings.size**2, dtype=torch.float64)
+    canvas[:3, seen.pixels] = seen.radiance(light()).double()
+    canvas[3, seen.pixels] = seen.coverage.double()
+    return canvas
 
 
 def light() -> Tensor:
@@ -75,12 +97,54 @@ def light() -> Tensor:
     return load_light("st_peters")
 
 
+@cache
+def light_and_map() -> tuple[Tensor, Tensor]:
+    """Its coefficients, and the map's texels with their graph."""
+    coefficients = light().double().requires_grad_()
+    return coefficients, to_map(coefficients, MAP_ROWS)
+
+
 def mitsuba_image(mesh: Mesh, settings: ImageSettings) -> tuple[Tensor, Tensor]:
     """The mean (4, size²) of SEEDS images and its standard error."""
-    with TemporaryDirectory() as folder, mitsuba() as mi:
+    with mitsuba_scene(mesh, settings, VARIANT) as (mi, scene):
+        images = np.stack([np.array(mi.render(scene, seed=seed)) for seed in range(SEEDS)])
+    return mean_and_noise(torch.from_numpy(images).double().permute(0, 3, 1, 2).flatten(2))
+
+
+def mitsuba_gradient(mesh: Mesh, settings: ImageSettings, upstream: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean (49, 3) of the gradients by the light of SEEDS images (3, size²) × upstream, and its standard error.
+
+    Mitsuba differentiates its integrator in reverse mode by the map's pixels, and these are linear in the light.
+    """
+    import drjit
+
+    (coefficients, texels), found = light_and_map(), []
+    weights = torch.zeros(settings.size**2, 4)
+    weights[:, :3] = upstream.T
+    with mitsuba_scene(mesh, settings, DIFFERENTIABLE) as (mi, scene):
+        parameters = mi.traverse(scene)
+        [name] = [name for name, _ in parameters if name.endswith(".data")]
+        for seed in range(SEEDS):
+            data = drjit.detach(mi.TensorXf(parameters[name]))
+            drjit.enable_grad(data)
+            parameters[name] = data
+            parameters.update()
+            above = mi.TensorXf(weights.view(settings.size, -1, 4).numpy())
+            drjit.backward(drjit.sum(mi.render(scene, parameters, seed=seed) * above, axis=None))
+            by_texel = torch.from_numpy(np.array(drjit.grad(data)))[:, 1:-1]  # its map has a column more on either side
+            found += torch.autograd.grad(texels, coefficients, by_texel.to(texels), retain_graph=True)
+    return mean_and_noise(torch.stack(found))
+
+
+@contextmanager
+def mitsuba_scene(mesh: Mesh, settings: ImageSettings, variant: str) -> Iterator[tuple[Any, Any]]:
+    """(the module, the scene)"""
+    with TemporaryDirectory() as folder, mitsuba(variant) as mi:
         write_mitsuba_scene(Path(folder), mesh, 1.0, [CAMERA], settings, "light.exr")
-        write_map(Path(folder, "light.exr"), to_map(light(), 256))
-        scene = mi.load_file(str(Path(folder, SCENE)))
-        images = np.stack([np.array(mi.render(scene, sensor=0, seed=seed)) for seed in range(SEEDS)])
-    drawn = torch.from_numpy(images).double().permute(0, 3, 1, 2).flatten(2)
-    return drawn.mean(0), drawn.std(0) / SEEDS**0.5
+        write_map(Path(folder, "light.exr"), light_and_map()[1].detach())
+        yield mi, mi.load_file(str(Path(folder, SCENE)))
+
+
+def mean_and_noise(draws: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean of (SEEDS, ...) draws and its standard error."""
+    return draws.mean(0), draws.std(0) / SEEDS**0.5

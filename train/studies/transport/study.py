@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from renderer.mesh import normalise
+from renderer.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.rays import DIRECTIONS
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
@@ -59,9 +60,11 @@ random, and how much the move changes the image:
 ## Beside Mitsuba's path tracer
 
 The same mesh at {size}² in the same environment map (St. Peter's, positive all round), with {directions} directions
-and 8² samples here, and {seeds} × 256 paths per pixel of depth N + 2 there. Errors are root mean squares over the
-brightest value, inside the outline; what is left beside Mitsuba's noise is the quadrature over directions, and for
-bounces the size of the patches.
+and 8² samples here, and {seeds} × 256 paths per pixel of depth N + 2 there. An image's errors are root mean squares
+over the brightest value, inside the outline. The gradient is that by the light, all 49 × 3 coefficients, of the sum of
+these pixels with random weights, and Mitsuba's is its integrator's in reverse mode; errors are L2 norms over that of
+the gradient. *Noise* is Mitsuba's own standard error, *direct* the error without transport. What is left beside the noise
+is the quadrature over directions, for bounces the size of the patches, and up to 0.4 % of a gradient the map's rows.
 
 {beside}
 """
@@ -79,6 +82,8 @@ class TransportSettings:
 def run(settings: TransportSettings) -> None:
     """Measure on one thread, and write the page."""
     out = writable_file(settings.out, "out")
+    with mitsuba(DIFFERENTIABLE):
+        pass  # a run without it would fail only at its end
     torch.set_num_threads(1)
     cup, clock = normalise(subdivide(solid("cup", 0), settings.vertices)), Clock(torch.device("cpu"), settings.rounds)
     text = TEXT.format(
