@@ -7,14 +7,19 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from augment.attacks.run import Attacked, attack
 from augment.attacks.settings import AttackSettings
 from augment.attacks.verification import RENDERERS, Verdict
 from augment.objects import SceneObject
 from augment.parameters import StepSettings
+from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Scene
+from renderer.basis import with_placed
+from renderer.lamps import Lamps
 from renderer.mitsuba_scene import SAMPLES
+from renderer.projector import Projector
 from train.studies.paper.adversaries import LIGHT, SHAPE
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
@@ -24,20 +29,26 @@ from train.tables import markdown
 ALBEDO = StepSettings("linf", 0.1, "sign", 0.02)
 ATTACKS: dict[str, dict[str, Any]] = {
     "light": {"lighting": LIGHT},
+    "projector": {"projector": StepSettings("linf", None, "unit", 1.0)},
+    "lamps": {"lamps": StepSettings("linf", None, "unit", 0.2)},
     "shape": {"geometry": SHAPE},
     "albedo": {"albedo": ALBEDO},
     "light, shape and albedo": {"lighting": LIGHT, "geometry": SHAPE, "albedo": ALBEDO},
 }
+PLACED: dict[str, ProjectorSettings | LampsSettings] = {"projector": ProjectorSettings(), "lamps": LampsSettings()}
 MARGIN, BATCH = 2.0, 8
 TEXT = """
-Adversaries of {classifier} on `{label}`, found as `scripts/attack.py` does unless told otherwise: images of 8 bits,
-physical light, and {margin:g} more in the logit of what fools than in any other; {steps} steps at most. Views of
-{meshes} at random azimuths, distances and greys, in the nearest light to `{probe}` without negative radiance,
-{examples} of each mesh that are recognised in `{probe}` itself. Each adversary is written as a folder; *reload* and
-*mitsuba* render it from these files alone, the latter by direct illumination, in which meshes shade themselves and here
-do not, with {samples} samples a pixel. The shares that still fool are of those that fooled:
+Adversaries of {classifier}, found as `scripts/attack.py` does unless told otherwise: images of 8 bits, physical light,
+and {margin:g} more in the logit of what fools than in any other; {steps} steps at most. Views at random azimuths,
+distances and greys of {meshes}, in the nearest light to `{probe}` without negative radiance, {examples} of each mesh
+that are recognised in `{probe}` itself; the projector and the lamps, dark to begin with, add to it. Each adversary is
+written as a folder; *reload* and *mitsuba* render it from these files alone, the latter by direct illumination, in
+which meshes shade themselves and here do not, with {samples} samples a pixel. The shares that still fool are of those
+that fooled:
 
 {table}
+
+{by_mesh}
 
 {differences}
 
@@ -60,14 +71,16 @@ def measure(study: Study, settings: SurvivalSettings) -> Section:
     fooled = [record for record in records if record["fooled"]]
     text = TEXT.format(
         classifier=study.classifier.name,
-        label=study.label,
         margin=MARGIN,
         steps=settings.steps,
-        meshes=study.meshes,
+        meshes=", ".join(f"{subject.name} (`{subject.label}`)" for subject in study.subjects),
         probe=study.light,
         examples=settings.examples,
         samples=SAMPLES,
-        table=markdown(["attack", "fooled", *versions], (_row(name, records, versions) for name in ATTACKS)),
+        table=markdown(["attack", "fooled", *versions], (_row("attack", name, records, versions) for name in ATTACKS)),
+        by_mesh=markdown(
+            ["mesh", "fooled", *versions], (_row("mesh", each.name, records, versions) for each in study.subjects)
+        ),
         differences=markdown(
             ["values differ from ours, in 255ths", *ATTACKS], (_differences(version, fooled) for version in versions)
         ),
@@ -79,7 +92,7 @@ def measure(study: Study, settings: SurvivalSettings) -> Section:
 
 def _outcomes(subject: Subject, study: Study, settings: SurvivalSettings) -> Iterator[dict[str, Any]]:
     """A record per attack and example that was recognised where the attack began."""
-    scene = _physical(recognised_scene(subject, study.classifier, study.light, settings.examples, study.seed), subject)
+    scene = recognised_scene(subject, study.classifier, study.light, settings.examples, study.seed)
     for name, kinds in ATTACKS.items():
         chosen = AttackSettings(
             **kinds,
@@ -89,16 +102,19 @@ def _outcomes(subject: Subject, study: Study, settings: SurvivalSettings) -> Ite
             rounded=True,
             batch_size=BATCH,
         )
-        done = attack(study.classifier, scene, settings=chosen, seed=study.seed, force=True)
+        shown = _shown(scene, subject, [PLACED[kind].build() for kind in kinds if kind in PLACED])
+        done = attack(study.classifier, shown, settings=chosen, seed=study.seed, force=True)
         with TemporaryDirectory() as folder:
             verdicts = done.save(Path(folder), verify=RENDERERS)
         for example in torch.nonzero(done.recognised).flatten().tolist():
             yield {"mesh": subject.name, "attack": name, **_record(done, verdicts, example)}
 
 
-def _physical(scene: Scene, subject: Subject) -> Scene:
+def _shown(scene: Scene, subject: Subject, placed: Sequence[tuple[Projector | Lamps, Tensor]]) -> Scene:
+    """The subject by its name and class, with lights that stand in the scene; all examples begin in the same light."""
     shown = SceneObject(subject.label, subject.mesh, subject.gain, subject.name)
-    return scene.with_rows(scene.examples, objects=[shown], light=scene.basis.nearest_physical(scene.lights))
+    basis, light = with_placed(scene.lights[0], placed)
+    return scene.with_rows(scene.examples, objects=[shown], basis=basis, light=light)
 
 
 def _record(done: Attacked, verdicts: Sequence[Verdict], example: int) -> dict[str, Any]:
@@ -106,8 +122,8 @@ def _record(done: Attacked, verdicts: Sequence[Verdict], example: int) -> dict[s
     return {"example": example, "fooled": bool(done.success[example]), "versions": versions}
 
 
-def _row(name: str, records: Sequence[dict[str, Any]], versions: Sequence[str]) -> list[str]:
-    here = [record for record in records if record["attack"] == name]
+def _row(column: str, name: str, records: Sequence[dict[str, Any]], versions: Sequence[str]) -> list[str]:
+    here = [record for record in records if record[column] == name]
     fooled = [record for record in here if record["fooled"]]
     kept = [percent([record["versions"][version]["fooled"] for record in fooled]) for version in versions]
     return [name, percent([record["fooled"] for record in here]), *kept]
@@ -119,5 +135,6 @@ def _differences(version: str, fooled: Sequence[dict[str, Any]]) -> list[str]:
     for name in ATTACKS:
         found = [record["versions"][version] for record in fooled if record["attack"] == name]
         mean = sum(each["mean_difference"] for each in found) / max(len(found), 1)
-        cells.append(f"{255 * mean:.2g}, at most {255 * max((e['largest_difference'] for e in found), default=0):.2g}")
+        largest = max((each["largest_difference"] for each in found), default=0)
+        cells.append(f"{255 * mean:.2g}, at most {255 * largest:.3g}")
     return cells
