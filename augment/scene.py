@@ -181,6 +181,10 @@ class Scene:
         }
         return Scene(examples=examples, **same | changed)
 
+    def in_physical_light(self) -> Scene:
+        """The same, in the nearest lights that something can emit."""
+        return self.with_rows(self.examples, light=self.basis.nearest_physical(self.lights))
+
     def __len__(self) -> int:
         return len(self.examples)
 

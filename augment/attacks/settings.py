@@ -30,7 +30,7 @@ class SkylightSettings(StepSettings):
 class AttackSettings:
     """None for what stays as it is. restarts: further starts, drawn from the norm-balls, where nothing is fooled yet.
 
-    light: what `lighting` may find: "physical", only what something can emit (of harmonics: radiance nowhere negative),
+    light: "physical", only what something can emit (of harmonics: radiance nowhere negative), whatever is attacked,
     beginning with the nearest such light to the scene's; or "signed", any coefficients.
     max_steps, shorten, batch_size, margin: see `DescentSettings`. rounded: the classifier is given images of 8 bits.
     expectation: over random changes of them.
@@ -86,7 +86,8 @@ class AttackSettings:
         return Expected(judge, self.expectation, draws) if self.expectation.draws else judge
 
     def problem(self, scene: Scene) -> Perturbation:
-        """What is changed of a scene."""
+        """What is changed of a scene, in light that is possible."""
+        scene = scene.in_physical_light() if self.light == PHYSICAL else scene
         return Perturbation(scene, [self._kind(name, scene, settings) for name, settings in self.kinds.items()])
 
     def _kind(self, name: str, scene: Scene, settings: StepSettings) -> Kind:

@@ -9,6 +9,7 @@ from augment.attacks.checks import Checks
 from augment.parameters import KINDS
 from renderer.errors import InputError
 from renderer.mesh import Mesh, load_mesh
+from renderer.nonnegative import nearest_nonnegative
 from renderer.shapes import solid
 
 OTHER_LIGHTS = {"skylight", "projector", "lamps"}
@@ -60,6 +61,24 @@ def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifi
     assert lines[0]["largest_change"].keys() == kinds.keys() and last["checks"]["random_search"] == checks.random_search
     shape = load_mesh(tmp_path / "new" / "example_000" / "mesh.glb")
     assert len(shape.faces) == len(scene.mesh(0).faces)
+
+
+@pytest.mark.parametrize(("light", "physical"), [("physical", True), ("signed", False)])
+@pytest.mark.parametrize("kind", ["geometry", "albedo"])
+def test_whatever_is_attacked_the_light_is_one_that_something_can_emit_unless_any_will_do(
+    classifier, kind, light, physical, tmp_path
+):
+    """So that the files, whose maps hold no negative radiance, show the same."""
+    scene = augment.build_scene([("solid:orange", "orange")], 8, **SMALL)
+    settings = augment.AttackSettings(**{kind: augment.StepSettings()}, light=light, max_steps=2)
+    attacked = augment.attack(classifier, scene, settings=settings)
+    lights = attacked.conditions.light
+    assert torch.equal(lights, nearest_nonnegative(scene.lights)) == physical
+    assert torch.equal(lights, scene.lights) != physical
+    images = [attacked.problem.images(values) for values in (attacked.problem.start, attacked.result.values)]
+    assert torch.equal(images[0], attacked.images_before) and torch.equal(images[1], attacked.images)
+    attacked.save(tmp_path)
+    assert (tmp_path / "example_000" / "light.exr").is_file() == physical
 
 
 def test_what_is_not_recognised_or_no_class_is_refused_in_one_sentence(classifier):

@@ -100,7 +100,8 @@ def test_a_gpu_attacks_as_a_cpu_does_to_rounding(kinds):
 
 
 def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
-    done = attacked("scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "attack.max_steps=0")
+    overrides = "scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "attack.light=signed"
+    done = attacked(*overrides, "attack.max_steps=0")
     cameras = ring(3, 2.0, math.pi / 2)
     assert done.problem.scene.cameras == [(camera,) for camera in cameras for _ in range(2)]
     assert done.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(grey)] * 3 for grey in [0.2, 0.6] * 3]
