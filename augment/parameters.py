@@ -8,6 +8,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -155,10 +156,15 @@ class OfPlace(OfLight):
     """The light from places, of which a scene has one kind each. InputError where it has none."""
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        found = [part for part in parts_of(scene.basis) if part[1].name == self.name]
-        if not found:
-            raise InputError(f"attack={self.name}: the scene has no {self.name}: set scene.{self.name}")
-        super().__init__(scene, settings, *found[0], physical=True)
+        super().__init__(scene, settings, *_of_name(scene, self.name, self.name), physical=True)
+
+
+def _of_name(scene: Scene, name: str, attacked: str) -> tuple[slice, Any]:
+    """(the coefficients of, the) light of a scene that has a name. InputError where there is none to be attacked."""
+    for part in parts_of(scene.basis):
+        if part[1].name == name:
+            return part
+    raise InputError(f"attack={attacked}: the scene has no {name}: set scene.{name}")
 
 
 class ProjectorPattern(OfPlace):
@@ -171,6 +177,21 @@ class LampPowers(OfPlace):
     """What each lamp emits, three channels from 0 to the largest power."""
 
     name = Lamps.name
+
+
+class LampPlaces(Kind):
+    """Where each lamp is, three coordinates in world units. Shadows are cast anew in each image, and are held in its
+    derivative. InputError where the scene has no lamps."""
+
+    name = "places"
+
+    def __init__(self, scene: Scene, settings: StepSettings):
+        lamps = _of_name(scene, Lamps.name, self.name)[1]
+        start = torch.tensor(lamps.places).to(scene.lights).flatten()
+        super().__init__(scene, start.expand(len(scene), -1), settings)
+
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        return replace(conditions, places=values.unflatten(1, (-1, 3)))
 
 
 class Skylight(Kind):
@@ -241,5 +262,5 @@ class Pixels(Kind):
 
 
 KINDS: dict[str, Callable[..., Kind]] = {
-    kind.name: kind for kind in (Lighting, Skylight, ProjectorPattern, LampPowers, Geometry, Albedo, Pixels)
+    kind.name: kind for kind in (Lighting, Skylight, ProjectorPattern, LampPowers, LampPlaces, Geometry, Albedo, Pixels)
 }

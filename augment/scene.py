@@ -14,18 +14,21 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from augment.held_transport import HeldTransport
+from augment.lamplit import Lamplit
 from augment.memory import require_memory
 from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
 from augment.progress import progress
 from renderer.albedo import painted_albedo, surface_albedo
-from renderer.basis import HARMONICS, Basis, Sum
+from renderer.basis import HARMONICS, Basis, Sum, parts_of
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, behind, clamp, clamped, develop_composite
+from renderer.lamps import Lamps, moved
 from renderer.mesh import Mesh
+from renderer.rays import Rays
 from renderer.shading import radiance
 from renderer.visibility import Backend
 
@@ -54,14 +57,15 @@ class Conditions:
     """What A examples are rendered under.
 
     light: of the scene's basis. vertices: None where they are the meshes'. albedo: added to each face's linear albedo.
-    pixels: added to the values of the V images. Where meshes differ in size, N and F are the largest's, and a smaller
-    mesh has the first of them.
+    pixels: added to the values of the V images. places: of the lamps, None where they are the basis'. Where meshes
+    differ in size, N and F are the largest's, and a smaller mesh has the first of them.
     """
 
     light: Float[Tensor, "A coefficients 3"]
     vertices: Float[Tensor, "A N 3"] | None = None
     albedo: Float[Tensor, "A F 3"] | None = None
     pixels: Float[Tensor, "A V 3 size size"] | None = None
+    places: Float[Tensor, "A L 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,8 @@ class Scene:
         self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
         self._fragments_of_meshes: dict[tuple[int, OrthographicCamera], tuple[Fragments, Tensor]] = {}
         self._held_transports: dict[tuple[int, OrthographicCamera], HeldTransport] = {}
+        self._rays: dict[int, Rays] = {}
+        self._lamplit_views: dict[tuple[int, OrthographicCamera], Lamplit] = {}
 
     @classmethod
     def grid(
@@ -221,6 +227,10 @@ class Scene:
         """What an example shows."""
         return self.objects[self.examples[example].object].mesh
 
+    def basis_under(self, conditions: Conditions, row: int) -> Basis:
+        """What the light of a row of conditions is of: lamps are where the conditions have them."""
+        return self.basis if conditions.places is None else moved(self.basis, conditions.places[row].detach())
+
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
         """The scene's own, for some examples."""
         return Conditions(self.lights[examples])
@@ -254,7 +264,9 @@ class Scene:
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
         if conditions.vertices is None and conditions.albedo is None:
-            return self._relit(light, examples)
+            if conditions.places is None:
+                return self._relit(light, examples)
+            return self._under_moved_lamps(light, conditions.places, examples)
         if isinstance(self.basis, Sum):
             raise InputError(f"light of {self.basis} falls on one shape in its colours: attack the light alone")
         return self._reshaded(light, conditions, examples)
@@ -278,6 +290,19 @@ class Scene:
         images = place[images]
         seen = stack.radiance(light, images)
         return _Layer(rows, stack.pixels, seen + added[images], stack.coverage, stack.shown[images])
+
+    def _under_moved_lamps(self, light: Tensor, places: Tensor, examples: Tensor) -> Iterator[_Layer]:
+        """By the same products for all other light, and by the lamps' image after image."""
+        where = next(where for where, part in parts_of(self.basis) if isinstance(part, Lamps))
+        rest = torch.cat([light[:, : where.start], torch.zeros_like(light[:, where]), light[:, where.stop :]], dim=1)
+        for layer in self._relit(rest, examples):
+            added = []
+            for image in range(len(layer.composite)) if layer.rows is None else layer.rows:
+                row, view = divmod(image, self.views)
+                example = self.examples[int(examples[row])]
+                seen = self._lamplit(example.object, example.cameras[view])
+                added.append(seen.radiance(places[row], light[row, where], layer.pixels))
+            yield replace(layer, composite=layer.composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[_Layer]:
         """View by view."""
@@ -341,6 +366,14 @@ class Scene:
         if view not in self._fragments_of_meshes:
             self._fragments_of_meshes[view] = self._fragments(number, camera, self.objects[number].mesh.vertices)
         return self._fragments_of_meshes[view]
+
+    def _lamplit(self, number: int, camera: OrthographicCamera) -> Lamplit:
+        view = number, camera
+        if view not in self._lamplit_views:
+            rays = self._rays.setdefault(number, Rays(self.objects[number].mesh))
+            fragments, albedo = self._still(*view)
+            self._lamplit_views[view] = Lamplit(rays, self.objects[number].mesh, fragments, albedo, self.settings)
+        return self._lamplit_views[view]
 
     def _held(self, number: int, camera: OrthographicCamera) -> HeldTransport:
         view = number, camera

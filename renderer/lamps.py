@@ -1,12 +1,12 @@
 """Point lamps at given places."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import torch
 from torch import Tensor
 
-from renderer.basis import Reach
+from renderer.basis import Basis, Reach, Sum, parts_of
 from renderer.convex import Ball, nearest_in_box
 from renderer.errors import FACTOR, InputError, require_range
 
@@ -15,8 +15,6 @@ from renderer.errors import FACTOR, InputError, require_range
 class Lamps:
     """A coefficient for each of the places (x, y, z): the irradiance head on at distance 1, from which it falls with
     the square. power: the largest; the least is 0. InputError: no place, or one on the origin.
-
-    No surface is farther away than a lamp on the same way, so that nothing behind a lamp is in the way.
     """
 
     places: tuple[tuple[float, float, float], ...]
@@ -43,9 +41,20 @@ class Lamps:
         return nearest_in_box(coefficients, 0, self.power, within)
 
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
-        toward = points.new_tensor(self.places) - points[:, None]
-        distance = toward.norm(dim=2)
-        cosine = (toward * normals[:, None]).sum(2) / distance
-        point, lamp = torch.nonzero(cosine > 0, as_tuple=True)
-        irradiance = (cosine / distance**2)[point, lamp]
-        return Reach(point, lamp, points.new_tensor(self.places)[lamp], irradiance)
+        places = points.new_tensor(self.places)
+        received = irradiance(places - points[:, None], normals[:, None])
+        point, lamp = torch.nonzero(received > 0, as_tuple=True)
+        return Reach(point, lamp, places[lamp], received[point, lamp])
+
+
+def irradiance(toward: Tensor, normals: Tensor) -> Tensor:
+    """(...) at surfaces of unit normals (..., 3) from lamps of power 1 that are `toward` (..., 3) from there, negative
+    behind a surface."""
+    return (toward * normals).sum(-1) / toward.square().sum(-1) ** 1.5
+
+
+def moved(basis: Basis, places: Tensor) -> Basis:
+    """The basis with its lamps at places (L, 3)."""
+    points = tuple(map(tuple, places.tolist()))
+    parts = [replace(part, places=points) if isinstance(part, Lamps) else part for _, part in parts_of(basis)]
+    return Sum(tuple(parts)) if isinstance(basis, Sum) else parts[0]

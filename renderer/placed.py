@@ -4,6 +4,7 @@ from torch import Tensor
 
 from renderer.basis import Placed, Reach
 from renderer.harmonics import unit_vectors
+from renderer.lamps import Lamps, irradiance
 from renderer.rays import Rays
 from renderer.surface import Surface
 
@@ -11,8 +12,8 @@ from renderer.surface import Surface
 def placed_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: Placed) -> tuple[Tensor, Tensor]:
     """((C, K, P) float64, the K functions of the basis that reach a pixel (K,)); albedo: (S, C), at the samples.
 
-    Every sample of a view has a ray to each place, so that shadows are as sharp as the image's samples. What lies
-    behind the place is no obstacle only if there is nothing: see the bases. InputError where Embree is not installed.
+    Every sample of a view has a ray to each place, so that shadows are as sharp as the image's samples. InputError
+    where Embree is not installed.
     """
     fragments = surface.fragments
     reach = _lit(rays, surface, basis.reach(surface.points, surface.normals))
@@ -24,11 +25,24 @@ def placed_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: Placed)
     return transfer.unflatten(1, (len(kept), pixels)), kept
 
 
+def lamplight(rays: Rays, surface: Surface, albedo: Tensor, places: Tensor, powers: Tensor) -> Tensor:
+    """(3, P) float64 radiance under lamps at places (L, 3) of powers (L, 3), differentiable in both; albedo: (S, 3).
+
+    It is not linear in the places: rays are cast anew, and which of them are free is held in the derivative.
+    """
+    fragments = surface.fragments
+    lamps, places = Lamps(tuple(map(tuple, places.tolist()))), places.double()
+    lit = _lit(rays, surface, lamps.reach(surface.points, surface.normals))
+    received = irradiance(places[lit.function] - surface.points[lit.point], surface.normals[lit.point])
+    weights = albedo[lit.point] / fragments.samples**2 * received[:, None] * powers.double()[lit.function]
+    return weights.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel[lit.point], weights).T
+
+
 def _lit(rays: Rays, surface: Surface, reach: Reach) -> Reach:
     """The ways on which no surface is met, nor the point's own from behind."""
     planes = surface.planes[reach.point]
     origins = surface.points[reach.point] + rays.offset * planes
-    toward = reach.place - origins
-    above = (toward * planes).sum(1) > 0
-    lit = above & (rays.meet(origins, unit_vectors(toward.T)[0].T) < 0)
+    directions, lengths = unit_vectors((reach.place - origins).T)
+    above = (directions.T * planes).sum(1) > 0
+    lit = above & (rays.meet(origins, directions.T, lengths) < 0)
     return Reach(reach.point[lit], reach.function[lit], reach.place[lit], reach.irradiance[lit])

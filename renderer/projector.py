@@ -21,8 +21,7 @@ class Projector:
     It stands at polar angle θ off +z and azimuth φ off +x, in radians, `distance` from the origin, which it aims at;
     field_of_view: the angle between opposite sides, in radians. A coefficient of 1 makes a white surface at the origin
     that faces it as bright as radiance 1; it falls with the square of the distance, and on a flat screen it is even, as
-    projectors are made. power: the largest coefficient; the least is 0. A surface is nearer than the projector, so that
-    nothing behind it is in the way. InputError: settings out of range.
+    projectors are made. power: the largest coefficient; the least is 0. InputError: settings out of range.
     """
 
     pixels: int = 16

@@ -101,10 +101,12 @@ class Rays:
         rises = reach - (planes * corners).sum(1) > self.offset
         return fragments.pixel[rises[fragments.face]].unique()
 
-    def meet(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """(N,) the face that each ray of (N, 3) meets first, -1 where there is none."""
-        rays = (np.ascontiguousarray(part.numpy(), dtype=np.float32) for part in (origins, directions))
-        return torch.from_numpy(self._scene.run(*rays)).long()
+    def meet(self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """(N,) the face that each ray of (N, 3) meets first, -1 where there is none. lengths: (N,) of the rays."""
+        rays = [origins, directions] if lengths is None else [origins, directions, lengths]
+        return torch.from_numpy(
+            self._scene.run(*(np.ascontiguousarray(each.numpy(), np.float32) for each in rays))
+        ).long()
 
 
 @per_degree

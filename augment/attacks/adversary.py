@@ -50,7 +50,7 @@ class Adversary:
             shown=replace(shown, mesh=mesh, gain=gain),
             cameras=row.cameras,
             light=after.light[example].detach().cpu() * row.exposure,
-            basis=scene.basis,
+            basis=scene.basis_under(after, example),
             background=scene.images_behind[row.background].cpu(),
             settings=scene.settings,
             images_before=before.cpu(),

@@ -16,6 +16,7 @@ from augment.attacks.figure import Exhibit, answer_caption, save_figure
 from augment.attacks.run import Attacked
 from augment.attacks.verification import Verdict, verify
 from augment.scene import Conditions, Scene
+from renderer.basis import Basis
 from renderer.light_sphere import light_sphere
 from renderer.mesh_damage import mesh_damage
 
@@ -54,9 +55,10 @@ def exhibits(attacked: Attacked, example: int) -> tuple[Exhibit, Exhibit]:
     """What an example shows before and after; its light only where the attack has changed it."""
     problem, result = attacked.problem, attacked.result
     one = problem.everything[example : example + 1]
-    before, after = (problem.conditions(values[one], one).light[0] for values in (problem.start, result.values))
-    changed = not torch.equal(before, after)
-    spheres = [_spheres(problem.scene, light, example) if changed else None for light in (before, after)]
+    sides = [problem.conditions(values[one], one) for values in (problem.start, result.values)]
+    lit = [(side.light[0], problem.scene.basis_under(side, 0)) for side in sides]
+    changed = not torch.equal(lit[0][0], lit[1][0]) or lit[0][1] != lit[1][1]
+    spheres = [_spheres(problem.scene, *each, example) if changed else None for each in lit]
     labels = [attacked.classifier.classes[label] for label in attacked.goal.decrease[example].tolist()]
 
     def captions(logits: Tensor) -> list[tuple[str, ...]]:
@@ -69,8 +71,8 @@ def exhibits(attacked: Attacked, example: int) -> tuple[Exhibit, Exhibit]:
     )
 
 
-def _spheres(scene: Scene, light: Tensor, example: int) -> Tensor:
-    return torch.stack([light_sphere(light, SPHERE, camera, scene.basis) for camera in scene.cameras[example]])
+def _spheres(scene: Scene, light: Tensor, basis: Basis, example: int) -> Tensor:
+    return torch.stack([light_sphere(light, SPHERE, camera, basis) for camera in scene.cameras[example]])
 
 
 def _numbers(attacked: Attacked, example: int) -> dict[str, object]:

@@ -40,6 +40,7 @@ class AttackSettings:
     skylight: SkylightSettings | None = None
     projector: StepSettings | None = None
     lamps: StepSettings | None = None
+    places: StepSettings | None = None
     geometry: StepSettings | None = None
     albedo: StepSettings | None = None
     pixels: StepSettings | None = None

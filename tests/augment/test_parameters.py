@@ -33,7 +33,7 @@ SIZES = {"lighting": 49 * 3, "skylight": 3, "geometry": 12 * 3, "albedo": 20 * 3
 
 
 def test_every_kind_has_a_name_of_its_own():
-    assert KINDS.keys() - {"projector", "lamps"} == MAKERS.keys() == SIZES.keys()
+    assert KINDS.keys() - {"projector", "lamps", "places"} == MAKERS.keys() == SIZES.keys()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -7,11 +7,12 @@ from PIL import Image
 import augment
 from augment.attacks.adversary import Adversary
 from augment.attacks.adversary_folder import read_adversary, write_adversary
-from augment.parameters import LampPowers, Lighting, ProjectorPattern, StepSettings
+from augment.parameters import LampPlaces, LampPowers, Lighting, ProjectorPattern, StepSettings
 from augment.perturbation import Perturbation
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from augment.service import TrainingAttackSettings
+from renderer.basis import parts_of
 from renderer.errors import InputError
 from renderer.visibility import choose
 
@@ -151,3 +152,42 @@ def test_shapes_and_colours_are_not_attacked_under_lights_in_the_scene():
     shown = scene()
     with pytest.raises(InputError, match="attack the light alone"):
         shown.render(Conditions(shown.lights, vertices=shown.vertices.expand(2, -1, -1)), EVERY)
+
+
+def test_lamps_are_moved_within_their_ball_and_stand_where_they_ended_when_read_back(tmp_path):
+    classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
+    steps, ball = StepSettings("linf", None, "unit", 0.5), StepSettings("l2", 0.6, "unit", 0.5)
+    settings = augment.AttackSettings(projector=steps, places=ball, max_steps=3)
+    done = augment.attack(classifier, scene(exposure=0.3), settings=settings, force=True)
+    start = torch.tensor(LAMPS.places)
+    reach = (done.conditions.places - start).flatten(1).norm(dim=1)
+    assert (reach > 0.1).all() and (reach <= 0.6 * (1 + 1e-5)).all()
+    after = Adversary.of(done.problem.scene, 1, done.conditions, done.images_before[1], done.images[1])
+    write_adversary(after, tmp_path)
+    found = read_adversary(tmp_path)
+    (lamps,) = [part for _, part in parts_of(found.basis) if part.name == "lamps"]
+    assert torch.equal(torch.tensor(lamps.places), done.conditions.places[1])
+    torch.testing.assert_close(found.render(choose("software")), done.images[1], rtol=0, atol=1e-6)
+
+
+def test_the_gradient_by_places_is_that_of_the_image_where_views_share_lamps():
+    """On an orange, most of which no shadow falls on: within a share of what moves."""
+    shown = augment.build_scene(
+        [("solid:orange", "orange")], SIZE, 2, shared=True, visibility="software", light="st_peters", exposure=0.3,
+        lamps=LAMPS, samples=4,
+    )  # fmt: skip
+    problem = Perturbation(shown, [LampPlaces(shown, StepSettings())])
+    draws = torch.Generator().manual_seed(0)
+    values = problem.start.clone().requires_grad_(True)
+    images = problem.render(values, torch.arange(1))
+    assert torch.allclose(images, shown.render(shown.conditions(torch.arange(1)), torch.arange(1)), rtol=0, atol=1e-6)
+    weights, way = torch.rand(images.shape, generator=draws), torch.randn(values.shape, generator=draws)
+    (gradient,) = torch.autograd.grad((images * weights).sum(), values)
+    ends = [problem.render(problem.start + step * way, torch.arange(1)) for step in (1e-2, -1e-2)]
+    slope = (weights.double() * (ends[0] - ends[1]).double()).sum() / 2e-2
+    torch.testing.assert_close((gradient * way).double().sum(), slope, rtol=2e-2, atol=0)
+
+
+def test_places_want_lamps():
+    with pytest.raises(InputError, match="attack=places: the scene has no lamps"):
+        LampPlaces(scene(lamps=None), StepSettings())

@@ -1,20 +1,26 @@
 """Light from places against Mitsuba 3's projector and point emitters, on convex and concave meshes."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
+from renderer.albedo import surface_albedo
 from renderer.basis import Placed
 from renderer.camera import OrthographicCamera
 from renderer.convex import Ball
+from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
-from renderer.lamps import Lamps
+from renderer.lamps import Lamps, moved
 from renderer.mesh import Mesh, concatenate
 from renderer.mitsuba_scene import mitsuba
+from renderer.placed import lamplight
 from renderer.projector import Projector
+from renderer.rays import Rays
+from renderer.surface import Surface
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
 
@@ -166,3 +172,54 @@ def test_nothing_emits_less_than_nothing_or_more_than_its_power(basis):
     assert torch.equal(basis.nearest_physical(light), expected)
     within = Ball(torch.full_like(light, 0.2), 0.1, "linf")
     assert torch.equal(basis.nearest_physical(light, within), torch.tensor([0.1, 0.3, 0.3]).expand_as(light))
+
+
+def moved_image(
+    mesh: Mesh, places: torch.Tensor, powers: torch.Tensor, size: int = SIZE, samples: int = SAMPLES
+) -> tuple[Operator, torch.Tensor]:
+    """The operator of LAMPS, and (3, P) of its pixels under lamps at other places."""
+    settings = ImageSettings(size, samples)
+    (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("software"), closed=mesh.closed)
+    surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
+    return operator(mesh, LAMPS, size, samples), lamplight(Rays(mesh), surface, albedo, places, powers)
+
+
+def test_lamps_that_are_moved_shine_and_throw_shadows_as_lamps_that_stand_there():
+    there = torch.tensor([[2.0, -1.0, 1.5], [-0.4, 1.7, 2.5]], dtype=torch.float64)
+    powers = torch.rand(2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    _, seen = moved_image(ball_on_a_table(), there, powers)
+    standing = operator(ball_on_a_table(), moved(LAMPS, there))
+    torch.testing.assert_close(seen, standing.radiance(powers), rtol=1e-12, atol=1e-14)
+    _, alone = moved_image(ball_on_a_table(), there[:1], powers[:1])
+    assert (alone == 0).any() and alone.max() > 0.02
+
+
+def test_the_derivative_by_places_and_powers_is_that_of_finite_differences_where_no_shadow_moves():
+    places = torch.tensor(LAMPS.places, dtype=torch.float64, requires_grad=True)
+    powers = torch.rand(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True)
+    small = partial(moved_image, ball(), size=6, samples=2)
+    assert torch.autograd.gradcheck(lambda *given: small(*given)[1], (places, powers), eps=1e-7)
+
+
+def test_the_derivative_by_places_is_mitsubas():
+    """On a ball, which no shadow of its own falls on; by central differences of Mitsuba's images."""
+    draws = torch.Generator().manual_seed(1)
+    places = torch.tensor(LAMPS.places, dtype=torch.float64, requires_grad=True)
+    powers, way = (torch.rand(3, 3, generator=draws, dtype=torch.float64) for _ in range(2))
+    built, seen = moved_image(ball(), places, powers)
+    weights = torch.rand(seen.shape, generator=draws, dtype=torch.float64)
+    (gradient,) = torch.autograd.grad((weights * seen).sum(), places)
+    ends = [mitsuba_image(ball(), moved(LAMPS, places.detach() + step * way), powers) for step in (0.02, -0.02)]
+    change = torch.from_numpy((ends[0] - ends[1]) / 0.04).flatten(0, 1)[built.pixels].T
+    slopes = gradient * way  # which nearly cancel
+    torch.testing.assert_close(slopes.sum(), (weights * change).sum(), rtol=0, atol=1e-3 * float(slopes.abs().sum()))
+
+
+def test_what_lies_behind_a_lamp_is_not_in_its_way():
+    """Halfway between two screens, of which the camera sees the lower one through a gap."""
+    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    vertices = np.concatenate([square, square * [0.2, 0.2, 0] + [0, 0, 1.0]])
+    screens = Mesh.plain(vertices, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    lamp = Lamps(((0.0, 0.0, 0.5),))
+    shown = canvas(operator(screens, lamp, size=5, samples=1), torch.ones(1, 3, dtype=torch.float64))
+    assert shown.max() == pytest.approx(4.0, rel=0.2)  # 1 / 0.5², and less away from below the lamp

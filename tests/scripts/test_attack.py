@@ -130,7 +130,7 @@ REFUSED = [
     (["attack=geometry", "transfer.meshes=[a.glb]"], "transfer.meshes: attack=geometry belongs to what was attacked"),
     (["attack=pixels", "transfer.azimuths=[3]"], "transfer.azimuths: attack=pixels belongs to what was attacked"),
     (["attack.sweep=[0.1,-1]"], "attack.sweep=-1.0 must be at least 1e-05"),
-    (["attack=lihgting"], "attack=lihgting is not known: choose from lighting, skylight, projector, lamps, geometry"),
+    (["attack=lihgting"], "attack=lihgting is not known: choose from lighting, skylight, projector, lamps, places"),
     (["attack=null"], "attack=null is not known: choose from lighting"),
     (["attack=[]"], "attack: name what to change"),
     (["attack=lighting+skylight"], "attack: lighting and skylight both set the light: choose one of them"),

@@ -11,6 +11,7 @@ from renderer.errors import FACTOR, InputError, require_range
 from train.settings import LARGEST_SEED, MOST_VIEWS, RendererSettings, SceneSettings
 
 MOST_RADII = 100
+LIT = 2.0  # power of the default lamps whose places alone are attacked
 
 
 @dataclass
@@ -99,3 +100,5 @@ class AttackExperimentSettings:
             self.scene.projector = ProjectorSettings()
         if self.attack.lamps is not None and self.scene.lamps is None:
             self.scene.lamps = LampsSettings()
+        if self.attack.places is not None and self.scene.lamps is None:
+            self.scene.lamps = LampsSettings(start=LIT)
