@@ -55,7 +55,7 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
     if free is not None and needed > free:
         raise InputError(
             f"{name} need {needed / 2**30:.1f} GB of memory and {free / 2**30:.1f} GB are free: ask for fewer or "
-            "smaller ones (augment.examples, scene.views, scene.backgrounds)"
+            "smaller ones"
         )
 
 

@@ -128,7 +128,10 @@ class Scene:
         pixels = settings.size**2
         self.at_once = max(1, AT_ONCE // (self.views * pixels))  # examples
         images = len(self.examples) * self.views
-        require_memory(f"{images} renders of {settings.size} pixels per side", 24 * images * pixels, self.lights.device)
+        asked = (
+            f"{images} renders of {settings.size} pixels per side (augment.examples, scene.views, scene.backgrounds)"
+        )
+        require_memory(asked, 24 * images * pixels, self.lights.device)
         self._per_stack = max(1, STACKED // pixels)
         # What is kept of views; `functools.cache` would tie a scene that each epoch replaces to itself.
         self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
@@ -340,7 +343,7 @@ class Scene:
             self._stacks[index] = stack, _, added = self._build_stack(index)
             if len(self._stacks) == 1:  # the others are as large
                 kept = (self._stack_count - 1) * (stack.transfer.nbytes + stack.albedo.nbytes + added.nbytes)
-                views = f"{len(self._distinct)} views of {self.settings.size} pixels per side"
+                views = f"{len(self._distinct)} views of {self.settings.size} pixels per side (scene.views)"
                 require_memory(views, kept, self.lights.device)
         return self._stacks[index]
 

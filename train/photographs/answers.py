@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from augment.model_state import eval_mode
+from augment.progress import progress
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.photographs.folder import Photograph
@@ -44,7 +45,7 @@ def ask(
     finite.
     """
     with eval_mode(model) if isinstance(model, torch.nn.Module) else nullcontext(), torch.inference_mode():
-        batches = [model(to_unit(batch.to(device))) for batch in images.split(batch_size)]
+        batches = [model(to_unit(batch.to(device))) for batch in progress(images.split(batch_size), "answers")]
         logits = torch.cat(batches).float().cpu()
     if logits.shape != (len(images), classes):
         raise InputError(

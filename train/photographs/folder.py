@@ -5,12 +5,15 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path, PurePosixPath
 from typing import NoReturn
 
 import numpy as np
 import torch
 
+from augment.memory import require_memory
+from augment.progress import progress
 from renderer.errors import InputError
 from renderer.image_files import read_square
 from train.classes import class_index, nearest_class
@@ -179,27 +182,37 @@ def load_photographs(
     with the reduction: detail too fine for `size` averages out rather than turning into false patterns, and
     of what fits the most is kept, which counts at 32 pixels.
 
-    Raises InputError at broken or oversized images unless `skip_unreadable`, and if no image can be read.
+    Raises InputError at broken or oversized images unless `skip_unreadable`, if no image can be read, and where the
+    images do not fit into the memory.
     advice: how they could be skipped, in the words of whoever calls.
     """
-    with ThreadPoolExecutor() as pool:  # Pillow releases the interpreter while it decodes and resizes
+    shape = len(photographs), 3, size, size
+    require_memory(f"{len(photographs)} photographs of {size} pixels per side", prod(shape), torch.device("cpu"))
+    images = torch.empty(shape, dtype=torch.uint8)
+    kept: list[Photograph] = []
+    errors: dict[Photograph, Exception] = {}
+    pool = ThreadPoolExecutor()  # Pillow releases the interpreter while it decodes and resizes
+    try:
         read = pool.map(lambda photograph: _try_read(folder / photograph.path, size), photographs)
-        results = dict(zip(photographs, read, strict=True))
-    errors = {photograph: result for photograph, result in results.items() if isinstance(result, Exception)}
-    kept = [photograph for photograph in photographs if photograph not in errors]
+        for photograph, result in zip(progress(photographs, "photographs"), read, strict=True):
+            if isinstance(result, Exception):
+                errors[photograph] = result
+            else:
+                images[len(kept)] = torch.from_numpy(result).permute(2, 0, 1)
+                kept.append(photograph)
+    finally:
+        pool.shutdown(cancel_futures=True)  # Ctrl-C does not wait for the others
     if errors and not (kept and skip_unreadable):
         first, reason = next(iter(errors.items()))
         raise InputError(
             f"{len(errors)} of {len(photographs)} photographs cannot be read, the first being "
             f"{folder / first.path} ({reason}): replace them{advice if kept else ''}"
         )
-    images = {photograph: result for photograph, result in results.items() if isinstance(result, np.ndarray)}
-    pixels = torch.from_numpy(np.stack([images[photograph] for photograph in kept]))
-    return kept, pixels.permute(0, 3, 1, 2).contiguous(), [str(photograph.path) for photograph in errors]
+    return kept, images[: len(kept)], [str(photograph.path) for photograph in errors]
 
 
 def _try_read(path: Path, size: int) -> np.ndarray | Exception:
     try:
-        return read_square(path, size)
+        return np.array(read_square(path, size))  # torch takes no memory of Pillow's
     except Exception as error:  # Pillow's decoders raise almost anything at a broken file
         return error

@@ -1,0 +1,10 @@
+"""A great many renders, views, faces, photographs and runs, to the end and until Ctrl-C: docs/load.md
+
+python scripts/check_load.py; a quarter of an hour on one free core.
+"""
+
+from train.cli import script
+from train.studies.load.study import LoadSettings, run
+
+if __name__ == "__main__":
+    script(run, LoadSettings)

@@ -1,0 +1,35 @@
+import signal
+import sys
+
+import numpy as np
+import pytest
+
+from renderer.mesh import load_mesh
+from train.studies.load.loads import write_sphere
+from train.studies.load.observed import observe
+from train.studies.load.study import LoadSettings, run
+
+
+def test_a_sphere_of_many_faces_is_a_mesh(tmp_path):
+    write_sphere(tmp_path / "sphere.ply", 1000)
+    mesh = load_mesh(tmp_path / "sphere.ply")
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1, rtol=1e-6)
+    assert 900 <= len(mesh.faces) <= 1100
+
+
+def test_a_command_is_observed_on_a_terminal_to_its_end_and_until_ctrl_c(tmp_path):
+    talks = [
+        "-c",
+        "import sys; bytes(10**8); print(' 50%|###  |'); print(sys.stderr.isatty(), file=sys.stderr); sys.exit(3)",
+    ]
+    whole = observe(talks, tmp_path)
+    assert (whole.status, whole.said, whole.progress) == (3, "True", True) and whole.memory > 10**8
+    waits = observe(["-c", "import time; time.sleep(60)"], tmp_path, ctrl_c=1)
+    assert waits.status == 128 + signal.SIGINT and waits.after_signal < 10 and waits.seconds < 20
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="no terminals")
+def test_the_study_writes_its_page(tmp_path):
+    assert run(LoadSettings(str(tmp_path / "page.md"), 100, 100, 10**5, 300, 20)) == []
+    assert (tmp_path / "page.md").read_text().count("| as asked |") == 5

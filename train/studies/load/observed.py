@@ -1,0 +1,76 @@
+"""A command on a terminal of its own: how long it took, how much memory, whether it said how far it was."""
+
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from train.studies.interruptions.small_run import ROOT
+
+BAR = "%|"  # tqdm's
+WAIT = 0.02  # seconds between two looks
+
+
+@dataclass(frozen=True)
+class Observed:
+    """status: as a shell says it. seconds: by the clock; cpu: of a core; memory: bytes at the peak. after_signal:
+    seconds from Ctrl-C to the end. said: the last line; progress: whether a bar was shown.
+    """
+
+    status: int
+    seconds: float
+    cpu: float
+    memory: int
+    after_signal: float
+    said: str
+    progress: bool
+
+
+def observe(command: Sequence[str], folder: Path, ctrl_c: float | None = None) -> Observed:
+    """Of `python` with `-m train ...` or a script of scripts/, in a folder. ctrl_c: after so many seconds."""
+    arguments = [str(ROOT / word) if word.startswith("scripts/") else word for word in command]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    terminal, end = pty.openpty()
+    start = time.monotonic()
+    process = subprocess.Popen([sys.executable, *arguments], cwd=folder, env=environment, stdout=end, stderr=end)
+    os.close(end)
+    signalled, output = None, b""
+    while True:
+        output += _read(terminal)
+        ended, code, used = os.wait4(process.pid, os.WNOHANG)
+        now = time.monotonic()
+        if ended:
+            break
+        if ctrl_c is not None and signalled is None and now - start > ctrl_c:
+            signalled = now
+            process.send_signal(signal.SIGINT)
+    output += _read(terminal)
+    os.close(terminal)
+    process.returncode = status = os.waitstatus_to_exitcode(code)
+    text = output.decode(errors="replace").replace("\r", "\n")
+    return Observed(
+        status=status if status >= 0 else 128 - status,
+        seconds=now - start,
+        cpu=used.ru_utime + used.ru_stime,
+        memory=1024 * used.ru_maxrss,
+        after_signal=now - (signalled or now),
+        said=next((line for line in reversed(text.splitlines()) if line.strip()), ""),
+        progress=BAR in text,
+    )
+
+
+def _read(terminal: int) -> bytes:
+    """What has been printed since the last time, after a short wait for it."""
+    if not select.select([terminal], [], [], WAIT)[0]:
+        return b""
+    try:
+        return os.read(terminal, 2**20)
+    except OSError:  # nobody writes any more
+        time.sleep(WAIT)
+        return b""

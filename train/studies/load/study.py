@@ -1,0 +1,91 @@
+"""Ask for a great deal of everything, to the end and ended by Ctrl-C, and write the page."""
+
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+
+from renderer.errors import require_range
+from train.cli import USER_ERROR, command_line
+from train.outputs import writable_file
+from train.studies.load import loads
+from train.studies.load.observed import Observed, observe
+from train.studies.page import joined, machine, wrapped, write
+from train.studies.reliability.study import prepare
+from train.tables import markdown
+
+INTRODUCTION = """\
+# Load
+
+Made by `{command}`. {machine}
+
+- Each command is run twice on a terminal: to its end, and until Ctrl-C after half of that time. *Memory* is the peak of
+  the process, of which some {idle:,.0f} MB are Python and its libraries. *Bar*: whether it showed how far it was.
+- Renders have 16 pixels per side and one step of attack. What does not fit into the memory that is free is refused
+  before it is made: those commands end with the sentence below the table.
+- The machine did other work at the same time, which lengthens the seconds by the clock, also those after Ctrl-C.
+"""
+HEADER = ["asked for", "ended", "s by the clock", "s of a core", "memory, MB", "bar", "s from Ctrl-C to the end"]
+SIGNALLED = 130  # as a shell says it of Ctrl-C
+
+
+@dataclass
+class LoadSettings:
+    """conf/check_load.yaml."""
+
+    out: str
+    renders: int
+    views: int
+    faces: int
+    photographs: int
+    runs: int
+
+    def __post_init__(self) -> None:
+        for name, count in self.counts.items():
+            require_range(name, count, 2, 10**7)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {name: count for name, count in asdict(self).items() if name != "out"}
+
+
+def run(settings: LoadSettings) -> list[str]:
+    """Print the page and write it; what did not end as it should, in words."""
+    out, described = writable_file(settings.out, "out"), machine(torch.device("cpu"))
+    rows, refusals, failures = [], [], []
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        corpus = prepare(Path(folder))
+        idle = observe(["-m", "train", "seed=-1"], corpus).memory
+        for name, count in settings.counts.items():
+            asked = f"{count:,} {name}"
+            whole, ended = _both(name, count, corpus)
+            if whole.status == USER_ERROR:
+                refusals.append(f"- {asked}: `{whole.said}`")
+            elif whole.status or ended.status != SIGNALLED:
+                failures.append(f"{asked} ended with {whole.status} ({whole.said}), by Ctrl-C with {ended.status}")
+            rows.append(_row(asked, whole, ended))
+    introduction = INTRODUCTION.format(command=command_line(), machine=described, idle=idle / 1e6)
+    write(out, joined([wrapped(introduction), markdown(HEADER, rows), "\n".join(refusals)]))
+    return failures
+
+
+def _both(name: str, count: int, corpus: Path) -> tuple[Observed, Observed]:
+    """To the end, and ended by Ctrl-C half-way, in copies of the corpus."""
+    folder = corpus.with_name(name)
+    shutil.copytree(corpus, folder, copy_function=shutil.copy)
+    command = getattr(loads, name)(folder, count)
+    whole = observe(command, folder)
+    shutil.rmtree(folder / "out", ignore_errors=True)
+    shutil.rmtree(folder / "cache", ignore_errors=True)
+    ended = observe(command, folder, whole.seconds / 2)
+    shutil.rmtree(folder)
+    return whole, ended
+
+
+def _row(asked: str, whole: Observed, ended: Observed) -> list[str]:
+    fate = {0: "as asked", USER_ERROR: "refused"}.get(whole.status, f"status {whole.status}")
+    seconds = [f"{whole.seconds:.0f}", f"{whole.cpu:.0f}"]
+    interrupted = f"{ended.after_signal:.1f}" if ended.status == SIGNALLED else f"status {ended.status}"
+    return [asked, fate, *seconds, f"{whole.memory / 1e6:,.0f}", "yes" if whole.progress else "no", interrupted]
