@@ -27,6 +27,7 @@ Made by `{command}`. {machine}
   Images are rendered 16.8 million pixels at a time. What would not fit is refused before it is made.
 """
 HEADER = ["load", "views", "operators, s", "attack, s", "ms per render and pass", "outside the network", "memory, MB"]
+FURTHER = "{n:,} renders would take {attack:,.0f} s and {memory:,.1f} GB"
 SHARED = """\
 ## Processes
 
@@ -65,8 +66,8 @@ class GrowthSettings:
     rates: dict[str, int]
 
     def __post_init__(self) -> None:
-        if not self.renders or any(n < 5 or n % 5 for n in [*self.renders, self.shared]):
-            raise InputError("renders and shared: give multiples of the 5 backgrounds")
+        if len(set(self.renders)) < 2 or any(n < 5 or n % 5 for n in [*self.renders, self.shared]):
+            raise InputError("renders and shared: give multiples of the 5 backgrounds, of renders two or more")
         if SIZE not in self.sizes:
             raise InputError(f"sizes: {SIZE} is what ImageNet on paper is made of; add it")
         for name, most in {"meshes": 1000, "processes": 64}.items():
@@ -96,6 +97,7 @@ def run(settings: GrowthSettings) -> None:
     blocks = [wrapped(introduction)]
     for title, rows in loads.items():
         blocks += [title, markdown(HEADER, [_row(few, load, costs[load]) for load in rows])]
+    blocks.insert(3, wrapped(_further(loads["## Renders"][-2:], costs)))
     blocks += _shared(settings.shared, {load.processes: costs[load] for load in shared})
     large = replace(few, size=SIZE)
     blocks += on_paper(measure_parts(settings.rounds), costs[large], large.views, settings)
@@ -113,6 +115,18 @@ def _row(usual: Load, load: Load, cost: Cost) -> list[str]:
         f"{1 - cost.network:.0%}",
         f"{cost.memory / 1e6:,.0f}",
     ]
+
+
+def _further(loads: Sequence[Load], costs: dict[Load, Cost]) -> str:
+    """What more renders would take, by a straight line through two loads."""
+    low, high = loads
+
+    def at(renders: int, name: str) -> float:
+        first, last = (float(getattr(costs[load], name)) for load in loads)
+        return last + (last - first) * (renders - high.renders) / (high.renders - low.renders)
+
+    further = [FURTHER.format(n=n, attack=at(n, "attack"), memory=at(n, "memory") / 1e9) for n in (10**5, 10**6)]
+    return f"By a straight line through the last two rows, {'; '.join(further)}."
 
 
 def _shared(renders: int, costs: dict[int, Cost]) -> list[str]:
