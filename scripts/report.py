@@ -32,7 +32,7 @@ def main(settings: Settings) -> None:
 
 def _as_overrides(arguments: list[str]) -> list[str]:
     """Folders without a key are those of `runs`."""
-    folders = [each for each in arguments if each[0:1] not in ("-", "") and (Path(each).exists() or "=" not in each)]
+    folders = [each for each in arguments if each[0:1] not in ("-", "") and (os.path.exists(each) or "=" not in each)]
     rest = [each for each in arguments if each not in folders]
     return [*rest, f"runs=[{','.join(map(quoted, folders))}]"] if folders else rest
 
