@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from augment.held_transport import HeldTransport
+from augment.held_transport import HeldTransport, HeldTransports
 from augment.lamplit import Lamplit
 from augment.memory import require_memory
 from augment.objects import SceneObject
@@ -88,10 +88,10 @@ class Scene:
 
     Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
     (`OperatorStack`), equal views share one, and what a background adds to an image is kept. Where vertices move, their
-    view is rasterised anew each time, and shadows and bounces are those of the mesh's own shape (`HeldTransport`).
-    light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are
-    those of the images. basis: what lights are coefficients of; 49 harmonics, unless another is given. taken: what a
-    camera makes of rendered images (A, V, 3, size, size) of examples (A,), differentiable; see `Snapshot`.
+    view is rasterised anew each time, and shadows and bounces are those of a shape close by (`HeldTransport`).
+    light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are those of the images. basis: what
+    lights are coefficients of; 49 harmonics, unless another is given. taken: what a camera makes of rendered images
+    (A, V, 3, size, size) of examples (A,), differentiable; see `Snapshot`.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Scene:
         # What is kept of views; `functools.cache` would tie a scene that each epoch replaces to itself.
         self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
         self._fragments_of_meshes: dict[tuple[int, OrthographicCamera], tuple[Fragments, Tensor]] = {}
-        self._held_transports: dict[tuple[int, OrthographicCamera], HeldTransport] = {}
+        self._transports = HeldTransports(settings, basis)
         self._rays: dict[int, Rays] = {}
         self._lamplit_views: dict[tuple[int, OrthographicCamera], Lamplit] = {}
 
@@ -312,30 +312,32 @@ class Scene:
         views = [(row, index, view) for row, index in enumerate(examples.tolist()) for view in range(self.views)]
         for image, (row, index, view) in enumerate(views):
             example = self.examples[index]
-            fragments, seen = self._reshaded_view(example.object, example.cameras[view], light[row], conditions, row)
+            fragments, seen = self._reshaded_view(index, example.cameras[view], light[row], conditions, row)
             coverage = fragments.coverage.to(seen)[None]
             there = self.backgrounds[example.background].index_select(1, fragments.pixels)
             composite = seen + behind(coverage, there, self.settings.encoding)
             yield _Layer([image], fragments.pixels, composite[None], coverage[None], [0])
 
     def _reshaded_view(
-        self, number: int, camera: OrthographicCamera, light: Tensor, conditions: Conditions, row: int
+        self, index: int, camera: OrthographicCamera, light: Tensor, conditions: Conditions, row: int
     ) -> tuple[Fragments, Tensor]:
-        """What a camera sees of an object under the conditions of one row, with its radiance (3, P)."""
+        """What a camera sees of an example under the conditions of one row, with its radiance (3, P)."""
+        number = self.examples[index].object
         mesh = self.objects[number].mesh
         if conditions.vertices is None:
-            vertices = self.vertices[number, : len(mesh.vertices)]
+            vertices, positions = self.vertices[number, : len(mesh.vertices)], mesh.vertices
             fragments, albedo = self._still(number, camera)
         else:
             vertices = conditions.vertices[row, : len(mesh.vertices)]
-            fragments, albedo = self._fragments(number, camera, vertices.detach().cpu().double().numpy())
+            positions = vertices.detach().cpu().double().numpy()
+            fragments, albedo = self._fragments(number, camera, positions)
         if conditions.albedo is not None:
             added, gain = conditions.albedo[row, : len(mesh.faces)], self.objects[number].gain
             albedo = painted_albedo(mesh, fragments, self.settings.encoding, gain, added)
         smooth_faces = self._faces[number] if self.settings.normals == "smooth" else None
         seen = radiance(fragments, vertices, light, albedo, smooth_faces)
         if self.settings.transport != "direct":
-            seen = seen + self._held(number, camera).radiance(fragments, albedo, light)
+            seen = seen + self._held(index, camera, positions).radiance(camera, fragments, albedo, light)
         return fragments, seen
 
     def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
@@ -378,17 +380,13 @@ class Scene:
             self._lamplit_views[view] = Lamplit(rays, self.objects[number].mesh, fragments, albedo, self.settings)
         return self._lamplit_views[view]
 
-    def _held(self, number: int, camera: OrthographicCamera) -> HeldTransport:
-        view = number, camera
-        if view not in self._held_transports:
-            item, like = self.objects[number], (self.basis, self.lights.dtype)
-            shaped, direct = (
-                self._cache.operators(item.mesh, [camera], settings, self.backend, item.gain, *like)[0]
-                for settings in (self.settings, replace(self.settings, transport="direct"))
-            )
-            device = self.lights.device
-            self._held_transports[view] = HeldTransport(shaped.to(device), direct.to(device), *self._still(*view))
-        return self._held_transports[view]
+    def _held(self, index: int, camera: OrthographicCamera, vertices: np.ndarray) -> HeldTransport:
+        """Of a shape near the vertices of an example, and with the camera's view of it."""
+        number = self.examples[index].object
+        held = self._transports.near(index, number, self.objects[number], vertices)
+        if not held.knows(camera):
+            held.add(camera, *self._fragments(number, camera, held.mesh.vertices))
+        return held
 
     def _fragments(self, number: int, camera: OrthographicCamera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
         """What a camera sees of an object's moved vertices, and the albedo there (S, 3)."""

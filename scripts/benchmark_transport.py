@@ -1,7 +1,7 @@
 """What shadows and bounces cost, and how right they are: python scripts/benchmark_transport.py
 
-Writes docs/transport.md. Takes a few minutes on one CPU thread, and needs the extras `shadows` and `lab`, and LLVM for Mitsuba's
-gradients (`apt install libllvm19`).
+Writes docs/transport.md. Takes a few minutes on one CPU thread, and needs the extras `shadows` and `lab`, and for
+Mitsuba's gradients LLVM (`apt install libllvm19`).
 """
 
 from train.cli import script

@@ -11,6 +11,7 @@ from augment import scene as scene_module
 from augment.backgrounds import load_backgrounds
 from augment.build import build_scene
 from augment.descent import DescentSettings, Goal, descend
+from augment.held_transport import NEAR
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
@@ -451,6 +452,31 @@ def test_where_no_vertex_or_colour_has_moved_yet_shadows_are_those_of_the_operat
     ):
         images = scene.render(replace(still, **changed), examples)
         torch.testing.assert_close(images, expected, rtol=0, atol=1000 * EPS32)
+
+
+def test_shadows_are_found_anew_for_a_shape_that_is_not_near_and_held_for_one_that_is():
+    """Each example has its own shape; back where it began, it has the mesh's own shadows."""
+    settings, cameras = replace(SETTINGS, transport="shadows"), ring(2, 2)
+    scene = built([ObjectSettings("solid:cup", "cup")], cameras, settings)
+    mesh, examples, lights = scene.mesh(0), torch.arange(len(scene)), random_lights(len(scene))
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(scene), *mesh.vertices.shape))
+
+    def off(radius: float) -> float:
+        """From the operators of the moved meshes; the backgrounds take turns, then the cameras."""
+        moved = (mesh.vertices + radius * signs).astype(np.float32)
+        images = scene.render(
+            replace(scene.conditions(examples), light=lights, vertices=torch.from_numpy(moved)), examples
+        )
+        expected = []
+        for index, vertices in enumerate(moved.astype(np.float64)):
+            shaped, [camera] = replace(mesh, vertices=vertices), scene.cameras[index]
+            [operator] = build_operators(shaped, [camera], settings, BACKEND)
+            expected.append(operator.image(lights[index], GREYS[index % len(GREYS)]))
+        return float((images[:, 0] - torch.stack(expected)).abs().max())
+
+    assert off(0.02) < 1000 * EPS32
+    assert 1e-4 < off(0.02 + 0.9 * NEAR) < 0.2
+    assert off(0.0) < 1000 * EPS32
 
 
 def test_a_shadow_goes_with_the_colour_of_its_pixel():

@@ -1,14 +1,18 @@
+import math
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 
+from augment import held_transport
 from renderer import rays
 from renderer.errors import InputError
 from renderer.image import ImageSettings
-from renderer.mesh import Mesh
+from renderer.mesh import Mesh, normalise
 from renderer.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.shapes import solid
+from train.run_classifier import load_classifier
 from train.studies.transport import beside_mitsuba, cost, held
 
 
@@ -48,9 +52,16 @@ def test_more_rays_err_less_and_the_number_is_put_back(few_rays, monkeypatch):
     assert rays.DIRECTIONS == 64
 
 
-def test_held_shadows_err_less_than_the_image_changes():
-    for _, error, change in cells(held.table(solid("cup", 0)))[:2]:
-        assert float(error.rstrip("%")) < float(change.rstrip("%")) < 5
+@pytest.mark.slow
+def test_shadows_found_anew_at_each_step_are_right_and_those_held_are_not(monkeypatch):
+    monkeypatch.setattr(held, "EXAMPLES", 2)
+    monkeypatch.setattr(held, "STEPS", 4)
+    monkeypatch.setattr(held, "EVERY", (1, math.inf))
+    near, network = held_transport.NEAR, load_classifier("run:pretrained/none", None)
+    anew, still = cells(held.table(normalise(solid("cup", 0)), network))
+    assert anew[0] == "one step" and anew[2:4] == ["0.00%", "0.0%"]
+    assert still[0] == "the whole attack" and 0 < float(still[2].rstrip("%")) < 5
+    assert near == held_transport.NEAR
 
 
 def test_mitsubas_image_is_in_the_place_of_ours(monkeypatch):

@@ -118,7 +118,8 @@ def mitsuba_gradient(mesh: Mesh, settings: ImageSettings, upstream: Tensor) -> t
     """
     import drjit
 
-    (coefficients, texels), found = light_and_map(), []
+    coefficients, texels = light_and_map()
+    found: list[Tensor] = []
     weights = torch.zeros(settings.size**2, 4)
     weights[:, :3] = upstream.T
     with mitsuba_scene(mesh, settings, DIFFERENTIABLE) as (mi, scene):

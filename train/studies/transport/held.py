@@ -1,35 +1,74 @@
-"""What it costs in accuracy that shadows and bounces are held while vertices move."""
+"""What it costs in accuracy that shadows are held from step to step while an attack moves vertices."""
 
+import math
+import time
 from dataclasses import replace
 
-import numpy as np
 import torch
+from torch import Tensor
 
-from augment.scene import Conditions, Scene
-from renderer.camera import ring
-from renderer.image import ImageSettings
-from renderer.lights import load_light
+from augment import held_transport
+from augment.attacks.run import attack, logits_of
+from augment.attacks.settings import AttackSettings
+from augment.classifiers import Classifier
+from augment.descent import Goal, adversarial_cost
+from augment.objects import SceneObject
+from augment.parameters import StepSettings
+from augment.perturbation import Perturbation
 from renderer.mesh import Mesh
-from renderer.transfer import build_operators
-from renderer.visibility import choose
+from train.studies.paper.subjects import Subject, recognised_scene
 from train.tables import markdown
 
-RADII = (0.0005, 0.002, 0.01, 0.03)
-SETTINGS = ImageSettings(32, transport="shadows")
+STEP = StepSettings("linf", 0.01, "sign", 0.0005)
+EVERY = (1, 2, 5, 10, math.inf)  # steps, each of which moves every coordinate by the step's size
+STEPS, EXAMPLES = 20, 16
 
 
-def table(mesh: Mesh) -> str:
-    """By how far each coordinate of each vertex moves, up or down at random."""
-    light, backend, [camera] = load_light("grace"), choose("software"), ring(1, 2.2)
-    scene = Scene.of_mesh(mesh, [[camera]], torch.zeros(1, 1, 32, 32), light, SETTINGS, backend)
-    signs, rows = np.random.default_rng(0).choice([-1.0, 1.0], mesh.vertices.shape), []
-    for radius in RADII:
-        moved = mesh.vertices + radius * signs
-        [exact] = build_operators(replace(mesh, vertices=moved), [camera], SETTINGS, backend)
-        truth = exact.image(light, 0.0)
-        conditions = Conditions(light[None], vertices=torch.from_numpy(moved).to(light)[None])
-        held = scene.render(conditions, torch.arange(1))[0, 0]
-        still = scene.render(scene.conditions(torch.arange(1)), torch.arange(1))[0, 0]
-        off, change = ((each - truth).square().mean().sqrt() / truth.max() for each in (held, still))
-        rows.append([f"{radius}", f"{off:.2%}", f"{change:.2%}"])
-    return markdown(["radius", "error of held shadows", "change of the image"], rows)
+def table(mesh: Mesh, classifier: Classifier) -> str:
+    """By how many steps shadows are held for; the mesh is a cup."""
+    chosen, rows = held_transport.NEAR, []
+    drawn = recognised_scene(Subject("solid:cup", mesh, "cup"), classifier, "grace", EXAMPLES, 0)
+    settings = AttackSettings(geometry=STEP, max_steps=STEPS, margin=2.0)
+    try:
+        for every in EVERY:
+            held_transport.NEAR = (every - 0.5) * STEP.step_size
+            shown = {"objects": [SceneObject("cup", mesh)], "settings": replace(drawn.settings, transport="shadows")}
+            scene = drawn.with_rows(drawn.examples, **shown)
+            start = time.process_time()
+            attacked = attack(classifier, scene, settings=settings, force=True)
+            taken = (time.process_time() - start) / int(attacked.steps.sum() + EXAMPLES)
+            images, slope = images_and_gradient(attacked.problem, classifier, attacked.goal, attacked.result.values)
+            held_transport.NEAR = -1.0  # no shape is near
+            exact, true = images_and_gradient(attacked.problem, classifier, attacked.goal, attacked.result.values)
+            fooled = attacked.goal.reached(logits_of(attacked.judge, exact, EXAMPLES).argmax(2))
+            rows.append(
+                [
+                    held_for(every),
+                    f"{1e3 * taken:.0f}",
+                    f"{(images - exact).square().mean().sqrt() / exact.max():.2%}",
+                    f"{((slope - true).norm(dim=1) / true.norm(dim=1)).mean():.1%}",
+                    f"{int((attacked.success & attacked.recognised).sum())} of {int(attacked.recognised.sum())}",
+                    f"{int((attacked.success & attacked.recognised & fooled).sum())}",
+                ]
+            )
+    finally:
+        held_transport.NEAR = chosen
+    return markdown(
+        ["held for", "ms per step", "image's error", "gradient's error", "fooled", "with shadows anew"], rows
+    )
+
+
+def held_for(every: float) -> str:
+    if every == 1:
+        return "one step"
+    return f"{every} steps" if math.isfinite(every) else "the whole attack"
+
+
+def images_and_gradient(
+    problem: Perturbation, classifier: Classifier, goal: Goal, values: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Of all examples of one view, and of the cost by the values (E, D)."""
+    values = values.detach().requires_grad_()
+    images = problem.render(values, problem.everything)
+    cost = adversarial_cost(classifier(images[:, 0]), goal.decrease[:, 0]).sum()
+    return images.detach(), torch.autograd.grad(cost, values)[0]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
+from augment.held_transport import NEAR
 from renderer.mesh import normalise
 from renderer.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.rays import DIRECTIONS
@@ -11,6 +12,7 @@ from renderer.shapes import solid
 from renderer.subdivision import subdivide
 from train.cli import command_line
 from train.outputs import writable_file
+from train.run_classifier import load_classifier
 from train.studies.page import joined, machine, wrapped, write
 from train.studies.renderer_speed.measure import Clock
 from train.studies.transport import beside_mitsuba, cost, held
@@ -50,10 +52,12 @@ any of a convex mesh, casts none and keeps its closed form to the bit.
 
 ## Shadows held while vertices move
 
-An attack on the shape or on the albedo differentiates shading, and takes from the mesh's own shape what transport adds
-to each pixel; operators that are built of the result, as an adversary's files are rendered, have it anew. How far the
-two are apart at {size}², root mean square over the brightest, with each coordinate of each vertex moved up or down at
-random, and how much the move changes the image:
+An attack on the shape or on the albedo differentiates shading, and takes from a shape close by what transport adds to
+each pixel: it is found anew once a coordinate has moved by more than {near} since it was, and in the end, when an
+adversary's files are rendered. {examples} views of the cup of {own:,} faces at {size}² that `pretrained/none`
+recognises are attacked by {steps} signed steps at most of {step} within {radius}, which move every coordinate at each
+step. Errors are against transport of the very shape where the attack ended, of the image as above and of the gradient
+of the cost by the vertices in L2 norm; the last column counts those that then still fool.
 
 {held}
 
@@ -63,8 +67,9 @@ The same mesh at {size}² in the same environment map (St. Peter's, positive all
 and 8² samples here, and {seeds} × 256 paths per pixel of depth N + 2 there. An image's errors are root mean squares
 over the brightest value, inside the outline. The gradient is that by the light, all 49 × 3 coefficients, of the sum of
 these pixels with random weights, and Mitsuba's is its integrator's in reverse mode; errors are L2 norms over that of
-the gradient. *Noise* is Mitsuba's own standard error, *direct* the error without transport. What is left beside the noise
-is the quadrature over directions, for bounces the size of the patches, and up to 0.4 % of a gradient the map's rows.
+the gradient. *Noise* is Mitsuba's own standard error, *direct* the error without transport. What is left beside the
+noise is the quadrature over directions, for bounces the size of the patches, and up to 0.4 % of a gradient the map's
+rows.
 
 {beside}
 """
@@ -85,7 +90,8 @@ def run(settings: TransportSettings) -> None:
     with mitsuba(DIFFERENTIABLE):
         pass  # a run without it would fail only at its end
     torch.set_num_threads(1)
-    cup, clock = normalise(subdivide(solid("cup", 0), settings.vertices)), Clock(torch.device("cpu"), settings.rounds)
+    coarse, clock = normalise(solid("cup", 0)), Clock(torch.device("cpu"), settings.rounds)
+    cup = subdivide(coarse, settings.vertices)
     text = TEXT.format(
         command=command_line(),
         machine=machine(clock.device),
@@ -99,7 +105,13 @@ def run(settings: TransportSettings) -> None:
         maps=cost.depth_maps(cup),
         resolution=cost.RESOLUTION,
         directions=DIRECTIONS,
-        held=held.table(cup),
+        near=NEAR,
+        examples=held.EXAMPLES,
+        own=len(coarse.faces),
+        steps=held.STEPS,
+        step=held.STEP.step_size,
+        radius=held.STEP.radius,
+        held=held.table(coarse, load_classifier("run:pretrained/none", None)),
         seeds=beside_mitsuba.SEEDS,
         beside=beside_mitsuba.table(),
     )
