@@ -1,11 +1,13 @@
 """Operators over a common set of pixels, so that one product renders all images that they are seen in."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from renderer.sparse import Sparse, joined
 from renderer.transfer import Operator, apply_transfer
 
 
@@ -25,6 +27,7 @@ class OperatorStack:
         kept = torch.cat([operator.kept for operator in operators]).unique()
         padded = F.pad(kept, (0, len(kept) % 2))  # with any coefficient
         parts = (pixels, *_stack(operators, pixels, kept), shown, slots, padded)
+        self._sparse, self._first = _joined(operators, pixels, device)
         self.pixels, self.transfer, self.albedo, self.coverage, self.shown, self._slot, self._coefficients = (
             part.to(device) for part in parts
         )
@@ -47,7 +50,18 @@ class OperatorStack:
         transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
         radiance = apply_transfer(grid.unflatten(0, (len(used), slots)), transfer, albedo).flatten(0, 1)
         no_gaps = len(cell) == len(grid) and (cell.diff() == 1).all()
-        return radiance if no_gaps else radiance.index_select(0, cell)
+        radiance = radiance if no_gaps else radiance.index_select(0, cell)
+        if self._sparse is None:
+            return radiance
+        entries, image = self._entries(self._sparse, self.shown[images])
+        return radiance + entries.radiance(lights, image, len(self.pixels))
+
+    def _entries(self, sparse: Sparse, shown: Tensor) -> tuple[Sparse, Tensor]:
+        """(the sparse entries of operators (A,), one after the other, (N,) which of the A each is of)."""
+        first, count = self._first[shown], self._first[shown + 1] - self._first[shown]
+        image = torch.arange(len(shown), device=shown.device).repeat_interleave(count)
+        entry = torch.arange(len(image), device=shown.device) + (first - count.cumsum(0) + count)[image]
+        return sparse.taken(entry), image
 
 
 def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:
@@ -56,6 +70,19 @@ def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:
     first = (counts.cumsum(0) - counts)[values[order]]
     ranks = torch.empty_like(values).index_copy_(0, order, torch.arange(len(values), device=values.device) - first)
     return ranks, int(counts.max())
+
+
+def _joined(operators: Sequence[Operator], pixels: Tensor, device: torch.device | str) -> tuple[Sparse | None, Tensor]:
+    """(the sparse entries of all operators, over common pixels, (O + 1,) where those of each begin)."""
+    counts, placed = [0], []
+    for operator in operators:
+        own = operator.sparse
+        counts.append(0 if own is None else len(own.function))
+        if own is not None:
+            places = torch.searchsorted(pixels, operator.pixels)
+            placed.append(replace(own, pixel=places[own.pixel]))
+    entries = joined(*placed)
+    return entries and entries.to(device), torch.tensor(counts, device=device).cumsum(0)
 
 
 def _stack(operators: Sequence[Operator], pixels: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -18,11 +18,13 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from renderer import sparse
 from renderer.basis import HARMONICS, Basis
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
+from renderer.sparse import Sparse
 from renderer.transfer import TENSORS, Operator, OperatorBuilder
 from renderer.visibility import Backend
 
@@ -178,8 +180,11 @@ class OperatorCache(TensorCache):
 
 def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
     counts = torch.tensor([len(mesh.faces), len(mesh.faces) - len(seen.faces), mesh.closed])
-    return {name: getattr(operator, name) for name in TENSORS} | {"counts": counts}
+    dense = {name: getattr(operator, name) for name in TENSORS}
+    few = {} if operator.sparse is None else {name: getattr(operator.sparse, name) for name in sparse.TENSORS}
+    return dense | few | {"counts": counts}
 
 
 def _unpack(view: Mapping[str, Tensor], settings: ImageSettings, basis: Basis) -> Operator:
-    return Operator(**{name: view[name] for name in TENSORS}, settings=settings, basis=basis)
+    few = Sparse(*(view[name] for name in sparse.TENSORS)) if sparse.TENSORS[0] in view else None
+    return Operator(**{name: view[name] for name in TENSORS}, settings=settings, basis=basis, sparse=few)

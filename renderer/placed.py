@@ -6,23 +6,22 @@ from renderer.basis import Placed, Reach
 from renderer.harmonics import unit_vectors
 from renderer.lamps import Lamps, irradiance
 from renderer.rays import Rays
+from renderer.sparse import Sparse
 from renderer.surface import Surface
 
 
-def placed_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: Placed) -> tuple[Tensor, Tensor]:
-    """((C, K, P) float64, the K functions of the basis that reach a pixel (K,)); albedo: (S, C), at the samples.
+def placed_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: Placed) -> Sparse:
+    """All that is not zero of it, in float64; albedo: (S, C), at the samples.
 
     Every sample of a view has a ray to each place, so that shadows are as sharp as the image's samples. InputError
     where Embree is not installed.
     """
     fragments = surface.fragments
     reach = _lit(rays, surface, basis.reach(surface.points, surface.normals))
-    kept, row = reach.function.unique(return_inverse=True)
-    pixels = len(fragments.pixels)
-    place = row * pixels + fragments.pixel[reach.point]
-    weights = (albedo[reach.point] * reach.irradiance[:, None] / fragments.samples**2).T
-    transfer = weights.new_zeros(albedo.shape[1], len(kept) * pixels).index_add_(1, place, weights)
-    return transfer.unflatten(1, (len(kept), pixels)), kept
+    place, entry = (fragments.pixel[reach.point] * basis.size + reach.function).unique(return_inverse=True)
+    weights = albedo[reach.point] * reach.irradiance[:, None] / fragments.samples**2
+    summed = weights.new_zeros(len(place), albedo.shape[1]).index_add_(0, entry, weights)
+    return Sparse(place % basis.size, place // basis.size, summed)
 
 
 def lamplight(rays: Rays, surface: Surface, albedo: Tensor, places: Tensor, powers: Tensor) -> Tensor:

@@ -26,6 +26,7 @@ from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.placed import placed_transfer
 from renderer.rays import Rays
+from renderer.sparse import SPARSE, Sparse, joined
 from renderer.surface import Surface
 from renderer.transport import build_transport
 from renderer.visibility import Backend
@@ -51,6 +52,7 @@ class Operator:
     kept: ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
     under an open sky (`Basis.live`), and all in a view with shadows.
     settings: of the image that they are pixels of. basis: of the lights.
+    sparse: of three channels, added to the others: what a pattern's pixels reach; None where that is not little.
     """
 
     transfer: Float[Tensor, "channels K P"]
@@ -60,6 +62,7 @@ class Operator:
     kept: Int[Tensor, " K"]
     settings: ImageSettings
     basis: Basis = HARMONICS
+    sparse: Sparse | None = None
 
     def image(
         self, lights: Float[Tensor, "*lights coefficients 3"], background: float | Tensor = 0.5
@@ -100,11 +103,17 @@ class Operator:
             product = linear(upstream * self.albedo, self._shared)
         else:
             product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
-        return (self._places @ product.mT).to(radiance_gradient.dtype)
+        gradient = self._places @ product.mT
+        if self.sparse is not None:
+            upstream = upstream.flatten(0, -3) if upstream.dim() > 2 else upstream[None]
+            entries, image = _repeated(self.sparse, len(upstream))
+            gradient = gradient + entries.light_gradient(upstream, image, self.basis.size).view_as(gradient)
+        return gradient.to(radiance_gradient.dtype)
 
     def to(self, device: torch.device | str) -> Operator:
         """The same on another device."""
-        return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS})
+        sparse = self.sparse and self.sparse.to(device)
+        return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS}, sparse=sparse)
 
     # Kept, since at 32² even an index or a look at a dtype counts.
 
@@ -137,7 +146,18 @@ def _radiance(operator: Operator, lights: Tensor) -> Tensor:
         product = (kept.mT @ operator._shared).mul_(operator.albedo)
     else:
         product = torch.einsum("...kc,ckp->...cp", kept, operator.transfer)
+    if operator.sparse is not None:
+        each = lights.to(product.dtype).reshape(-1, *lights.shape[-2:])
+        entries, image = _repeated(operator.sparse, len(each))
+        product = product + entries.radiance(each, image, product.shape[-1]).reshape(product.shape)
     return product.to(lights.dtype)
+
+
+def _repeated(entries: Sparse, images: int) -> tuple[Sparse, Tensor]:
+    """(the entries for each of several images, (N,) which one each is of)."""
+    every = torch.arange(len(entries.function), device=entries.function.device)
+    image = torch.arange(images, device=every.device).repeat_interleave(len(every))
+    return entries if images == 1 else entries.taken(every.repeat(images)), image
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
@@ -186,10 +206,16 @@ class OperatorBuilder:
             factor = torch.ones(len(fragments.pixels), 3)
         else:
             albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
-        surface, transfers, kept = Surface.of(self._mesh, fragments, self._settings), [], []
+        surface, pixels = Surface.of(self._mesh, fragments, self._settings), len(fragments.pixels)
+        transfers, kept, sparse = [torch.empty(albedo.shape[1], 0, pixels, dtype=self._dtype)], [torch.arange(0)], None
         for where, part in parts_of(self._basis):
             if isinstance(part, Placed):
-                transfer, reaching = placed_transfer(self._rays, surface, albedo, part)
+                entries = placed_transfer(self._rays, surface, albedo, part)
+                if entries.share(pixels) < SPARSE:
+                    weight = (entries.weight * factor[entries.pixel]).to(self._dtype)
+                    sparse = joined(sparse, Sparse(where.start + entries.function, entries.pixel, weight))
+                    continue
+                transfer, reaching = entries.dense(pixels)
             else:
                 transfer, reaching = self._distant_transfer(surface, albedo, part)
             transfers.append(transfer.to(self._dtype))
@@ -202,6 +228,7 @@ class OperatorBuilder:
             kept=torch.cat(kept),
             settings=self._settings,
             basis=self._basis,
+            sparse=sparse,
         )
 
     def _distant_transfer(self, surface: Surface, albedo: Tensor, basis: Distant) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,9 @@ from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from augment.service import TrainingAttackSettings
 from renderer.basis import parts_of
+from renderer.cache import OperatorCache
 from renderer.errors import InputError
+from renderer.transfer import build_operators
 from renderer.visibility import choose
 
 SIZE, EVERY = 16, torch.arange(2)
@@ -191,3 +193,24 @@ def test_the_gradient_by_places_is_that_of_the_image_where_views_share_lamps():
 def test_places_want_lamps():
     with pytest.raises(InputError, match="attack=places: the scene has no lamps"):
         LampPlaces(scene(lamps=None), StepSettings())
+
+
+def test_a_stack_of_sparse_operators_gives_each_image_its_own_in_any_order(tmp_path):
+    """Against the operators one by one, with examples left out, repeated and in another order; read from a cache."""
+    few = {"projector": ProjectorSettings(pixels=16, power=2.0), "operators": OperatorCache(tmp_path)}
+    for shown in (scene(**few), scene(**few)):  # built, and read back
+        draws = torch.Generator().manual_seed(0)
+        rows = torch.tensor([1, 0, 0, 1])
+        light = (torch.rand(4, shown.basis.size, 3, generator=draws) * 0.2).requires_grad_(True)
+        images = shown.render(Conditions(light), rows)[:, 0]
+        weights = torch.rand(images.shape, generator=draws)
+        (gradient,) = torch.autograd.grad((images * weights).sum(), light)
+        for row, image, own, its, weight in zip(rows.tolist(), images, light, gradient, weights, strict=True):
+            item, camera = shown.objects[0], shown.examples[row].cameras[0]
+            single = build_operators(item.mesh, [camera], shown.settings, shown.backend, item.gain, shown.basis)[0]
+            assert single.sparse is not None
+            alone = own.detach().requires_grad_(True)
+            expected = single.image(alone)
+            torch.testing.assert_close(image, expected, rtol=0, atol=1e-6)
+            (slope,) = torch.autograd.grad((expected * weight).sum(), alone)
+            torch.testing.assert_close(its, slope, rtol=1e-5, atol=1e-5)

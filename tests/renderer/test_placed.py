@@ -8,8 +8,9 @@ import pytest
 import torch
 import trimesh
 
+from renderer import transfer
 from renderer.albedo import surface_albedo
-from renderer.basis import Placed
+from renderer.basis import HARMONICS, Placed, Sum
 from renderer.camera import OrthographicCamera
 from renderer.convex import Ball
 from renderer.fragments import build_fragments
@@ -160,9 +161,10 @@ def test_a_screen_at_the_origin_shows_the_pattern_upright_and_as_bright():
 def test_pixels_that_reach_nothing_are_left_out_and_have_a_gradient_of_zero():
     wide = Projector(16, PROJECTOR.polar, PROJECTOR.azimuth, 3.0, 1.5)
     built = operator(ball(), wide, samples=2)
-    assert 0 < len(built.kept) < wide.size / 2
+    reaching = built.sparse.function.unique()
+    assert 0 < len(reaching) < wide.size / 2 and not len(built.kept)
     gradient = built.light_gradient(torch.ones(3, len(built.pixels), dtype=torch.float64))
-    assert torch.equal(gradient.any(1).nonzero().squeeze(1), built.kept) and (gradient >= 0).all()
+    assert torch.equal(gradient.any(1).nonzero().squeeze(1), reaching) and (gradient >= 0).all()
 
 
 @pytest.mark.parametrize("basis", [PROJECTOR, LAMPS], ids=["projector", "lamps"])
@@ -223,3 +225,20 @@ def test_what_lies_behind_a_lamp_is_not_in_its_way():
     lamp = Lamps(((0.0, 0.0, 0.5),))
     shown = canvas(operator(screens, lamp, size=5, samples=1), torch.ones(1, 3, dtype=torch.float64))
     assert shown.max() == pytest.approx(4.0, rel=0.2)  # 1 / 0.5², and less away from below the lamp
+
+
+@pytest.mark.parametrize("several", [(), (2,), (2, 3)], ids=str)
+@pytest.mark.parametrize("solid", [ball, ball_on_a_table])
+def test_what_is_little_is_multiplied_one_by_one_to_the_same_sums(monkeypatch, several, solid):
+    """In harmonics and a projector at once, of one colour and of two."""
+    both, mesh = Sum((HARMONICS, Projector(16, 0.5, 1.6, 3.0, 0.8))), solid()
+    few = operator(mesh, both, samples=2)
+    monkeypatch.setattr(transfer, "SPARSE", 0)
+    whole = operator(mesh, both, samples=2)
+    assert few.sparse is not None and whole.sparse is None and len(few.kept) == len(HARMONICS.live)
+    assert 50 * len(few.sparse.function) < whole.transfer[0, len(few.kept) :].numel()
+    draws = torch.Generator().manual_seed(0)
+    lights = torch.rand(*several, both.size, 3, generator=draws, dtype=torch.float64)
+    torch.testing.assert_close(few.radiance(lights), whole.radiance(lights), rtol=1e-13, atol=1e-13)
+    upstream = torch.randn(*several, 3, len(few.pixels), generator=draws, dtype=torch.float64)
+    torch.testing.assert_close(few.light_gradient(upstream), whole.light_gradient(upstream), rtol=1e-12, atol=1e-12)

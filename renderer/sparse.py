@@ -1,0 +1,60 @@
+"""Transfer of which little is not zero: a pixel of a pattern reaches few of an image's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+TENSORS = ("function", "pixel", "weight")
+SPARSE = 1 / 16  # of the entries, below which they are multiplied one by one in less time than all of them
+
+
+@dataclass(frozen=True)
+class Sparse:
+    """N entries: function, pixel (N,) int64; weight (N, C), radiance per unit of the function's
+    coefficient, of one channel or of three."""
+
+    function: Tensor
+    pixel: Tensor
+    weight: Tensor
+
+    def dense(self, pixels: int) -> tuple[Tensor, Tensor]:
+        """((C, K, P), the K functions that reach a pixel (K,))."""
+        kept, row = self.function.unique(return_inverse=True)
+        whole = self.weight.new_zeros(self.weight.shape[1], len(kept) * pixels)
+        return whole.index_copy_(1, row * pixels + self.pixel, self.weight.T).unflatten(1, (len(kept), pixels)), kept
+
+    def share(self, pixels: int) -> float:
+        """What the entries are of those of `dense`."""
+        return len(self.function) / max(1, len(self.function.unique()) * pixels)
+
+    def taken(self, entries: Tensor) -> Sparse:
+        """Some of the entries (M,), or the same more than once."""
+        return Sparse(self.function[entries], self.pixel[entries], self.weight[entries])
+
+    def to(self, device: torch.device | str) -> Sparse:
+        return Sparse(self.function.to(device), self.pixel.to(device), self.weight.to(device))
+
+    def radiance(self, lights: Tensor, image: Tensor, pixels: int) -> Tensor:
+        """(B, 3, P) of B images in a light each, (B, size, 3): entries, of three channels, are of image (N,).
+        Differentiable in the lights."""
+        arriving = lights.flatten(0, 1).index_select(0, image * lights.shape[1] + self.function) * self.weight
+        seen = arriving.new_zeros(len(lights) * pixels, 3).index_add(0, image * pixels + self.pixel, arriving)
+        return seen.unflatten(0, (len(lights), pixels)).mT
+
+    def light_gradient(self, upstream: Tensor, image: Tensor, size: int) -> Tensor:
+        """(B, size, 3) of `radiance`, from a gradient by it (B, 3, P)."""
+        images, _, pixels = upstream.shape
+        arriving = upstream.mT.flatten(0, 1).index_select(0, image * pixels + self.pixel) * self.weight
+        gradient = arriving.new_zeros(images * size, 3).index_add(0, image * size + self.function, arriving)
+        return gradient.unflatten(0, (images, size))
+
+
+def joined(*parts: Sparse | None) -> Sparse | None:
+    """The entries of all; None where there are none."""
+    there = [part for part in parts if part is not None]
+    if not there:
+        return None
+    return Sparse(*(torch.cat([getattr(part, name) for part in there]) for name in TENSORS))
