@@ -15,8 +15,8 @@ from renderer.lights import PROBES, load_light
 from train.attacks.scene import scene_of
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 
-POLAR, FIELD_OF_VIEW = (40.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
-EXPOSURES = (1.0, 1.5, 2.5, 4.0)  # times the scene's own
+POLAR, FIELD_OF_VIEW = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
+EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)  # times the scene's own
 SURE = 0.5  # confidence, in every image, at which the search ends
 
 
@@ -25,7 +25,8 @@ def search(
 ) -> AttackSceneSettings:
     """The settings as they are, where every image is recognised, or else the ones most surely recognised among
     `scene.search` cameras, the first of them the scene's own, each under the scene's light and the probes at several
-    exposures; the settings as they are, where none is recognised."""
+    exposures; the settings as they are, where none is recognised. Greys behind the mesh stay as they are, and what a
+    classifier hardly knows from anywhere, such as smooth fruit of one plain colour, may not be found."""
     scene, draws = settings.scene, generator(settings.seed, item.mesh, "search")
     if _confidence(scene_of(item, settings, classifier.size, device), settings, classifier).item() > 0:
         return scene
