@@ -1,6 +1,5 @@
 import math
 
-import numpy as np
 import pytest
 import torch
 import trimesh
@@ -37,10 +36,14 @@ def cells(table: str) -> list[list[str]]:
 @pytest.mark.slow
 def test_costs_are_of_each_transport_against_direct_light(few_rays):
     clock = cost.Clock(torch.device("cpu"), rounds=1)
-    mesh = Mesh.plain(*pit(), np.eye(3)[[0, 1, 2, 0, 1, 2, 0, 1]])
-    rows = cells(cost.costs({"grey": cost.grey(mesh), "coloured": mesh}, [8], clock))
-    assert [row[:2] for row in rows] == [[name, each] for name in ("grey", "coloured") for each in cost.TRANSPORTS]
-    assert [row[3] for row in rows] == ["1 × 31", "1 × 49", "1 × 49", "3 × 31", "3 × 49", "3 × 49"]
+    mesh = Mesh.plain(*pit())
+    rows = cells(
+        cost.costs(
+            {"grey": cost.painted(mesh, (0.5, 0.5, 0.5)), "red": cost.painted(mesh, (0.9, 0.1, 0.1))}, [8], clock
+        )
+    )
+    assert [row[:2] for row in rows] == [[name, each] for name in ("grey", "red") for each in cost.TRANSPORTS]
+    assert [row[3] for row in rows] == ["1 × 31", "1 × 49", "1 × 49", "1 × 31", "1 × 49", "3 × 49"]
     assert rows[0][5].endswith("1.00 ×") and rows[3][5].endswith("1.00 ×")
 
 

@@ -27,9 +27,10 @@ EACH = 8  # of them is timed
 DIRECTIONS = (128, 256, 512, 1024)
 
 
-def grey(mesh: Mesh) -> Mesh:
-    """Of one grey, which needs one channel where several colours need three."""
-    return replace(mesh, corner_colors=np.full_like(mesh.corner_colors, 0.5), texture_ids=np.full(len(mesh.faces), -1))
+def painted(mesh: Mesh, color: Sequence[float]) -> Mesh:
+    """Of one colour, which needs one channel where several need three, unless coloured light bounces."""
+    colors = np.ones_like(mesh.corner_colors) * np.array(color, dtype=np.float32)
+    return replace(mesh, corner_colors=colors, texture_ids=np.full(len(mesh.faces), -1))
 
 
 def operators(mesh: Mesh, transport: str, size: int, views: int = VIEWS) -> list[Operator]:

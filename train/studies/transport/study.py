@@ -18,6 +18,7 @@ from train.studies.renderer_speed.measure import Clock
 from train.studies.transport import beside_mitsuba, cost, held
 
 SIZES = (32, 224)
+COLORS = {"several colours": None, "one grey": (0.5, 0.5, 0.5), "one colour": (0.9, 0.5, 0.2)}
 
 TEXT = """
 # Shadows and bounces
@@ -34,7 +35,8 @@ of an attack remains one product.
 
 A cup of {faces:,} faces ({vertices:,} vertices), 8² samples per pixel, {views} views around it; time is the process's
 own, on one thread: of operators the lesser of two, of steps the median of rounds in which the transports take turns.
-*MB* is all views' operators. A light step is image, clamp and the gradient of a loss by the light, of one view.
+*MB* is all views' operators. A light step is image, clamp and the gradient of a loss by the light, of one view. Light
+that bounces off a colour is of that colour, so that a mesh of one that is not grey then needs three channels.
 
 {costs}
 
@@ -98,7 +100,9 @@ def run(settings: TransportSettings) -> None:
         faces=len(cup.faces),
         vertices=len(cup.vertices),
         views=cost.VIEWS,
-        costs=cost.costs({"several colours": cup, "one grey": cost.grey(cup)}, SIZES, clock),
+        costs=cost.costs(
+            {name: cost.painted(cup, color) if color else cup for name, color in COLORS.items()}, SIZES, clock
+        ),
         size=SIZES[0],
         converged=cost.CONVERGED,
         by_rays=cost.errors_by_rays(cup, SIZES[0]),
