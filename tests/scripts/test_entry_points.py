@@ -67,7 +67,7 @@ WRONG = [
     (["compare_runs", "runs=null"], "runs: "),
     (["compare_runs", "runs=[[a]]"], "runs[0]: give a plain value"),
     (["compare_runs", "runs=[a]", "exclude=[{a: b}]"], "exclude[0]: give a plain value"),
-    (["benchmark_growth", "rates={a: [1]}"], "rates.a: give a plain value"),
+    (["benchmark_growth", "rates={8 V100: [1]}"], "rates.8 V100: give a plain value"),
     (["compare_runs", "runs=[a]", "exclude=web"], "exclude: "),
     (["compare_runs", "runs=[2024]"], "2024 holds no finished run"),
     ([*EXPORT, "height=abc", "out=a.hdr"], "height: "),
