@@ -13,7 +13,7 @@ from scipy.special import eval_legendre, sph_harm_y
 from train.studies.accuracy import reference
 from train.studies.accuracy.conditions import Row
 from train.studies.accuracy.measure import Error, Setup, light
-from train.studies.accuracy.page import Table, failures, page
+from train.studies.accuracy.page import Table, failures, page, with_table
 from train.studies.accuracy.reference import exact, extended
 from train.studies.accuracy.refusals import Refusal, refusals
 from train.studies.accuracy.shapes import sphere
@@ -27,7 +27,7 @@ BOTH = pytest.mark.parametrize("lift", [extended, exact], ids=["extended", "exac
 
 @pytest.fixture(scope="module")
 def tables():
-    return measure(AccuracySettings("", **REDUCED))
+    return measure(AccuracySettings("", None, **REDUCED))
 
 
 def rows_by_title(text: str) -> dict[str, int]:
@@ -70,6 +70,15 @@ def test_what_is_not_finite_or_not_refused_fails_the_script():
     ]
     text = page([Table("Lights", [row])], [Refusal("NaN", None)], "command")
     assert "| dark | **not finite** | 5.0e-01 (5e+06 ε) |  |" in text and "| NaN | **nothing** |" in text
+
+
+@pytest.mark.parametrize("title", ["Lights", "Meshes", "Shadows"])
+def test_a_table_alone_takes_its_place_on_the_page(title):
+    new = Table(title, [Row("new", {"image": Error(0.0, 1e-7)}, "")])
+    old = [Table(each, [Row("old", {"image": Error(0.0, 1e-7)}, "")]) for each in ("Meshes", "Lights")]
+    text = with_table(page(old, [Refusal("NaN", "no")], "command"), new)
+    kept = [new if each.title == title else each for each in old]
+    assert text == page(kept if new in kept else [*kept, new], [Refusal("NaN", "no")], "command")
 
 
 @pytest.mark.slow

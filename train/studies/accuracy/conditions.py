@@ -19,6 +19,7 @@ from train.studies.accuracy.measure import (
     by_both,
     by_geometry,
     by_operator,
+    by_shadows,
     light,
     of_development,
     of_harmonics,
@@ -161,6 +162,23 @@ def merged(mesh: Mesh) -> np.ndarray:
     for face in mesh.faces[::9]:
         vertices[face[1]] = vertices[face[2]]
     return vertices
+
+
+def shadows() -> Iterator[Row]:
+    lumpy, cast = shapes.lumpy(), "rays by Embree in float32, their sum in float64"
+    for condition, mesh in {
+        "closed and lumpy": lumpy,
+        "open, self-touching, of several parts": shapes.heap(),
+        "thin boards, 0.03 apart": shapes.boards(),
+        "open, its inside seen": shapes.opened(shapes.sphere(1)),
+        "not manifold": shapes.non_manifold(),
+    }.items():
+        yield Row(condition, by_shadows(Setup(mesh, light())), cast)
+    yield Row("convex", by_shadows(Setup(shapes.box(), light())), "no ray is cast; the operator of direct light")
+    small = replace(lumpy, vertices=1e-3 * lumpy.vertices)
+    framed = Setup(small, light(), camera=framing(1e-3 * CAMERA.field_of_view))
+    yield Row("scaled by 10⁻³, not normalised", by_shadows(framed), "rays start 1e-5 of the mesh's extent above it")
+    yield Row("float64", by_shadows(Setup(lumpy, light()), torch.float64), cast)
 
 
 def thin_faces(count: int) -> Iterator[Row]:

@@ -1,7 +1,7 @@
 """The renderer's largest errors against the wide reference, quantity by quantity."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
@@ -16,7 +16,9 @@ from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import basis, basis_gradient
 from renderer.image import ImageSettings, develop
 from renderer.mesh import Mesh
+from renderer.rays import Rays
 from renderer.shading import radiance
+from renderer.surface import Surface
 from renderer.transfer import build_operators
 from renderer.visibility import Backend, choose
 from train.studies.accuracy import reference
@@ -114,6 +116,26 @@ def by_operator(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     gradient = reference.light_gradient(view, setup.lift(upstream.double().numpy()), setup.degree)
     return {
         IMAGE: error(operator.radiance(light).T, wide),
+        LIGHT_GRADIENT: error(operator.light_gradient(upstream.to(dtype).T), gradient),
+    }
+
+
+def by_shadows(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
+    """Of the image and its gradient by the light under transport=shadows, one sample per pixel, which then casts all
+    rays: these, and where they start, the reference takes as they are."""
+    mesh, settings = setup.mesh, replace(setup.settings, samples=1, transport="shadows")
+    setup = replace(setup, settings=settings)
+    [operator] = build_operators(mesh, [setup.camera], settings, setup.backend, dtype=dtype)
+    view, light = setup.view(), setup.light.to(dtype)
+    surface, rays = Surface.of(mesh, setup.fragments(), settings), Rays(mesh)
+    points, directions = (surface.points + rays.offset * surface.planes).numpy(), rays.directions.numpy()
+    places = extended(points), extended(mesh.vertices[mesh.faces]), extended(directions)
+    lost, upstream = reference.shadow(view, *places, setup.degree), _upstream(len(view.pixels))
+    lit, above = extended(light.double().numpy()), extended(upstream.double().numpy())
+    image = reference.image(view, lit) - (lost * lit).sum(axis=1)
+    gradient = reference.light_gradient(view, above, setup.degree) - (lost * above[:, None]).sum(axis=0)
+    return {
+        IMAGE: error(operator.radiance(light).T, image),
         LIGHT_GRADIENT: error(operator.light_gradient(upstream.to(dtype).T), gradient),
     }
 

@@ -33,7 +33,8 @@ face a sample sees as the rasteriser says, which has tests of its own.
   harmonics are each over its own largest component.
 
 Unless the row says otherwise: images of 16² pixels and 4 samples, a light of degree 6 with random coefficients in all
-49 places, a colour per face; under "Lights" the geometry is float32. Made by
+49 places, a colour per face; under "Lights" the geometry is float32, and under "Shadows" (`renderer.transport`) a pixel
+has one sample, whose 512 rays the reference casts, too. Made by
 
 ```bash
 {command}
@@ -63,6 +64,14 @@ def page(tables: Sequence[Table], refusals: Sequence[Refusal], command: str) -> 
     refused = [[refusal.condition, refusal.error or "**nothing**"] for refusal in refusals]
     sections = [block for table in tables for block in (f"## {table.title}", _errors(table.rows))]
     return joined([introduction, *sections, "## What is refused", markdown(["input", "error"], refused)])
+
+
+def with_table(page: str, table: Table) -> str:
+    """The page with a table in place of the one of that title, or of none: then before what is refused."""
+    before, _, rest = page.partition(f"## {table.title}\n")
+    _, heading, after = rest.partition("\n## ") if rest else before.partition("\n## What is refused")
+    before = before if rest else before.partition(heading)[0]
+    return joined([before.strip(), f"## {table.title}", _errors(table.rows), (heading + after).strip()])
 
 
 def failures(tables: Sequence[Table], refusals: Sequence[Refusal]) -> list[str]:

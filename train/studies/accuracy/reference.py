@@ -105,6 +105,18 @@ def vertex_gradient(view: View, upstream: np.ndarray, light: np.ndarray, vertice
     return _add(vertices, view.corners.ravel(), by_corner.reshape(-1, 3))
 
 
+def shadow(view: View, points: np.ndarray, corners: np.ndarray, directions: np.ndarray, degree: int) -> np.ndarray:
+    """(P, (degree + 1)², 3) what an image loses, per unit of each coefficient, since faces of corners (F, 3 corners, 3)
+    are in the way of rays from the samples (S, 3) in directions (D, 3), which share the sphere equally."""
+    sky = basis(directions.T, degree)
+    lost = np.zeros((len(view.pixels), sky.shape[1], 3), dtype=points.dtype)
+    normals, solid_angle = _normals(view).T[view.face], _as_in(points, 4 * MP.pi) / len(directions)
+    for pixel, face, point, normal in zip(view.pixel, view.face, points, normals, strict=True):
+        cosine = (directions @ normal).clip(0) * _meets(point, directions, corners)
+        lost[pixel] += np.outer(cosine @ sky, view.albedo[face]) * solid_angle / view.samples
+    return lost
+
+
 def smooth_image(
     view: View, vertices: np.ndarray, faces: np.ndarray, barycentric: np.ndarray, light: np.ndarray
 ) -> np.ndarray:
@@ -189,6 +201,14 @@ def _reflected(normals: np.ndarray, degree: int) -> dict[int, np.ndarray]:
     live = [l for l in range(degree + 1) if lambertian(l)]
     factors = {l: _as_in(normals, 2 * MP.pi * _number(lambertian(l))) for l in live}
     return {index: value * factors[int(index**0.5)] for index, value in harmonics(normals, live).items()}
+
+
+def _meets(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """(D,) whether rays from a point (3,) meet a face: they pass all its edges on the side that the face is on."""
+    a, b, c = (corners[:, corner] - point for corner in range(3))
+    passed = np.stack([directions @ np.cross(first, second).T for first, second in ((a, b), (b, c), (c, a))])
+    volume = (a * np.cross(b, c)).sum(axis=1)
+    return (passed * np.sign(volume) > 0).all(axis=0).any(axis=1)
 
 
 def _face_weight(view: View, upstream: np.ndarray) -> np.ndarray:

@@ -71,6 +71,27 @@ def opened(mesh: Mesh) -> Mesh:
     return painted(mesh.vertices, mesh.faces[mesh.vertices[mesh.faces][:, :, 2].mean(axis=1) < 0.2])
 
 
+def lumpy() -> Mesh:
+    """A closed ball of 80 faces with dents, each of which sees its own other side."""
+    shape = trimesh.creation.icosphere(subdivisions=1)
+    depth = np.random.default_rng(0).uniform(0.5, 1, (len(shape.vertices), 1))
+    return painted(shape.vertices * depth, shape.faces)
+
+
+def heap() -> Mesh:
+    """A ball that touches the plate below it, beside a thin wall: open, self-touching and of several parts."""
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
+    plate = painted([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    wall = painted([[-0.7, -0.8, 0], [-0.7, 0.8, 0], [-0.6, 0.7, 0.9]], [[0, 1, 2]])
+    return concatenate([painted(ball.vertices + np.array([0, 0, 0.4]), ball.faces), plate, wall])
+
+
+def boards() -> Mesh:
+    """Five thin boards, 0.03 apart."""
+    box = trimesh.creation.box((0.8, 0.8, 0.02))
+    return concatenate([painted(box.vertices + np.array([0, 0, 0.05 * each]), box.faces) for each in range(5)])
+
+
 def non_manifold() -> Mesh:
     """Three faces on one edge, and two tetrahedra that share a corner."""
     fan = [[0, 0, -0.7], [0, 0, 0.7], [0.8, 0, 0], [-0.4, 0.7, 0], [-0.4, -0.7, 0]]
