@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 TENSORS = ("function", "pixel", "weight")
-SPARSE = 1 / 16  # of the entries, below which they are multiplied one by one in less time than all of them
+SPARSE = 1 / 16  # of all entries, below which those that are not zero are multiplied one by one in less time,
+SMALL = 2**16  # unless they are no more than this; see docs/performance_lights.md
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,10 @@ class Sparse:
         whole = self.weight.new_zeros(self.weight.shape[1], len(kept) * pixels)
         return whole.index_copy_(1, row * pixels + self.pixel, self.weight.T).unflatten(1, (len(kept), pixels)), kept
 
-    def share(self, pixels: int) -> float:
-        """What the entries are of those of `dense`."""
-        return len(self.function) / max(1, len(self.function.unique()) * pixels)
+    def few(self, pixels: int) -> bool:
+        """Whether it takes less time to multiply them than all of `dense`."""
+        whole = len(self.function.unique()) * pixels
+        return whole > SMALL and len(self.function) < SPARSE * whole
 
     def taken(self, entries: Tensor) -> Sparse:
         """Some of the entries (M,), or the same more than once."""

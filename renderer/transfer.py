@@ -26,7 +26,7 @@ from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.placed import placed_transfer
 from renderer.rays import Rays
-from renderer.sparse import SPARSE, Sparse, joined
+from renderer.sparse import Sparse, joined
 from renderer.surface import Surface
 from renderer.transport import build_transport
 from renderer.visibility import Backend
@@ -211,7 +211,7 @@ class OperatorBuilder:
         for where, part in parts_of(self._basis):
             if isinstance(part, Placed):
                 entries = placed_transfer(self._rays, surface, albedo, part)
-                if entries.share(pixels) < SPARSE:
+                if entries.few(pixels):
                     weight = (entries.weight * factor[entries.pixel]).to(self._dtype)
                     sparse = joined(sparse, Sparse(where.start + entries.function, entries.pixel, weight))
                     continue

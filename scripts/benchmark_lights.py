@@ -1,0 +1,10 @@
+"""What projectors and lamps cost, and how right they are: python scripts/benchmark_lights.py
+
+Writes docs/performance_lights.md. Takes a minute or two on one CPU thread, and needs the extra `shadows`.
+"""
+
+from train.cli import script
+from train.studies.placed_lights import PlacedLightSettings, run
+
+if __name__ == "__main__":
+    script(run, PlacedLightSettings)

@@ -1,0 +1,195 @@
+"""docs/performance_lights.md: what lights in a scene cost, beside light from afar, and how right they are."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from renderer import sparse
+from renderer.albedo import surface_albedo
+from renderer.basis import HARMONICS, Basis, Sum
+from renderer.camera import OrthographicCamera
+from renderer.fragments import build_fragments
+from renderer.image import ImageSettings
+from renderer.lamps import Lamps
+from renderer.mesh import Mesh, normalise
+from renderer.placed import lamplight
+from renderer.projector import Projector
+from renderer.rays import Rays
+from renderer.shapes import solid
+from renderer.subdivision import subdivide
+from renderer.surface import Surface
+from renderer.transfer import Operator, build_operators
+from renderer.visibility import choose
+from train.cli import command_line
+from train.outputs import writable_file
+from train.studies.page import joined, machine, wrapped, write
+from train.studies.renderer_speed.measure import Clock, relative_error
+from train.studies.transport.cost import light_step, seconds
+from train.tables import markdown
+
+CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
+SIZES, SAMPLES, REFERENCE = (32, 224), (2, 8), 64  # pixels per side, and samples
+LAMPS = Lamps(((2.0, 2.0, 2.0), (-2.0, 2.0, 2.0), (2.0, -2.0, 2.0)))
+BASES: dict[str, Basis] = {
+    "harmonics": HARMONICS,
+    "3 lamps": LAMPS,
+    "projector of 16²": Projector(16),
+    "projector of 32²": Projector(32),
+    "harmonics and projector of 16²": Sum((HARMONICS, Projector(16))),
+}
+TEXT = """
+# Lights in the scene: time and error
+
+`{command}` measures everything on this page in one run and writes it; do not edit.
+
+{machine}
+
+A cup of several colours, {faces:,} faces and {vertices:,} vertices, with flat normals and 2² samples per pixel unless
+said otherwise, from one side; time is the process's own, on one thread.
+
+## A light step
+
+Image, clamp and the gradient of a loss by the light; the median of rounds in which all take turns, and as a multiple of
+the harmonics'. An operator is built once: rasterised, and a ray cast from each sample to each place. *All entries* is
+the same operator with what is zero in it: of more than {small_operator:,} entries a channel, if less than 1/{fewer} are
+not zero, these alone are stored and multiplied.
+
+{steps}
+
+## Error
+
+Of one view at {small}² with so many samples per pixel, float32, against float64 with {reference}²: root mean square of
+the difference over that of the reference, of the radiance in random light from 0 to 1 and of the gradient of
+Σ radiance × normal random numbers. What is left are edges of pattern, shadow and outline within a pixel. Mitsuba's
+images of the same lights are compared in tests/renderer/test_placed.py.
+
+{errors}
+
+## Lamps that are moved
+
+A step by the places of the 3 lamps is not linear: each casts its rays anew, {samples}² per pixel. *Held* is the same
+without casting any, as if shadows stayed where they are, which would leave images that are not those of the lamps.
+
+{moved}
+"""
+
+
+@dataclass
+class PlacedLightSettings:
+    """conf/benchmark_lights.yaml. out: the page. vertices: the cup has more. rounds: of the clock."""
+
+    out: str
+    vertices: int
+    rounds: int
+
+
+def run(settings: PlacedLightSettings) -> None:
+    """Measure on one thread, and write the page."""
+    out = writable_file(settings.out, "out")
+    torch.set_num_threads(1)
+    cup, clock = subdivide(normalise(solid("cup", 0)), settings.vertices), Clock(torch.device("cpu"), settings.rounds)
+    text = TEXT.format(
+        command=command_line(),
+        machine=machine(clock.device),
+        faces=len(cup.faces),
+        vertices=len(cup.vertices),
+        small_operator=sparse.SMALL,
+        fewer=round(1 / sparse.SPARSE),
+        steps=_steps(cup, clock),
+        small=SIZES[0],
+        reference=REFERENCE,
+        errors=_errors(cup),
+        samples=SAMPLES[0],
+        moved=_moved(cup, clock),
+    )
+    write(out, joined([wrapped(text.strip())]))
+
+
+def operator(mesh: Mesh, basis: Basis, size: int, samples: int = SAMPLES[0], **kind: Any) -> Operator:
+    return build_operators(mesh, [CAMERA], ImageSettings(size, samples), choose("software"), basis=basis, **kind)[0]
+
+
+@contextmanager
+def all_entries() -> Iterator[None]:
+    """No operator is sparse."""
+    chosen = sparse.SPARSE
+    sparse.SPARSE = 0.0
+    try:
+        yield
+    finally:
+        sparse.SPARSE = chosen
+
+
+def megabytes(built: Operator) -> float:
+    few = [] if built.sparse is None else [getattr(built.sparse, name) for name in sparse.TENSORS]
+    return sum(each.nbytes for each in (built.transfer, *few)) / 1e6
+
+
+def _steps(mesh: Mesh, clock: Clock) -> str:
+    """A row per basis, and where it is sparse, one with all of its entries."""
+    built = {(name, size): operator(mesh, basis, size) for name, basis in BASES.items() for size in SIZES}
+    with all_entries():
+        for name, basis in BASES.items():
+            if built[name, SIZES[1]].sparse is not None:
+                built |= {(f"{name}, all entries", size): operator(mesh, basis, size) for size in SIZES}
+    lights = {key: torch.rand(each.basis.size, 3).requires_grad_() for key, each in built.items()}
+    times = clock.medians({key: partial(light_step, each, lights[key]) for key, each in built.items()})
+    first = next(iter(BASES))
+    rows = []
+    for name in dict.fromkeys(name for name, _ in built):
+        each = built[name, SIZES[1]]
+        build = f"{seconds(partial(operator, mesh, each.basis, SIZES[1])):.2f}" if name in BASES else ""
+        cells = [f"{times[name, size]:.3g} ms, {times[name, size] / times[first, size]:.2f} ×" for size in SIZES]
+        rows.append([name, str(each.basis.size), build, f"{megabytes(each):.3g}", *cells])
+    head = ["light", "functions", f"s to build, {SIZES[1]}²", f"MB, {SIZES[1]}²"]
+    return markdown([*head, *(f"light step, {size}²" for size in SIZES)], rows)
+
+
+def _errors(mesh: Mesh) -> str:
+    rows, size = [], SIZES[0]
+    for name, basis in BASES.items():
+        draws = torch.Generator().manual_seed(0)
+        light = torch.rand(basis.size, 3, generator=draws, dtype=torch.float64)
+        weights = torch.randn(3, size**2, generator=draws, dtype=torch.float64)
+        exact = _image_and_gradient(operator(mesh, basis, size, REFERENCE, dtype=torch.float64), light, weights)
+        for samples in SAMPLES:
+            seen = _image_and_gradient(operator(mesh, basis, size, samples), light.float(), weights.float())
+            errors = (f"{relative_error(ours, true):.2%}" for ours, true in zip(seen, exact, strict=True))
+            rows.append([name, f"{samples}²", *errors])
+    return markdown(["light", "samples", "radiance", "gradient"], rows)
+
+
+def _image_and_gradient(built: Operator, light: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    canvas = light.new_zeros(3, built.settings.size**2).index_copy(1, built.pixels, built.radiance(light))
+    return canvas, built.light_gradient(weights[:, built.pixels])
+
+
+class _Unobstructed(Rays):
+    """Casts none."""
+
+    def meet(self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None) -> Tensor:
+        return torch.full((len(origins),), -1)
+
+
+def _moved(mesh: Mesh, clock: Clock) -> str:
+    calls: dict[tuple[str, int], Callable[[], None]] = {}
+    places = torch.tensor(LAMPS.places).requires_grad_()
+    powers = torch.ones(len(places), 3)
+    for size in SIZES:
+        settings = ImageSettings(size, SAMPLES[0])
+        (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("software"))
+        surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
+        for name, rays in (("cast anew", Rays(mesh)), ("held", _Unobstructed(mesh))):
+            calls[name, size] = partial(_step_by_places, rays, surface, albedo, places, powers)
+    times = clock.medians(calls)
+    rows = [[name, *(f"{times[name, size]:.3g} ms" for size in SIZES)] for name in ("cast anew", "held")]
+    return markdown(["shadows", *(f"step by places, {size}²" for size in SIZES)], rows)
+
+
+def _step_by_places(rays: Rays, surface: Surface, albedo: Tensor, places: Tensor, powers: Tensor) -> None:
+    torch.autograd.grad(lamplight(rays, surface, albedo, places, powers).square().sum(), places)
