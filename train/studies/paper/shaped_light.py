@@ -53,7 +53,7 @@ recognises in the light before, here and there. *Path-traced*: of these adversar
 *Concave* are the meshes that keep more than {share:.0%} of a white sky's light from themselves: {meshes}. In brackets
 95 % Wilson intervals. *Difference* is the mean of the absolute difference between Mitsuba's adversary and ours, of all
 pixels that the mesh covers. Initial light `{light}`, its nearest that is nowhere negative; {size}², 4² samples, flat
-normals. Examples are few, of procedural solids, for one network: the intervals say nothing about others.
+normals. Examples are few, for one network: the intervals say nothing about others.
 """
 
 
