@@ -35,17 +35,14 @@ sweep() {
     "$python" -m train --multirun "experiment=$experiment" augment=none,random,adversarial seed=0,1,2,3,4 \
         data=npz "data.path=$DATA" "scene.meshes=$MESHES" "evaluate.photos=$PHOTOS" "train.device=$device" \
         "sweep=$folder" "$@"
-    compare "$experiment" "$folder"/*/
+    tables photographs "${EXCLUDE:-[]}" "$folder"/*/ | write_page "$experiment"
 }
 
-compare() {
-    local experiment=$1 page=$docs/runs_$1.md
-    shift
+write_page() {
     {
-        printf '# experiment=%s\n\n`scripts/reproduce.sh` trains these runs and writes this page; do not edit.\n\n' \
-            "$experiment"
-        tables photographs "${EXCLUDE:-[]}" "$@"
-    } >"$page"
+        printf '# experiment=%s\n\n`scripts/reproduce.sh` trains these runs and writes this page; do not edit.\n\n' "$1"
+        cat
+    } >"$docs/runs_$1.md"
 }
 
 tables() {
@@ -62,6 +59,10 @@ fine_tuned() {
         "sweep=$runs/$experiment" "$@"
 }
 
+best() {
+    fine_tuned best "$@"
+}
+
 harden() {
     local pgd_images=1800 # so many take as long as the others' images, at three steps each
     fine_tuned harden augment=none,random,adversarial "$@"
@@ -70,16 +71,14 @@ harden() {
     fine_tuned harden augment=none train.distortion=pgd "train.images_per_epoch=$pgd_images" "$@"
 }
 
-write_page() {
-    local experiment=$1 folder=$runs/$1
+compare_fine_tuned() {
+    local folder=$runs/$1
     {
-        printf '# experiment=%s\n\n`scripts/reproduce.sh` trains these runs and writes this page; do not edit.\n' \
-            "$experiment"
-        printf '\n## The laboratory\n\n'
+        printf '## The laboratory\n\n'
         tables laboratory [] "$folder"/*/
         printf '\n## Photographs\n\n'
         tables photographs "${EXCLUDE:-[]}" "$folder"/*/
-    } >"$docs/runs_$experiment.md"
+    } | write_page "$1"
 }
 
 [[ -n ${DATA:-} && -n ${MESHES:-} && -n ${PHOTOS:-} ]] || usage
@@ -88,18 +87,10 @@ python=${PYTHON:-python} docs=${DOCS:-docs} runs=${RUNS:-runs/reproduce}
 case ${1:-} in
 gpu) device=cuda experiments=(paper fast) ;;
 cpu) device=cpu experiments=(cpu) ;;
-harden)
+harden | best)
     [[ -n ${LAB:-} ]] || usage
-    shift
-    harden "$@"
-    write_page harden
-    exit
-    ;;
-best)
-    [[ -n ${LAB:-} ]] || usage
-    shift
-    fine_tuned best "$@"
-    write_page best
+    "$@"
+    compare_fine_tuned "$1"
     exit
     ;;
 *) usage ;;
