@@ -25,7 +25,11 @@ def test_a_command_is_observed_on_a_terminal_to_its_end_and_until_ctrl_c(tmp_pat
     whole = observe(talks, tmp_path)
     assert (whole.status, whole.said, whole.progress) == (3, "True", True) and whole.memory > 10**8
     waits = observe(["-c", "import time; time.sleep(60)"], tmp_path, ctrl_c=1)
-    assert waits.status == 128 + signal.SIGINT and waits.after_signal < 10 and waits.seconds < 20
+    assert (
+        waits.status == 128 + signal.SIGINT
+        and 0 <= waits.cpu_after <= waits.cpu
+        and 0 < waits.after_signal < waits.seconds < 60
+    )
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ def faces(folder: Path, count: int) -> list[str]:
     return TRAIN.command("scene.meshes=[sphere.ply]")
 
 
-def photographs(folder: Path, count: int) -> list[str]:
+def jpegs(folder: Path, count: int) -> list[str]:
     """Links to one JPEG."""
     many = folder / "many" / "orange"
     many.mkdir(parents=True)

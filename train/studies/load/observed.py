@@ -19,8 +19,8 @@ WAIT = 0.02  # seconds between two looks
 
 @dataclass(frozen=True)
 class Observed:
-    """status: as a shell says it. seconds: by the clock; cpu: of a core; memory: bytes at the peak. after_signal:
-    seconds from Ctrl-C to the end. said: the last line; progress: whether a bar was shown.
+    """status: as a shell says it. seconds: by the clock; cpu: of a core; memory: bytes at the peak. after_signal,
+    cpu_after: seconds from Ctrl-C to the end. said: the last line; progress: whether a bar was shown.
     """
 
     status: int
@@ -28,6 +28,7 @@ class Observed:
     cpu: float
     memory: int
     after_signal: float
+    cpu_after: float
     said: str
     progress: bool
 
@@ -40,29 +41,42 @@ def observe(command: Sequence[str], folder: Path, ctrl_c: float | None = None) -
     start = time.monotonic()
     process = subprocess.Popen([sys.executable, *arguments], cwd=folder, env=environment, stdout=end, stderr=end)
     os.close(end)
-    signalled, output = None, b""
-    while True:
-        output += _read(terminal)
-        ended, code, used = os.wait4(process.pid, os.WNOHANG)
-        now = time.monotonic()
-        if ended:
-            break
-        if ctrl_c is not None and signalled is None and now - start > ctrl_c:
-            signalled = now
-            process.send_signal(signal.SIGINT)
+    signalled, cpu_before, output = None, 0.0, b""
+    try:
+        while True:
+            output += _read(terminal)
+            ended, code, used = os.wait4(process.pid, os.WNOHANG)
+            now = time.monotonic()
+            if ended:
+                break
+            if ctrl_c is not None and signalled is None and now - start > ctrl_c:
+                signalled, cpu_before = now, _cpu(process.pid)
+                process.send_signal(signal.SIGINT)
+    except KeyboardInterrupt:  # of the study itself
+        process.kill()
+        process.wait()
+        raise
     output += _read(terminal)
     os.close(terminal)
     process.returncode = status = os.waitstatus_to_exitcode(code)
     text = output.decode(errors="replace").replace("\r", "\n")
+    cpu = used.ru_utime + used.ru_stime
     return Observed(
         status=status if status >= 0 else 128 - status,
         seconds=now - start,
-        cpu=used.ru_utime + used.ru_stime,
+        cpu=cpu,
         memory=1024 * used.ru_maxrss,
         after_signal=now - (signalled or now),
+        cpu_after=cpu - cpu_before,
         said=next((line for line in reversed(text.splitlines()) if line.strip()), ""),
         progress=BAR in text,
     )
+
+
+def _cpu(process: int) -> float:
+    """Seconds of a core that a process has taken."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _read(terminal: int) -> bytes:

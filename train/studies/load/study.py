@@ -1,6 +1,7 @@
 """Ask for a great deal of everything, to the end and ended by Ctrl-C, and write the page."""
 
 import shutil
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,7 +28,8 @@ Made by `{command}`. {machine}
   before it is made: those commands end with the sentence below the table.
 - The machine did other work at the same time, which lengthens the seconds by the clock, also those after Ctrl-C.
 """
-HEADER = ["asked for", "ended", "s by the clock", "s of a core", "memory, MB", "bar", "s from Ctrl-C to the end"]
+HEADER = ["asked for", "ended", "s by the clock", "s of a core", "memory, MB", "bar"]
+HEADER += ["s from Ctrl-C to the end", "of a core"]
 SIGNALLED = 130  # as a shell says it of Ctrl-C
 
 
@@ -39,7 +41,7 @@ class LoadSettings:
     renders: int
     views: int
     faces: int
-    photographs: int
+    jpegs: int
     runs: int
 
     def __post_init__(self) -> None:
@@ -52,10 +54,10 @@ class LoadSettings:
 
 
 def run(settings: LoadSettings) -> list[str]:
-    """Print the page and write it; what did not end as it should, in words."""
+    """Print the page and write it; what did not end as it should, in words. Ctrl-C ends it before its time."""
     out, described = writable_file(settings.out, "out"), machine(torch.device("cpu"))
     rows, refusals, failures = [], [], []
-    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder, suppress(KeyboardInterrupt):
         corpus = prepare(Path(folder))
         idle = observe(["-m", "train", "seed=-1"], corpus).memory
         for name, count in settings.counts.items():
@@ -87,5 +89,5 @@ def _both(name: str, count: int, corpus: Path) -> tuple[Observed, Observed]:
 def _row(asked: str, whole: Observed, ended: Observed) -> list[str]:
     fate = {0: "as asked", USER_ERROR: "refused"}.get(whole.status, f"status {whole.status}")
     seconds = [f"{whole.seconds:.0f}", f"{whole.cpu:.0f}"]
-    interrupted = f"{ended.after_signal:.1f}" if ended.status == SIGNALLED else f"status {ended.status}"
-    return [asked, fate, *seconds, f"{whole.memory / 1e6:,.0f}", "yes" if whole.progress else "no", interrupted]
+    after = [f"{ended.after_signal:.1f}", f"{ended.cpu_after:.1f}"]
+    return [asked, fate, *seconds, f"{whole.memory / 1e6:,.0f}", "yes" if whole.progress else "no", *after]
