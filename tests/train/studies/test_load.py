@@ -22,9 +22,9 @@ def test_a_command_is_observed_on_a_terminal_to_its_end_and_until_ctrl_c(tmp_pat
         "-c",
         "import sys; bytes(10**8); print(' 50%|###  |'); print(sys.stderr.isatty(), file=sys.stderr); sys.exit(3)",
     ]
-    whole = observe(talks, tmp_path)
+    whole = observe(talks, tmp_path, patience=60)
     assert (whole.status, whole.said, whole.progress) == (3, "True", True) and whole.memory > 10**8
-    waits = observe(["-c", "import time; time.sleep(60)"], tmp_path, ctrl_c=1)
+    waits = observe(["-c", "while True: pass"], tmp_path, patience=1)
     assert (
         waits.status == 128 + signal.SIGINT
         and 0 <= waits.cpu_after <= waits.cpu
@@ -35,5 +35,5 @@ def test_a_command_is_observed_on_a_terminal_to_its_end_and_until_ctrl_c(tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no terminals")
 def test_the_study_writes_its_page(tmp_path):
-    assert run(LoadSettings(str(tmp_path / "page.md"), 100, 100, 10**5, 300, 20)) == []
+    assert run(LoadSettings(str(tmp_path / "page.md"), 100, 100, 10**5, 300, 20, 60)) == []
     assert (tmp_path / "page.md").read_text().count("| as asked |") == 5

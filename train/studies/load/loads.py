@@ -10,12 +10,13 @@ from train.studies.reliability.corpus import RUN
 from train.studies.reliability.doors import BY_NAME
 
 TRAIN = BY_NAME["train data=npz"]
-GREYS = [round(number / 20, 2) for number in range(20)]
 
 
 def renders(folder: Path, count: int) -> list[str]:
-    """One mesh before twenty greys, of 16 pixels per side."""
-    return TRAIN.command(f"augment.examples={count}", f"scene.backgrounds={GREYS}")
+    """One mesh before twenty greys, of 32 pixels per side."""
+    greys = [round(number / 20, 2) for number in range(20)]
+    more = ["augment=adversarial", "data.size=32", f"augment.examples={count}", f"scene.backgrounds={greys}"]
+    return BY_NAME["train data=folder"].command(*more, "scene.meshes=[mesh.obj]")
 
 
 def views(folder: Path, count: int) -> list[str]:

@@ -33,8 +33,8 @@ class Observed:
     progress: bool
 
 
-def observe(command: Sequence[str], folder: Path, ctrl_c: float | None = None) -> Observed:
-    """Of `python` with `-m train ...` or a script of scripts/, in a folder. ctrl_c: after so many seconds."""
+def observe(command: Sequence[str], folder: Path, patience: float) -> Observed:
+    """Of `python` with `-m train ...` or a script of scripts/, in a folder, by Ctrl-C after `patience` s of a core."""
     arguments = [str(ROOT / word) if word.startswith("scripts/") else word for word in command]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     terminal, end = pty.openpty()
@@ -49,8 +49,8 @@ def observe(command: Sequence[str], folder: Path, ctrl_c: float | None = None) -
             now = time.monotonic()
             if ended:
                 break
-            if ctrl_c is not None and signalled is None and now - start > ctrl_c:
-                signalled, cpu_before = now, _cpu(process.pid)
+            if signalled is None and (cpu_before := _cpu(process.pid)) > patience:
+                signalled = now
                 process.send_signal(signal.SIGINT)
     except KeyboardInterrupt:  # of the study itself
         process.kill()
@@ -67,7 +67,7 @@ def observe(command: Sequence[str], folder: Path, ctrl_c: float | None = None) -
         cpu=cpu,
         memory=1024 * used.ru_maxrss,
         after_signal=now - (signalled or now),
-        cpu_after=cpu - cpu_before,
+        cpu_after=cpu - cpu_before if signalled else 0.0,
         said=next((line for line in reversed(text.splitlines()) if line.strip()), ""),
         progress=BAR in text,
     )

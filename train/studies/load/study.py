@@ -22,10 +22,11 @@ INTRODUCTION = """\
 
 Made by `{command}`. {machine}
 
-- Each command is run twice on a terminal: to its end, and until Ctrl-C after half of that time. *Memory* is the peak of
-  the process, of which some {idle:,.0f} MB are Python and its libraries. *Bar*: whether it showed how far it was.
-- Renders have 16 pixels per side and one step of attack. What does not fit into the memory that is free is refused
-  before it is made: those commands end with the sentence below the table.
+- Each command is run on a terminal and gets Ctrl-C after {patience} s of a core. Where it ends before, it is run again,
+  with Ctrl-C after half of what it took. *Memory* is the peak of the process, of which some {idle:,.0f} MB are Python
+  and its libraries. *Bar*: whether it showed how far it was.
+- Renders have 32 pixels per side, views 16, and one step of attack. What does not fit into the memory that is free is
+  refused before it is made, with the sentence below the table.
 - The machine did other work at the same time, which lengthens the seconds by the clock, also those after Ctrl-C.
 """
 HEADER = ["asked for", "ended", "s by the clock", "s of a core", "memory, MB", "bar"]
@@ -43,51 +44,56 @@ class LoadSettings:
     faces: int
     jpegs: int
     runs: int
+    patience: int
 
     def __post_init__(self) -> None:
         for name, count in self.counts.items():
             require_range(name, count, 2, 10**7)
+        require_range("patience", self.patience, 1, 10**5)
 
     @property
     def counts(self) -> dict[str, int]:
-        return {name: count for name, count in asdict(self).items() if name != "out"}
+        return {name: count for name, count in asdict(self).items() if name not in ("out", "patience")}
 
 
 def run(settings: LoadSettings) -> list[str]:
     """Print the page and write it; what did not end as it should, in words. Ctrl-C ends it before its time."""
     out, described = writable_file(settings.out, "out"), machine(torch.device("cpu"))
-    rows, refusals, failures = [], [], []
+    idle, rows, refusals, failures = 0, [], [], []
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder, suppress(KeyboardInterrupt):
         corpus = prepare(Path(folder))
-        idle = observe(["-m", "train", "seed=-1"], corpus).memory
+        idle = observe(["-m", "train", "seed=-1"], corpus, settings.patience).memory
         for name, count in settings.counts.items():
             asked = f"{count:,} {name}"
-            whole, ended = _both(name, count, corpus)
+            whole, ended = _both(name, count, corpus, settings.patience)
             if whole.status == USER_ERROR:
                 refusals.append(f"- {asked}: `{whole.said}`")
-            elif whole.status or ended.status != SIGNALLED:
+            elif whole.status not in (0, SIGNALLED) or ended.status != SIGNALLED:
                 failures.append(f"{asked} ended with {whole.status} ({whole.said}), by Ctrl-C with {ended.status}")
             rows.append(_row(asked, whole, ended))
-    introduction = INTRODUCTION.format(command=command_line(), machine=described, idle=idle / 1e6)
+    introduction = INTRODUCTION.format(
+        command=command_line(), machine=described, patience=settings.patience, idle=idle / 1e6
+    )
     write(out, joined([wrapped(introduction), markdown(HEADER, rows), "\n".join(refusals)]))
     return failures
 
 
-def _both(name: str, count: int, corpus: Path) -> tuple[Observed, Observed]:
-    """To the end, and ended by Ctrl-C half-way, in copies of the corpus."""
+def _both(name: str, count: int, corpus: Path, patience: float) -> tuple[Observed, Observed]:
+    """To its end, if it comes, and ended by Ctrl-C, which may be the same, in a copy of the corpus."""
     folder = corpus.with_name(name)
     shutil.copytree(corpus, folder, copy_function=shutil.copy)
     command = getattr(loads, name)(folder, count)
-    whole = observe(command, folder)
-    shutil.rmtree(folder / "out", ignore_errors=True)
-    shutil.rmtree(folder / "cache", ignore_errors=True)
-    ended = observe(command, folder, whole.seconds / 2)
+    whole = ended = observe(command, folder, patience)
+    if whole.status != SIGNALLED:
+        shutil.rmtree(folder / "out", ignore_errors=True)
+        shutil.rmtree(folder / "cache", ignore_errors=True)
+        ended = observe(command, folder, whole.cpu / 2)
     shutil.rmtree(folder)
     return whole, ended
 
 
 def _row(asked: str, whole: Observed, ended: Observed) -> list[str]:
-    fate = {0: "as asked", USER_ERROR: "refused"}.get(whole.status, f"status {whole.status}")
+    fate = {0: "as asked", USER_ERROR: "refused", SIGNALLED: "by Ctrl-C"}.get(whole.status, f"status {whole.status}")
     seconds = [f"{whole.seconds:.0f}", f"{whole.cpu:.0f}"]
     after = [f"{ended.after_signal:.1f}", f"{ended.cpu_after:.1f}"]
     return [asked, fate, *seconds, f"{whole.memory / 1e6:,.0f}", "yes" if whole.progress else "no", *after]
