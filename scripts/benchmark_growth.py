@@ -1,6 +1,6 @@
 """How the cost of adversarial renders grows with their number, size, meshes and processes: docs/performance_growth.md
 
-python scripts/benchmark_growth.py; a quarter of an hour on one free core.
+python scripts/benchmark_growth.py; three minutes on a free core, 23 where other work left it a tenth of one.
 """
 
 from train.cli import script
