@@ -10,6 +10,8 @@ import trimesh
 from torch import nn
 from torch.utils.data import Dataset
 
+from augment.attacks import checks
+
 README = (Path(__file__).parents[1] / "README.md").read_text()
 HEADINGS = re.split(r"^#{2,3} (.*)$", README, flags=re.MULTILINE)
 BLOCKS = {
@@ -52,7 +54,8 @@ class Brightness(nn.Module):
         return torch.stack([mean, 20.5 - mean], dim=1)
 
 
-def test_attack_a_classifier(folder, capsys):
+def test_attack_a_classifier(folder, capsys, monkeypatch):
+    monkeypatch.setattr(checks, "GROWTH", (1,))  # ten times as many steps take some 20 s
     names = run("Attack a classifier", network=Brightness(), CLASSES=["orange", "plum"])
     attacked = names["attacked"]
     assert capsys.readouterr().out and names["after"].shape == names["before"].shape == (1, 3, 3, 224, 224)
