@@ -454,6 +454,24 @@ def test_where_no_vertex_or_colour_has_moved_yet_shadows_are_those_of_the_operat
         torch.testing.assert_close(images, expected, rtol=0, atol=1000 * EPS32)
 
 
+def test_a_table_is_shadowed_by_the_object_on_it_and_returns_light_of_its_own_colour():
+    """Green, mostly to the object; where the sky alone lights it, nothing changes."""
+    seen = {"size": 16, "views": 1, "light": "st_peters", "exposure": 0.2, "backgrounds": [0.0], "field_of_view": 3.0}
+
+    def image(transport: str, ground: list[float] | None = (0.1, 0.8, 0.1)) -> torch.Tensor:
+        fixed = {"transport": transport, "ground": ground, "visibility": "software"}
+        scene = build_scene([("solid:orange", "orange")], **seen | fixed)
+        return render(scene, scene.lights)[0]
+
+    alone, open_sky, shadowed, lit = (image("direct", None), *map(image, ("direct", "shadows", "bounces:2")))
+    object_, table = alone.sum(0) > 0, (alone.sum(0) == 0) & (open_sky.sum(0) > 0)
+    kept = (shadowed / open_sky)[1, table]
+    assert kept.min() < 0.3 and kept.max() > 0.8
+    assert (shadowed <= open_sky + 0.02 * open_sky.max()).all()
+    red, green, blue = ((lit - shadowed) / shadowed)[:, object_].mean(1)
+    assert green > 3 * red > 0 and green > 3 * blue > 0
+
+
 def test_shadows_are_found_anew_for_a_shape_that_is_not_near_and_held_for_one_that_is():
     """Each example has its own shape; back where it began, it has the mesh's own shadows."""
     settings, cameras = replace(SETTINGS, transport="shadows"), ring(2, 2)
