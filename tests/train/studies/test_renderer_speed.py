@@ -12,7 +12,8 @@ import torch
 
 from renderer import reference
 from renderer.visibility import choose
-from train.studies.renderer_speed import measure, results, scenes, steps, study
+from train.studies.renderer_speed import measure, rasterising, results, scenes, steps, study
+from train.studies.renderer_speed.rasterising import Drawn
 from train.studies.renderer_speed.reference import Converged
 from train.studies.renderer_speed.results import Row
 
@@ -174,6 +175,25 @@ def test_plain_autograd_by_face_and_by_sample_is_the_analytic_gradient():
     ]
     for other in found[1:]:
         torch.testing.assert_close(other, found[0], rtol=0, atol=1e3 * EPS64 * float(found[0].abs().max()))
+
+
+# ---------------------------------------------------------------------------- rasterising
+
+
+@pytest.mark.parametrize(
+    ("slower", "unlike", "found", "passed"),
+    [
+        (9.0, 0, "3× to 4.5×, no samples differ", True),
+        (8.9, 0, "2.97× to 4.45×, no samples differ", False),
+        (9.0, 2, "3× to 4.5×, 2 samples differ", False),
+        (9.0, None, "not measured", None),
+    ],
+)
+def test_the_compiled_rasteriser_is_held_to_its_slowest_case_and_to_every_sample(slower, unlike, found, passed):
+    ms = 2.0, 3.0
+    drawn = [Drawn(20, 8, {"compiled": each, "software": slower}, unlike) for each in ms]
+    target = rasterising.target(drawn)
+    assert (target.found, target.passed) == (found, passed)
 
 
 # ---------------------------------------------------------------------------- the study

@@ -17,11 +17,12 @@ from train.studies.renderer_speed.errors import Exact
 from train.studies.renderer_speed.panels import SAMPLES, Bench, Entries, row_of
 from train.studies.renderer_speed.results import Row
 from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View, coefficients
-from train.studies.renderer_speed.steps import shade_by_face, vertex_step
+from train.studies.renderer_speed.steps import seen, shade_by_face, vertex_step
 
 DIRECT, AUTOGRAD, WHOLE = "operator, direct", "operator, autograd", "operator, direct, whole images in and out"
 ANALYTIC, BY_FACE, BY_SAMPLE = "analytic", "plain autograd, face by face", "plain autograd, sample by sample"
 KEPT, REFRESHED = "visibility kept", "re-rasterised"
+LIGHT_BY_FACE = f"{BY_FACE}, {KEPT}"
 MITSUBA, PYTORCH3D = "Mitsuba 3", "PyTorch3D"
 SAMPLES_OF = {MITSUBA: 16, PYTORCH3D: 1}  # per pixel
 
@@ -58,6 +59,9 @@ def by_light(bench: Bench, size: int, peers: Peers) -> list[Row]:
         row = row_of(view, f"gradient by the light, {size}²", "", SAMPLES, **exact.light_errors(operator, light))
         for name, call in _light_gradients(view, operator, light).items():
             yield replace(row, setting=name), call
+        image, by_face = _shaded_by_face(view, light)
+        errors = exact.errors(image, by_face(), exact.by_light[: len(light)])
+        yield replace(row, setting=LIGHT_BY_FACE, samples=1, **errors), by_face
         for name, peer in _set_up(view, peers):
             differentiate = partial(peer.light_gradient, view.image_gradient.cpu().float().numpy())
             errors = exact.errors(
@@ -84,6 +88,20 @@ def _light_gradients(view: View, operator: Operator, light: Tensor) -> dict[str,
         return operator.light_gradient(image_gradient.index_select(1, operator.pixels))
 
     return {DIRECT: direct, AUTOGRAD: autograd, WHOLE: whole}
+
+
+def _shaded_by_face(view: View, light: Tensor) -> tuple[Tensor, Callable[[], Tensor]]:
+    """(the image, what renders it and finds its gradient by the light) without an operator, with visibility kept."""
+    vertices = view.vertices(light.dtype)
+    fragments, albedo, _ = seen(view, 1, vertices)
+    upstream = view.upstream(fragments.pixels, light.dtype)
+
+    def differentiate() -> Tensor:
+        variable = light.clone().requires_grad_()
+        radiance = shade_by_face(fragments, vertices, variable, albedo)
+        return torch.autograd.grad((radiance * upstream).sum(), variable)[0]
+
+    return view.canvas(shade_by_face(fragments, vertices, light, albedo), fragments.pixels), differentiate
 
 
 def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:

@@ -10,14 +10,14 @@ from augment.objects import load_object
 from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.shapes import solid
-from renderer.visibility import Backend, choose
+from renderer.visibility import NAMES, Backend, choose
 from train.cli import command_line
 from train.device import choose_device
 from train.outputs import writable_folder
 from train.settings import SceneSettings, read_object
 from train.studies.figures import pyplot
 from train.studies.page import machine, write
-from train.studies.renderer_speed import comparison, figures, panels, results, scaling, skipping, targets
+from train.studies.renderer_speed import comparison, figures, panels, rasterising, results, scaling, skipping, targets
 from train.studies.renderer_speed.measure import Clock
 from train.studies.renderer_speed.page import Findings, page
 from train.studies.renderer_speed.panels import QUICK, Bench, Plan
@@ -57,7 +57,7 @@ def run(settings: RendererSpeedSettings) -> None:
 def _backends() -> tuple[Backend, ...]:
     """The rasterisers that work here, the one that "auto" chooses first."""
     backends = [choose()]
-    for name in ("software", "opengl"):
+    for name in NAMES[1:]:
         if name != backends[0].name:
             try:
                 backends.append(choose(name))
@@ -85,14 +85,17 @@ def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
         comparison.by_vertices(bench, plan.large, peers),
     ]
     print("measured: comparisons", flush=True)
+    drawn = rasterising.measure(bench)
+    print("measured: rasterising", flush=True)
     workloads = [*(panels.workloads(bench, axis) for axis in ("size", "vertices")), panels.batches(bench)]
     print("measured: workloads", flush=True)
     reference = Converged(bench.view(plan.mesh, plan.large))
     return Findings(
-        targets=[*targets.compared(compared), *targets.measured(bench, meshes)],
+        targets=[*targets.compared(compared), rasterising.target(drawn), *targets.measured(bench, meshes)],
         choices=choices,
         descent=panels.refreshes(bench),
         comparisons=compared,
+        rasterising=[rasterising.section(drawn), rasterising.starting(bench)],
         workloads=workloads,
         savings=skipping.measure(bench, meshes),
         scaling=scaling.measure(bench),

@@ -12,14 +12,15 @@ from train.studies.renderer_speed.steps import light_step, vertex_step
 from train.studies.targets import Target
 from train.tables import shown
 
-QUOTED = {32: 1.3, 224: 13.0}  # ms, PyTorch3D with its fragments kept, measured once on another machine
-
 
 def compared(panels: Sequence[Sequence[Row]]) -> list[Target]:
     """Of the panels of `comparison`: light at the small size, light at the large one, vertices at the large one."""
     small, large, vertices = ({row.setting: row for row in rows} for rows in panels)
     return [
-        *(_faster(rows, comparison.DIRECT, comparison.PYTORCH3D, least) for rows, least in ((large, 10), (small, 30))),
+        *(
+            _faster(rows, comparison.DIRECT, comparison.LIGHT_BY_FACE, least)
+            for rows, least in ((large, 10), (small, 30))
+        ),
         *(_faster(rows, comparison.DIRECT, comparison.MITSUBA, least) for rows, least in ((large, 300), (small, 400))),
         _faster(vertices, comparison.rasterised(comparison.ANALYTIC, 1), comparison.MITSUBA, 30),
         *(
@@ -37,7 +38,7 @@ def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Targe
     own, other = rows[ours], rows.get(theirs)
     what, asked = f"{own.panel}: {ours}, against {theirs}", f"at least {least}× faster"
     if other is None:
-        return _unmeasured(own, what, asked, theirs)
+        return Target(what, asked, "not measured", None)
     ratio, found = other.time_ms / own.time_ms, f"{shown(other.time_ms / own.time_ms)}×"
     if theirs not in (comparison.MITSUBA, comparison.PYTORCH3D):
         return Target(what, asked, found, ratio >= least)
@@ -48,14 +49,6 @@ def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Targe
 
 def _at_most(error: float | None, other: float | None) -> bool:
     return error is not None and other is not None and error <= other
-
-
-def _unmeasured(own: Row, what: str, asked: str, theirs: str) -> Target:
-    if theirs != comparison.PYTORCH3D or own.size not in QUOTED:
-        return Target(what, asked, "not measured", None)
-    quoted = QUOTED[own.size]
-    found = f"not measured here; {shown(quoted / own.time_ms)}× against {quoted} ms on another machine"
-    return Target(what, asked, found, None)
 
 
 def _errors(row: Row) -> str:
