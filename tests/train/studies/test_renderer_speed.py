@@ -208,7 +208,7 @@ def test_a_quick_run_writes_every_file(tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(study, "_backends", lambda: (choose("software"),))
     monkeypatch.setattr(sys, "argv", ["scripts/benchmark_renderer.py", "quick=true"])
-    settings = study.RendererSpeedSettings(str(tmp_path), "cpu", peers=False, quick=True, scene=study.SceneSettings([]))
+    settings = study.RendererSpeedSettings(str(tmp_path), "cpu", False, True, None, study.SceneSettings([]))
     monkeypatch.setenv("LP_NUM_THREADS", "0")
     threads = torch.get_num_threads()
     try:

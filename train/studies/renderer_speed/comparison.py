@@ -22,7 +22,7 @@ from train.studies.renderer_speed.steps import seen, shade_by_face, vertex_step
 DIRECT, AUTOGRAD, WHOLE = "operator, direct", "operator, autograd", "operator, direct, whole images in and out"
 ANALYTIC, BY_FACE, BY_SAMPLE = "analytic", "plain autograd, face by face", "plain autograd, sample by sample"
 KEPT, REFRESHED = "visibility kept", "re-rasterised"
-LIGHT_BY_FACE = f"{BY_FACE}, {KEPT}"
+BY_FACE_KEPT = f"{BY_FACE}, {KEPT}"
 MITSUBA, PYTORCH3D = "Mitsuba 3", "PyTorch3D"
 SAMPLES_OF = {MITSUBA: 16, PYTORCH3D: 1}  # per pixel
 
@@ -61,7 +61,7 @@ def by_light(bench: Bench, size: int, peers: Peers) -> list[Row]:
             yield replace(row, setting=name), call
         image, by_face = _shaded_by_face(view, light)
         errors = exact.errors(image, by_face(), exact.by_light[: len(light)])
-        yield replace(row, setting=LIGHT_BY_FACE, samples=1, **errors), by_face
+        yield replace(row, setting=BY_FACE_KEPT, samples=1, **errors), by_face
         for name, peer in _set_up(view, peers):
             differentiate = partial(peer.light_gradient, view.image_gradient.cpu().float().numpy())
             errors = exact.errors(

@@ -4,15 +4,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from train.studies.page import joined
-from train.studies.renderer_speed.results import Row, pareto_front, verdict
+from train.studies.renderer_speed.results import Row, compared, pareto_front, verdict
 from train.studies.renderer_speed.scaling import Point
 from train.studies.renderer_speed.skipping import Saving
+from train.studies.renderer_speed.vertices import Vertices, section
 from train.studies.targets import Target, table_of
 from train.tables import markdown, shown
 
 HEADER = """# Time against error
 
-`{command}` measures everything on this page in one run and writes it; do not edit.
+`{command}` measures everything on this page in one run, but what names a command
+of its own, and writes it; do not edit.
 
 {machine}.
 
@@ -34,15 +36,15 @@ class Findings:
     """What a run measured.
 
     choices: panels with a default. comparisons: with plain autograd and, where asked for, with other renderers.
-    rasterising: a table, and a sentence on the start. workloads: by size, vertices and lights. notes: what could not be
-    measured. reference: (its samples per side, the image's size, its own relative error) of the large image.
+    workloads: by size, vertices and lights. notes: what could not be measured. reference: (its samples per side, the
+    image's size, its own relative error) of the large image.
     """
 
     targets: Sequence[Target]
     choices: Sequence[Sequence[Row]]
     descent: Sequence[Row]
     comparisons: Sequence[Sequence[Row]]
-    rasterising: Sequence[str]
+    vertices: Vertices
     workloads: Sequence[Sequence[Row]]
     savings: Sequence[Saving]
     scaling: Sequence[Point]
@@ -52,17 +54,14 @@ class Findings:
     @property
     def panels(self) -> list[Sequence[Row]]:
         """Those that have a front."""
-        return [*self.choices, self.descent, *self.comparisons]
+        return [*self.choices, self.descent, *self.comparisons, self.vertices.rows]
 
 
 WHY_NOT = """\
 At 32² one light's image and gradient are some twenty operations on a few thousand numbers, whose cost is Python's and
 torch's for each operation and not the arithmetic; a light among 100 costs a fraction of it
-([Light step by lights](#light-step-by-lights-32)). Plain autograd sample by sample is `renderer.reference`; face by
-face it shades each face once, as the analytic derivative does. That is the fastest other way that runs here, also where
-PyTorch3D was meant. Rasterising anew is the same work for all;
-[Gradient by the vertices](#gradient-by-the-vertices-224) has the ratios without it, too. Of 200,000 faces, the compiled
-rasteriser spends most of its time on reading the corners of those that cover no sample.
+([Light step by lights](#light-step-by-lights-32)). Plain autograd face by face shades each face once and keeps
+visibility; it is the fastest other way that runs here, also where PyTorch3D was meant.
 """
 
 
@@ -90,10 +89,7 @@ def page(findings: Findings, command: str, machine: str) -> str:
         *_descent(findings.descent),
         "## Side by side",
         *_comparisons(findings.comparisons),
-        "## Rasterising",
-        "One view of the ellipsoid, without its back faces. `auto` takes `compiled` where numba is installed and no GPU"
-        " draws.",
-        *findings.rasterising,
+        section(findings.vertices, command, machine),
         "## What a scene does not need",
         _savings(findings.savings),
         "## How it grows",
@@ -125,11 +121,8 @@ def _descent(rows: Sequence[Row]) -> Iterator[str]:
 def _comparisons(panels: Sequence[Sequence[Row]]) -> Iterator[str]:
     yield "The light is cut after degree 6 in the reference too, since that is what all are given."
     for rows in panels:
-        fastest = min(row.time_ms for row in rows)
-        lines = [(row.setting, row.samples, *_numbers(row), f"{shown(row.time_ms / fastest)}×") for row in rows]
         yield f"### {_title(rows)}"
-        header = ["who", "samples per pixel", "ms", "image's error", "gradient's error", "of the fastest"]
-        yield markdown(header, lines)
+        yield compared(rows)
 
 
 def _savings(savings: Sequence[Saving]) -> str:

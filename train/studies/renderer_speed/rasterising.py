@@ -64,7 +64,7 @@ def target(drawn: Sequence[Drawn]) -> Target:
     return Target(what, asked, found, min(ratios) >= 3 and not unlike)
 
 
-def section(drawn: Sequence[Drawn]) -> str:
+def table(drawn: Sequence[Drawn]) -> str:
     """A line per mesh and size."""
     names = list(drawn[0].times)
     header = ["faces", "size", *(f"{name}: ms" for name in names), "compiled against software"]

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from train.tables import markdown, shown
+
 NOISE = 0.05  # of a median: times closer than that may change places from run to run
 
 
@@ -70,6 +72,19 @@ def verdict(rows: Sequence[Row]) -> str:
     return (
         f"The default, {default.setting}, {where} the front: {best.setting} takes {best.time_ms / default.time_ms:.2f} "
         f"of its time at {best.error / default.error:.2f} of its error."
+    )
+
+
+def compared(rows: Sequence[Row]) -> str:
+    """A Markdown table of who took how long, and how much longer than the fastest."""
+    fastest = min(row.time_ms for row in rows)
+    header = ["who", "samples per pixel", "ms", "image's error", "gradient's error", "of the fastest"]
+    return markdown(
+        header,
+        [
+            (r.setting, r.samples, r.time_ms, r.image_error, r.gradient_error, f"{shown(r.time_ms / fastest)}×")
+            for r in rows
+        ],
     )
 
 

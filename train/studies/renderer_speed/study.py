@@ -17,17 +17,20 @@ from train.outputs import writable_folder
 from train.settings import SceneSettings, read_object
 from train.studies.figures import pyplot
 from train.studies.page import machine, write
-from train.studies.renderer_speed import comparison, figures, panels, rasterising, results, scaling, skipping, targets
+from train.studies.renderer_speed import comparison, figures, panels, results, scaling, skipping, targets, vertices
 from train.studies.renderer_speed.measure import Clock
 from train.studies.renderer_speed.page import Findings, page
 from train.studies.renderer_speed.panels import QUICK, Bench, Plan
 from train.studies.renderer_speed.reference import Converged
 from train.studies.renderer_speed.scenes import irradiance
 
+PAGE = "performance_renderer.md"
+
 
 @dataclass
 class RendererSpeedSettings:
     """conf/benchmark_renderer.yaml. out: a folder. peers: whether others are timed, too. quick: tiny settings, once.
+    only: null, or vertices, whose section of the page is measured anew and the rest kept.
 
     scene.meshes: those whose operators are built; none: two solid oranges as they are, not normalised.
     """
@@ -36,18 +39,26 @@ class RendererSpeedSettings:
     device: str
     peers: bool
     quick: bool
+    only: str | None
     scene: SceneSettings
 
 
 def run(settings: RendererSpeedSettings) -> None:
     """Measure, and write the page, its figures and its numbers."""
     out = writable_folder(settings.out, "out")
+    if settings.only not in (None, "vertices"):
+        raise InputError(f"only={settings.only}: choose vertices, or null for the whole page")
+    if settings.only and not (out / PAGE).is_file():
+        raise InputError(f"only={settings.only}: there is no {out / PAGE} to put the section into")
     pyplot()  # a run without matplotlib would fail only at its end
     torch.set_num_threads(1)
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software OpenGL, too, on the one thread
     device, plan = choose_device(settings.device), QUICK if settings.quick else Plan()
     description = machine(device)
     bench = Bench(plan, Clock(device, plan.rounds), _backends(), device)
+    if settings.only:
+        section = vertices.section(vertices.measure(bench, _peers(settings.peers)[0]), command_line(), description)
+        return write(out / PAGE, vertices.put(section, (out / PAGE).read_text("utf-8")))
     named = [read_object(item, "", index) for index, item in enumerate(settings.scene.meshes)]
     meshes = [load_object(item).mesh for item in named] or [solid("orange", seed) for seed in (0, 1)]
     findings = _measure(bench, meshes, settings.peers)
@@ -66,11 +77,13 @@ def _backends() -> tuple[Backend, ...]:
     return tuple(backends)
 
 
+def _peers(asked: bool) -> tuple[comparison.Peers, list[str]]:
+    return comparison.installed_peers() if asked else ({}, ["Run with peers=true to time other renderers."])
+
+
 def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
     plan = bench.plan
-    peers, notes = (
-        comparison.installed_peers() if with_peers else ({}, ["Run with peers=true to time other renderers."])
-    )
+    peers, notes = _peers(with_peers)
     print(f"rasterisers: {', '.join(backend.description for backend in bench.backends)}", flush=True)
     choices = [
         panels.light_steps(bench, plan.small),
@@ -82,20 +95,19 @@ def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
     compared = [
         comparison.by_light(bench, plan.small, peers),
         comparison.by_light(bench, plan.large, peers),
-        comparison.by_vertices(bench, plan.large, peers),
     ]
     print("measured: comparisons", flush=True)
-    drawn = rasterising.measure(bench)
-    print("measured: rasterising", flush=True)
+    of_vertices = vertices.measure(bench, peers)
+    print("measured: vertices", flush=True)
     workloads = [*(panels.workloads(bench, axis) for axis in ("size", "vertices")), panels.batches(bench)]
     print("measured: workloads", flush=True)
     reference = Converged(bench.view(plan.mesh, plan.large))
     return Findings(
-        targets=[*targets.compared(compared), rasterising.target(drawn), *targets.measured(bench, meshes)],
+        targets=[*targets.by_light(*compared), *targets.measured(bench, meshes)],
         choices=choices,
         descent=panels.refreshes(bench),
         comparisons=compared,
-        rasterising=[rasterising.section(drawn), rasterising.starting(bench)],
+        vertices=of_vertices,
         workloads=workloads,
         savings=skipping.measure(bench, meshes),
         scaling=scaling.measure(bench),
@@ -106,7 +118,7 @@ def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
 
 def _write(folder: Path, findings: Findings, description: str) -> None:
     text = page(findings, command_line(), description)
-    write(folder / "performance_renderer.md", text)
+    write(folder / PAGE, text)
     rows = [*results.records(findings.panels), *(asdict(row) for rows in findings.workloads for row in rows)]
     results.write_csv(folder / "renderer_pareto.csv", rows)
     results.write_csv(folder / "renderer_scaling.csv", [asdict(point) for point in findings.scaling])

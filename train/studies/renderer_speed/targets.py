@@ -13,20 +13,24 @@ from train.studies.targets import Target
 from train.tables import shown
 
 
-def compared(panels: Sequence[Sequence[Row]]) -> list[Target]:
-    """Of the panels of `comparison`: light at the small size, light at the large one, vertices at the large one."""
-    small, large, vertices = ({row.setting: row for row in rows} for rows in panels)
+def by_light(small: Sequence[Row], large: Sequence[Row]) -> list[Target]:
+    """Of panels of `comparison` at the two sizes."""
+    asked = {comparison.BY_FACE_KEPT: (10, 30), comparison.MITSUBA: (300, 400)}
+    panels = [{row.setting: row for row in rows} for rows in (large, small)]
     return [
+        _faster(rows, comparison.DIRECT, peer, least)
+        for peer, each in asked.items()
+        for rows, least in zip(panels, each, strict=True)
+    ]
+
+
+def by_vertices(rows: Sequence[Row]) -> list[Target]:
+    """Of a panel of `comparison`."""
+    named = {row.setting: row for row in rows}
+    return [
+        _faster(named, comparison.rasterised(comparison.ANALYTIC, 1), comparison.MITSUBA, 30),
         *(
-            _faster(rows, comparison.DIRECT, comparison.LIGHT_BY_FACE, least)
-            for rows, least in ((large, 10), (small, 30))
-        ),
-        *(_faster(rows, comparison.DIRECT, comparison.MITSUBA, least) for rows, least in ((large, 300), (small, 400))),
-        _faster(vertices, comparison.rasterised(comparison.ANALYTIC, 1), comparison.MITSUBA, 30),
-        *(
-            _faster(
-                vertices, comparison.rasterised(comparison.ANALYTIC, samples), comparison.rasterised(peer, samples), 3
-            )
+            _faster(named, comparison.rasterised(comparison.ANALYTIC, samples), comparison.rasterised(peer, samples), 3)
             for peer in (comparison.BY_SAMPLE, comparison.BY_FACE)
             for samples in (comparison.COARSER, 1)
         ),
