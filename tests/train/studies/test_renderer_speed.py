@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from renderer import reference
+from renderer.errors import InputError
 from renderer.visibility import choose
-from train.studies.renderer_speed import measure, rasterising, results, scenes, steps, study
+from train.studies.renderer_speed import measure, rasterising, results, scenes, steps, study, vertices
 from train.studies.renderer_speed.rasterising import Drawn
 from train.studies.renderer_speed.reference import Converged
 from train.studies.renderer_speed.results import Row
@@ -185,7 +186,7 @@ def test_plain_autograd_by_face_and_by_sample_is_the_analytic_gradient():
     [
         (9.0, 0, "3× to 4.5×, no samples differ", True),
         (8.9, 0, "2.97× to 4.45×, no samples differ", False),
-        (9.0, 2, "3× to 4.5×, 2 samples differ", False),
+        (9.0, 2, "3× to 4.5×, 4 samples differ", False),
         (9.0, None, "not measured", None),
     ],
 )
@@ -230,3 +231,15 @@ def test_a_quick_run_writes_every_file(tmp_path, monkeypatch, capsys):
     assert page.startswith("# Time against error\n\n`python scripts/benchmark_renderer.py quick=true` measures ")
     assert page in capsys.readouterr().out
     assert page.count("The default, ") == 4 and "| not measured | — |" in page
+
+
+def test_a_section_is_put_in_place_of_the_one_before():
+    page = "# Page\n\n## First\n\none\n\n## Vertices\n\nold\n\n### Below\n\nold\n\n## Last\n\n| a \\1 |\n"
+    expected = "# Page\n\n## First\n\none\n\n## Vertices\n\nnew \\1\n\n## Last\n\n| a \\1 |\n"
+    assert vertices.put("## Vertices\n\nnew \\1\n", page) == expected
+
+
+@pytest.mark.parametrize(("only", "says"), [("shapes", "only=shapes: choose vertices"), ("vertices", "there is no ")])
+def test_a_section_that_cannot_be_put_anywhere_is_refused_before_it_is_measured(tmp_path, only, says):
+    with pytest.raises(InputError, match=says):
+        study.run(study.RendererSpeedSettings(str(tmp_path), "cpu", False, True, only, study.SceneSettings([])))

@@ -15,8 +15,8 @@ from train.tables import shown
 WHY_NOT = """\
 Plain autograd sample by sample is `renderer.reference`; face by face it shades each face once, as the analytic
 derivative does, which is the fastest other way that runs here. Rasterising anew is the same work for all: with
-visibility kept, the ratio to that way is {kept}×, and no rasteriser brings it beyond. The light is cut after degree 6 in the
-reference too, since that is what all are given.
+visibility kept, the ratio to that way is {kept}×, and no rasteriser brings it beyond. The light is cut after degree 6
+in the reference too, since that is what all are given.
 """
 
 
