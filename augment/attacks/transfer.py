@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -60,7 +61,7 @@ def transfer(
         turned = _changed(pairs, partial(_turned, angle=math.radians(angle)))
         yield _judged(attacked, turned, "azimuth", f"{angle:+g}°", own)
     for shown in objects:
-        yield _judged(attacked, _changed(pairs, partial(replace, shown=shown)), "mesh", shown.name, own)
+        yield _judged(attacked, _changed(pairs, partial(replace, shown=shown)), "mesh", Path(shown.name).name, own)
 
 
 def require_transferable(kinds: Collection[str], azimuths: Collection[float], objects: Collection[Any]) -> None:
@@ -72,11 +73,11 @@ def require_transferable(kinds: Collection[str], azimuths: Collection[float], ob
 
 def _pairs(attacked: Attacked) -> list[Pair]:
     scene, problem = attacked.problem.scene, attacked.problem
-    start = problem.conditions(problem.start, problem.everything)
+    ends = problem.conditions(problem.start, problem.everything), attacked.conditions
     found = []
     for example in torch.nonzero(attacked.recognised & attacked.success).flatten().tolist():
         images = attacked.images_before[example], attacked.images[example]
-        old, new = (Adversary.of(scene, example, each, *images) for each in (start, attacked.conditions))
+        old, new = (Adversary.of(scene, example, each, *images) for each in ends)
         found.append((old, new))
     return found
 
