@@ -55,8 +55,12 @@ def require_finite(**tensors: Tensor) -> None:
 
 
 def require_bounded(**tensors: Tensor) -> None:
-    """InputError naming the first tensor that holds NaN, infinity or magnitudes beyond 1e12."""
+    """InputError naming the first tensor that is of no real floating-point type, or holds NaN, infinity or magnitudes
+    beyond 1e12."""
     for name, tensor in tensors.items():
+        if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+            kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+            raise InputError(f"{name} is {kind}: give a tensor of floating-point numbers")
         if not _largest(tensor) <= LARGEST:
             raise InputError(f"{name} holds NaN, infinity or magnitudes beyond {LARGEST:g}: give finite values")
 

@@ -192,7 +192,7 @@ class OperatorBuilder:
     """Operators of one mesh in lights of one basis; see `build_operators`. What the views share is made once."""
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis, dtype: torch.dtype):
-        require_bounded(gain=torch.tensor(gain))
+        require_bounded(gain=torch.tensor(float(gain)))
         self._mesh, self._settings, self._gain, self._basis, self._dtype = mesh, settings, gain, basis, dtype
         self._transport = build_transport(mesh, settings, gain, basis)
         self._rays = self._transport.rays if self._transport else Rays(mesh)

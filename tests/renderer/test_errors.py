@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -96,6 +97,14 @@ def test_all_that_is_finite_passes_in_every_dtype(dtype):
     require_bounded(
         values=values.detach().double().clamp(-0.99 * LARGEST, 0.99 * LARGEST).to(dtype), nothing=values[:0]
     )
+
+
+@pytest.mark.parametrize(
+    "light", [torch.ones(49, 3, dtype=torch.int64), torch.ones(49, 3, dtype=torch.complex64), np.ones((49, 3)), None]
+)
+def test_what_is_no_tensor_of_real_numbers_is_refused_by_name(light):
+    with pytest.raises(InputError, match=r"^light is .*: give a tensor of floating-point numbers"):
+        require_bounded(light=light)
 
 
 @pytest.mark.parametrize("require", [require_finite, require_bounded])
