@@ -19,7 +19,7 @@ from renderer.mesh import Mesh
 from renderer.shapes import solid
 from renderer.visibility import choose
 
-OTHER_LIGHTS = {"skylight", "projector", "lamps"}
+OTHER_LIGHTS = {"skylight", "projector", "lamps", "places"}
 CLASSES = ("orange", "lime", "sky")
 SOFTWARE = choose("software")
 

@@ -12,7 +12,7 @@ from renderer.mesh import Mesh, load_mesh
 from renderer.nonnegative import nearest_nonnegative
 from renderer.shapes import solid
 
-OTHER_LIGHTS = {"skylight", "projector", "lamps"}
+OTHER_LIGHTS = {"skylight", "projector", "lamps", "places"}
 CLASSES = ("orange", "lime", "sky", "night")
 SIGNED = augment.AttackSettings(lighting=augment.StepSettings(), light="signed")
 SMALL = {"visibility": "software", "field_of_view": 2.4}
