@@ -54,7 +54,7 @@ def adversary_of(done: augment.Attacked) -> Adversary:
 @pytest.mark.parametrize(
     "kinds",
     [{"lighting"}, {"geometry"}, {"albedo"}, {"pixels"}, set(KINDS) - OTHER_LIGHTS],
-    ids=str,
+    ids=lambda kinds: "+".join(sorted(kinds)),
 )
 def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, kinds, encoding):
     """And exactly but for rounding to float32 where no texture is painted."""
