@@ -18,9 +18,14 @@ def with_added_albedo(mesh: Mesh, added: np.ndarray, encoding: str, gain: float 
 
     added: (F, 3) linear, per face. The colours of corners hold the sum to float32. Textures hold it to 8 bits: each
     face gets texels of its own, in the grid that it had, so that interpolation finds what it found before; the colours
-    of its corners are painted into them. The new gain is at least 1, since colours in files end there.
+    of its corners are painted into them. The new gain is at least 1, since colours in files end there, and no larger
+    than the colours need, since it multiplies what 8 bits round off.
     """
-    ceiling, offset = max(1.0, gain), torch.from_numpy(added).float()
+    of_corners = decode(torch.from_numpy(mesh.corner_colors), encoding)
+    decoded = decode(torch.arange(256, dtype=torch.float32) / 255, encoding)
+    lightest = max((float(decoded[texture.max()]) for texture in mesh.textures), default=1.0)
+    largest = float(of_corners.max()) * (lightest if (mesh.texture_ids >= 0).all() else 1.0)
+    ceiling, offset = max(1.0, gain * largest), torch.from_numpy(added).float()
 
     def painted(albedo: Tensor, faces: np.ndarray) -> Tensor:
         """Linear albedo (N, 3) of faces (N,), changed and encoded."""
@@ -29,9 +34,7 @@ def with_added_albedo(mesh: Mesh, added: np.ndarray, encoding: str, gain: float 
 
     colors, uvs, textures = np.ones_like(mesh.corner_colors), mesh.corner_uvs.copy(), []
     plain = np.flatnonzero(mesh.texture_ids < 0)
-    of_corners = decode(torch.from_numpy(mesh.corner_colors), encoding)
     colors[plain] = painted(of_corners[plain].flatten(0, 1), plain.repeat(3)).view(-1, 3, 3).numpy()
-    decoded = decode(torch.arange(256, dtype=torch.float32) / 255, encoding)
     for index, source in enumerate(mesh.textures):
         faces = np.flatnonzero(mesh.texture_ids == index)
         charts = _Charts(mesh.corner_uvs[faces], source.shape[1::-1])

@@ -242,6 +242,17 @@ def test_the_derivative_by_what_is_added_is_that_of_finite_differences():
     assert torch.autograd.gradcheck(lambda each: painted_albedo(mesh, fragments, "srgb", 1.5, each), [added])
 
 
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_gain_that_is_left_is_no_larger_than_the_lightest_colour_needs(encoding):
+    """So that a dark texture, which a large gain brightens, loses little to 8 bits."""
+    texture = random_texture(16, 16) // 3
+    mesh, added = poster(texture, color=(0.9, 0.5, 0.7)), np.zeros((2, 3))
+    lightest = float(linear_of(texture / 255, encoding).max() * linear_of(np.array(0.9), encoding))
+    painted, gain = with_added_albedo(mesh, added, encoding, 4 / lightest)
+    assert gain == pytest.approx(4, rel=1e-5) and painted.textures[0].max() <= 255
+    assert with_added_albedo(mesh, added, encoding, 0.5 / lightest)[1] == 1
+
+
 @pytest.mark.parametrize(("encoding", "gain"), [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)])
 def test_colours_and_textures_hold_what_was_added(encoding, gain):
     """Colours at corners to float32; texels, in which no colours vary, to half of a step of 8 bits, encoded."""
@@ -250,7 +261,7 @@ def test_colours_and_textures_hold_what_was_added(encoding, gain):
     mesh = replace(mesh, corner_colors=np.where((mesh.texture_ids >= 0)[:, None, None], even, mesh.corner_colors))
     added = 0.6 * (draw(len(mesh.faces), 3) - 0.5)
     painted, new_gain = with_added_albedo(mesh, added.numpy(), encoding, gain)
-    assert new_gain == max(1, gain)
+    assert 1 <= new_gain <= max(1, gain)
     bare = torch.from_numpy(mesh.texture_ids < 0)
     step = {"linear": 0.5 / 255, "srgb": 0.5 / 255 * 2.4 / 1.055}[encoding] * new_gain  # the curve's steepest, at 1
     for polar in (0.3, 1.5, 2.8):
