@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from augment.progress import progress
 from renderer.errors import InputError
 from train.cli import script
 from train.comparison import format_comparison
@@ -26,7 +27,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    runs = [summarise(Path(run)) for run in settings.runs]
+    runs = [summarise(Path(run)) for run in progress(settings.runs, "runs")]
     print(format_comparison(runs, settings.exclude, settings.photographs))
 
 

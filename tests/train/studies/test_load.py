@@ -18,12 +18,14 @@ def test_a_sphere_of_many_faces_is_a_mesh(tmp_path):
 
 
 def test_a_command_is_observed_on_a_terminal_to_its_end_and_until_ctrl_c(tmp_path):
-    talks = [
-        "-c",
-        "import sys; bytes(10**8); print(' 50%|###  |'); print(sys.stderr.isatty(), file=sys.stderr); sys.exit(3)",
-    ]
-    whole = observe(talks, tmp_path, patience=60)
+    talks = (
+        "import sys, time; full = b'x' * 10**8; time.sleep(0.3); print(' 50%|###  |');"
+        "print(sys.stderr.isatty(), file=sys.stderr); sys.exit(3)"
+    )
+    whole = observe(["-c", talks], tmp_path, patience=60)
     assert (whole.status, whole.said, whole.progress) == (3, "True", True) and whole.memory > 10**8
+    bar = observe(["-c", "from tqdm import tqdm; [*tqdm(range(9))]"], tmp_path, patience=60)
+    assert bar.progress and 0 < bar.memory < whole.memory
     waits = observe(["-c", "while True: pass"], tmp_path, patience=1)
     assert (
         waits.status == 128 + signal.SIGINT

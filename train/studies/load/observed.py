@@ -2,10 +2,12 @@
 
 import os
 import pty
+import re
 import select
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,10 +40,11 @@ def observe(command: Sequence[str], folder: Path, patience: float) -> Observed:
     arguments = [str(ROOT / word) if word.startswith("scripts/") else word for word in command]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     terminal, end = pty.openpty()
+    termios.tcsetwinsize(end, (24, 80))  # on one without a width tqdm draws no bar
     start = time.monotonic()
     process = subprocess.Popen([sys.executable, *arguments], cwd=folder, env=environment, stdout=end, stderr=end)
     os.close(end)
-    signalled, cpu_before, output = None, 0.0, b""
+    signalled, cpu_before, memory, output = None, 0.0, 0, b""
     try:
         while True:
             output += _read(terminal)
@@ -49,6 +52,7 @@ def observe(command: Sequence[str], folder: Path, patience: float) -> Observed:
             now = time.monotonic()
             if ended:
                 break
+            memory = max(memory, _peak_memory(process.pid))
             if signalled is None and (cpu_before := _cpu(process.pid)) > patience:
                 signalled = now
                 process.send_signal(signal.SIGINT)
@@ -65,7 +69,7 @@ def observe(command: Sequence[str], folder: Path, patience: float) -> Observed:
         status=status if status >= 0 else 128 - status,
         seconds=now - start,
         cpu=cpu,
-        memory=1024 * used.ru_maxrss,
+        memory=memory,
         after_signal=now - (signalled or now),
         cpu_after=cpu - cpu_before if signalled else 0.0,
         said=next((line for line in reversed(text.splitlines()) if line.strip()), ""),
@@ -77,6 +81,12 @@ def _cpu(process: int) -> float:
     """Seconds of a core that a process has taken."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _peak_memory(process: int) -> int:
+    """Bytes. What `wait4` tells begins with the peak of the process that started it."""
+    status = Path(f"/proc/{process}/status").read_text()
+    return 1024 * int(found[1]) if (found := re.search(r"VmHWM:\s+(\d+) kB", status)) else 0  # none once it has ended
 
 
 def _read(terminal: int) -> bytes:
