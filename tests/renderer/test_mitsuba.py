@@ -14,7 +14,7 @@ import torch
 import trimesh
 from scipy.special import sph_harm_y
 
-from renderer import radiosity, rays
+from renderer import rays
 from renderer.camera import OrthographicCamera
 from renderer.mesh import Mesh, concatenate
 from renderer.transfer import ImageSettings, build_operators
@@ -270,7 +270,6 @@ def test_the_outline_is_mitsubas_to_a_sixteenth_of_a_pixel(solid, view):
 def test_shadows_and_bounces_are_mitsubas_within_its_noise(solid, view, bounces, monkeypatch):
     """With rays enough for a quadrature of 0.5 % of the brightest, root mean square, and 0.1 % on average."""
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
-    monkeypatch.setattr(radiosity, "PATCHES", 2**9)
     theirs, noise = mitsuba_image(solid, view, 32, 128, bounces)
     inside, brightest = theirs[..., 3] == 1, theirs[..., :3].max()
     ours, less = (
