@@ -59,9 +59,8 @@ def build_scene(
     """
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
     basis, lights = with_placed(sky, [each.build() for each in (projector, lamps) if each is not None])
-    objects = [_object(member, vertices) for member in meshes]
     return Scene.grid(
-        objects if ground is None else [on_ground(item, ground) for item in objects],
+        [on_ground(_object(member, vertices), ground) for member in meshes],
         ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
         load_backgrounds(backgrounds, size),
         lights.to(device),

@@ -61,11 +61,14 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
     return SceneObject(item.label, normalise(subdivide(mesh, vertices)), item.gain, item.mesh)
 
 
-def on_ground(item: SceneObject, color: Sequence[float]) -> SceneObject:
-    """The object on a square table, as one mesh; color: RGB, sRGB-encoded in [0, 1], multiplied with the gain, too.
+def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
+    """The object on a square table, as one mesh; color: RGB, sRGB-encoded in [0, 1], multiplied with the gain, too, or
+    None for no table.
 
     InputError: no colour.
     """
+    if color is None:
+        return item
     if len(color) != 3 or not all(0 <= each <= 1 for each in color):
         raise InputError(f"scene.ground={color} must be red, green and blue from 0 to 1")
     lowest = item.mesh.vertices[np.unique(item.mesh.faces), 2].min()
@@ -80,8 +83,7 @@ def another_individual(item: SceneObject, seed: int) -> SceneObject:
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item
-    other = replace(item, mesh=normalise(solid(rest[0], seed)))
-    return other if item.ground is None else on_ground(other, item.ground)
+    return on_ground(replace(item, mesh=normalise(solid(rest[0], seed))), item.ground)
 
 
 def _colored(mesh: Mesh, item: ObjectSettings) -> Mesh:

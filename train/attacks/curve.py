@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from augment.attacks.sweep import Sweep
-from train.photographs.shares import share
+from train.photographs.shares import counted, share
 from train.showcase.plots import COLOURS, LINES, MARKERS
 from train.tables import aligned
 
@@ -41,9 +41,8 @@ def format_curve(sweep: Sweep) -> str:
     """One mesh's, a line per radius."""
     if not sweep.adversarial.numel():
         return "nothing was recognised before, so that there is no success against radius"
-    cells = "{hits} of {n} [{low:.0%}, {high:.0%}]"
     rows = [
-        [_words(radii), *(cells.format(**share(int(each.sum()), len(each))) for each in (adversarial, random))]
+        [_words(radii), *(counted(share(int(each.sum()), len(each))) for each in (adversarial, random))]
         for radii, adversarial, random in zip(sweep.radii, sweep.adversarial, sweep.random, strict=True)
     ]
     return aligned(["radius", *METHODS.values()], rows)

@@ -12,7 +12,7 @@ from augment.attacks.transfer import Transfer
 from augment.objects import load_object, on_ground
 from renderer.errors import InputError
 from train.attacks.settings import AttackExperimentSettings
-from train.photographs.shares import share
+from train.photographs.shares import counted, share
 from train.run_classifier import load_classifier
 from train.settings import read_object
 from train.tables import aligned
@@ -30,9 +30,7 @@ def load_others(settings: AttackExperimentSettings, device: torch.device) -> dic
     for classifier in classifiers:
         classifier.label(settings.label)  # before anything is attacked
     items = [read_object(item, settings.label, index, "transfer.meshes") for index, item in enumerate(asked.meshes)]
-    objects = [load_object(item, scene.vertices) for item in items]
-    if scene.ground is not None:
-        objects = [on_ground(item, scene.ground) for item in objects]
+    objects = [on_ground(load_object(item, scene.vertices), scene.ground) for item in items]
     others = {"classifiers": classifiers, "azimuths": asked.azimuths, "objects": objects}
     return {name: each for name, each in others.items() if each}
 
@@ -55,12 +53,10 @@ def write_transfers(found: Sequence[Transfer], folder: Path) -> None:
 
 def format_transfers(found: Sequence[Transfer]) -> str:
     """The shares as a table."""
-    cells = "{hits} of {n} [{low:.0%}, {high:.0%}]"
     rows = []
     for each in found:
-        counted = _share(each)
-        fooled = cells.format(**counted) if counted["n"] else "none of 0"
-        rows.append([f"{each.kind} {each.name}", f"{counted['n']} of {len(each.recognised)}", fooled])
+        found_here = _share(each)
+        rows.append([f"{each.kind} {each.name}", f"{found_here['n']} of {len(each.recognised)}", counted(found_here)])
     return aligned(["what fools, shown to", "recognised before", "fooled"], rows)
 
 
