@@ -23,8 +23,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
 from renderer.errors import InputError, is_out_of_memory
+from train.configuration import read_settings
 from train.distributed import is_process_lost
-from train.settings import read_settings
 
 USER_ERROR = 2
 LONGEST_NAME = 200  # characters

@@ -6,7 +6,6 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
-import torchvision
 from torch import Tensor
 
 from augment.seeding import generator
@@ -79,8 +78,10 @@ def channel_statistics(images: Tensor) -> tuple[list[float], list[float]]:
 
 def load_cifar100(path: str) -> DataSet:
     """torchvision's CIFAR-100 in folder `path`, downloaded where there is a network, checksums verified."""
+    from torchvision.datasets import CIFAR100
+
     try:
-        train, test = (torchvision.datasets.CIFAR100(path, train=part, download=True) for part in (True, False))
+        train, test = (CIFAR100(path, train=part, download=True) for part in (True, False))
     except (OSError, RuntimeError) as error:
         raise InputError(
             f"data.path={path}: CIFAR-100 is not there and cannot be downloaded ({error}); "

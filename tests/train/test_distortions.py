@@ -6,7 +6,7 @@ from torchvision.transforms import v2
 
 from augment import processes
 from renderer.image import to_unit
-from train.distortions import DISTORTIONS, RADIUS, TRANSFORMS, distortion
+from train.distortions import DISTORTIONS, RADIUS, TRANSFORMS, distortion, torchvision_transform
 from train.wideresnet import WideResNet
 
 
@@ -55,7 +55,7 @@ def test_colour_jitter_is_torchvisions(images, model):
     grey = torch.full_like(images, 100)
     found = distortion("color_jitter", model, 0)(grey, LABELS, 0)
     assert found.min() >= 60 - 1 and found.max() <= 140 + 1
-    assert isinstance(TRANSFORMS["color_jitter"](), v2.ColorJitter)
+    assert isinstance(torchvision_transform("color_jitter"), v2.ColorJitter)
 
 
 def test_pgd_stays_within_its_radius_and_raises_the_loss(images, model):

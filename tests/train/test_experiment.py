@@ -21,11 +21,12 @@ from augment.labels import anything_but
 from augment.variation import VariationSettings
 from renderer.errors import InputError
 from train import checkpoint, fit
+from train.configuration import read_settings
 from train.data import DataSet
 from train.experiment import load_data, prepare, run
 from train.interruption import Interrupted
 from train.logs import read_metrics
-from train.settings import ExperimentSettings, read_settings, require_same_settings
+from train.settings import ExperimentSettings, require_same_settings
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:

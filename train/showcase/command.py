@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from augment.parameters import KINDS
 from train.cli import quoted
-from train.settings import as_dict, dotted
+from train.configuration import as_dict, dotted
 
 CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "out", "train.resume", "data.images")
 DATA = ("cifar100", "npz", "folder")  # besides the default

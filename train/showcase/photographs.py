@@ -6,12 +6,13 @@ from typing import Any
 
 from renderer.errors import InputError
 from train.comparison import difference_tables, read_evaluations
+from train.configuration import as_dict
 from train.photographs import figure_title, find_figure, format_interval
 from train.photographs.answers_table import ANSWERS, read_answers
 from train.photographs.figures import pool_all
 from train.photographs.ranking import Ranking
 from train.report import RunSummary, complete
-from train.settings import PHOTOGRAPHS, as_dict
+from train.settings import PHOTOGRAPHS
 from train.showcase import images, plots
 from train.showcase.arms import Arms, Score, score
 from train.showcase.blocks import Block, Gallery, Illustration, Section

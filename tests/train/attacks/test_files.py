@@ -21,7 +21,8 @@ from renderer.mesh import load_mesh
 from renderer.mesh_damage import mesh_damage
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
-from train.settings import read_object, read_settings
+from train.configuration import read_settings
+from train.settings import read_object
 
 CLASSES = ("orange", "lime", "sky")
 

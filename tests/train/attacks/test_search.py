@@ -13,7 +13,8 @@ from renderer.errors import InputError
 from train.attacks.experiment import attacks
 from train.attacks.search import overrides, search
 from train.attacks.settings import AttackExperimentSettings
-from train.settings import read_object, read_settings
+from train.configuration import read_settings
+from train.settings import read_object
 
 CPU = torch.device("cpu")
 CHANGED = ("polar", "azimuth", "field_of_view", "light", "exposure")

@@ -12,9 +12,10 @@ from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.cli import command_line
+from train.configuration import read_settings
 from train.outputs import writable_folder
 from train.run_classifier import load_classifier
-from train.settings import SceneSettings, read_object, read_settings
+from train.settings import SceneSettings, read_object
 from train.studies.figures import pyplot
 from train.studies.page import joined, versions, wrapped, write
 from train.studies.paper import (

@@ -11,10 +11,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import require_range
+from train.configuration import read_settings
 from train.data import DataSet, Split, channel_statistics, stratified_split
 from train.device import choose_precision
 from train.experiment import load_data
-from train.settings import ExperimentSettings, read_settings
+from train.settings import ExperimentSettings
 from train.studies.training_speed.arm import Arm
 from train.studies.training_speed.baseline import Baseline, build_loader
 from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, PRODUCTS, Findings, Turn, Workload

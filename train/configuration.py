@@ -1,0 +1,67 @@
+"""A configuration as OmegaConf composed it, read into dataclasses or plain values; errors name the key at fault."""
+
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar, cast
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from renderer.errors import InputError
+
+Settings = TypeVar("Settings")
+
+
+def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") -> Settings:
+    """The dataclass from its configuration; InputError naming the key that is unknown, unset or of the wrong type."""
+    if unset := OmegaConf.missing_keys(config):
+        raise InputError(f"{min(unset)} is not set: give {min(unset)}=...")
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(kind), config)
+        for nested in _nested(merged):
+            raise InputError(f"{'.'.join(filter(None, (parent, nested)))}: give a plain value, no list or mapping")
+        return cast(Settings, OmegaConf.to_object(merged))
+    except OmegaConfBaseException as error:
+        within = error.full_key or ""
+        at_fault = (
+            key for key, value in dotted(as_dict(config)) if key.startswith(within) and not _fits(kind, key, value)
+        )
+        key = ".".join(filter(None, (parent, next(at_fault, within))))
+        said = "give a list, as in [a,b]" if "is not a ListConfig" in str(error.msg) else str(error.msg).splitlines()[0]
+        raise InputError(f"{key}: {said}") from error
+
+
+def _nested(node: Any) -> Iterator[str]:
+    """The keys of lists and mappings that stand where plain values are declared, which OmegaConf lets pass."""
+    if isinstance(node, ListConfig | DictConfig) and not (node._is_none() or node._is_missing()):
+        plain = node._metadata.element_type in (str, int, float, bool)
+        keys: Iterable[Any] = range(len(node)) if isinstance(node, ListConfig) else node
+        for key in keys:
+            child = node._get_node(key)
+            if plain and OmegaConf.is_config(child):
+                yield node._get_full_key(key)
+            yield from _nested(child)
+
+
+def _fits(kind: type, key: str, value: object) -> bool:
+    """Whether a value is no fault by itself, of which OmegaConf names the group at most."""
+    alone = OmegaConf.create()
+    OmegaConf.update(alone, key, value, force_add=True)
+    try:
+        OmegaConf.merge(OmegaConf.structured(kind), alone)
+    except OmegaConfBaseException:
+        return False
+    return True
+
+
+def as_dict(config: DictConfig, resolve: bool = False) -> dict[str, Any]:
+    """The settings as plain dictionaries and lists."""
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=resolve))
+
+
+def dotted(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
+    """The values of nested settings by dotted key."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from dotted(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
