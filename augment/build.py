@@ -39,6 +39,7 @@ def build_scene(
     polar: float = 60.0,
     azimuth: float = 0.0,
     field_of_view: float = 2.0,
+    perspective: float | None = None,
     vertices: int = 0,
     samples: int = 2,
     encoding: str = "linear",
@@ -54,14 +55,16 @@ def build_scene(
     example share one light, shape or colour; otherwise each is an example. backgrounds: grey values or image files.
     light: coefficients or what `renderer.load_light` takes; exposure multiplies it. projector, lamps: that shine as
     well. ground: the colour of a table under each mesh (`on_ground`). polar: degrees off +z; azimuth: of the first
-    view, off +x. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility: as for
-    `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
+    view, off +x. field_of_view: width of the image in world units. perspective: degrees between its sides, None of an
+    orthographic camera. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility:
+    as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
     basis, lights = with_placed(sky, [each.build() for each in (projector, lamps) if each is not None])
+    angle = None if perspective is None else math.radians(perspective)
     return Scene.grid(
         [on_ground(_object(member, vertices), ground) for member in meshes],
-        ring(views, field_of_view, math.radians(polar), math.radians(azimuth)),
+        ring(views, field_of_view, math.radians(polar), math.radians(azimuth), angle),
         load_backgrounds(backgrounds, size),
         lights.to(device),
         ImageSettings(size, samples, encoding, normals, transport),

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from augment.objects import SceneObject
 from renderer.basis import Basis
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.fragments import Fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
@@ -27,16 +27,16 @@ class HeldTransport:
     def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis):
         self.mesh, self._settings = mesh, settings
         self._transport = build_transport(mesh, settings, gain, basis)
-        self._views: dict[OrthographicCamera, tuple[Tensor, Tensor] | None] = {}
+        self._views: dict[Camera, tuple[Tensor, Tensor] | None] = {}
 
     def fits(self, vertices: np.ndarray) -> bool:
         """Whether vertices (V, 3) are near the mesh's."""
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
-    def knows(self, camera: OrthographicCamera) -> bool:
+    def knows(self, camera: Camera) -> bool:
         return camera in self._views
 
-    def add(self, camera: OrthographicCamera, fragments: Fragments, albedo: Tensor) -> None:
+    def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
         """A view of the mesh, and its albedo there (S, 3)."""
         surface = Surface.of(self.mesh, fragments.to("cpu"), self._settings)
         change = self._transport.change(surface, albedo.cpu().double()) if self._transport else None
@@ -47,7 +47,7 @@ class HeldTransport:
             canvas[..., surface.fragments.pixels] = change
             self._views[camera] = canvas.to(albedo), _by_pixel(fragments, albedo)
 
-    def radiance(self, camera: OrthographicCamera, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
+    def radiance(self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
         """(3, P) of a known view's fragments with albedo (S, 3) in a light (size, 3); differentiable in both."""
         view = self._views[camera]
         if view is None:

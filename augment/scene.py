@@ -22,7 +22,7 @@ from augment.progress import progress
 from renderer.albedo import painted_albedo, surface_albedo
 from renderer.basis import HARMONICS, Basis, Sum, parts_of
 from renderer.cache import OperatorCache
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, behind, clamp, clamped, develop_composite
@@ -47,7 +47,7 @@ class Example:
     """
 
     object: int
-    cameras: tuple[OrthographicCamera, ...]
+    cameras: tuple[Camera, ...]
     background: int
     exposure: float = 1.0
 
@@ -135,16 +135,16 @@ class Scene:
         self._per_stack = max(1, STACKED // pixels)
         # What is kept of views; `functools.cache` would tie a scene that each epoch replaces to itself.
         self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
-        self._fragments_of_meshes: dict[tuple[int, OrthographicCamera], tuple[Fragments, Tensor]] = {}
+        self._fragments_of_meshes: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
         self._transports = HeldTransports(settings, basis)
         self._rays: dict[int, Rays] = {}
-        self._lamplit_views: dict[tuple[int, OrthographicCamera], Lamplit] = {}
+        self._lamplit_views: dict[tuple[int, Camera], Lamplit] = {}
 
     @classmethod
     def grid(
         cls,
         objects: Sequence[SceneObject],
-        cameras: Sequence[OrthographicCamera],
+        cameras: Sequence[Camera],
         backgrounds: Tensor,
         light: Tensor,
         settings: ImageSettings,
@@ -164,7 +164,7 @@ class Scene:
     def of_mesh(
         cls,
         mesh: Mesh,
-        cameras: Sequence[Sequence[OrthographicCamera]],
+        cameras: Sequence[Sequence[Camera]],
         backgrounds: Tensor,
         light: Tensor,
         settings: ImageSettings,
@@ -203,7 +203,7 @@ class Scene:
         return self.backgrounds.unflatten(2, (self.settings.size, -1))
 
     @cached_property
-    def cameras(self) -> list[tuple[OrthographicCamera, ...]]:
+    def cameras(self) -> list[tuple[Camera, ...]]:
         """The V of each example."""
         return [example.cameras for example in self.examples]
 
@@ -319,7 +319,7 @@ class Scene:
             yield _Layer([image], fragments.pixels, composite[None], coverage[None], [0])
 
     def _reshaded_view(
-        self, index: int, camera: OrthographicCamera, light: Tensor, conditions: Conditions, row: int
+        self, index: int, camera: Camera, light: Tensor, conditions: Conditions, row: int
     ) -> tuple[Fragments, Tensor]:
         """What a camera sees of an example under the conditions of one row, with its radiance (3, P)."""
         number = self.examples[index].object
@@ -366,13 +366,13 @@ class Scene:
         added = behind(stack.coverage[stack.shown], backgrounds[which], self.settings.encoding)
         return stack, here.cumsum(0) - 1, added
 
-    def _still(self, number: int, camera: OrthographicCamera) -> tuple[Fragments, Tensor]:
+    def _still(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
         view = number, camera
         if view not in self._fragments_of_meshes:
             self._fragments_of_meshes[view] = self._fragments(number, camera, self.objects[number].mesh.vertices)
         return self._fragments_of_meshes[view]
 
-    def _lamplit(self, number: int, camera: OrthographicCamera) -> Lamplit:
+    def _lamplit(self, number: int, camera: Camera) -> Lamplit:
         view = number, camera
         if view not in self._lamplit_views:
             rays = self._rays.setdefault(number, Rays(self.objects[number].mesh))
@@ -380,7 +380,7 @@ class Scene:
             self._lamplit_views[view] = Lamplit(rays, self.objects[number].mesh, fragments, albedo, self.settings)
         return self._lamplit_views[view]
 
-    def _held(self, index: int, camera: OrthographicCamera, vertices: np.ndarray) -> HeldTransport:
+    def _held(self, index: int, camera: Camera, vertices: np.ndarray) -> HeldTransport:
         """Of a shape near the vertices of an example, and with the camera's view of it."""
         number = self.examples[index].object
         held = self._transports.near(index, number, self.objects[number], vertices)
@@ -388,7 +388,7 @@ class Scene:
             held.add(camera, *self._fragments(number, camera, held.mesh.vertices))
         return held
 
-    def _fragments(self, number: int, camera: OrthographicCamera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
+    def _fragments(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
         """What a camera sees of an object's moved vertices, and the albedo there (S, 3)."""
         item = self.objects[number]
         (fragments,) = build_fragments(

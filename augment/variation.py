@@ -14,7 +14,7 @@ from augment.objects import SceneObject, another_individual
 from augment.scene import Example, Scene
 from augment.snapshot import SnapshotSettings, draw_snapshot
 from renderer.cache import OperatorCache
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.harmonics import irradiance_basis, live_coefficients
 from renderer.image import clamp, decode, encode
@@ -116,7 +116,7 @@ def _between(limits: Sequence[float], count: int, draws: torch.Generator) -> lis
 
 
 def _moved(row: Example, right: float, up: float, scale: float) -> Example:
-    def moved(camera: OrthographicCamera) -> OrthographicCamera:
+    def moved(camera: Camera) -> Camera:
         width = camera.field_of_view / scale
         return replace(camera, field_of_view=width, right=camera.right + right * width, up=camera.up + up * width)
 
@@ -138,7 +138,7 @@ def _angles(most: float, count: int, draws: torch.Generator) -> list[list[float]
 
 
 def _turned(row: Example, polar: float, azimuth: float) -> Example:
-    def turned(camera: OrthographicCamera) -> OrthographicCamera:
+    def turned(camera: Camera) -> Camera:
         return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
     return replace(row, cameras=tuple(turned(camera) for camera in row.cameras))

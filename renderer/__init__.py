@@ -5,7 +5,7 @@ from renderer.lazy import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        "camera": ["OrthographicCamera", "ring"],
+        "camera": ["OrthographicCamera", "PerspectiveCamera", "ring"],
         "errors": ["InputError"],
         "image": ["ImageSettings"],
         "lights": ["load_light", "save_light"],

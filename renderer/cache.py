@@ -20,7 +20,7 @@ from torch import Tensor
 
 from renderer import sparse
 from renderer.basis import HARMONICS, Basis
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
@@ -155,7 +155,7 @@ class OperatorCache(TensorCache):
     def operators(
         self,
         mesh: Mesh,
-        cameras: Sequence[OrthographicCamera],
+        cameras: Sequence[Camera],
         settings: ImageSettings,
         backend: Backend,
         gain: float = 1.0,

@@ -1,20 +1,29 @@
-"""Orthographic cameras that look at the origin, and rings of them. World axes are right-handed with z up."""
+"""Orthographic and perspective cameras that look at the origin, and rings of them.
+
+World axes are right-handed with z up.
+"""
 
 import math
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from renderer.errors import LARGEST, InputError, require_range
 
+REACH = 2.0  # world units from the origin along the view within which surface is seen: a normalised mesh's radius is √3
+NEAREST = 0.01  # of its distance: what comes nearer to a camera than that is no view of a mesh
+
 
 @dataclass(frozen=True)
-class OrthographicCamera:
-    """A parallel projection from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
+class Camera(ABC):
+    """A square image from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
 
-    field_of_view: width of the square image in world units; a normalised mesh spans at most [-1, 1] per axis.
-    right, up: where the origin lies in the image, in world units from its middle.
-    InputError where the field of view is not positive, an angle is not finite, or any is too large.
+    field_of_view: width of the image in world units, at the origin; a normalised mesh spans at most [-1, 1] per axis.
+    right, up: where the origin lies in the image, in world units from its middle: by so much the camera stands aside.
+    distance: of its plane from the origin. InputError where a width or distance is not positive, an angle is not
+    finite, or any is too large.
     """
 
     polar: float
@@ -23,12 +32,23 @@ class OrthographicCamera:
     right: float = 0.0
     up: float = 0.0
 
+    distance: ClassVar[float]
+
     def __post_init__(self) -> None:
         require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
         if not (abs(self.right) <= LARGEST and abs(self.up) <= LARGEST):  # NaN is not
             raise InputError(f"camera place right={self.right}, up={self.up}: give lengths of at most {LARGEST:g}")
+
+    @property
+    def near(self) -> float:
+        """Distance from which on it sees surface, up to `far`."""
+        return max(self.distance - REACH, NEAREST * self.distance)
+
+    @property
+    def far(self) -> float:
+        return self.distance + REACH
 
     def axes(self) -> np.ndarray:
         """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""
@@ -38,19 +58,87 @@ class OrthographicCamera:
         right = [-sin_azimuth, cos_azimuth, 0.0]
         return np.array([right, np.cross(back, right), back])
 
+    def position(self) -> np.ndarray:
+        """(3,) where it stands."""
+        return np.array([-self.right, -self.up, self.distance]) @ self.axes()
+
+    @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
         """World points (V, 3) to normalised device coordinates (V, 3): x right, y up, z depth.
 
-        The image is [-1, 1]² in x and y. Depth is smaller where nearer and in [-1, 1] within 2 world units of the
-        origin, which every normalised mesh (radius at most √3) is.
+        The image is [-1, 1]² in x and y. Depth is smaller where nearer, from -1 at `near` to 1 at `far`, and planes
+        stay planes in it.
         """
-        scale = np.array([2 / self.field_of_view, 2 / self.field_of_view, -1 / 2])
+
+    @abstractmethod
+    def depths(self, points: np.ndarray) -> np.ndarray | None:
+        """(V,) along the view from the camera to world points (V, 3), by which an image with perspective is divided;
+        None of one without."""
+
+
+@dataclass(frozen=True)
+class OrthographicCamera(Camera):
+    """A parallel projection."""
+
+    distance: ClassVar[float] = 4.0  # in files: in an image it shows nowhere
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        scale = np.array([2 / self.field_of_view, 2 / self.field_of_view, -1 / REACH])
         return points @ (self.axes() * scale[:, None]).T + np.array([self.right, self.up, 0.0]) * scale
+
+    def depths(self, points: np.ndarray) -> None:
+        return None
+
+
+@dataclass(frozen=True)
+class PerspectiveCamera(Camera):
+    """A pinhole at a distance; from far away, an orthographic camera of the same field of view sees the same."""
+
+    distance: float = field(kw_only=True)  # type: ignore[misc]  # each has its own, where orthographic cameras share one
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_range("a camera's distance", self.distance, 1 / LARGEST, LARGEST)
+
+    @property
+    def angle(self) -> float:
+        """Between opposite sides of the image, in radians."""
+        return 2 * math.atan(self.field_of_view / 2 / self.distance)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """InputError: as `depths`."""
+        depths, (right, up, back) = self.depths(points), self.axes() @ points.T
+        scale = 2 / self.field_of_view * (self.distance / depths)
+        before = self.distance - self.near
+        depth = 2 * self.far / (self.far - self.near) * ((before - back) / depths) - 1
+        return np.stack([(right + self.right) * scale, (up + self.up) * scale, depth], axis=1)
+
+    def depths(self, points: np.ndarray) -> np.ndarray:
+        """InputError where a point lies behind the camera or as good as there."""
+        depths = self.distance - points @ self.axes()[2]
+        if not (depths >= NEAREST * self.distance).all():
+            raise InputError(
+                f"a camera at distance {self.distance:g} is within the mesh, or the mesh behind it: give a larger "
+                "distance (a smaller scene.perspective or a larger scene.field_of_view), or normalise the mesh"
+            )
+        return depths
 
 
 def ring(
-    views: int, field_of_view: float, polar: float = math.pi / 3, azimuth: float = 0.0
-) -> list[OrthographicCamera]:
-    """Cameras at one polar angle and equally spaced azimuths from a first (the paper's appendix C: π/3 and 10)."""
+    views: int,
+    field_of_view: float,
+    polar: float = math.pi / 3,
+    azimuth: float = 0.0,
+    perspective: float | None = None,
+) -> list[Camera]:
+    """Cameras at one polar angle and equally spaced azimuths from a first (the paper's appendix C: π/3 and 10).
+
+    perspective: the angle between opposite sides of the image, in radians, which says how far off perspective cameras
+    are; None of orthographic ones.
+    """
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
-    return [OrthographicCamera(polar, each, field_of_view) for each in azimuths]
+    if perspective is None:
+        return [OrthographicCamera(polar, each, field_of_view) for each in azimuths]
+    require_range("a camera's perspective", perspective, 1e-3, 3)
+    distance = field_of_view / 2 / math.tan(perspective / 2)
+    return [PerspectiveCamera(polar, each, field_of_view, distance=distance) for each in azimuths]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.errors import require_finite
 from renderer.image import ImageSettings
 from renderer.visibility import Backend
@@ -32,6 +32,7 @@ class Fragments:
     outlines: (G, 3, 2) float64, their corners as projected, x right and y up in [-1, 1].
     pixel, face: (S,) int64, indices into `pixels` and `faces`; samples of a pixel lie together.
     sample: (S,) int64, their place in the image: pixel by pixel, and row by row within a pixel.
+    depths: (G, 3) float64 of the corners, by which perspective divides (`Camera.depths`); None without perspective.
     """
 
     size: int
@@ -45,9 +46,14 @@ class Fragments:
     pixel: Tensor
     face: Tensor
     sample: Tensor
+    depths: Tensor | None = None
 
     def barycentric(self) -> Tensor:
-        """(S, 3) float64 weights of the faces' corners at the samples, clipped into the face: corners were snapped."""
+        """(S, 3) float64 weights of the faces' corners at the samples, clipped into the face: corners were snapped.
+
+        What is linear on a face is, under perspective, a quotient of linear functions in the image: both of it are
+        interpolated there (Heckbert and Moreton 1991).
+        """
         return self._barycentric.T
 
     @cached_property
@@ -59,13 +65,17 @@ class Fragments:
         area = bx * cy - cx * by
         scaled = edges / area.masked_fill(area == 0, 1)
         faces = torch.cat([outlines[:, 0], scaled.flatten(0, 1)])
+        nearness = None if self.depths is None else self.depths.T.reciprocal()
         weights = faces.new_empty(3, len(self.face))
         for weight, face, at in _blocks(weights, self.face, self.positions().T):
             x0, y0, bx, cx, by, cy = faces.index_select(1, face)
             x, y = at[0] - x0, at[1] - y0
             weight[1], weight[2] = x * cy - y * cx, y * bx - x * by
             weight[0] = 1 - weight[1] - weight[2]
-            weight.clamp_(0, 1).div_(weight.sum(0))
+            weight.clamp_(0, 1)
+            if nearness is not None:
+                weight.mul_(nearness.index_select(1, face))
+            weight.div_(weight.sum(0))
         return weights
 
     def positions(self) -> Tensor:
@@ -135,7 +145,7 @@ class _Interpolation(torch.autograd.Function):
 def build_fragments(
     vertices: np.ndarray,
     faces: np.ndarray,
-    cameras: Sequence[OrthographicCamera],
+    cameras: Sequence[Camera],
     settings: ImageSettings,
     backend: Backend,
     closed: bool = False,
@@ -144,16 +154,19 @@ def build_fragments(
 
     closed: the mesh is watertight and its faces are counter-clockwise from outside (`Mesh.closed`), so that the ones
     seen from behind need not be drawn, unless the near plane cuts the mesh open. A mesh outside the image has no
-    fragments; that is no error. InputError: NaN.
+    fragments; that is no error. InputError: NaN, or a perspective camera that the mesh is not all in front of.
     """
     require_finite(vertices=torch.from_numpy(vertices))
     points = np.stack([camera.project(vertices) for camera in cameras])
     closed = closed and bool((points[..., 2] >= -1).all())
     ids = backend.rasterise(points, faces, settings.size * settings.samples, closed=closed)
-    return [_fragments(view, faces, view_ids, settings) for view, view_ids in zip(points, ids, strict=True)]
+    depths = [camera.depths(vertices) for camera in cameras]
+    return [_fragments(*view, faces, settings) for view in zip(points, depths, ids, strict=True)]
 
 
-def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settings: ImageSettings) -> Fragments:
+def _fragments(
+    projected: np.ndarray, depths: np.ndarray | None, ids: np.ndarray, faces: np.ndarray, settings: ImageSettings
+) -> Fragments:
     size, samples = settings.size, settings.samples
     within = ids.view(f"V{samples * ids.itemsize}").reshape(size, samples, size)  # a pixel's row of samples as one item
     by_pixel = within.swapaxes(1, 2).reshape(-1).view(ids.dtype)
@@ -182,6 +195,7 @@ def _fragments(projected: np.ndarray, faces: np.ndarray, ids: np.ndarray, settin
         pixel=torch.from_numpy(pixel),
         face=torch.from_numpy(face),
         sample=torch.from_numpy(hits),
+        depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,
     )
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from renderer.basis import HARMONICS, Basis, Placed, parts_of
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera, OrthographicCamera
 from renderer.image import develop
 from renderer.shading import irradiance
 
@@ -15,7 +15,7 @@ _SAMPLES = 2  # per pixel side
 _OBLIQUE = OrthographicCamera(math.pi / 3, 0.0, 2.0)  # the first of `renderer.camera.ring`
 
 
-def light_sphere(light: Tensor, size: int, camera: OrthographicCamera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:
+def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:
     """A diffuse white ball in a light (basis.size, 3), which fills a square image as the camera sees it, on white.
 
     The ball is that of radius 1 about the origin, which says how far lights in the scene are. A light in harmonics may

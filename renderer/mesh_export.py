@@ -13,7 +13,7 @@ from torch.nn.functional import grid_sample
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import NORMALS, decode, encode
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh
@@ -21,12 +21,9 @@ from renderer.normals import vertex_normals
 
 # glTF's names for colours and normals after an underscore, under which trimesh writes any attribute.
 _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
-DISTANCE = 4.0  # of a file's cameras from the origin, in world units: that of an orthographic one shows nowhere
 
 
-def export_mesh(
-    mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[OrthographicCamera] = ()
-) -> None:
+def export_mesh(mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[Camera] = ()) -> None:
     """Write a mesh to a .glb or .ply file. A vertex whose corners differ in colour, uv or normal is written for each.
 
     .glb: `load_mesh` gives back the same surface, to float32: y up, linear colours, one part per texture; a diffuse
@@ -59,7 +56,7 @@ def corner_normals(mesh: Mesh, normals: str) -> np.ndarray:
     return np.where(flat.any(axis=-1, keepdims=True), flat, [0.0, 0.0, 1.0])
 
 
-def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[OrthographicCamera]) -> bytes:
+def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera]) -> bytes:
     parts = [_textured_part(mesh, normals, texture_id) for texture_id in np.unique(mesh.texture_ids)]
     finish = partial(_as_one_mesh, cameras=cameras)
     return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=finish)
@@ -90,7 +87,7 @@ def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int) -> trimesh.
     )
 
 
-def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[OrthographicCamera]) -> None:
+def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
     """One node with the parts as primitives, in order, and colours of full precision: trimesh's own have 8 bits, too
     few for dark linear ones. A node for each camera."""
     primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
@@ -104,19 +101,19 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[OrthographicCamera]) ->
     tree["scenes"] = [{"nodes": list(range(len(tree["nodes"])))}]
 
 
-def _gltf_camera(camera: OrthographicCamera) -> dict[str, Any]:
+def _gltf_camera(camera: Camera) -> dict[str, Any]:
+    planes = {"znear": camera.near, "zfar": camera.far}
+    if isinstance(camera, PerspectiveCamera):
+        return {"type": "perspective", "perspective": {"yfov": camera.angle, "aspectRatio": 1.0, **planes}}
     half = camera.field_of_view / 2
-    return {
-        "type": "orthographic",
-        "orthographic": {"xmag": half, "ymag": half, "znear": DISTANCE - 2, "zfar": DISTANCE + 2},
-    }
+    return {"type": "orthographic", "orthographic": {"xmag": half, "ymag": half, **planes}}
 
 
-def _camera_node(camera: OrthographicCamera, index: int) -> dict[str, Any]:
+def _camera_node(camera: Camera, index: int) -> dict[str, Any]:
     """Where a camera stands, y up; it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
     pose = np.eye(4)
     pose[:3, :3] = camera.axes().T
-    pose[:3, 3] = camera.axes().T @ [-camera.right, -camera.up, DISTANCE]
+    pose[:3, 3] = camera.position()
     return {"camera": index, "name": f"view {index}", "matrix": (Y_UP_TO_Z_UP.T @ pose).T.ravel().tolist()}
 
 

@@ -19,13 +19,13 @@ from PIL import Image
 
 from renderer.albedo_bake import with_added_albedo
 from renderer.basis import Distant, Placed
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera, PerspectiveCamera
 from renderer.environment import write_map
 from renderer.errors import InputError
 from renderer.image import ImageSettings, bounces, decode
 from renderer.lamps import Lamps
 from renderer.mesh import Mesh
-from renderer.mesh_export import DISTANCE, corner_normals
+from renderer.mesh_export import corner_normals
 from renderer.projector import Projector
 
 SCENE = "scene.xml"
@@ -70,7 +70,8 @@ _LAMP = """    <emitter type="point">
         <point name="position" x="{}" y="{}" z="{}"/>
         <rgb name="intensity" value="{} {} {}"/>
     </emitter>"""
-_SENSOR = """    <sensor type="orthographic">
+_SENSOR = """    <sensor type="{kind}">
+        {angle}
         <transform name="to_world"><matrix value="{pose}"/></transform>
         <film type="hdrfilm">
             <integer name="width" value="{size}"/>
@@ -96,7 +97,7 @@ def write_mitsuba_scene(
     folder: Path,
     mesh: Mesh,
     gain: float,
-    cameras: Sequence[OrthographicCamera],
+    cameras: Sequence[Camera],
     settings: ImageSettings,
     light: str,
     placed: Sequence[tuple[Distant | Placed, torch.Tensor]] = (),
@@ -164,27 +165,30 @@ def _emitters(folder: Path, basis: Distant | Placed, coefficients: torch.Tensor,
             yield _LAMP.format(*place, *power)
     elif isinstance(basis, Projector):
         write_map(folder / "pattern.exr", coefficients.view(basis.pixels, basis.pixels, 3))
-        camera = OrthographicCamera(basis.polar, basis.azimuth, 2.0)
+        camera = PerspectiveCamera(basis.polar, basis.azimuth, 1.0, distance=basis.distance)
         yield _PROJECTOR.format(
             file="pattern.exr",
             degrees=math.degrees(basis.field_of_view),
             scale=gain * basis.distance**2,
-            pose=_pose(camera, basis.distance),
+            pose=_pose(camera, 1.0),
         )
 
 
-def _pose(camera: OrthographicCamera, distance: float) -> str:
+def _pose(camera: Camera, scale: float) -> str:
     """Mitsuba's cameras and projectors look along +z and have x to the left."""
     right, up, back = camera.axes()
-    half, pose = camera.field_of_view / 2, np.eye(4)
-    pose[:3, :3] = np.stack([-half * right, half * up, -back], axis=1)
-    pose[:3, 3] = distance * back - camera.right * right - camera.up * up
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([-scale * right, scale * up, -back], axis=1)
+    pose[:3, 3] = camera.position()
     return " ".join(f"{value:.17g}" for value in pose.ravel())
 
 
-def _sensor(camera: OrthographicCamera, size: int) -> str:
+def _sensor(camera: Camera, size: int) -> str:
     """Mitsuba's orthographic camera sees [-1, 1] in x and y."""
-    return _SENSOR.format(pose=_pose(camera, DISTANCE), size=size, samples=SAMPLES)
+    kind, angle, scale = "orthographic", "", camera.field_of_view / 2
+    if isinstance(camera, PerspectiveCamera):
+        kind, angle, scale = "perspective", f'<float name="fov" value="{math.degrees(camera.angle)}"/>', 1.0
+    return _SENSOR.format(kind=kind, angle=angle, pose=_pose(camera, scale), size=size, samples=SAMPLES)
 
 
 def _write_parts(folder: Path, mesh: Mesh, settings: ImageSettings) -> Iterator[str]:

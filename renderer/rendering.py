@@ -13,7 +13,7 @@ from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.basis import Harmonics
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.errors import InputError
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, compose
@@ -32,7 +32,7 @@ _choose = cache(choose)  # "auto" asks the driver, which takes longer than an im
 
 def render(
     mesh: Mesh,
-    cameras: OrthographicCamera | Sequence[OrthographicCamera],
+    cameras: Camera | Sequence[Camera],
     light: Float[Tensor, "coefficients 3"],
     size: int = 224,
     background: float | Float[Tensor, "*views channels size size"] | Float[Tensor, " 3"] = 0.5,
@@ -79,7 +79,7 @@ def render(
 
 def operators(
     mesh: Mesh,
-    cameras: OrthographicCamera | Sequence[OrthographicCamera],
+    cameras: Camera | Sequence[Camera],
     size: int = 224,
     *,
     gain: float = 1.0,
@@ -97,7 +97,7 @@ def operators(
     return build_operators(mesh, _listed(cameras), settings, _choose(visibility), gain)
 
 
-def _listed(cameras: OrthographicCamera | Sequence[OrthographicCamera]) -> Sequence[OrthographicCamera]:
+def _listed(cameras: Camera | Sequence[Camera]) -> Sequence[Camera]:
     listed = cameras if isinstance(cameras, Sequence) else [cameras]
     if not listed:
         raise InputError("cameras is empty: give one camera or several")

@@ -19,7 +19,7 @@ from torch.nn.functional import linear
 
 from renderer.albedo import surface_albedo
 from renderer.basis import HARMONICS, Basis, Distant, Placed, parts_of
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, compose
@@ -171,7 +171,7 @@ def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
 
 def build_operators(
     mesh: Mesh,
-    cameras: Sequence[OrthographicCamera],
+    cameras: Sequence[Camera],
     settings: ImageSettings,
     backend: Backend,
     gain: float = 1.0,

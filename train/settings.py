@@ -68,6 +68,7 @@ class SceneSettings:
     polar: float = 60.0
     azimuth: float = 0.0
     field_of_view: float = 2.0
+    perspective: float | None = None
     vertices: int = 0
     light: str = "grace"
     exposure: float = 1.0
@@ -81,6 +82,7 @@ class SceneSettings:
         require_range("scene.vertices", self.vertices, 0, MOST_VERTICES)
         require_range("scene.polar", self.polar, 0, 180)
         require_range("scene.azimuth", self.azimuth, -360, 360)
+        require_range("scene.perspective", self.perspective, 0.1, 150)
 
     @property
     def choices(self) -> dict[str, Any]:

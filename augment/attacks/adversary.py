@@ -11,7 +11,7 @@ from augment.objects import SceneObject
 from augment.scene import Conditions, Example, Scene
 from renderer.albedo_bake import with_added_albedo
 from renderer.basis import Basis
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.image import ImageSettings
 from renderer.visibility import Backend
 
@@ -26,7 +26,7 @@ class Adversary:
     """
 
     shown: SceneObject
-    cameras: tuple[OrthographicCamera, ...]
+    cameras: tuple[Camera, ...]
     light: Tensor
     basis: Basis
     background: Tensor

@@ -19,7 +19,7 @@ from augment.attacks.adversary import Adversary
 from augment.backgrounds import load_background
 from augment.objects import SceneObject
 from renderer.basis import parts_of, with_placed
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.environment import negative_share, to_map, write_map
 from renderer.errors import FACTOR, InputError, require_bounded, require_file, require_range
 from renderer.image import ImageSettings, to_bytes
@@ -94,7 +94,7 @@ def read_adversary(folder: Path) -> Adversary:
     try:
         description = json.loads(path.read_text(encoding="utf-8"))
         settings = ImageSettings(**description["image"])
-        cameras = tuple(OrthographicCamera(**camera) for camera in description["cameras"])
+        cameras = tuple(_camera(**camera) for camera in description["cameras"])
         label, name, gain = str(description["label"]), str(description["name"]), float(description["gain"])
         mesh, light, pixels = (folder / str(description.get(key)) for key in ("mesh", "light", "pixels"))
         background = description["background"]
@@ -119,6 +119,10 @@ def read_adversary(folder: Path) -> Adversary:
         images=_read_images(folder / f"{AFTER}.npy", shape),
         pixels=_read_images(pixels, shape) if "pixels" in description else None,
     )
+
+
+def _camera(**described: float) -> Camera:
+    return PerspectiveCamera(**described) if "distance" in described else OrthographicCamera(**described)
 
 
 def _write_background(background: Tensor, folder: Path) -> float | str:

@@ -1,6 +1,7 @@
 """Exported meshes: read back, read by trimesh alone, and the bytes of a .glb taken apart by hand."""
 
 import json
+import math
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 
 from renderer.albedo import surface_albedo
-from renderer.camera import OrthographicCamera, ring
+from renderer.camera import OrthographicCamera, PerspectiveCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
@@ -204,21 +205,32 @@ def test_a_glb_has_the_normals_that_the_renderer_shades_with(tmp_path, normals):
 
 def test_a_glbs_cameras_see_what_ours_see(tmp_path):
     """A point through the node's matrix, turned from y up, lands where `project` puts it."""
-    cameras = [*ring(2, 3.0, 1.0, 0.4), OrthographicCamera(2.0, 1.0, 2.5, right=0.3, up=-0.2)]
+    place = {"polar": 2.0, "azimuth": 1.0, "field_of_view": 2.5, "right": 0.3, "up": -0.2}
+    close = [PerspectiveCamera(**place, distance=distance) for distance in (1.2, 3.0)]
+    cameras = [*ring(2, 3.0, 1.0, 0.4), OrthographicCamera(**place), *close]
     export_mesh(box(), tmp_path / "mesh.glb", cameras=cameras)
     blob = (tmp_path / "mesh.glb").read_bytes()
     tree = json.loads(blob[20 : 20 + struct.unpack("<I", blob[12:16])[0]])
-    points = np.random.default_rng(0).normal(size=(20, 3))
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, size=(20, 3))
     x, y, z = points.T
     nodes = [tree["nodes"][index] for index in tree["scenes"][0]["nodes"][1:]]
     assert len(nodes) == len(cameras)
     for camera, node in zip(cameras, nodes, strict=True):
-        pose, lens = np.reshape(node["matrix"], (4, 4)).T, tree["cameras"][node["camera"]]["orthographic"]
-        seen = np.linalg.inv(pose) @ np.stack([x, z, -y, np.ones(20)])
-        expected = camera.project(points)
-        assert_allclose(seen[0] / lens["xmag"], expected[:, 0], atol=1e-12)
-        assert_allclose(seen[1] / lens["ymag"], expected[:, 1], atol=1e-12)
-        assert_allclose((-seen[2] - lens["znear"]) / (lens["zfar"] - lens["znear"]) * 2 - 1, expected[:, 2], atol=1e-12)
+        pose, lens = np.reshape(node["matrix"], (4, 4)).T, tree["cameras"][node["camera"]]
+        clipped = gltf_projection(lens) @ np.linalg.inv(pose) @ np.stack([x, z, -y, np.ones(20)])
+        assert_allclose((clipped[:3] / clipped[3]).T, camera.project(points), atol=1e-12)
+
+
+def gltf_projection(lens: dict) -> np.ndarray:
+    """The matrix of a camera by the specification (glTF 2.0, 3.10.3)."""
+    kind = lens[lens["type"]]
+    near, far = kind["znear"], kind["zfar"]
+    if lens["type"] == "orthographic":
+        depth = [0, 0, 2 / (near - far), (far + near) / (near - far)]
+        return np.array([[1 / kind["xmag"], 0, 0, 0], [0, 1 / kind["ymag"], 0, 0], depth, [0, 0, 0, 1]])
+    tangent = math.tan(kind["yfov"] / 2)
+    depth = [0, 0, (far + near) / (near - far), 2 * far * near / (near - far)]
+    return np.array([[1 / (kind["aspectRatio"] * tangent), 0, 0, 0], [0, 1 / tangent, 0, 0], depth, [0, 0, -1, 0]])
 
 
 @every_mesh

@@ -15,7 +15,7 @@ import trimesh
 from scipy.special import sph_harm_y
 
 from renderer import rays
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.mesh import Mesh, concatenate
 from renderer.transfer import ImageSettings, build_operators
 from renderer.visibility import choose
@@ -32,6 +32,7 @@ VIEWS = {
     "near the pole": OrthographicCamera(0.03, 0.4, 2.5),
     "from above": OrthographicCamera(1.0, 2.2, 2.3),
     "from below": OrthographicCamera(2.3, 5.1, 2.7),
+    "from close by": PerspectiveCamera(1.1, 0.7, 2.7, right=0.1, up=-0.2, distance=2.0),
 }
 
 
@@ -130,13 +131,15 @@ each_case = pytest.mark.parametrize(
         (coloured_cube, "from below"),
         (textured_hull, "near the pole"),
         (textured_hull, "from below"),
+        (coloured_cube, "from close by"),
+        (textured_hull, "from close by"),
     ],
 )
 
 # ---------------------------------------------------------------------------- images
 
 
-def our_image(mesh: Mesh, camera: OrthographicCamera, size: int, samples: int, transport="direct") -> np.ndarray:
+def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, transport="direct") -> np.ndarray:
     """(size, size, 4): radiance and coverage."""
     settings = ImageSettings(size, samples, transport=transport)
     [operator] = build_operators(mesh, [camera], settings, choose("software"))
@@ -171,11 +174,17 @@ def mitsuba_light() -> dict:
     return {"type": "envmap", "bitmap": mi.Bitmap(light_map(LIGHT).astype(np.float32)), "to_world": turn}
 
 
-def mitsuba_sensor(camera: OrthographicCamera, size: int) -> dict:
-    _, up, back = camera.axes()
-    look = mi.ScalarTransform4f().look_at(origin=list(4 * back), target=[0, 0, 0], up=list(up))
-    half = camera.field_of_view / 2  # Mitsuba's image spans [-1, 1]
+def mitsuba_sensor(camera: Camera, size: int) -> dict:
+    right, up, back = camera.axes()
+    aim = -camera.right * right - camera.up * up
+    look = mi.ScalarTransform4f().look_at(origin=list(aim + camera.distance * back), target=list(aim), up=list(up))
+    half = camera.field_of_view / 2
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "rfilter": {"type": "box"}}
+    if isinstance(camera, PerspectiveCamera):
+        return {"type": "perspective", "fov": 2 * math.degrees(math.atan(half / camera.distance)), "to_world": look} | {
+            "film": film
+        }
+    # Mitsuba's image spans [-1, 1]
     return {"type": "orthographic", "to_world": look @ mi.ScalarTransform4f().scale([half, half, 1]), "film": film}
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from renderer.camera import OrthographicCamera
+from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.environment import to_map, write_map
 from renderer.errors import InputError
 from renderer.image import ImageSettings
@@ -21,7 +21,11 @@ from renderer.transfer import build_operators
 from renderer.visibility import choose
 
 pytest.importorskip("mitsuba")
-CAMERAS = [OrthographicCamera(1.0, 2.2, 2.3), OrthographicCamera(2.3, 5.1, 2.7, right=0.2, up=-0.1)]
+CAMERAS = [
+    OrthographicCamera(1.0, 2.2, 2.3),
+    OrthographicCamera(2.3, 5.1, 2.7, right=0.2, up=-0.1),
+    PerspectiveCamera(1.4, 0.3, 2.7, right=0.2, up=-0.1, distance=2.2),
+]
 
 
 def ball() -> Mesh:

@@ -19,7 +19,7 @@ from scipy.special import sph_harm_y_all
 
 from renderer import shading
 from renderer.albedo import face_albedo, surface_albedo, textured_albedo
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import LARGEST, InputError
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import MAX_DEGREE, irradiance_basis, lambertian_factors, live_coefficients, rotate
@@ -221,7 +221,7 @@ IN_FRONT, BEHIND = OrthographicCamera(1.0, 0.4, 2.2), OrthographicCamera(math.pi
 @dataclass(frozen=True)
 class Scene:
     mesh: Mesh
-    camera: OrthographicCamera = IN_FRONT
+    camera: Camera = IN_FRONT
     size: int = 5
     samples: int = 3
 
@@ -245,6 +245,7 @@ SCENES = {
     "wound the other way": Scene(turned_round(solid())),
     "spoiled": Scene(spoiled(solid())),
     "one sample per pixel": Scene(solid(), size=9, samples=1),
+    "from close by": Scene(solid(), PerspectiveCamera(1.0, 0.4, 2.2, distance=1.8)),
 }
 OUTSIDE = Scene(replace(solid(), vertices=solid().vertices + 9))
 each_scene = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
@@ -254,7 +255,7 @@ flat_and_smooth = pytest.mark.parametrize("smooth", [False, True], ids=["flat", 
 def test_the_scenes_are_what_they_are_called():
     facing = {name: scene.fragments.facing for name, scene in SCENES.items()}
     in_front = {name for name, signs in facing.items() if (signs == 1).all()}
-    assert in_front == {"solid", "spoiled", "one sample per pixel"}
+    assert in_front == {"solid", "spoiled", "one sample per pixel", "from close by"}
     assert (facing["wound the other way"] == -1).all()
     assert {sign for sign in facing["open, from behind"].flatten().tolist()} == {-1, 1}
     for scene in SCENES.values():

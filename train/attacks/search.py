@@ -81,5 +81,7 @@ def _drawn(scene: AttackSceneSettings, draws: torch.Generator) -> AttackSceneSet
 
 def overrides(found: AttackSceneSettings) -> str:
     """What the command line would say for this camera and this light."""
-    names = ("polar", "azimuth", "field_of_view", "light", "exposure")
+    names = ["polar", "azimuth", "field_of_view", "light", "exposure"]
+    if found.perspective is not None:
+        names.insert(3, "perspective")
     return " ".join(f"scene.{name}={getattr(found, name)}" for name in names)

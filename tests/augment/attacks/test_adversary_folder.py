@@ -70,9 +70,10 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=limit)
 
 
-def test_exposure_gain_background_and_place_are_kept(tmp_path):
+@pytest.mark.parametrize("perspective", [None, 50.0])
+def test_exposure_gain_background_and_place_are_kept(tmp_path, perspective):
     """A row as training draws them: its own exposure, an image behind it, a camera that looks past the middle."""
-    scene = augment.build_scene([("solid:orange", "orange")], 16, visibility="software")
+    scene = augment.build_scene([("solid:orange", "orange")], 16, visibility="software", perspective=perspective)
     backgrounds = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
     ((camera,),) = scene.cameras
     row = Example(0, (replace(camera, right=0.3, up=-0.2, field_of_view=3.0),), 1, exposure=1.7)

@@ -15,7 +15,7 @@ from augment.classifiers import Classifier
 from augment.objects import SceneObject
 from augment.parameters import StepSettings
 from augment.scene import Scene
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera
 from renderer.environment import to_map, write_map
 from renderer.image import ImageSettings, behind, develop_composite
 from renderer.lights import ambient
@@ -104,7 +104,7 @@ def adversaries(subject: Subject, study: Study, settings: ShapedLightSettings) -
             }
 
 
-def kept_from_itself(subject: Subject, cameras: Sequence[OrthographicCamera], settings: ImageSettings) -> float:
+def kept_from_itself(subject: Subject, cameras: Sequence[Camera], settings: ImageSettings) -> float:
     """The share of a white sky's light on the surface in sight that shadows take."""
     sky, seen = ambient(torch.ones(3)), {}
     for transport in ("direct", "shadows"):

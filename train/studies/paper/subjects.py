@@ -13,7 +13,7 @@ from augment.classifiers import Classifier
 from augment.objects import ObjectSettings, load_object
 from augment.scene import Scene
 from augment.seeding import generator
-from renderer.camera import OrthographicCamera
+from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import InputError
 from renderer.image import ImageSettings
 from renderer.lights import load_light
@@ -62,7 +62,7 @@ def scene_of(
     subject: Subject,
     classifier: Classifier,
     light: str,
-    cameras: Sequence[Sequence[OrthographicCamera]],
+    cameras: Sequence[Sequence[Camera]],
     greys: Tensor,
     samples: int = 2,
     normals: str = "smooth",
