@@ -1,7 +1,7 @@
 """Time against error of the renderer, in one run: python scripts/benchmark_renderer.py peers=true
 
 Writes docs/performance_renderer.md with docs/renderer_pareto.{png,csv} and docs/renderer_scaling.{png,csv}. Takes a few
-minutes on one CPU thread; peers=true adds Mitsuba 3 and, where it is installed, PyTorch3D.
+minutes on one CPU thread; peers=true adds Mitsuba 3.
 """
 
 from train.cli import script

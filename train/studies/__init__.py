@@ -1,4 +1,4 @@
 """What this project reports of itself, a package per page of docs/: each measures, and writes its page.
 
-accuracy, interruptions, paper, renderer_speed, training_speed; peers are other renderers on the same scene.
+accuracy, interruptions, paper, renderer_speed, training_speed.
 """

@@ -1,1 +1,1 @@
-"""The renderer's time against its error: scenes and reference, clocks, panels, peers, targets, page."""
+"""The renderer's time against its error: scenes and reference, clocks, panels, Mitsuba, targets, page."""

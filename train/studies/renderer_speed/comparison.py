@@ -1,56 +1,33 @@
-"""Side by side on one scene: this renderer, plain autograd through its shading, and other differentiable renderers."""
+"""Side by side on one scene: this renderer, plain autograd through its shading, and Mitsuba 3."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from renderer import reference, shading
-from renderer.errors import InputError
 from renderer.transfer import DEGREE, Operator
-from train.studies.peers import Peer, PeerScene
+from train.studies.renderer_speed import mitsuba_peer
 from train.studies.renderer_speed.errors import Exact
+from train.studies.renderer_speed.mitsuba_peer import MitsubaPeer
 from train.studies.renderer_speed.panels import SAMPLES, Bench, Entries, row_of
 from train.studies.renderer_speed.results import Row
-from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View, coefficients
+from train.studies.renderer_speed.scenes import View, coefficients
 from train.studies.renderer_speed.steps import seen, shade_by_face, vertex_step
 
 DIRECT, AUTOGRAD, WHOLE = "operator, direct", "operator, autograd", "operator, direct, whole images in and out"
 ANALYTIC, BY_FACE, BY_SAMPLE = "analytic", "plain autograd, face by face", "plain autograd, sample by sample"
 KEPT, REFRESHED = "visibility kept", "re-rasterised"
 BY_FACE_KEPT = f"{BY_FACE}, {KEPT}"
-MITSUBA, PYTORCH3D = "Mitsuba 3", "PyTorch3D"
-SAMPLES_OF = {MITSUBA: 16, PYTORCH3D: 1}  # per pixel
 
 COARSER, FINER = 2, 4  # samples per side: as attacks have by default, and as many in all as Mitsuba has
 SHADINGS = {ANALYTIC: shading.radiance, BY_FACE: shade_by_face, BY_SAMPLE: reference.radiance}
 
-Peers = Mapping[str, Callable[[PeerScene], Peer]]  # makers by name
 
-
-def installed_peers() -> tuple[Peers, list[str]]:
-    """(the peers that start here, by name, and a sentence about each that does not)."""
-    from train.studies.peers.mitsuba import MitsubaPeer
-    from train.studies.peers.pytorch3d import PyTorch3DPeer
-
-    peers, absent = {}, []
-    makers: Peers = {MITSUBA: MitsubaPeer, PYTORCH3D: PyTorch3DPeer}
-    for name, make in makers.items():
-        triangle = np.eye(3), np.array([[0, 1, 2]])
-        try:
-            make(PeerScene(*triangle, np.array(ALBEDO), np.zeros((49, 3)), CAMERA, 4, SAMPLES_OF[name]))
-        except InputError as error:
-            absent.append(f"{name} was not timed: {error}.")
-        else:
-            peers[name] = make
-    return peers, absent
-
-
-def by_light(bench: Bench, size: int, peers: Peers) -> list[Row]:
+def by_light(bench: Bench, size: int, with_mitsuba: bool) -> list[Row]:
     """Radiance of a light of degree 6, and the gradient of a scalar loss on it by the light."""
 
     def entries() -> Entries:
@@ -62,12 +39,12 @@ def by_light(bench: Bench, size: int, peers: Peers) -> list[Row]:
         image, by_face = _shaded_by_face(view, light)
         errors = exact.errors(image, by_face(), exact.by_light[: len(light)])
         yield replace(row, setting=BY_FACE_KEPT, samples=1, **errors), by_face
-        for name, peer in _set_up(view, peers):
+        if with_mitsuba:
+            peer = MitsubaPeer(view)
             differentiate = partial(peer.light_gradient, view.image_gradient.cpu().float().numpy())
-            errors = exact.errors(
-                torch.from_numpy(peer.image()), torch.from_numpy(differentiate()), exact.by_light[: len(light)]
-            )
-            yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), differentiate
+            image, gradient = torch.from_numpy(peer.image()), torch.from_numpy(differentiate())
+            errors = exact.errors(image, gradient, exact.by_light[: len(light)])
+            yield replace(row, setting=mitsuba_peer.NAME, samples=mitsuba_peer.SAMPLES, **errors), differentiate
 
     return bench.timed(entries())
 
@@ -104,7 +81,7 @@ def _shaded_by_face(view: View, light: Tensor) -> tuple[Tensor, Callable[[], Ten
     return view.canvas(shade_by_face(fragments, vertices, light, albedo), fragments.pixels), differentiate
 
 
-def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
+def by_vertices(bench: Bench, size: int, with_mitsuba: bool) -> list[Row]:
     """An image, and the gradient of a scalar loss on it by the vertices."""
 
     def entries() -> Entries:
@@ -117,10 +94,11 @@ def by_vertices(bench: Bench, size: int, peers: Peers) -> list[Row]:
             if samples == 1:
                 yield replace(found, setting=f"{name}, {KEPT}"), vertex_step(view, 1, light, kept=True, shade=shade)
             yield replace(found, setting=rasterised(name, samples)), vertex_step(view, samples, light, shade=shade)
-        for name, peer in _set_up(view, peers):
+        if with_mitsuba:
+            peer = MitsubaPeer(view)
             call = partial(peer.vertex_gradient, view.image_gradient.cpu().float().numpy())
             errors = exact.errors(torch.from_numpy(peer.image()), torch.from_numpy(call()), exact.by_vertices)
-            yield replace(row, setting=name, samples=SAMPLES_OF[name], **errors), call
+            yield replace(row, setting=mitsuba_peer.NAME, samples=mitsuba_peer.SAMPLES, **errors), call
 
     return bench.timed(entries())
 
@@ -131,12 +109,5 @@ def rasterised(name: str, samples: int) -> str:
 
 
 def _irradiance(normals: Tensor) -> Tensor:
-    """Of the light as the peers are given it, cut off after degree 6."""
+    """Of the light as Mitsuba is given it, cut off after degree 6."""
     return reference.irradiance(normals, coefficients(DEGREE))
-
-
-def _set_up(view: View, peers: Peers) -> Iterator[tuple[str, Peer]]:
-    light = coefficients(DEGREE).float().numpy()
-    for name, make in peers.items():
-        mesh, samples = view.mesh, SAMPLES_OF[name]
-        yield name, make(PeerScene(mesh.vertices, mesh.faces, np.array(ALBEDO), light, CAMERA, view.size, samples))

@@ -35,7 +35,7 @@ of its own, and writes it; do not edit.
 class Findings:
     """What a run measured.
 
-    choices: panels with a default. comparisons: with plain autograd and, where asked for, with other renderers.
+    choices: panels with a default. comparisons: with plain autograd and, where asked for, with Mitsuba.
     workloads: by size, vertices and lights. notes: what could not be measured. reference: (its samples per side, the
     image's size, its own relative error) of the large image.
     """
@@ -61,7 +61,7 @@ WHY_NOT = """\
 At 32² one light's image and gradient are some twenty operations on a few thousand numbers, whose cost is Python's and
 torch's for each operation and not the arithmetic; a light among 100 costs a fraction of it
 ([Light step by lights](#light-step-by-lights-32)). Plain autograd face by face shades each face once and keeps
-visibility; it is the fastest other way that runs here, also where PyTorch3D was meant.
+visibility; it is the fastest other way that runs here.
 """
 
 

@@ -17,7 +17,17 @@ from train.outputs import writable_folder
 from train.settings import SceneSettings, read_object
 from train.studies.figures import pyplot
 from train.studies.page import machine, write
-from train.studies.renderer_speed import comparison, figures, panels, results, scaling, skipping, targets, vertices
+from train.studies.renderer_speed import (
+    comparison,
+    figures,
+    mitsuba_peer,
+    panels,
+    results,
+    scaling,
+    skipping,
+    targets,
+    vertices,
+)
 from train.studies.renderer_speed.measure import Clock
 from train.studies.renderer_speed.page import Findings, page
 from train.studies.renderer_speed.panels import QUICK, Bench, Plan
@@ -29,7 +39,7 @@ PAGE = "performance_renderer.md"
 
 @dataclass
 class RendererSpeedSettings:
-    """conf/benchmark_renderer.yaml. out: a folder. peers: whether others are timed, too. quick: tiny settings, once.
+    """conf/benchmark_renderer.yaml. out: a folder. peers: whether Mitsuba 3 is timed, too. quick: tiny settings, once.
     only: null, or vertices, whose section of the page is measured anew and the rest kept.
 
     scene.meshes: those whose operators are built; none: two solid oranges as they are, not normalised.
@@ -57,7 +67,8 @@ def run(settings: RendererSpeedSettings) -> None:
     description = machine(device)
     bench = Bench(plan, Clock(device, plan.rounds), _backends(), device)
     if settings.only:
-        section = vertices.section(vertices.measure(bench, _peers(settings.peers)[0]), command_line(), description)
+        found = vertices.measure(bench, _mitsuba_starts(settings.peers)[0])
+        section = vertices.section(found, command_line(), description)
         return write(out / PAGE, vertices.put(section, (out / PAGE).read_text("utf-8")))
     named = [read_object(item, "", index) for index, item in enumerate(settings.scene.meshes)]
     meshes = [load_object(item).mesh for item in named] or [solid("orange", seed) for seed in (0, 1)]
@@ -77,13 +88,20 @@ def _backends() -> tuple[Backend, ...]:
     return tuple(backends)
 
 
-def _peers(asked: bool) -> tuple[comparison.Peers, list[str]]:
-    return comparison.installed_peers() if asked else ({}, ["Run with peers=true to time other renderers."])
+def _mitsuba_starts(asked: bool) -> tuple[bool, list[str]]:
+    """(whether Mitsuba is timed, and why not)."""
+    if not asked:
+        return False, ["Run with peers=true to time Mitsuba 3, too."]
+    try:
+        mitsuba_peer.on_one_thread()
+    except InputError as error:
+        return False, [f"{mitsuba_peer.NAME} was not timed: {error}."]
+    return True, []
 
 
-def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
+def _measure(bench: Bench, meshes: list[Mesh], peers: bool) -> Findings:
     plan = bench.plan
-    peers, notes = _peers(with_peers)
+    with_mitsuba, notes = _mitsuba_starts(peers)
     print(f"rasterisers: {', '.join(backend.description for backend in bench.backends)}", flush=True)
     choices = [
         panels.light_steps(bench, plan.small),
@@ -93,11 +111,11 @@ def _measure(bench: Bench, meshes: list[Mesh], with_peers: bool) -> Findings:
     ]
     print("measured: choices", flush=True)
     compared = [
-        comparison.by_light(bench, plan.small, peers),
-        comparison.by_light(bench, plan.large, peers),
+        comparison.by_light(bench, plan.small, with_mitsuba),
+        comparison.by_light(bench, plan.large, with_mitsuba),
     ]
     print("measured: comparisons", flush=True)
-    of_vertices = vertices.measure(bench, peers)
+    of_vertices = vertices.measure(bench, with_mitsuba)
     print("measured: vertices", flush=True)
     workloads = [*(panels.workloads(bench, axis) for axis in ("size", "vertices")), panels.batches(bench)]
     print("measured: workloads", flush=True)

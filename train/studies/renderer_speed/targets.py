@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from renderer.cache import OperatorCache
 from renderer.mesh import Mesh
-from train.studies.renderer_speed import comparison
+from train.studies.renderer_speed import comparison, mitsuba_peer
 from train.studies.renderer_speed.panels import SAMPLES, Bench
 from train.studies.renderer_speed.results import Row
 from train.studies.renderer_speed.skipping import build_operators
@@ -15,7 +15,7 @@ from train.tables import shown
 
 def by_light(small: Sequence[Row], large: Sequence[Row]) -> list[Target]:
     """Of panels of `comparison` at the two sizes."""
-    asked = {comparison.BY_FACE_KEPT: (10, 30), comparison.MITSUBA: (300, 400)}
+    asked = {comparison.BY_FACE_KEPT: (10, 30), mitsuba_peer.NAME: (300, 400)}
     panels = [{row.setting: row for row in rows} for rows in (large, small)]
     return [
         _faster(rows, comparison.DIRECT, peer, least)
@@ -28,7 +28,7 @@ def by_vertices(rows: Sequence[Row]) -> list[Target]:
     """Of a panel of `comparison`."""
     named = {row.setting: row for row in rows}
     return [
-        _faster(named, comparison.rasterised(comparison.ANALYTIC, 1), comparison.MITSUBA, 30),
+        _faster(named, comparison.rasterised(comparison.ANALYTIC, 1), mitsuba_peer.NAME, 30),
         *(
             _faster(named, comparison.rasterised(comparison.ANALYTIC, samples), comparison.rasterised(peer, samples), 3)
             for peer in (comparison.BY_SAMPLE, comparison.BY_FACE)
@@ -38,13 +38,13 @@ def by_vertices(rows: Sequence[Row]) -> list[Target]:
 
 
 def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Target:
-    """Beside the ratio, for other renderers: no larger an error of the image and of the gradient."""
+    """Beside the ratio, for Mitsuba: no larger an error of the image and of the gradient."""
     own, other = rows[ours], rows.get(theirs)
     what, asked = f"{own.panel}: {ours}, against {theirs}", f"at least {least}× faster"
     if other is None:
         return Target(what, asked, "not measured", None)
     ratio, found = other.time_ms / own.time_ms, f"{shown(other.time_ms / own.time_ms)}×"
-    if theirs not in (comparison.MITSUBA, comparison.PYTORCH3D):
+    if theirs != mitsuba_peer.NAME:
         return Target(what, asked, found, ratio >= least)
     accurate = _at_most(own.image_error, other.image_error) and _at_most(own.gradient_error, other.gradient_error)
     errors = f"errors of image and gradient {_errors(own)} against {_errors(other)}"

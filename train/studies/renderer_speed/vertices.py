@@ -29,8 +29,8 @@ class Vertices:
     start: str
 
 
-def measure(bench: Bench, peers: comparison.Peers) -> Vertices:
-    rows = comparison.by_vertices(bench, bench.plan.large, peers)
+def measure(bench: Bench, with_mitsuba: bool) -> Vertices:
+    rows = comparison.by_vertices(bench, bench.plan.large, with_mitsuba)
     return Vertices(rows, rasterising.measure(bench), rasterising.starting(bench))
 
 

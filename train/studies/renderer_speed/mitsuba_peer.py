@@ -7,35 +7,37 @@ from typing import Any
 import numpy as np
 import torch
 
-from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.harmonics import basis
-from train.studies.peers import PeerScene
+from renderer.transfer import DEGREE
+from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View, coefficients
 
+NAME, SAMPLES = "Mitsuba 3", 16  # camera rays per pixel
 MAP_ROWS, MAP_COLUMNS = 32, 64  # bilinear texels this wide dim band l by l(l + 1) (π / 31)² / 12: band 2 by 0.5 %
 TO_Z_UP = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]  # its maps have y up and +z in the middle
 
 
 class MitsubaPeer:
-    """Mitsuba's `direct` integrator in llvm_ad_rgb on one thread, `samples` camera rays per pixel.
+    """A view in its light of degree 6 by Mitsuba's `direct` integrator in llvm_ad_rgb on one thread.
 
     Each camera ray draws one direction by the cosine and looks the map up there: Mitsuba's cheapest way, and the least
     noisy for a smooth light. Each call turns coefficients into texels by a matrix product, and the gradient back by its
     transpose, or moves the vertices and rebuilds the ray tracer's tree. Outlines count as fixed.
+    Everything is float32 NumPy. A call returns when its result is there; the first one of each kind compiles.
     """
 
-    def __init__(self, scene: PeerScene):
-        self._mi, self._dr = _mitsuba_on_one_thread()
-        self._positions = scene.vertices.astype(np.float32).ravel()
-        self._light = scene.light.astype(np.float32)
-        self._samples = scene.samples
+    def __init__(self, view: View):
+        """InputError as `on_one_thread`."""
+        self._mi, self._dr = on_one_thread()
+        self._positions = view.mesh.vertices.astype(np.float32).ravel()
+        self._light = coefficients(DEGREE).float().numpy()
         numbered = self._mi.Bitmap(np.tile(np.arange(MAP_COLUMNS, dtype=np.float32)[:, None], (MAP_ROWS, 1, 3)))
         description = {
             "type": "scene",
             "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1, "hide_emitters": True},
             "light": {"type": "envmap", "bitmap": numbered, "to_world": self._mi.ScalarTransform4f(TO_Z_UP)},
-            "mesh": self._mesh(scene.faces, scene.albedo),
-            "sensor": self._sensor(scene.camera, scene.size),
+            "mesh": self._mesh(view.mesh.faces),
+            "sensor": self._sensor(view.size),
         }
         self._scene = self._mi.load_dict(description)
         self._parameters = self._mi.traverse(self._scene)
@@ -45,14 +47,17 @@ class MitsubaPeer:
         self._parameters.update()
 
     def image(self) -> np.ndarray:
+        """(3, size, size) linear radiance by our conventions, black where nothing is."""
         return math.pi * np.array(self._render()).transpose(2, 0, 1)
 
     def light_gradient(self, image_gradient: np.ndarray) -> np.ndarray:
+        """(49, 3): renders, and differentiates Σ image × image_gradient (3, size, size)."""
         texels = self._mi.TensorXf(self._basis @ self._light)
         by_texel = self._gradient("light.data", texels, image_gradient)
         return np.tensordot(self._basis, by_texel, ([0, 1], [0, 1]))
 
     def vertex_gradient(self, image_gradient: np.ndarray) -> np.ndarray:
+        """(V, 3): the same by the vertices' positions, through the shading alone."""
         positions = self._mi.Float(self._positions)
         return self._gradient("mesh.vertex_positions", positions, image_gradient).reshape(-1, 3)
 
@@ -67,12 +72,12 @@ class MitsubaPeer:
         return gradient
 
     def _render(self) -> Any:
-        return self._mi.render(self._scene, self._parameters, spp=self._samples)
+        return self._mi.render(self._scene, self._parameters, spp=SAMPLES)
 
-    def _mesh(self, faces: np.ndarray, albedo: np.ndarray) -> Any:
+    def _mesh(self, faces: np.ndarray) -> Any:
         properties = self._mi.Properties()
         properties["face_normals"] = True
-        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo.tolist()}}
+        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ALBEDO)}}
         properties["bsdf"] = self._mi.load_dict(diffuse)
         mesh = self._mi.Mesh("mesh", len(self._positions) // 3, len(faces), props=properties)
         buffers = self._mi.traverse(mesh)
@@ -81,15 +86,15 @@ class MitsubaPeer:
         buffers.update()
         return mesh
 
-    def _sensor(self, camera: OrthographicCamera, size: int) -> dict[str, Any]:
-        _, up, back = camera.axes()
-        half = camera.field_of_view / 2  # its image spans [-1, 1]
+    def _sensor(self, size: int) -> dict[str, Any]:
+        _, up, back = CAMERA.axes()
+        half = CAMERA.field_of_view / 2  # its image spans [-1, 1]
         look = self._mi.ScalarTransform4f().look_at(origin=list(4 * back), target=[0, 0, 0], up=list(up))
         film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
         return {"type": "orthographic", "to_world": look.scale([half, half, 1]), "film": film}
 
 
-def _mitsuba_on_one_thread() -> tuple[ModuleType, ModuleType]:
+def on_one_thread() -> tuple[ModuleType, ModuleType]:
     """The modules (mitsuba, drjit). InputError: not installed, or no LLVM library."""
     try:
         import drjit
@@ -108,4 +113,4 @@ def _texel_basis() -> np.ndarray:
     azimuth = math.pi - 2 * math.pi * (np.arange(MAP_COLUMNS) + 0.5) / MAP_COLUMNS
     polar, azimuth = np.meshgrid(np.linspace(0, math.pi, MAP_ROWS), azimuth, indexing="ij")
     directions = [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
-    return basis(torch.from_numpy(np.stack(directions, axis=-1)), 6).numpy().astype(np.float32)
+    return basis(torch.from_numpy(np.stack(directions, axis=-1)), DEGREE).numpy().astype(np.float32)
