@@ -131,16 +131,21 @@ class OfLight(Kind):
         super().__init__(scene, (basis.nearest_physical(start) if self.physical else start).flatten(1), settings)
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        light, own = conditions.light, values.unflatten(1, (-1, 3))
-        if own.shape[1] < light.shape[1]:
-            own = torch.cat([light[:, : self._where.start], own, light[:, self._where.stop :]], dim=1)
-        return replace(conditions, light=own)
+        return _relit(conditions, self._where, values.unflatten(1, (-1, 3)))
 
     def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
         if not self.physical:
             return super().within_domain(values, within)
         of_lights = None if within is None else within.unflatten(-1, 3)
         return self.basis.nearest_physical(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
+
+
+def _relit(conditions: Conditions, where: slice, own: Tensor) -> Conditions:
+    """With other coefficients of one of the light's bases."""
+    light = conditions.light
+    if own.shape[1] < light.shape[1]:
+        own = torch.cat([light[:, : where.start], own, light[:, where.stop :]], dim=1)
+    return replace(conditions, light=own)
 
 
 class Lighting(OfLight):
@@ -196,7 +201,7 @@ class LampPlaces(Kind):
 
 class Skylight(Kind):
     """Three values: zenith, azimuth, turbidity / 4. The sky is scaled to the mean luminance of the example's own light
-    where the attack starts, and by the same factor elsewhere."""
+    where the attack starts, and by the same factor elsewhere. Lights in the scene stay as they are."""
 
     name = "skylight"
 
@@ -204,13 +209,14 @@ class Skylight(Kind):
         start = torch.tensor([zenith, azimuth, turbidity / TURBIDITY_UNIT], dtype=torch.float64).to(scene.lights)
         super().__init__(scene, start.expand(len(scene), -1), settings)
         sky = mean_luminance(coefficients(zenith, azimuth, turbidity))
-        scales = [mean_luminance(light) / sky for light in scene.lights]
+        self._where, _ = parts_of(scene.basis)[0]
+        scales = [mean_luminance(light) / sky for light in scene.lights[:, self._where]]
         self._scale = torch.tensor(scales, dtype=torch.float64, device=start.device)[:, None, None]
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         zenith, azimuth, turbidity = values.unbind(1)
         sky = coefficients(zenith, azimuth, turbidity * TURBIDITY_UNIT) * self._scale[examples]
-        return replace(conditions, light=sky.to(conditions.light))
+        return _relit(conditions, self._where, sky.to(conditions.light))
 
     def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
         clear, hazy = (limit / TURBIDITY_UNIT for limit in TURBIDITY)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from augment.held_transport import HeldTransport, HeldTransports
-from augment.lamplit import Lamplit
 from augment.memory import require_memory
 from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
+from augment.placed_view import PlacedView
 from augment.progress import progress
 from renderer.albedo import painted_albedo, surface_albedo
-from renderer.basis import HARMONICS, Basis, Sum, parts_of
+from renderer.basis import HARMONICS, Basis, Placed, parts_of
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
@@ -88,7 +88,8 @@ class Scene:
 
     Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
     (`OperatorStack`), equal views share one, and what a background adds to an image is kept. Where vertices move, their
-    view is rasterised anew each time, and shadows and bounces are those of a shape close by (`HeldTransport`).
+    view is rasterised anew each time; shadows and bounces of distant light are those of a shape close by
+    (`HeldTransport`), shadows of light from places are its own (`PlacedView`).
     light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are those of the images. basis: what
     lights are coefficients of; 49 harmonics, unless another is given. taken: what a camera makes of rendered images
     (A, V, 3, size, size) of examples (A,), differentiable; see `Snapshot`.
@@ -138,7 +139,7 @@ class Scene:
         self._fragments_of_meshes: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
         self._transports = HeldTransports(settings, basis)
         self._rays: dict[int, Rays] = {}
-        self._lamplit_views: dict[tuple[int, Camera], Lamplit] = {}
+        self._placed_views: dict[tuple[int, Camera], PlacedView] = {}
 
     @classmethod
     def grid(
@@ -270,8 +271,6 @@ class Scene:
             if conditions.places is None:
                 return self._relit(light, examples)
             return self._under_moved_lamps(light, conditions.places, examples)
-        if isinstance(self.basis, Sum):
-            raise InputError(f"light of {self.basis} falls on one shape in its colours: attack the light alone")
         return self._reshaded(light, conditions, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[_Layer]:
@@ -296,15 +295,18 @@ class Scene:
 
     def _under_moved_lamps(self, light: Tensor, places: Tensor, examples: Tensor) -> Iterator[_Layer]:
         """By the same products for all other light, and by the lamps' image after image."""
-        where = next(where for where, part in parts_of(self.basis) if isinstance(part, Lamps))
+        where, lamps = next((where, part) for where, part in parts_of(self.basis) if isinstance(part, Lamps))
         rest = torch.cat([light[:, : where.start], torch.zeros_like(light[:, where]), light[:, where.stop :]], dim=1)
         for layer in self._relit(rest, examples):
             added = []
             for image in range(len(layer.composite)) if layer.rows is None else layer.rows:
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
-                seen = self._lamplit(example.object, example.cameras[view])
-                added.append(seen.radiance(places[row], light[row, where], layer.pixels))
+                shown = example.object, example.cameras[view]
+                placed, (fragments, albedo) = self._placed_view(*shown), self._still(*shown)
+                seen = placed.radiance(lamps, albedo, light[row, where], places[row])
+                covered = torch.searchsorted(layer.pixels, fragments.pixels)
+                added.append(seen.new_zeros(3, len(layer.pixels)).index_copy(1, covered, seen))
             yield replace(layer, composite=layer.composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[_Layer]:
@@ -327,17 +329,27 @@ class Scene:
         if conditions.vertices is None:
             vertices, positions = self.vertices[number, : len(mesh.vertices)], mesh.vertices
             fragments, albedo = self._still(number, camera)
+            placed = partial(self._placed_view, number, camera)
         else:
             vertices = conditions.vertices[row, : len(mesh.vertices)]
             positions = vertices.detach().cpu().double().numpy()
             fragments, albedo = self._fragments(number, camera, positions)
+            rays = Rays(replace(mesh, vertices=positions))
+            placed = partial(PlacedView, rays, mesh, fragments, self.settings, vertices)
         if conditions.albedo is not None:
             added, gain = conditions.albedo[row, : len(mesh.faces)], self.objects[number].gain
             albedo = painted_albedo(mesh, fragments, self.settings.encoding, gain, added)
         smooth_faces = self._faces[number] if self.settings.normals == "smooth" else None
-        seen = radiance(fragments, vertices, light, albedo, smooth_faces)
-        if self.settings.transport != "direct":
-            seen = seen + self._held(index, camera, positions).radiance(camera, fragments, albedo, light)
+        places = None if conditions.places is None else conditions.places[row]
+        seen = vertices.new_zeros(3, len(fragments.pixels))
+        for where, part in parts_of(self.basis):
+            own = light[where]
+            if isinstance(part, Placed):
+                seen = seen + placed().radiance(part, albedo, own, places)
+                continue
+            seen = seen + radiance(fragments, vertices, own, albedo, smooth_faces)
+            if self.settings.transport != "direct":
+                seen = seen + self._held(index, camera, positions).radiance(camera, fragments, albedo, own)
         return fragments, seen
 
     def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
@@ -372,13 +384,14 @@ class Scene:
             self._fragments_of_meshes[view] = self._fragments(number, camera, self.objects[number].mesh.vertices)
         return self._fragments_of_meshes[view]
 
-    def _lamplit(self, number: int, camera: Camera) -> Lamplit:
+    def _placed_view(self, number: int, camera: Camera) -> PlacedView:
+        """Of an object in its own shape."""
         view = number, camera
-        if view not in self._lamplit_views:
-            rays = self._rays.setdefault(number, Rays(self.objects[number].mesh))
-            fragments, albedo = self._still(*view)
-            self._lamplit_views[view] = Lamplit(rays, self.objects[number].mesh, fragments, albedo, self.settings)
-        return self._lamplit_views[view]
+        if view not in self._placed_views:
+            mesh, (fragments, _) = self.objects[number].mesh, self._still(*view)
+            rays = self._rays.setdefault(number, Rays(mesh))
+            self._placed_views[view] = PlacedView(rays, mesh, fragments, self.settings)
+        return self._placed_views[view]
 
     def _held(self, index: int, camera: Camera, vertices: np.ndarray) -> HeldTransport:
         """Of a shape near the vertices of an example, and with the camera's view of it."""

@@ -50,7 +50,8 @@ class Distant(Functions, Protocol):
 @dataclass(frozen=True)
 class Reach:
     """E ways on which light goes: point, function: (E,) int64, to which surface point and of which function of a basis.
-    place: (E, 3), where it comes from. irradiance: (E,) per unit of the function's coefficient."""
+    place: (E, 3), where it comes from. irradiance: (E,) per unit of the function's coefficient, differentiable in the
+    surface's points and normals; which ways there are is held."""
 
     point: Tensor
     function: Tensor

@@ -40,14 +40,15 @@ class Lamps:
     def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
         return nearest_in_box(coefficients, 0, self.power, within)
 
-    def reach(self, points: Tensor, normals: Tensor) -> Reach:
-        places = points.new_tensor(self.places)
-        received = irradiance(places - points[:, None], normals[:, None])
-        point, lamp = torch.nonzero(received > 0, as_tuple=True)
-        return Reach(point, lamp, places[lamp], received[point, lamp])
+    def reach(self, points: Tensor, normals: Tensor, places: Tensor | None = None) -> Reach:
+        """places: (L, 3) of the lamps, in place of their own; the irradiance is differentiable in them, too."""
+        places = points.new_tensor(self.places) if places is None else places
+        with torch.no_grad():
+            point, lamp = torch.nonzero(_irradiance(places - points[:, None], normals[:, None]) > 0, as_tuple=True)
+        return Reach(point, lamp, places[lamp], _irradiance(places[lamp] - points[point], normals[point]))
 
 
-def irradiance(toward: Tensor, normals: Tensor) -> Tensor:
+def _irradiance(toward: Tensor, normals: Tensor) -> Tensor:
     """(...) at surfaces of unit normals (..., 3) from lamps of power 1 that are `toward` (..., 3) from there, negative
     behind a surface."""
     return (toward * normals).sum(-1) / toward.square().sum(-1) ** 1.5

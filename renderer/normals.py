@@ -30,7 +30,7 @@ def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> F
     Source: the paper's Section 3, ∂n/∂v = -h nᵀ/|h|² with h from the opposite edge to the corner v; the sign in print
     is the wrong way round.
     """
-    return _Unit.apply(area_vectors(vertices, faces)).T.to(vertices.dtype)
+    return unit(area_vectors(vertices, faces)).T.to(vertices.dtype)
 
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
@@ -42,7 +42,12 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) ->
     summed = weighted.new_zeros(3, len(vertices)).index_add(1, corners, weighted)
     areas = weighted.new_zeros(len(vertices)).index_add(0, corners, _length(weighted.detach()))
     cancelled = _length(summed.detach()) <= ROUNDING * areas
-    return _Unit.apply(summed.masked_fill(cancelled, 0)).T.to(vertices.dtype)
+    return unit(summed.masked_fill(cancelled, 0)).T.to(vertices.dtype)
+
+
+def unit(vectors: Tensor) -> Tensor:
+    """Vectors (3, N) at unit length; a zero vector stays zero, with a gradient of zero."""
+    return _Unit.apply(vectors)
 
 
 def area_vectors(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float64[Tensor, "3 F"]:
@@ -81,8 +86,6 @@ class _AreaVectors(torch.autograd.Function):
 
 
 class _Unit(torch.autograd.Function):
-    """Vectors (3, N) at unit length, with a gradient of zero where the vector is zero."""
-
     @staticmethod
     def forward(ctx: Any, vectors: Tensor) -> Tensor:
         unit, length = unit_vectors(vectors)

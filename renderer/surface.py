@@ -7,16 +7,15 @@ import torch
 from torch import Tensor
 
 from renderer.fragments import Fragments
-from renderer.harmonics import unit_vectors
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
-from renderer.normals import face_normals
+from renderer.normals import face_normals, unit
 from renderer.shading import smooth_normals
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What the S samples of a view lie on, in float64; found when asked for.
+    """What the S samples of a view lie on, in float64; found when asked for, and differentiable in the vertices (V, 3).
 
     smooth_faces: (F, 3), all faces of the mesh, to shade with interpolated vertex normals.
     """
@@ -26,9 +25,11 @@ class Surface:
     smooth_faces: Tensor | None = None
 
     @staticmethod
-    def of(mesh: Mesh, fragments: Fragments, settings: ImageSettings) -> "Surface":
+    def of(mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None) -> "Surface":
+        """vertices: (V, 3), in place of the mesh's."""
         smooth_faces = torch.from_numpy(mesh.faces) if settings.normals == "smooth" else None
-        return Surface(fragments, torch.from_numpy(mesh.vertices).double(), smooth_faces)
+        vertices = torch.from_numpy(mesh.vertices) if vertices is None else vertices
+        return Surface(fragments, vertices.double(), smooth_faces)
 
     @cached_property
     def planes(self) -> Tensor:
@@ -45,7 +46,7 @@ class Surface:
         """(S, 3) unit normals to shade with."""
         if self.smooth_faces is None:
             return self.planes
-        return unit_vectors(smooth_normals(self.fragments, self.vertices, self.smooth_faces).T)[0].T
+        return unit(smooth_normals(self.fragments, self.vertices, self.smooth_faces).T).T
 
     @cached_property
     def points(self) -> Tensor:

@@ -151,12 +151,6 @@ def test_lights_that_make_no_sense_are_refused_by_name(make, message):
         make()
 
 
-def test_shapes_and_colours_are_not_attacked_under_lights_in_the_scene():
-    shown = scene()
-    with pytest.raises(InputError, match="attack the light alone"):
-        shown.render(Conditions(shown.lights, vertices=shown.vertices.expand(2, -1, -1)), EVERY)
-
-
 def test_lamps_are_moved_within_their_ball_and_stand_where_they_ended_when_read_back(tmp_path):
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
     steps, ball = StepSettings("linf", None, "unit", 0.5), StepSettings("l2", 0.6, "unit", 0.5)

@@ -18,7 +18,7 @@ from renderer.image import ImageSettings
 from renderer.lamps import Lamps, moved
 from renderer.mesh import Mesh, concatenate
 from renderer.mitsuba_scene import mitsuba
-from renderer.placed import lamplight
+from renderer.placed import lit, placed_radiance
 from renderer.projector import Projector
 from renderer.rays import Rays
 from renderer.surface import Surface
@@ -31,8 +31,8 @@ LAMPS = Lamps(((1.5, 1.0, 1.0), (-0.5, -1.5, 1.6), (0.0, 1.5, -1.2)))
 SIZE, SAMPLES = 24, 16
 
 
-def ball() -> Mesh:
-    sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.9)
+def ball(subdivisions: int = 2) -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.9)
     return Mesh.plain(sphere.vertices, sphere.faces, (0.9, 0.5, 0.2))
 
 
@@ -183,7 +183,8 @@ def moved_image(
     settings = ImageSettings(size, samples)
     (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("software"), closed=mesh.closed)
     surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
-    return operator(mesh, LAMPS, size, samples), lamplight(Rays(mesh), surface, albedo, places, powers)
+    reach = lit(Rays(mesh), surface, LAMPS.reach(surface.points, surface.normals, places))
+    return operator(mesh, LAMPS, size, samples), placed_radiance(view, albedo, reach, powers)
 
 
 def test_lamps_that_are_moved_shine_and_throw_shadows_as_lamps_that_stand_there():
@@ -201,6 +202,25 @@ def test_the_derivative_by_places_and_powers_is_that_of_finite_differences_where
     powers = torch.rand(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True)
     small = partial(moved_image, ball(), size=6, samples=2)
     assert torch.autograd.gradcheck(lambda *given: small(*given)[1], (places, powers), eps=1e-7)
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+@pytest.mark.parametrize("basis", [PROJECTOR, LAMPS], ids=["projector", "lamps"])
+def test_the_derivative_by_vertices_and_albedo_is_that_of_finite_differences_where_visibility_is_held(basis, normals):
+    mesh, settings = ball(1), ImageSettings(5, 2, normals=normals)
+    (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("software"), closed=True)
+    powers = torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rays = Rays(mesh)
+
+    def seen(vertices: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
+        surface = Surface.of(mesh, view, settings, vertices)
+        return placed_radiance(view, albedo, lit(rays, surface, basis.reach(surface.points, surface.normals)), powers)
+
+    vertices = torch.from_numpy(mesh.vertices).requires_grad_()
+    albedo = surface_albedo(mesh, view, settings.encoding).contiguous().requires_grad_()
+    assert torch.autograd.gradcheck(seen, (vertices, albedo), eps=1e-7)
+    (gradient,) = torch.autograd.grad(seen(vertices, albedo).sum(), vertices)
+    assert gradient.abs().max() > 1e-3
 
 
 def test_the_derivative_by_places_is_mitsubas():

@@ -17,7 +17,7 @@ from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.lamps import Lamps
 from renderer.mesh import Mesh, normalise
-from renderer.placed import lamplight
+from renderer.placed import lit, placed_radiance
 from renderer.projector import Projector
 from renderer.rays import Rays
 from renderer.shapes import solid
@@ -192,4 +192,6 @@ def _moved(mesh: Mesh, clock: Clock) -> str:
 
 
 def _step_by_places(rays: Rays, surface: Surface, albedo: Tensor, places: Tensor, powers: Tensor) -> None:
-    torch.autograd.grad(lamplight(rays, surface, albedo, places, powers).square().sum(), places)
+    reach = lit(rays, surface, LAMPS.reach(surface.points, surface.normals, places.double()))
+    seen = placed_radiance(surface.fragments, albedo, reach, powers.double())
+    torch.autograd.grad(seen.square().sum(), places)
