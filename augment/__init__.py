@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = attach(
         "attacks.settings": ["AttackSettings", "SkylightSettings"],
         "build": ["build_scene"],
         "classifiers": ["Classifier", "load_classifier"],
+        "objects": ["CompanionSettings", "ObjectSettings"],
         "parameters": ["StepSettings"],
         "scene": ["Conditions", "Example", "Scene"],
         "service": ["AugmentationService", "AugmentationSettings"],

@@ -1,7 +1,10 @@
-"""What a scene shows: meshes from files or solids, each with the name of its class."""
+"""What a scene shows: meshes from files or solids, each with the name of its class and what stands beside it."""
 
+from __future__ import annotations
+
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,54 +14,115 @@ from renderer.shapes import solid
 from renderer.subdivision import subdivide
 
 GROUND = 1.2  # half a table's width: its corners are within what cameras see in depth
+FARTHEST = 10.0  # of company, in world units
 
 
 @dataclass
-class ObjectSettings:
-    """One mesh of a scene.
-
-    mesh: a file that trimesh reads, or `solid:NAME` or `solid:NAME:SEED`, a built-in procedural solid. label: the
-    name of its class. up: the axis that points up in the file, auto|y|z. gain: multiplies the albedo. color: RGB (3),
-    sRGB-encoded in [0, 1], of a mesh that brings no colours.
-    """
+class MeshSettings:
+    """mesh: a file that trimesh reads, or `solid:NAME` or `solid:NAME:SEED`, a built-in procedural solid. up: the axis
+    that points up in the file, auto|y|z. color: RGB (3), sRGB-encoded in [0, 1], of a mesh that brings no colours."""
 
     mesh: str
-    label: str
-    up: str = "auto"
-    gain: float = 1.0
-    color: list[float] | None = None
+    up: str = field(default="auto", kw_only=True)
+    color: list[float] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not self.mesh:
             raise InputError("scene.meshes: a mesh is '': give a file or solid:NAME")
-        require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
         if self.color is not None and (len(self.color) != 3 or not all(0 <= each <= 1 for each in self.color)):
             raise InputError(f"scene.meshes: {self.mesh}: color={self.color} must be red, green and blue from 0 to 1")
+
+
+@dataclass
+class CompanionSettings(MeshSettings):
+    """A mesh that stands beside another, on the same ground.
+
+    at: (2,) x and y of its centroid, in world units. scale: its largest coordinate, where the other's is 1. azimuth:
+    degrees by which it is turned about the vertical.
+    """
+
+    at: list[float]
+    scale: float = 1.0
+    azimuth: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.at) != 2:
+            raise InputError(f"scene.meshes: beside: {self.mesh}: at={self.at} must be x and y")
+        for place in self.at:
+            require_range(f"scene.meshes: beside: {self.mesh}: at", place, -FARTHEST, FARTHEST)
+        require_range(f"scene.meshes: beside: {self.mesh}: scale", self.scale, 1 / FARTHEST, FARTHEST)
+        require_range(f"scene.meshes: beside: {self.mesh}: azimuth", self.azimuth, -360, 360)
+
+
+@dataclass
+class ObjectSettings(MeshSettings):
+    """One mesh of a scene. label: the name of its class. gain: multiplies the albedo. beside: what is in the image,
+    too, shadows it and is shadowed, and is no part of what is attacked."""
+
+    label: str
+    gain: float = 1.0
+    beside: list[CompanionSettings] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
 
 
 @dataclass(frozen=True)
 class SceneObject:
     """A mesh that spans [-1, 1], the name of its class, what multiplies its albedo, and its own name in messages.
 
-    ground: the colour of the table that the mesh ends in, if it stands on one.
+    Company and table, whose albedo the gain multiplies, too, are in the mesh after the object's own faces.
+    own: the number of these, None where all are. company: meshes that stand on z = 0 beside the object. ground: the
+    colour of its table, None where there is none.
     """
 
     label: str
     mesh: Mesh
     gain: float = 1.0
     name: str = "the mesh"
+    own: int | None = None
+    company: Sequence[Mesh] = ()
     ground: Sequence[float] | None = None
+
+    @property
+    def own_faces(self) -> np.ndarray:
+        """(F,) bool"""
+        return np.arange(len(self.mesh.faces)) < (len(self.mesh.faces) if self.own is None else self.own)
+
+    @property
+    def own_vertices(self) -> np.ndarray:
+        """(V,) bool: all but those of company and table."""
+        others = self.mesh.faces[~self.own_faces]
+        return ~np.isin(np.arange(len(self.mesh.vertices)), others)
+
+    def among(self, others: Sequence[Mesh]) -> SceneObject:
+        """The same with more in its mesh."""
+        if not others:
+            return self
+        return replace(self, mesh=concatenate([self.mesh, *others]), own=int(self.own_faces.sum()))
+
+    @property
+    def lowest(self) -> float:
+        """The height of the ground that it stands on."""
+        return float(self.mesh.vertices[np.unique(self.mesh.faces), 2].min())
 
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
-    """The mesh, subdivided until it has more than so many vertices, and normalised.
+    """The mesh, subdivided until it has more than so many vertices, and normalised; and what is beside it.
 
     InputError: as `load_mesh` and `solid`.
     """
-    mesh = _load(item)
-    if item.color is not None:
-        mesh = _colored(mesh, item)
-    return SceneObject(item.label, normalise(subdivide(mesh, vertices)), item.gain, item.mesh)
+    mesh = normalise(subdivide(_load(item), vertices))
+    return in_company(SceneObject(item.label, mesh, item.gain, item.mesh), [_companion(each) for each in item.beside])
+
+
+def in_company(item: SceneObject, company: Sequence[Mesh]) -> SceneObject:
+    """The object among meshes that stand on z = 0, which are raised or lowered to where it stands."""
+    height = np.array([0, 0, item.lowest])
+    placed = [replace(each, vertices=_rounded(each.vertices + height)) for each in company]
+    return replace(item.among(placed), company=company)
 
 
 def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
@@ -71,22 +135,41 @@ def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
         return item
     if len(color) != 3 or not all(0 <= each <= 1 for each in color):
         raise InputError(f"scene.ground={color} must be red, green and blue from 0 to 1")
-    lowest = item.mesh.vertices[np.unique(item.mesh.faces), 2].min()
-    corners = [[x * GROUND, y * GROUND, lowest] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    corners = [[x * GROUND, y * GROUND, item.lowest] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     table = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.array(color))
-    return replace(item, mesh=concatenate([item.mesh, table]), ground=color)
+    return replace(item.among([table]), ground=color)
 
 
 def another_individual(item: SceneObject, seed: int) -> SceneObject:
-    """Another of the same kind, on the same table, where the object is a solid named without a seed, and otherwise the
-    object itself."""
+    """Another of the same kind, in the same company and on the same table, where the object is a solid named without a
+    seed, and otherwise the object itself."""
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item
-    return on_ground(replace(item, mesh=normalise(solid(rest[0], seed))), item.ground)
+    other = replace(item, mesh=normalise(solid(rest[0], seed)), own=None)
+    return on_ground(in_company(other, item.company), item.ground)
 
 
-def _colored(mesh: Mesh, item: ObjectSettings) -> Mesh:
+def _companion(item: CompanionSettings) -> Mesh:
+    """Where it stands, on z = 0."""
+    mesh, angle = normalise(_load(item)), math.radians(item.azimuth)
+    turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+    turned = item.scale * mesh.vertices @ turn
+    lowest = turned[np.unique(mesh.faces), 2].min()
+    return replace(mesh, vertices=turned + np.array([*item.at, -lowest]))
+
+
+def _rounded(vertices: np.ndarray) -> np.ndarray:
+    """To float32, as `normalise` does."""
+    return vertices.astype(np.float32).astype(np.float64)
+
+
+def _load(item: MeshSettings) -> Mesh:
+    mesh = _read(item)
+    return mesh if item.color is None else _colored(mesh, item)
+
+
+def _colored(mesh: Mesh, item: MeshSettings) -> Mesh:
     if not mesh.uncolored:
         raise InputError(
             f"scene.meshes: {item.mesh} brings colours of its own: leave color out; gain brightens or dims them"
@@ -94,7 +177,7 @@ def _colored(mesh: Mesh, item: ObjectSettings) -> Mesh:
     return Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
 
 
-def _load(item: ObjectSettings) -> Mesh:
+def _read(item: MeshSettings) -> Mesh:
     kind, _, name = item.mesh.partition(":")
     if kind != "solid":
         return load_mesh(item.mesh, up=item.up)

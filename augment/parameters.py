@@ -10,9 +10,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from augment.norm_ball import NormBall, anywhere
 from augment.scene import Conditions, Scene
@@ -110,14 +112,20 @@ class Kind(ABC):
 
 
 class OfMesh(Kind):
-    """Three values for each of the items, vertices or faces, that a mesh has; a smaller mesh uses the first of them."""
+    """Three values for each of the items, vertices or faces, that a mesh has; the first of them in a smaller mesh, and
+    used where they are the object's own."""
 
-    def __init__(self, scene: Scene, settings: StepSettings, counts: Sequence[int]):
-        """counts: of items, for each object."""
-        start = scene.lights.new_zeros(len(scene), 3 * max(counts))
-        items = 3 * torch.tensor(counts, device=start.device)[scene.object_of]
-        used = torch.arange(start.shape[1], device=start.device) < items[:, None]
+    def __init__(self, scene: Scene, settings: StepSettings, own: Sequence[np.ndarray]):
+        """own: bool, of the items of each object."""
+        items = pad_sequence([torch.from_numpy(each) for each in own], batch_first=True).to(scene.lights.device)
+        used = items.repeat_interleave(3, dim=1)[scene.object_of]
+        start = scene.lights.new_zeros(used.shape)
         super().__init__(scene, start, settings, None if used.all() else used)
+
+    def by_item(self, values: Tensor, examples: Tensor) -> Tensor:
+        """(A, items, 3) of values (A, D): zero where they are not used."""
+        used = values if self.used is None else values * self.used[examples]
+        return used.unflatten(1, (-1, 3))
 
 
 class OfLight(Kind):
@@ -225,16 +233,16 @@ class Skylight(Kind):
 
 
 class Geometry(OfMesh):
-    """Displacements of all vertices, in world units; the mesh spans [-1, 1]. The gradient sees how normals turn."""
+    """Displacements of the object's vertices, in world units; it spans [-1, 1]. The gradient sees how normals turn."""
 
     name = "geometry"
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        super().__init__(scene, settings, [len(item.mesh.vertices) for item in scene.objects])
+        super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         vertices = self.scene.vertices[self.scene.object_of[examples]]
-        return replace(conditions, vertices=vertices + values.unflatten(1, (-1, 3)))
+        return replace(conditions, vertices=vertices + self.by_item(values, examples))
 
 
 class Albedo(OfMesh):
@@ -243,10 +251,10 @@ class Albedo(OfMesh):
     name = "albedo"
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        super().__init__(scene, settings, [len(item.mesh.faces) for item in scene.objects])
+        super().__init__(scene, settings, [item.own_faces for item in scene.objects])
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        return replace(conditions, albedo=values.unflatten(1, (-1, 3)))
+        return replace(conditions, albedo=self.by_item(values, examples))
 
 
 class Pixels(Kind):

@@ -23,18 +23,26 @@ from renderer.normals import vertex_normals
 _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
 
 
-def export_mesh(mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[Camera] = ()) -> None:
+def export_mesh(
+    mesh: Mesh,
+    path: str | Path,
+    normals: str = "smooth",
+    cameras: Sequence[Camera] = (),
+    first: int | None = None,
+) -> None:
     """Write a mesh to a .glb or .ply file. A vertex whose corners differ in colour, uv or normal is written for each.
 
     .glb: `load_mesh` gives back the same surface, to float32: y up, linear colours, one part per texture; a diffuse
-    material that is seen from both sides. A mesh of several textures has its faces ordered by texture.
+    material that is seen from both sides. A mesh of several textures has its faces ordered by texture, the `first` so
+    many of them before the others.
     normals: those that the renderer shades with, "smooth" or "flat". cameras: as nodes of a .glb, in order.
     .ply: z up, colours of 8 bits. The format has no standard texture, so that vertices get their texel's colour, times
     their own in linear light: between them the texture is lost, unless the mesh is subdivided.
     InputError where the suffix is another or the file cannot be written.
     """
     path = Path(path)
-    writers: dict[str, Callable[[Mesh, np.ndarray], bytes]] = {".glb": partial(_glb, cameras=cameras), ".ply": _ply}
+    glb = partial(_glb, cameras=cameras, first=first)
+    writers: dict[str, Callable[[Mesh, np.ndarray], bytes]] = {".glb": glb, ".ply": _ply}
     if path.suffix.lower() not in writers:
         raise InputError(f"{path} is no name for a mesh to write: give one that ends in {', '.join(writers)}")
     try:
@@ -56,15 +64,16 @@ def corner_normals(mesh: Mesh, normals: str) -> np.ndarray:
     return np.where(flat.any(axis=-1, keepdims=True), flat, [0.0, 0.0, 1.0])
 
 
-def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera]) -> bytes:
-    parts = [_textured_part(mesh, normals, texture_id) for texture_id in np.unique(mesh.texture_ids)]
+def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int | None) -> bytes:
+    later = np.arange(len(mesh.faces)) >= (len(mesh.faces) if first is None else first)
+    order = np.stack([later, mesh.texture_ids], axis=1)
+    parts = [_textured_part(mesh, normals, part[1], (order == part).all(1)) for part in np.unique(order, axis=0)]
     finish = partial(_as_one_mesh, cameras=cameras)
     return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=finish)
 
 
-def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int) -> trimesh.Trimesh:
-    """The faces of one texture, or of none, y up."""
-    here = mesh.texture_ids == texture_id
+def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int, here: np.ndarray) -> trimesh.Trimesh:
+    """The faces (F,) bool that are `here`, of one texture or of none, y up."""
     corners = np.concatenate([mesh.corner_colors[here], mesh.corner_uvs[here], normals[here]], axis=-1)
     ids, values, faces = _split(mesh.faces[here], corners)
     colors, uvs, normals = values[:, :3], values[:, 3:5], values[:, 5:]

@@ -13,10 +13,11 @@ Settings = TypeVar("Settings")
 
 def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") -> Settings:
     """The dataclass from its configuration; InputError naming the key that is unknown, unset or of the wrong type."""
-    if unset := OmegaConf.missing_keys(config):
-        raise InputError(f"{min(unset)} is not set: give {min(unset)}=...")
     try:
         merged = OmegaConf.merge(OmegaConf.structured(kind), config)
+        if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
+            key = ".".join(filter(None, (parent, min(unset))))
+            raise InputError(f"{key} is not set: give {key}=...")
         for nested in _nested(merged):
             raise InputError(f"{'.'.join(filter(None, (parent, nested)))}: give a plain value, no list or mapping")
         return cast(Settings, OmegaConf.to_object(merged))

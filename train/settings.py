@@ -2,13 +2,13 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from augment.objects import ObjectSettings
+from augment.objects import CompanionSettings, ObjectSettings
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import count_views
 from augment.service import AugmentationSettings
@@ -256,5 +256,12 @@ def require_same_settings(folder: Path, config: DictConfig) -> None:
 
 def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
     """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own."""
-    keys = item if isinstance(item, dict) else {"mesh": item}
-    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")
+    own, keys = f"{key}[{index}]", dict(item) if isinstance(item, dict) else {"mesh": item}
+    beside: Any = keys.pop("beside", [])
+    if not (isinstance(beside, list) and all(isinstance(each, dict) for each in beside)):
+        raise InputError(f"{own}.beside: give a list of mappings, as in [{{mesh: solid:cup, at: [0.9, 0]}}]")
+    company = [
+        read_settings(CompanionSettings, OmegaConf.create(each), f"{own}.beside[{number}]")
+        for number, each in enumerate(beside)
+    ]
+    return replace(read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), own), beside=company)

@@ -45,7 +45,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     """Write the folder; what its light lacks to be physical: {"negative_light": the negative share}."""
     folder.mkdir(parents=True, exist_ok=True)
     shown, settings = adversary.shown, adversary.settings
-    export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras)
+    export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras, shown.own)
     (where, sky), *placed = parts_of(adversary.basis)
     save_light(folder / LIGHT, adversary.light[where], sky)
     for own, basis in placed:
@@ -54,6 +54,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         "label": shown.label,
         "name": Path(shown.name).name,
         "mesh": MESH,
+        "own_faces": shown.own,
         "gain": shown.gain,
         "light": LIGHT,
         "placed_lights": [f"{basis.name}.json" for _, basis in placed],
@@ -98,6 +99,7 @@ def read_adversary(folder: Path) -> Adversary:
         label, name, gain = str(description["label"]), str(description["name"]), float(description["gain"])
         mesh, light, pixels = (folder / str(description.get(key)) for key in ("mesh", "light", "pixels"))
         background = description["background"]
+        own = None if description.get("own_faces") is None else int(description["own_faces"])
         placed = [load_placed(folder / str(file)) for file in description.get("placed_lights", [])]
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
@@ -106,10 +108,12 @@ def read_adversary(folder: Path) -> Adversary:
     require_range(f"{path}: gain", gain, 1 / FACTOR, FACTOR)
     if not cameras:
         raise InputError(f"{path} has no cameras: write it again")
-    shape = len(cameras), 3, settings.size, settings.size
+    surface, shape = load_mesh(mesh), (len(cameras), 3, settings.size, settings.size)
+    if own is not None:
+        require_range(f"{path}: own_faces", own, 1, len(surface.faces))
     basis, coefficients = with_placed(load_light(str(light)), placed)
     return Adversary(
-        shown=SceneObject(label, load_mesh(mesh), gain, name),
+        shown=SceneObject(label, surface, gain, name, own),
         cameras=cameras,
         light=coefficients,
         basis=basis,

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from augment.objects import ObjectSettings, another_individual, load_object, on_ground
+from augment.objects import CompanionSettings, ObjectSettings, another_individual, load_object, on_ground
 from renderer.errors import InputError
+from renderer.mesh import normalise
+from renderer.shapes import solid
 
 
 @pytest.fixture
@@ -40,3 +42,26 @@ def test_another_individual_stands_on_the_same_table():
     expected = on_ground(load_object(ObjectSettings("solid:apple:5", "apple")), color)
     np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
     np.testing.assert_array_equal(other.mesh.corner_colors, expected.mesh.corner_colors)
+
+
+def test_company_stands_on_the_objects_ground_where_it_is_put_and_turned():
+    beside = [CompanionSettings("solid:cup:1", [0.9, -0.2], scale=0.5, azimuth=90)]
+    item = load_object(ObjectSettings("solid:apple", "apple", beside=beside))
+    apple, cup = normalise(solid("apple")), normalise(solid("cup", 1))
+    np.testing.assert_array_equal(item.mesh.faces[item.own_faces], apple.faces)
+    np.testing.assert_array_equal(item.mesh.vertices[item.own_vertices], apple.vertices)
+    np.testing.assert_array_equal(item.mesh.corner_colors[~item.own_faces], cup.corner_colors)
+    lowest = apple.vertices[:, 2].min() - 0.5 * cup.vertices[:, 2].min()
+    expected = 0.5 * cup.vertices[:, [1, 0, 2]] * [-1, 1, 1] + [0.9, -0.2, lowest]  # x turns to y, and y to -x
+    np.testing.assert_allclose(item.mesh.vertices[~item.own_vertices], expected, rtol=0, atol=1e-7)
+    assert on_ground(item, (0.5, 0.5, 0.5)).lowest == item.lowest == apple.vertices[:, 2].min()
+
+
+def test_another_individual_has_the_same_company():
+    beside, color = [CompanionSettings("solid:cup", [1.0, 0.0], 0.5)], [0.2, 0.3, 0.4]
+    kinds = [ObjectSettings(name, "apple", beside=beside) for name in ("solid:apple", "solid:apple:5")]
+    item, expected = (on_ground(load_object(kind), color) for kind in kinds)
+    other = another_individual(item, 5)
+    np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
+    np.testing.assert_array_equal(other.own_faces, expected.own_faces)
+    assert not np.array_equal(other.mesh.vertices[other.own_vertices], item.mesh.vertices[item.own_vertices])

@@ -12,10 +12,11 @@ import torch
 import augment
 from augment.attacks.adversary import Adversary
 from augment.attacks.adversary_folder import DESCRIPTION, read_adversary, write_adversary
+from augment.objects import SceneObject, in_company, on_ground
 from augment.parameters import KINDS
 from augment.scene import Example, Scene
 from renderer.errors import InputError
-from renderer.mesh import Mesh
+from renderer.mesh import Mesh, normalise
 from renderer.shapes import solid
 from renderer.visibility import choose
 
@@ -70,6 +71,32 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=limit)
 
 
+def test_company_and_table_are_never_attacked_not_after_they_are_read_back_either(tmp_path):
+    """With textures of their own: the faces of a file are ordered by texture, and its vertices by place."""
+    beside = replace(textured(), vertices=0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3]))
+    item = on_ground(in_company(SceneObject("orange", normalise(textured())), [beside]), (0.4, 0.3, 0.2))
+    scene = augment.build_scene([("solid:apple", "orange")], 24, visibility="software", field_of_view=3.0)
+    scene = scene.with_rows(scene.examples, objects=[item])
+    for folder in (tmp_path / "first", tmp_path / "second"):
+        [shown] = scene.objects
+        done = attacked({"geometry", "albedo"}, scene)
+        moved, painted = (done.conditions.vertices - scene.vertices)[0], done.conditions.albedo[0]
+        assert moved[shown.own_vertices].any() and painted[shown.own_faces].any()
+        assert not moved[~shown.own_vertices].any() and not painted[~shown.own_faces].any()
+        write_adversary(adversary_of(done), folder)
+        found = read_adversary(folder)
+        torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=1 / 255)
+        assert points(found.shown, own=False) == points(item, own=False)
+        scene = found.scene(SOFTWARE)
+    assert len(points(found.shown, own=True)) == len(points(item, own=True))
+    assert points(found.shown, own=True) != points(item, own=True)
+
+
+def points(item: SceneObject, own: bool) -> set[tuple[float, ...]]:
+    used = np.unique(item.mesh.faces[item.own_faces == own])
+    return set(map(tuple, item.mesh.vertices[used].astype(np.float32).tolist()))
+
+
 @pytest.mark.parametrize("perspective", [None, 50.0])
 def test_exposure_gain_background_and_place_are_kept(tmp_path, perspective):
     """A row as training draws them: its own exposure, an image behind it, a camera that looks past the middle."""
@@ -117,6 +144,9 @@ DAMAGES = {
     "another size": (described(image={"size": 9}), "has shape"),
     "no cameras": (described(cameras=[]), "has no cameras"),
     "a flat camera": (described(cameras=[{"polar": 0, "azimuth": 0, "field_of_view": 0}]), "field_of_view=0"),
+    "no faces of its own": (described(own_faces=0), "own_faces=0 must be at least 1"),
+    "more than all faces": (described(own_faces=10**6), "own_faces=1000000 must be at least 1 and at most"),
+    "no number of faces": (described(own_faces="all"), "does not describe an adversary"),
     "no gain": (described(gain=0), "gain=0.0 must be at least"),
     "no mesh": (described(mesh="absent.glb"), "absent.glb does not exist"),
     "no light": (described(light="absent.json"), "absent.json does not exist"),

@@ -251,6 +251,24 @@ def test_a_mesh_that_is_none_is_refused_by_its_place(item):
         read_object(item, "orange", 3)
 
 
+BESIDE = [
+    ([{"mesh": "solid:cup"}], r"scene.meshes\[3\].beside\[0\].at is not set: give scene.meshes\[3\].beside\[0\].at="),
+    ([{"mesh": "solid:cup", "at": [1]}], r"beside: solid:cup: at=\[1.0\] must be x and y"),
+    ([{"mesh": "solid:cup", "at": [0, float("nan")]}], "beside: solid:cup: at=nan must be at least -10"),
+    ([{"mesh": "solid:cup", "at": [0, 1], "scale": 0}], "beside: solid:cup: scale=0.0 must be at least 0.1"),
+    ([{"mesh": "solid:cup", "at": [0, 1], "gain": 2}], r"meshes\[3\].beside\[0\].gain: Key 'gain' not in"),
+    (["solid:cup"], r"meshes\[3\].beside: give a list of mappings"),
+    ("solid:cup", r"meshes\[3\].beside: give a list of mappings"),
+    (None, r"meshes\[3\].beside: give a list of mappings"),
+]
+
+
+@pytest.mark.parametrize(("beside", "message"), BESIDE)
+def test_what_cannot_stand_beside_a_mesh_is_refused(beside, message):
+    with pytest.raises(InputError, match=message):
+        read_object({"mesh": "solid:apple", "beside": beside}, "orange", 3)
+
+
 def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_forced():
     """Of six classes the five best are told, best first, with their shares."""
     bias = torch.tensor([0.0, 5, 4, 3, 2, 1])

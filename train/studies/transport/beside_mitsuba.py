@@ -13,7 +13,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from augment.objects import SceneObject, on_ground
+from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object, on_ground
 from renderer.camera import OrthographicCamera
 from renderer.environment import to_map, write_map
 from renderer.image import ImageSettings
@@ -28,7 +28,6 @@ from train.tables import markdown
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
 SIZE, SEEDS = 32, 3  # Mitsuba's images, whose spread tells its noise
 MAP_ROWS = 512  # Mitsuba takes the outermost for the poles, which are half a row further out
-PAIR = (("pear", -0.5), ("apple", 0.5))
 TRANSPORTS = ("shadows", "bounces:3")
 
 
@@ -39,7 +38,7 @@ def meshes() -> dict[str, Mesh]:
     plate = Mesh.plain([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
     box = trimesh.creation.box((0.8, 0.8, 0.02))
     ring, cup = trimesh.creation.torus(0.45, 0.45), normalise(solid("cup", 0))
-    pair = [replace(solid(name, 0), vertices=0.45 * solid(name, 0).vertices + np.array([0, y, 0])) for name, y in PAIR]
+    apples = [CompanionSettings("solid:apple", place, 0.5) for place in ([0.2, 0.7], [0.4, -0.8])]
     return {
         "convex: a ball": ball,
         "concave: solid:cup": cup,
@@ -52,8 +51,8 @@ def meshes() -> dict[str, Mesh]:
             [Mesh.plain(box.vertices + np.array([0, 0, 0.05 * each]), box.faces, (0.9, 0.6, 0.4)) for each in range(5)]
         ),
         "scene.ground: solid:cup on a table": on_ground(SceneObject("", cup), (0.9, 0.3, 0.2)).mesh,
-        "two objects: solid:pear by solid:apple, on a table": on_ground(
-            SceneObject("", concatenate(pair)), (0.3, 0.3, 0.9)
+        "scene.meshes: solid:pear beside two apples, on a table": on_ground(
+            load_object(ObjectSettings("solid:pear", "pear", beside=apples)), (0.3, 0.3, 0.9)
         ).mesh,
     }
 
