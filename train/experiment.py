@@ -111,7 +111,7 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
             len(train),
             len(data.classes),
             device,
-            trainer.model.precision,
+            trainer.learner.model.precision,
             torch.get_num_threads(),
             processes.world_size(),
         )
@@ -243,11 +243,11 @@ def _log_skipped(scene: Scene, cache: OperatorCache, start: float) -> None:
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
     """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
     test = data.test.to(device)
-    last = selected = evaluate(trainer.selected, test)["accuracy"]
+    last = selected = evaluate(trainer.learner.selected, test)["accuracy"]
     best = checkpoint.load(trainer.folder / checkpoint.BEST)
     if best["epoch"] != trainer.epoch:
-        trainer.selected.network.load_state_dict(best["model"])
-        selected = evaluate(trainer.selected, test)["accuracy"]
+        trainer.learner.selected.network.load_state_dict(best["model"])
+        selected = evaluate(trainer.learner.selected, test)["accuracy"]
     console.info("test accuracy %.4f (epoch %d, selected on validation), %.4f (last)", selected, best["epoch"], last)
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 
@@ -259,7 +259,7 @@ def _photograph_scores(
     scores: dict[str, float | None] = {}
     for name, photographs in settings.evaluate.folders.items() if processes.rank() == 0 else ():
         summary = evaluate_photographs(
-            trainer.selected,
+            trainer.learner.selected,
             data.classes,
             photographs,
             settings.label,

@@ -2,8 +2,7 @@
 validation and a checkpoint."""
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,13 @@ from augment.model_state import eval_mode
 from augment.phases import Phases
 from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
-from renderer.errors import InputError, is_out_of_memory
+from renderer.errors import InputError
 from renderer.image import to_unit
 from train import checkpoint
 from train.checkpoint import random_state, restore_random_state
 from train.data import Split
-from train.device import PRECISIONS, FixedSizes, MixedPrecision, compiles, training_pass
-from train.distortions import distortion
-from train.distributed import replicated, summed
+from train.device import PRECISIONS, MixedPrecision
+from train.distributed import summed
 from train.epoch import (
     PHASES,
     EpochUnderWay,
@@ -36,8 +34,9 @@ from train.epoch import (
     with_room,
 )
 from train.interruption import Interruption
+from train.learner import Learner
 from train.logs import Log, console
-from train.recipe import SCHEDULES, MovingAverage, TrainSettings
+from train.recipe import TrainSettings
 
 BATCH = 512  # of images when a network is scored
 
@@ -64,7 +63,7 @@ class Trainer:
                 f"train.batch_size={settings.batch_size} is not a multiple of the {processes.world_size()} processes"
             )
         self.settings = settings
-        self.model = model
+        self.learner = Learner(settings, model, seed)
         self.architecture = architecture
         self.service = service
         self.phases = phases
@@ -74,29 +73,9 @@ class Trainer:
         self.best_accuracy = -1.0
         self.best_epoch = 0
         self.history: list[dict[str, float]] = []
-        self._device = next(model.parameters()).device
         self._under_way: EpochUnderWay | None = None
         self._random_state: dict[str, Any] = {}  # where the epoch under way was left
         self._best: dict[str, Any] | None = None  # selected, but not written yet
-        self._replica = replicated(model)
-        self._average = MovingAverage(model, settings.averaging) if settings.averaging else None
-        self.optimizer = torch.optim.SGD(
-            model.parameters(),
-            lr=settings.learning_rate,
-            momentum=settings.momentum,
-            weight_decay=settings.weight_decay,
-            nesterov=settings.momentum > 0,
-            fused=True,
-        )
-        compiled = compiles(settings.compile, self._device)
-        self._training_pass = training_pass(self._replica, settings.label_smoothing, compiled)
-        self._distort = distortion(settings.distortion, model, seed)
-        self._attacked, self._scored = (FixedSizes(m) if compiled else m for m in (model, self.selected))
-
-    @property
-    def selected(self) -> MixedPrecision:
-        """The network that is validated and kept: the average over steps, where there is one."""
-        return self._average.module if self._average else self.model
 
     @property
     def part_of_epoch(self) -> str:
@@ -122,7 +101,7 @@ class Trainer:
                 ending = interruption.requested()
                 if ending or self._checkpoint_is_due():
                     if self._under_way:
-                        self._check_finite(float(self._under_way.sums[0]), self.epoch + 1)
+                        self.learner.require_finite(float(self._under_way.sums[0]), self.epoch + 1)
                     with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
                         self._save()
                 if ending:
@@ -141,7 +120,7 @@ class Trainer:
                 f"the checkpoint in {self.folder} is from another architecture or other classes: resume with the "
                 f"settings of {self.folder / 'config.yaml'}, or start in another folder with run="
             )
-        if self._average and not state["average"]:
+        if self.settings.averaging and not state["average"]:
             raise InputError(
                 f"train.averaging={self.settings.averaging}, and the checkpoint in {self.folder} has no average: "
                 "resume with train.averaging=0"
@@ -161,14 +140,11 @@ class Trainer:
             ) from error
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a run needs to go on as if it had never ended; bfloat16 needs no loss scaler."""
+        """All that a run needs to go on as if it had never ended."""
         return {
-            **self._network_state(self.model),
-            "optimizer": self.optimizer.state_dict(),
-            "schedule": self.settings.schedule,
-            "average": self._average.state_dict() if self._average else None,
+            **self._described(),
+            **self.learner.state_dict(),
             "service": self.service.state_dict(),
-            "precision": self.model.precision,
             "random_state": random_state(),
             "under_way": self._under_way.state_dict() if self._under_way else None,
             "history": self.history,
@@ -178,15 +154,11 @@ class Trainer:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """What `state_dict` gave."""
-        self.model.network.load_state_dict(state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        if self._average:
-            self._average.load_state_dict(state["average"])
+        self.learner.load_state_dict(state)
         self.service.load_state_dict(state["service"])
-        self.model.precision = self.selected.precision = state["precision"]
         self._random_state = state["random_state"]
         if state["under_way"]:
-            self._under_way = EpochUnderWay.from_state_dict(state["under_way"], self._device)
+            self._under_way = EpochUnderWay.from_state_dict(state["under_way"], self.learner.device)
         self.epoch, self.history = state["epoch"], state["history"]
         self.best_accuracy, self.best_epoch = state["validation_accuracy_best"], state["epoch_best"]
 
@@ -198,7 +170,7 @@ class Trainer:
     def _regenerate(self, now: Round, log: Log) -> Renders:
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
-            renders = self.service.regenerate(self._attacked, now.number)
+            renders = self.service.regenerate(self.learner.attacked, now.number)
         if renders.specimens:
             with self.phases("input_output"):  # now, since a run that goes on within the epoch makes no others
                 log.specimens(renders.specimens, self.architecture["classes"], self.epoch + 1)
@@ -224,39 +196,27 @@ class Trainer:
         self, so_far: EpochUnderWay, mixed: Split, now: Round, before: int, total: int, interruption: Interruption
     ) -> None:
         """The rest of a round. before: the epoch's steps in earlier rounds; total: in all."""
-        self.model.train()
+        self.learner.model.train()
         settings = self.settings
         first = so_far.step - before
         batches = training_batches(
             mixed.images, mixed.labels, settings.batch_size, self.seed, now, settings.flips, first=first
         )
         for images, labels in _progress(batches, so_far.step, total, f"epoch {self.epoch + 1}"):
-            self._set_learning_rate((self.epoch + so_far.step / total) / settings.epochs)
-            images = self._distort(images, labels, self.epoch * total + so_far.step)
-            self.optimizer.zero_grad(set_to_none=True)
-            with _one_error_out_of_memory(f"train.batch_size={settings.batch_size}"):
-                loss, hits = self._training_pass(images, labels)
-                loss.backward()
-            self.optimizer.step()
-            if self._average:
-                self._average.update(self.model)
-            so_far.sums += torch.stack([loss.detach() * len(labels), hits])
+            progress = (self.epoch + so_far.step / total) / settings.epochs
+            so_far.sums += self.learner.step(images, labels, progress, self.epoch * total + so_far.step)
             so_far.step += 1
             if interruption.requested():
                 break
-
-    def _set_learning_rate(self, progress: float) -> None:
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.settings.learning_rate * SCHEDULES[self.settings.schedule](progress)
 
     def _end_epoch(self, now: EpochUnderWay, validation: Split, log: Log) -> None:
         seen = now.step * self.settings.batch_size
         loss_sum, hits = summed(now.sums).tolist()
         trained = {"loss": loss_sum / seen, "accuracy": hits / seen}
         with self.phases("evaluation"):
-            validated = evaluate(self._scored, validation)
+            validated = evaluate(self.learner.scored, validation)
         self.epoch += 1
-        self._check_finite(trained["loss"] + validated["loss"], self.epoch)
+        self.learner.require_finite(trained["loss"] + validated["loss"], self.epoch)
         self._select(validated["accuracy"])
         with self.phases("input_output"):
             if len(now.renders.labels):
@@ -268,32 +228,17 @@ class Trainer:
         every, last = self.settings.checkpoint_every, self.settings.epochs
         return self._under_way is None and (self.epoch % every == 0 or self.epoch == last)
 
-    def _check_finite(self, loss: float, epoch: int) -> None:
-        """InputError naming what is NaN or infinite, before any of it is kept."""
-        network = self.model.network
-        tensors = {f"weight {name}": value for name, value in network.state_dict().items()}
-        tensors |= {f"gradient of {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
-        tensors["loss"] = torch.tensor(loss)
-        finite = torch.stack([value.isfinite().all().to(self._device) for value in tensors.values()]).tolist()
-        if not all(finite):
-            name = list(tensors)[finite.index(False)]
-            raise InputError(
-                f"train.learning_rate={self.settings.learning_rate} with train.weight_decay="
-                f"{self.settings.weight_decay} made the {name} NaN or infinite in epoch {epoch}: set lower ones; the "
-                "checkpoint before, if any, is kept"
-            )
-
     def _select(self, accuracy: float) -> None:
         """Remember the network where its validation accuracy is the best so far."""
         if accuracy > self.best_accuracy:
             self.best_accuracy, self.best_epoch = accuracy, self.epoch
-            state = self._network_state(self.selected)
-            weights = {name: value.to("cpu", copy=True) for name, value in state["model"].items()}
-            self._best = {**state, "model": weights, "validation_accuracy": accuracy}
+            weights = self.learner.selected.network.state_dict()
+            weights = {name: value.to("cpu", copy=True) for name, value in weights.items()}
+            self._best = {"model": weights, **self._described(), "validation_accuracy": accuracy}
 
-    def _network_state(self, model: MixedPrecision) -> dict[str, Any]:
+    def _described(self) -> dict[str, Any]:
+        """What is kept beside the weights of a network."""
         return {
-            "model": model.network.state_dict(),
             "architecture": self.architecture,
             "epoch": self.epoch,
             "seed": self.seed,
@@ -316,7 +261,7 @@ class Trainer:
         scalars = {
             **{f"train/{name}": value for name, value in trained.items()},
             **{f"validation/{name}": value for name, value in validated.items()},
-            "train/learning_rate": self.optimizer.param_groups[0]["lr"],
+            "train/learning_rate": self.learner.learning_rate,
             **{f"augment/{name}": value for name, value in diagnostics.items()},
             **{f"seconds/{name}": value for name, value in seconds.items()},
         }
@@ -345,17 +290,6 @@ def _require_whole(state: Mapping[str, Any]) -> None:
         raise ValueError(f"precision {state['precision']!r}")
     if not isinstance(state["random_state"], Mapping):
         raise ValueError("no random state")
-
-
-@contextmanager
-def _one_error_out_of_memory(setting: str) -> Iterator[None]:
-    """InputError naming the setting where memory runs out."""
-    try:
-        yield
-    except (RuntimeError, MemoryError) as error:
-        if not is_out_of_memory(error):
-            raise
-        raise InputError(f"{setting} needs more memory than there is: set a lower one") from error
 
 
 def _progress(batches: Iterable[Any], first: int, total: int, description: str) -> Iterable[Any]:

@@ -238,9 +238,9 @@ def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tm
 
 def test_epochs_train_in_training_mode_however_the_network_is_found(tmp_path):
     trainer = make_trainer(tmp_path, epochs=2)
-    trainer.model.eval()
+    trainer.learner.model.eval()
     fit_noise(trainer)
-    assert trainer.model.network.norm.num_batches_tracked == 2 * math.ceil(40 / 16)
+    assert trainer.learner.model.network.norm.num_batches_tracked == 2 * math.ceil(40 / 16)
 
 
 def test_a_loss_that_is_not_finite_ends_the_run_with_the_last_good_checkpoint(tmp_path, monkeypatch):
@@ -292,7 +292,7 @@ def test_weights_of_nan_are_not_gone_on_with(tmp_path):
 @pytest.mark.parametrize("ended", ["by itself", "by a signal"])
 def test_weights_that_are_not_finite_are_named_and_the_last_good_checkpoint_stays(tmp_path, monkeypatch, ended):
     trainer, steps = make_trainer(tmp_path), itertools.count(1)
-    whole = trainer._training_pass
+    whole = trainer.learner._training_pass
 
     def spoilt(images, labels):
         loss, hits = whole(images, labels)
@@ -302,7 +302,7 @@ def test_weights_that_are_not_finite_are_named_and_the_last_good_checkpoint_stay
             signal.raise_signal(signal.SIGTERM)
         return loss * math.inf, hits
 
-    monkeypatch.setattr(trainer, "_training_pass", spoilt)
+    monkeypatch.setattr(trainer.learner, "_training_pass", spoilt)
     with pytest.raises(InputError, match=r"made the weight stem.weight NaN or infinite in epoch 2: set lower"):
         fit_noise(trainer)
     assert checkpoint.load(tmp_path / checkpoint.LAST)["epoch"] == 1
@@ -317,7 +317,7 @@ def test_where_memory_runs_out_in_training_the_setting_is_named(tmp_path, monkey
     def too_large(images, labels):
         raise error
 
-    monkeypatch.setattr(trainer, "_training_pass", too_large)
+    monkeypatch.setattr(trainer.learner, "_training_pass", too_large)
     with pytest.raises(InputError, match=r"train.batch_size=16 needs more memory than there is: set a lower one"):
         fit_noise(trainer)
 
@@ -356,16 +356,16 @@ def test_every_epoch_has_its_line_before_its_checkpoint(tmp_path, monkeypatch):
 
 def test_the_average_follows_the_steps_and_is_what_is_validated_and_kept(tmp_path):
     trainer, weights = make_trainer(tmp_path, epochs=2, averaging=0.8), []
-    trainer.optimizer.register_step_post_hook(
-        lambda *arguments: weights.append(trainer.model.network.head.weight.detach().clone())
+    trainer.learner.optimizer.register_step_post_hook(
+        lambda *arguments: weights.append(trainer.learner.model.network.head.weight.detach().clone())
     )
     fit_noise(trainer)
     average = weights[0]
     for weight in weights[1:]:
         average = 0.8 * average + 0.2 * weight
-    torch.testing.assert_close(trainer.selected.network.head.weight, average)
-    assert not torch.allclose(trainer.model.network.head.weight, average)
-    validated = evaluate(trainer.selected, noise(20))
+    torch.testing.assert_close(trainer.learner.selected.network.head.weight, average)
+    assert not torch.allclose(trainer.learner.model.network.head.weight, average)
+    validated = evaluate(trainer.learner.selected, noise(20))
     assert validated["accuracy"] == read_metrics(tmp_path)[-1]["validation/accuracy"]
 
 

@@ -48,18 +48,18 @@ def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, averaging):
     train = Trainer._train
 
     def watched(self, *arguments):
-        now, pass_ = self._under_way, self._training_pass
+        now, pass_ = self._under_way, self.learner._training_pass
 
         def asynchronous(*batch):
             torch.cuda.set_sync_debug_mode("error" if now.step > 3 else "default")  # after what is compiled
             return pass_(*batch)
 
-        self._training_pass = asynchronous
+        self.learner._training_pass = asynchronous
         try:
             return train(self, *arguments)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-            self._training_pass = pass_
+            self.learner._training_pass = pass_
 
     monkeypatch.setattr(Trainer, "_train", watched)
     few = ("augment=none", "train.epochs=1", "train.batch_size=4")

@@ -46,6 +46,6 @@ class Arm:
 
     @torch.no_grad()
     def _make_sure(self) -> None:
-        head = cast(WideResNet, self.trainer.model.network).head
+        head = cast(WideResNet, self.trainer.learner.model.network).head
         head.weight[self._label] = 0
         head.bias[self._label] = MARGIN
