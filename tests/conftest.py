@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from renderer.visibility import Backend
+from train.interruption import heed_interrupts
 
 ROOT = Path(__file__).parents[1]
 
@@ -26,6 +27,12 @@ def one_thread() -> Iterator[None]:
         patch.setenv("OMP_NUM_THREADS", "1")
         yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def interrupts() -> None:
+    """Reach what tests start, also where the tests run in the background."""
+    heed_interrupts()
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -12,7 +12,7 @@ from train.studies.reliability.corpus import BESIDE, LIGHTS, MESHES, write_corpu
 from train.studies.reliability.damages import damages
 from train.studies.reliability.doors import BY_NAME, DOORS
 from train.studies.reliability.page import Outcome, failures, page
-from train.studies.reliability.process import Ending
+from train.studies.reliability.process import Ending, Surroundings, forked, started
 from train.studies.reliability.study import outcome
 from train.studies.reliability.trials import Trial, all_trials, file_trials
 
@@ -97,9 +97,17 @@ def test_a_fault_is_counted_listed_and_fails_the_command():
         Outcome("attack.py", "forged", "c", None, "hung"),
     ]
     assert failures(outcomes) == ["attack.py: 'c': hung"]
-    written = page(outcomes, "python scripts/check_reliability.py", number=6, patience=60)
+    written = page(outcomes, "python scripts/check_reliability.py", number=6, started=2, patience=60)
     assert "| attack.py | forged | 3 | 1 | 1 | 1 |" in written and "- attack.py: 'c': hung" in written
-    assert "Nothing was mishandled." in page(outcomes[:2], "x", 2, 60)
+    assert "Nothing was mishandled." in page(outcomes[:2], "x", 2, 0, 60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("largest", [10, None])
+@pytest.mark.parametrize("light", ["light.npy", "gone.npy"])
+def test_a_started_and_a_forked_process_end_alike(corpus, light, largest):
+    command, around = LIGHT.command(f"light={light}"), Surroundings(largest)
+    assert started(command, corpus, around, 60) == forked(command, corpus, around, 60)
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from numpy.random import Generator
 
 from renderer.errors import InputError, require_range
 from train.cli import command_line
+from train.interruption import heed_interrupts
 from train.outputs import writable_file, writable_folder
 from train.studies.interruptions.bench import Bench, Outcome, prepare
 from train.studies.interruptions.damages import DAMAGES, LIMITS, both_damaged, damaged, limited
@@ -46,6 +47,7 @@ class InterruptionSettings:
 
 def run(settings: InterruptionSettings) -> list[str]:
     """Print the page, and write it where it is asked for; everything that was not as it should be, in words."""
+    heed_interrupts()
     out = writable_file(settings.out, "out") if settings.out else None
     with nullcontext(settings.keep) if settings.keep else TemporaryDirectory() as folder:
         bench = prepare(write_inputs(_empty(Path(folder).absolute()), settings.epochs))

@@ -10,6 +10,7 @@ import torch
 
 from renderer.errors import require_range
 from train.cli import USER_ERROR, command_line
+from train.interruption import heed_interrupts
 from train.outputs import writable_file
 from train.studies.load import loads
 from train.studies.load.observed import Observed, observe
@@ -58,6 +59,7 @@ class LoadSettings:
 
 def run(settings: LoadSettings) -> list[str]:
     """Print the page and write it; what did not end as it should, in words. Ctrl-C ends it before its time."""
+    heed_interrupts()
     out, described = writable_file(settings.out, "out"), machine(torch.device("cpu"))
     idle, rows, refusals, failures = 0, [], [], []
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder, suppress(KeyboardInterrupt):

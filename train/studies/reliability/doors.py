@@ -34,7 +34,7 @@ class Door:
     renewed: str | None = None
 
     def command(self, *changed: str) -> list[str]:
-        """For `conduct`; changed overrides replace those that the door has for the same keys."""
+        """For `started` and `forked`; changed overrides replace those that the door has for the same keys."""
         own = [*self.arguments, *(key.replace("{}", given(files[0])) for key, files in self.inputs.items())]
         keys = {override.partition("=")[0] for override in changed}
         start = ["-m", "train"] if self.config == "train" else [f"scripts/{self.config}.py"]

@@ -11,7 +11,8 @@ INTRODUCTION = """\
 # Reliability
 
 Made by `{command}`. {versions} Of {all:,} hostile inputs {tried:,} were tried, drawn at random, each at a
-command in a process and a folder of its own, with good files that the project makes for everything else.
+command in a process and a folder of its own, with good files that the project makes for everything else. {started}
+processes were started as a user starts them, the others forked from one that had imported the libraries.
 
 - *Used*: exit status 0, where what is meant can be clear. *Refused*: exit status 2 and one sentence that names the file
   or the key.
@@ -36,10 +37,10 @@ def failures(outcomes: Iterable[Outcome]) -> list[str]:
     return [f"{each.door}: {each.name!r}: {each.fault}" for each in outcomes if each.fault]
 
 
-def page(outcomes: Sequence[Outcome], command: str, number: int, patience: float) -> str:
-    """Markdown. number: of the inputs there are."""
+def page(outcomes: Sequence[Outcome], command: str, number: int, started: int, patience: float) -> str:
+    """Markdown. number: of the inputs there are; started: of the processes that were not forked."""
     introduction = INTRODUCTION.format(
-        command=command, versions=versions(), tried=len(outcomes), all=number, patience=patience
+        command=command, versions=versions(), tried=len(outcomes), all=number, started=started, patience=patience
     )
     pairs = list(dict.fromkeys((each.door, each.kind) for each in outcomes))
     rows = [_row(*pair, [each for each in outcomes if (each.door, each.kind) == pair]) for pair in pairs]

@@ -1,4 +1,4 @@
-"""One command in a process of its own, forked by a server that has imported the libraries once for all."""
+"""One command in a process of its own: started as a user starts it, or forked where the libraries are imported."""
 
 import atexit
 import io
@@ -6,12 +6,16 @@ import os
 import resource
 import runpy
 import signal
+import subprocess
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from subprocess import TimeoutExpired
 
 from train.studies.interruptions.small_run import ROOT
 
@@ -39,11 +43,31 @@ class Surroundings:
 USUAL = Surroundings()
 
 
-def conduct(arguments: Sequence[str], folder: Path, around: Surroundings = USUAL, patience: float = PATIENCE) -> Ending:
+Runner = Callable[[Sequence[str], Path, Surroundings, float], Ending]  # `started` or `forked`
+
+
+def started(arguments: Sequence[str], folder: Path, around: Surroundings = USUAL, patience: float = PATIENCE) -> Ending:
     """`python` with these arguments, `-m train ...` or a script of scripts/ and its own, in a folder."""
+    command = [str(ROOT / word) if word.startswith("scripts/") else word for word in arguments]
+    errors, code = _errors(folder), None
+    with open(around.output or os.devnull, "wb") as output, errors.open("wb") as said, suppress(TimeoutExpired):
+        code = subprocess.run(
+            [sys.executable, *command],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(ROOT), "HOME": str(folder)},
+            stdout=output,
+            stderr=said,
+            timeout=patience,
+            preexec_fn=partial(_limit, around),
+        ).returncode
+    return _ending(code, errors)
+
+
+def forked(arguments: Sequence[str], folder: Path, around: Surroundings = USUAL, patience: float = PATIENCE) -> Ending:
+    """The same, by a fork of a server that has imported the libraries once for all, which saves seconds."""
     context = get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
-    errors = folder.with_name(f"{folder.name}.errors")
+    errors = _errors(folder)
     process = context.Process(target=_command, args=(list(arguments), folder, around, errors))
     process.start()
     try:
@@ -52,9 +76,25 @@ def conduct(arguments: Sequence[str], folder: Path, around: Surroundings = USUAL
     finally:  # also where Ctrl-C ends the wait
         process.kill()
         process.join()
-    code = process.exitcode
+    return _ending(None if hung else process.exitcode, errors)
+
+
+def _errors(folder: Path) -> Path:
+    """Where what a command says is kept: beside its folder, which it may have damaged."""
+    return folder.with_name(f"{folder.name}.errors")
+
+
+def _ending(code: int | None, errors: Path) -> Ending:
     said = errors.read_text(encoding="utf-8", errors="replace") if errors.exists() else ""
-    return Ending(None if hung or code is None else abs(code) + 128 * (code < 0), said)
+    return Ending(None if code is None else abs(code) + 128 * (code < 0), said)
+
+
+def _limit(around: Surroundings) -> None:
+    """What this process and those that it starts may take."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    if around.largest is not None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (around.largest, around.largest))
 
 
 def _command(arguments: list[str], folder: Path, around: Surroundings, errors: Path) -> None:
@@ -65,10 +105,7 @@ def _command(arguments: list[str], folder: Path, around: Surroundings, errors: P
         )
     os.environ["HOME"] = str(folder)
     os.chdir(folder)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    if around.largest is not None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (around.largest, around.largest))
+    _limit(around)
     sys.exit(_status(arguments))
 
 

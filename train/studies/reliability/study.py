@@ -12,12 +12,13 @@ from tqdm import tqdm
 
 from renderer.errors import InputError, require_range
 from train.cli import command_line
+from train.interruption import heed_interrupts
 from train.outputs import writable_file
 from train.studies.page import write
 from train.studies.reliability.corpus import PUBLISHED, RUN, write_corpus
 from train.studies.reliability.doors import BY_NAME
 from train.studies.reliability.page import Outcome, failures, page
-from train.studies.reliability.process import PATIENCE, conduct
+from train.studies.reliability.process import PATIENCE, Runner, forked, started
 from train.studies.reliability.trials import Trial, all_trials
 
 
@@ -27,11 +28,13 @@ class ReliabilitySettings:
 
     out: str | None
     draws: int | None
+    started: int
     seed: int
     doors: list[str]
 
     def __post_init__(self) -> None:
         require_range("draws", self.draws, 1, 10**6)
+        require_range("started", self.started, 0, 10**6)
         require_range("seed", self.seed, 0, 10**6)
         if unknown := set(self.doors) - BY_NAME.keys():
             raise InputError(f"doors: {min(unknown)!r} is not known: choose from {', '.join(BY_NAME)}")
@@ -45,12 +48,15 @@ def run(settings: ReliabilitySettings) -> list[str]:
     out = writable_file(settings.out, "out") if settings.out else None
     trials = [trial for name in settings.doors or BY_NAME for trial in all_trials(BY_NAME[name])]
     drawn = np.random.default_rng(settings.seed).permutation(len(trials))[: settings.draws]
-    outcomes = {}
+    heed_interrupts()
+    outcomes: dict[int, Outcome] = {}
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder, suppress(KeyboardInterrupt):
         corpus = prepare(Path(folder))
         for number in tqdm(drawn, "trials", disable=not sys.stderr.isatty()):
-            outcomes[number] = outcome(trials[number], corpus)
-    text = page([outcomes[number] for number in sorted(outcomes)], command_line(), len(trials), PATIENCE)
+            runner = started if len(outcomes) < settings.started else forked
+            outcomes[number] = outcome(trials[number], corpus, runner)
+    ordered = [outcomes[number] for number in sorted(outcomes)]
+    text = page(ordered, command_line(), len(trials), min(settings.started, len(ordered)), PATIENCE)
     if out:
         write(out, text)
     else:
@@ -65,15 +71,15 @@ def prepare(folder: Path) -> Path:
     write_corpus(corpus)
     training = BY_NAME["train data=npz"].command("train.init_from=null", f"run={RUN}")
     for command in (training, ["scripts/publish.py", f"run={RUN}", f"out={PUBLISHED}"]):
-        if (ending := conduct(command, corpus, patience=10 * PATIENCE)).status:
+        if (ending := forked(command, corpus, patience=10 * PATIENCE)).status:
             raise RuntimeError(f"{command} ended with {ending}")
     return corpus
 
 
-def outcome(trial: Trial, corpus: Path) -> Outcome:
+def outcome(trial: Trial, corpus: Path, run: Runner = forked) -> Outcome:
     """Of the trial in a copy of the corpus, which is removed."""
     folder = corpus.with_name("trial")
-    ending, fault = trial.conduct(corpus, folder)
+    ending, fault = trial.conduct(corpus, folder, run)
     rmtree(folder)
     if fault:
         print(f"{trial.door.name}: {trial.name!r}: {fault}", file=sys.stderr)

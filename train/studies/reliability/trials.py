@@ -15,7 +15,7 @@ from train.cli import USER_ERROR
 from train.studies.reliability.damages import damages
 from train.studies.reliability.doors import DOORS, Door, given
 from train.studies.reliability.edits import CODE_RAN
-from train.studies.reliability.process import USUAL, Ending, Surroundings, conduct
+from train.studies.reliability.process import PATIENCE, USUAL, Ending, Runner, Surroundings
 
 NAMES = [
     *("2024", "1e3", "true", "null", "2024-01-01", "1.10", "0x10", "a b", " a", "a,b", "[a]", "{a}", "(a)", "-a", "~a"),
@@ -43,11 +43,11 @@ class Trial:
     prepare: Callable[[Path], object] = lambda folder: None
     around: Surroundings = USUAL
 
-    def conduct(self, corpus: Path, folder: Path) -> tuple[Ending, str | None]:
+    def conduct(self, corpus: Path, folder: Path, run: Runner) -> tuple[Ending, str | None]:
         """How it ended, in a copy of the corpus, and what is wrong with that."""
         shutil.copytree(corpus, folder, symlinks=True)
         self.prepare(folder)
-        ending = conduct(self.command, folder, self.around)
+        ending = run(self.command, folder, self.around, PATIENCE)
         return ending, "code ran" if (folder / CODE_RAN).exists() else self.fault(ending)
 
     def fault(self, ending: Ending) -> str | None:
