@@ -1,4 +1,4 @@
-"""Patterns that a projector throws onto an image: stripes, checkers, halves and solid colours, drawn at random."""
+"""Patterns that a projector throws onto an image: stripes, checkers, spots, halves, solid colours, drawn at random."""
 
 import math
 from collections.abc import Callable
@@ -34,6 +34,11 @@ def _checkers(points: Tensor, place: Tensor) -> Tensor:
     return (((points + place[:, None, None]) % 1 < 0.5).sum(0) == 1).float()
 
 
+def _spots(points: Tensor, place: Tensor) -> Tensor:
+    """Discs on a square grid, over half of it."""
+    return (((points + place[:, None, None]) % 1 - 0.5).norm(dim=0) < 0.4).float()
+
+
 def _half(points: Tensor, place: Tensor) -> Tensor:
     return (points[0] > place[0] - 0.5).float()
 
@@ -42,7 +47,7 @@ def _solid(points: Tensor, place: Tensor) -> Tensor:
     return torch.ones_like(points[0])
 
 
-FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (_stripes, _checkers, _half, _solid)
+FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (_stripes, _checkers, _spots, _half, _solid)
 
 
 def _colour(draws: torch.Generator) -> Tensor:

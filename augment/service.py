@@ -36,16 +36,23 @@ STARTS = ("light", "random")
 SCHEDULES = ("restart", "continue")
 MOST_EXAMPLES = 10**6  # at 32 × 32 pixels they take 12 GB
 MOST_EVERY = 10**9
+MOST_CANDIDATES = 100
 
 
 @dataclass
 class RandomLights:
-    """Perturbations of the initial light: uniform ±amplitude, or scaled to an L2 radius (see `lights.perturb`)."""
+    """Perturbations of the initial light: uniform ±amplitude, or scaled to an L2 radius (see `lights.perturb`).
+
+    candidates: how many lights are tried of each example of the random arm, all that `vary` draws of the light and the
+    camera's part included, to keep the one of the highest loss.
+    """
 
     amplitude: float = 0.5
     radius: float | None = None
+    candidates: int = 1
 
     def __post_init__(self) -> None:
+        require_range("augment.random.candidates", self.candidates, 1, MOST_CANDIDATES)
         for name in ("amplitude", "radius"):  # no radius: null
             require_range(f"augment.random.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
 
@@ -165,7 +172,7 @@ class AugmentationService:
         self.settings = settings
         self._scene = scene
         self._labels = labels
-        self._label = label
+        self.label = label
         self._seed = seed
         self._phases = phases
         self._continued: Tensor | None = None
@@ -207,8 +214,10 @@ class AugmentationService:
         """
         if self._scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
-        make = self._random if self.settings.arm == "random" else self._adversarial
-        scene = vary(self._scene, self.settings.vary, generator(self._seed, number, "rows"))
+        random = self.settings.arm == "random"
+        lights = self.settings.random.candidates if random else 1
+        scene = vary(self._scene, self.settings.vary, generator(self._seed, number, "rows"), lights)
+        make = self._random if random else self._adversarial
         return make(model, self.settings.attack.problem(scene), number)
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -234,13 +243,13 @@ class AugmentationService:
         with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
             batches = BatchSize(self.settings.attack.batch_size).map(lambda part: model(images[part]), len(images))
             logits = torch.cat(list(batches))
-        fooled = ~is_right(logits.argmax(1), self._labels)
-        diagnostics = {
-            "fooled": _mean(fooled),
-            "loss": _mean(label_loss(logits, self._labels)),
-        }
-        specimens = choose_specimens(model, problem, values, fooled, self._labels)
-        return Renders(images, self._labels, diagnostics | _changes(problem, values), specimens)
+        labels = self._labels.repeat(self.settings.random.candidates)
+        fooled, losses = ~is_right(logits.argmax(1), labels), label_loss(logits, labels)
+        worst = losses.unflatten(0, (-1, len(self))).argmax(0) * len(self) + torch.arange(len(self)).to(labels)
+        diagnostics = {"fooled": _mean(fooled[worst]), "loss": _mean(losses[worst])}
+        kept = torch.zeros_like(fooled).index_fill(0, worst, True)
+        specimens = choose_specimens(model, problem, values, fooled & kept, labels)
+        return Renders(images[worst], self._labels, diagnostics | _changes(problem, values), specimens)
 
     def _adversarial(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
         attack, goal = self.settings.attack, self._goal()
@@ -261,10 +270,10 @@ class AugmentationService:
         return Renders(result.images[:, 0], self._labels, diagnostics, specimens)
 
     def _goal(self) -> Goal:
-        if self._label is None:
+        if self.label is None:
             return Goal(self._labels[:, None])
         decrease = torch.where(self._labels < 0, NO_CLASS, self._labels)
-        increase = torch.where(self._labels == self._label, NO_CLASS, self._label)
+        increase = torch.where(self._labels == self.label, NO_CLASS, self.label)
         return Goal(decrease[:, None], increase[:, None])
 
     def _start(self, problem: Perturbation, number: int) -> Tensor:

@@ -31,13 +31,13 @@ class VariationSettings:
     """What is drawn for each example in each round; by default nothing, which leaves the grid of the paper.
 
     place: the mesh's middle is moved by at most this share of the frame's width, to either side and up and down.
-    scale, exposure: [least, most] that its size in the frame and the light are multiplied by, uniform in the logarithm.
-    backgrounds: a folder of images, each example before one of them. individuals: every solid that is named without a
-    seed is another of its kind. turn: degrees that the camera goes around the mesh, at most, to either side and up and
-    down. lights: each example is in one of these, as `load_light` takes them. lamps: the share of examples that stand
-    in the parallel light of a lamp on the camera's side, up to 70° off, over [least, most] `ambient` of their own.
-    lit: a background is a wall that faces the camera in the example's light. snapshot: what a camera makes of the
-    images.
+    scale, exposure: [least, most] that its size in the frame and the light are multiplied by, uniform in the
+    logarithm. backgrounds: a folder of images, each example before one of them. individuals: every solid that is
+    named without a seed is another of its kind in each of its views. turn: degrees that the camera goes around the
+    mesh, at most, to either side and up and down. lights: each example is in one of these, as `load_light` takes
+    them. lamps: the share of examples that stand in the parallel light of a lamp on the camera's side, up to 70°
+    off, over [least, most] `ambient` of their own. lit: a background is a wall that faces the camera in the
+    example's light. snapshot: what a camera makes of the images.
     """
 
     place: float = 0.0
@@ -73,39 +73,58 @@ class VariationSettings:
         return bool(self.moves or of_light or self.backgrounds is not None or self.snapshot.changes)
 
 
-def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, lights: int = 1) -> Scene:
     """The scene with rows drawn afresh around its own; the scene itself where nothing varies.
 
-    All views of a row are moved alike. InputError where the folder of backgrounds has no readable image.
+    All views of a row are moved alike. lights: how often all rows come, one after the other, each time the same but for
+    the light and the camera's part. InputError where the folder of backgrounds has no readable image.
     """
-    if not settings.varies:
-        return scene
+    moved = _moved_rows(scene, settings, draws) if settings.moves or settings.backgrounds is not None else scene
+    repeated = (
+        moved.with_rows(moved.examples * lights, light=moved.lights.repeat(lights, 1, 1)) if lights > 1 else moved
+    )
+    return _taken_anew(repeated, settings, draws) if settings.varies else repeated
+
+
+def _moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+    """What is shown, where and before what."""
     place = settings.place * (2 * torch.rand(len(scene), 2, generator=draws, dtype=torch.float64) - 1)
-    scale, exposure = (_between(limits, len(scene), draws) for limits in (settings.scale, settings.exposure))
+    scale = _between(settings.scale, len(scene), draws)
+    angles = _angles(settings.turn, len(scene), draws)
     rows = [
-        replace(_moved(row, right, up, size) if settings.moves else row, exposure=row.exposure * bright)
-        for row, (right, up), size, bright in zip(scene.examples, place.tolist(), scale, exposure, strict=True)
+        _turned(_moved(row, right, up, size), *angle)
+        for row, (right, up), size, angle in zip(scene.examples, place.tolist(), scale, angles, strict=True)
     ]
     changed: dict[str, Any] = {}
     if settings.backgrounds is not None:
         changed["backgrounds"] = _images(Path(settings.backgrounds), len(scene), scene.settings.size, draws)
         rows = [replace(row, background=index) for index, row in enumerate(rows)]
-    if settings.turn:
-        angles = _angles(settings.turn, len(rows), draws)
-        rows = [_turned(row, *each) for row, each in zip(rows, angles, strict=True)]
     if settings.individuals:
-        seeds = torch.randint(2**31, (len(scene.objects),), generator=draws).tolist()
-        changed["objects"] = [another_individual(item, seed) for item, seed in zip(scene.objects, seeds, strict=True)]
+        views = list(dict.fromkeys((row.object, row.cameras) for row in scene.examples))
+        seeds = torch.randint(2**31, (len(views),), generator=draws).tolist()
+        drawn = zip(views, seeds, strict=True)
+        changed["objects"] = [another_individual(scene.objects[index], seed) for (index, _), seed in drawn]
+        number = {view: index for index, view in enumerate(views)}
+        which = [number[row.object, row.cameras] for row in scene.examples]
+        rows = [replace(row, object=index) for row, index in zip(rows, which, strict=True)]
+    if settings.moves:  # views that never come again are not worth a place on the disk
+        changed["operators"] = OperatorCache()
+    return scene.with_rows(rows, **changed)
+
+
+def _taken_anew(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+    """In which light, and through which camera."""
+    exposure = _between(settings.exposure, len(scene), draws)
+    rows = [replace(row, exposure=row.exposure * each) for row, each in zip(scene.examples, exposure, strict=True)]
+    changed: dict[str, Any] = {}
     if settings.lights:
         which = torch.randint(len(settings.lights), (len(rows),), generator=draws)
         changed["light"] = torch.stack([load_light(light) for light in settings.lights])[which].to(scene.lights)
     if settings.lamps > 0:
-        changed["light"] = _in_lamplight(changed.get("light", scene.lights), rows, scene.objects, settings, draws)
+        shown = [scene.objects[row.object] for row in rows]
+        changed["light"] = _in_lamplight(changed.get("light", scene.lights), rows, shown, settings, draws)
     if settings.snapshot.changes:
-        snapshot = draw_snapshot(settings.snapshot, len(rows), scene.settings, draws)
-        changed["taken"] = snapshot.to(scene.lights.device)
-    if settings.moves:  # views that never come again are not worth a place on the disk
-        changed["operators"] = OperatorCache()
+        changed["taken"] = draw_snapshot(settings.snapshot, len(rows), scene.settings, draws).to(scene.lights.device)
     varied = scene.with_rows(rows, **changed)
     return _with_lit_walls(varied) if settings.lit else varied
 
@@ -153,7 +172,7 @@ def _in_lamplight(
 ) -> Tensor:
     """The lights (E, 49, 3), some of them dimmed, with a white lamp that gives 1 to a surface facing it.
 
-    What stands on a table has no lamp below: one that were drawn there is mirrored to above.
+    objects: what each row shows. What stands on a table has no lamp below it: one that is drawn there is mirrored.
     """
     low, high = settings.ambient
     shape = (len(rows), 1, 1)
@@ -162,8 +181,8 @@ def _in_lamplight(
     angles = _angles(LAMP_REACH, len(rows), draws)
     cameras = [_turned(row, *each).cameras[0] for row, each in zip(rows, angles, strict=True)]
     towards = [torch.from_numpy(camera.axes()[2]) for camera in cameras]
-    for row, direction in zip(rows, towards, strict=True):
-        if objects[row.object].ground is not None:
+    for item, direction in zip(objects, towards, strict=True):
+        if item.ground is not None:
             direction[2].abs_()
     lamps = torch.stack([directional(direction, torch.ones(3)) for direction in towards]).to(lights)
     return torch.where(chosen.to(lights.device), lamps + ambient.to(lights) * lights, lights)

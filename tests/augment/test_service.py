@@ -1,3 +1,4 @@
+import copy
 import math
 
 import pytest
@@ -134,6 +135,22 @@ def test_random_lights_of_a_radius_have_that_norm(serve, model):
     assert renders.diagnostics["light_change"] == pytest.approx(1.5, rel=8 * EPS32)
 
 
+def test_of_the_candidates_each_render_is_the_one_of_the_highest_loss(serve, model, labels):
+    shown = []
+    still = copy.deepcopy(model).eval()  # without dropout
+    still.register_forward_hook(lambda _, images, logits: shown.append(images[0]))
+    varied = VariationSettings(exposure=[0.2, 5.0])
+    renders = serve(arm="random", vary=varied, random=RandomLights(candidates=3)).regenerate(still, 0)
+    candidates = torch.cat(shown)[:300].unflatten(0, (3, 100))
+    with torch.no_grad():
+        logits = still(candidates.flatten(0, 1))
+    losses = nn.functional.cross_entropy(logits, labels.repeat(3), reduction="none").unflatten(0, (3, 100))
+    worst = losses.argmax(0)
+    assert set(worst.tolist()) == {0, 1, 2}
+    torch.testing.assert_close(renders.images, candidates[worst, torch.arange(100)], rtol=0, atol=0)
+    assert renders.diagnostics["loss"] == pytest.approx(float(losses.amax(0).mean()), rel=1e-5)
+
+
 def test_random_images_leave_the_model_and_the_random_state_as_they_were(serve, model):
     model.train()
     before, state = {name: value.clone() for name, value in model.state_dict().items()}, torch.random.get_rng_state()
@@ -230,6 +247,7 @@ def test_lights_that_an_older_version_continued_are_refused(serve):
     ("make", "message"),
     [
         (lambda: AugmentationSettings(arm="both"), r"augment\.arm=both: choose one of none, random, adversarial"),
+        (lambda: RandomLights(candidates=0), r"augment\.random\.candidates=0"),
         (lambda: AugmentationSettings(start="dark"), r"augment\.start=dark: choose one of light, random"),
         (lambda: AugmentationSettings(lights="stay"), r"augment\.lights=stay: choose one of restart, continue"),
         (lambda: AugmentationSettings(examples=-1), r"augment\.examples=-1"),

@@ -116,6 +116,27 @@ def test_individuals_are_drawn_of_solids_without_a_seed_alone(scene):
         assert not any(np.array_equal(a, b) for a, b in itertools.combinations(colors, 2))
 
 
+def test_each_view_shows_an_individual_of_its_own_before_all_backgrounds():
+    """In lamplight, which looks at what the rows show."""
+    apple, settings = load_object(ObjectSettings("solid:apple", "apple")), ImageSettings(SIZE, samples=2)
+    backgrounds = load_backgrounds([0.0, 1.0], SIZE)
+    grid = Scene.grid([apple, apple], ring(3, 3.0), backgrounds, LIGHT, settings, choose("software"))
+    varied = drawn(grid, individuals=True, lamps=0.5)
+    assert [row.object for row in varied.examples] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
+    assert [row.background for row in varied.examples] == [row.background for row in grid.examples]
+    assert len({item.mesh.corner_colors.tobytes() for item in varied.objects}) == 6
+
+
+def test_rows_repeat_under_several_lights_with_all_but_the_light_as_it_was(scene):
+    varying = {"place": 0.2, "turn": 30.0, "individuals": True, "exposure": [0.5, 2.0], "lamps": 0.5}
+    varied = vary(scene, VariationSettings(**varying), generator(0), lights=3)
+    parts = [varied.examples[first : first + len(scene)] for first in range(0, 3 * len(scene), len(scene))]
+    assert [(row.object, row.cameras, row.background) for part in parts for row in part] == 3 * [
+        (row.object, row.cameras, row.background) for row in parts[0]
+    ]
+    assert len({row.exposure for row in varied.examples}) == 3 * len(scene)
+
+
 def test_lights_are_shared_out_among_the_examples(scene):
     varied = drawn(scene, lights=["eucalyptus", "st_peters"])
     choices = torch.stack([probe("eucalyptus"), probe("st_peters")])
