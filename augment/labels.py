@@ -22,6 +22,23 @@ def label_loss(logits: Tensor, labels: Tensor, label_smoothing: float = 0.0) -> 
     return torch.where(labels < 0, denial, entropy)
 
 
+def log_odds(logits: Tensor, label: int) -> Tensor:
+    """log p / (1 − p) of a class, (N,), from logits (N, classes): finite also where p rounds to 0 or 1."""
+    others = torch.cat([logits[:, :label], logits[:, label + 1 :]], dim=1)
+    return logits[:, label] - others.logsumexp(dim=1)
+
+
+def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
+    """How far images of a class are from standing above all others in its log-odds: the mean of log(1 + e^(o − p)) over
+    the pairs of an image of the class, of log-odds p, and one of none, of log-odds o; 0 without a pair.
+
+    A smooth bound of 1 − AUC (RankNet, Burges et al. 2005). logits: (N, classes). labels: (N,) int64.
+    """
+    odds = log_odds(logits, label)
+    pairs = (labels == label)[:, None] & (labels != label)
+    return (F.softplus(odds - odds[:, None]) * pairs).sum() / pairs.sum().clamp(min=1)
+
+
 def is_right(predicted: Tensor, labels: Tensor) -> Tensor:
     """Whether classes agree with labels, both (N,) int64; boolean."""
     return (predicted == _subject(labels)) != (labels < 0)

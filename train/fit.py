@@ -63,7 +63,7 @@ class Trainer:
                 f"train.batch_size={settings.batch_size} is not a multiple of the {processes.world_size()} processes"
             )
         self.settings = settings
-        self.learner = Learner(settings, model, seed)
+        self.learner = Learner(settings, model, seed, service.label)
         self.architecture = architecture
         self.service = service
         self.phases = phases

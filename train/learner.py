@@ -18,7 +18,10 @@ class Learner:
     """attacked: the network that renders are found against; scored: `selected`, as it is validated. Either may be CUDA
     graphs."""
 
-    def __init__(self, settings: TrainSettings, model: MixedPrecision, seed: int):
+    def __init__(self, settings: TrainSettings, model: MixedPrecision, seed: int, label: int | None = None):
+        """label: the class that is ranked above look-alikes; InputError for a ranking without them."""
+        if settings.ranking and label is None:
+            raise InputError(f"train.ranking={settings.ranking} ranks look-alikes: name some in scene.look_alikes")
         self.settings = settings
         self.model = model
         self.device = next(model.parameters()).device
@@ -32,7 +35,9 @@ class Learner:
             fused=True,
         )
         compiled = compiles(settings.compile, self.device)
-        self._training_pass = training_pass(replicated(model), settings.label_smoothing, compiled)
+        self._training_pass = training_pass(
+            replicated(model), settings.label_smoothing, compiled, settings.ranking, label
+        )
         self._distort = distortion(settings.distortion, model, seed)
         self.attacked, self.scored = (FixedSizes(each) if compiled else each for each in (model, self.selected))
 

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from renderer.errors import InputError, require_range
+from renderer.errors import FACTOR, InputError, require_range
 from train.device import COMPILE
 from train.distortions import DISTORTIONS
 from train.epoch import FLIPS
@@ -86,6 +86,7 @@ class TrainSettings:
     flips: str = "random"
     distortion: str = "none"
     label_smoothing: float = 0.0
+    ranking: float = 0.0
     averaging: float = 0.0
     precision: str = "auto"
     device: str = "auto"
@@ -105,6 +106,7 @@ class TrainSettings:
         for name in ("momentum", "label_smoothing", "averaging"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")
+        require_range("train.ranking", self.ranking, 0, FACTOR)
         if not 0 < self.learning_rate < math.inf:
             raise InputError(f"train.learning_rate={self.learning_rate} must be positive")
         if not 0 <= self.weight_decay < math.inf:

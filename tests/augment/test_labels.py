@@ -1,8 +1,9 @@
+import numpy as np
 import pytest
 import torch
-from scipy.special import log_softmax, softmax
+from scipy.special import log_softmax, logit, softmax
 
-from augment.labels import anything_but, is_right, label_loss
+from augment.labels import anything_but, is_right, label_loss, log_odds, ranking_loss
 
 EPS = torch.finfo(torch.float64).eps
 LOGITS = 3 * torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -33,3 +34,32 @@ def test_the_gradient_is_exact_and_finite_where_the_excluded_class_is_certain():
 @pytest.mark.parametrize(("predicted", "label", "right"), [(2, 2, True), (1, 2, False), (2, -3, False), (0, -3, True)])
 def test_what_is_right(predicted, label, right):
     assert is_right(torch.tensor([predicted]), torch.tensor([label])).tolist() == [right]
+
+
+def test_log_odds_are_the_probability_s_logit():
+    expected = logit(softmax(LOGITS.numpy(), axis=1)[:, 2])
+    torch.testing.assert_close(log_odds(LOGITS, 2), torch.from_numpy(expected), rtol=64 * EPS, atol=64 * EPS)
+
+
+def test_ranking_is_the_mean_logistic_loss_of_all_pairs_of_the_class_and_another():
+    labels = torch.tensor([2, 0, anything_but(2), 2, anything_but(2), 4])
+    odds = log_odds(LOGITS, 2).numpy()
+    pairs = [np.log1p(np.exp(odds[other] - odds[own])) for own in (0, 3) for other in (1, 2, 4, 5)]
+    torch.testing.assert_close(
+        ranking_loss(LOGITS, labels, 2), torch.tensor(np.mean(pairs)), rtol=64 * EPS, atol=64 * EPS
+    )
+
+
+def test_ranking_costs_nothing_and_pulls_nowhere_without_a_pair():
+    logits = LOGITS.clone().requires_grad_(True)
+    for labels in (torch.full((6,), 2), torch.full((6,), anything_but(2))):
+        loss = ranking_loss(logits, labels, 2)
+        loss.backward()
+        assert loss == 0 and not logits.grad.any()
+
+
+def test_ranking_compares_images_and_has_no_threshold():
+    """Where every image's log-odds rise alike."""
+    labels = torch.tensor([2, 0, anything_but(2), 2, anything_but(2), 4])
+    shifted = LOGITS + 3 * (torch.arange(5) == 2)
+    torch.testing.assert_close(ranking_loss(shifted, labels, 2), ranking_loss(LOGITS, labels, 2))

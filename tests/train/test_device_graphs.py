@@ -3,6 +3,7 @@ import torch
 import torch.nn.functional as F
 from torch._dynamo.exc import BackendCompilerFailed
 
+from augment.labels import ranking_loss
 from augment.model_state import eval_mode
 from train import device as compute
 from train.device import RECOMPILE_LIMIT, SIZES, FixedSizes, compiler_works, compiles, training_pass
@@ -124,6 +125,14 @@ def test_the_training_pass_is_the_mean_cross_entropy_and_the_number_of_hits(netw
     assert hits == (logits.argmax(1) == labels).sum()
 
 
+def test_the_training_pass_adds_the_weighted_ranking(network):
+    images, labels = torch.randint(0, 256, (9, 3, 8, 8), dtype=torch.uint8), torch.arange(9) % 3 - 1  # one "no class 0"
+    network.float().eval()
+    alone, _ = training_pass(network, 0.0, compiled=False)(images, labels)
+    both, _ = training_pass(network, 0.0, compiled=False, ranking=4.0, label=1)(images, labels)
+    torch.testing.assert_close(both, alone + 4 * ranking_loss(network(images / 255), labels, 1))
+
+
 @pytest.mark.slow
 def test_compiled_passes_give_the_same_gradients_and_logits(network):
     """Through the compiler of the CPU; there are no graphs to record there."""
@@ -133,7 +142,7 @@ def test_compiled_passes_give_the_same_gradients_and_logits(network):
     for compiled in (False, True):
         network.zero_grad()
         network.train()
-        training_pass(network, 0.1, compiled)(images, labels)[0].backward()
+        training_pass(network, 0.1, compiled, ranking=1.0, label=1)(images, labels)[0].backward()
         gradients.append({name: parameter.grad.clone() for name, parameter in network.named_parameters()})
     torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-5)
     network.eval()

@@ -30,6 +30,8 @@ class NoRenders:
         arm = "none"
         every = None
 
+    label = None
+
     def __len__(self):
         return 0
 
@@ -61,6 +63,11 @@ def fit_noise(trainer: Trainer) -> list[dict]:
     return read_metrics(trainer.folder)
 
 
+def test_a_ranking_without_look_alikes_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"train\.ranking=1\.0 ranks look-alikes: name some in scene\.look_alikes"):
+        make_trainer(tmp_path, ranking=1.0)
+
+
 @pytest.mark.parametrize(
     "settings, key",
     [
@@ -69,6 +76,7 @@ def fit_noise(trainer: Trainer) -> list[dict]:
         ({"learning_rate": 0.0}, "train.learning_rate=0.0"),
         ({"learning_rate": math.inf}, "train.learning_rate=inf"),
         ({"learning_rate": math.nan}, "train.learning_rate=nan"),
+        ({"ranking": -1.0}, "train.ranking=-1.0"),
         ({"momentum": 1.0}, "train.momentum=1.0"),
         ({"momentum": -0.1}, "train.momentum=-0.1"),
         ({"weight_decay": -1.0}, "train.weight_decay=-1.0"),

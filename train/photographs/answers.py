@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from augment.labels import log_odds
 from augment.model_state import eval_mode
 from augment.progress import progress
 from renderer.errors import InputError
@@ -67,7 +68,7 @@ def rank_classes(
     ranks = (order.argsort(dim=1) + 1).numpy()
     index = {name: column for column, name in enumerate(classes)}
     asked = index[label]
-    log_odds = _log_odds(logits.double(), asked)
+    odds = log_odds(logits.double(), asked)
     answers = []
     for row, photograph in enumerate(photographs):
         true, best = index.get(photograph.label), int(order[row, 0])
@@ -80,13 +81,7 @@ def rank_classes(
                 true_rank=None if true is None else int(ranks[row, true]),
                 asked_probability=float(probabilities[row, asked]),
                 asked_rank=int(ranks[row, asked]),
-                asked_log_odds=float(log_odds[row]),
+                asked_log_odds=float(odds[row]),
             )
         )
     return answers
-
-
-def _log_odds(logits: torch.Tensor, asked: int) -> torch.Tensor:
-    """log p / (1 - p) of a class, (N,), from logits (N, C): finite also where p rounds to 0 or 1."""
-    others = torch.cat([logits[:, :asked], logits[:, asked + 1 :]], dim=1)
-    return logits[:, asked] - others.logsumexp(dim=1)
