@@ -14,6 +14,7 @@ from augment.scene import Scene
 from renderer.basis import with_placed
 from renderer.cache import OperatorCache
 from renderer.camera import ring
+from renderer.errors import InputError
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, normalise
@@ -82,3 +83,28 @@ def _object(member: Member, vertices: int) -> SceneObject:
     if isinstance(mesh, Mesh):
         return SceneObject(label, normalise(subdivide(mesh, vertices)))
     return load_object(ObjectSettings(str(mesh), label), vertices)
+
+
+def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
+    """Views per mesh, so that meshes × views × backgrounds are the examples; either is derived where it is None.
+
+    The paper's 100 examples are 2 meshes × 10 views × 5 backgrounds. InputError where no such product exists.
+    """
+    if not objects or not backgrounds:
+        raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
+    if examples is None:
+        if views is None:
+            raise InputError("augment.examples=null makes as many renders as scene.views says: set either")
+        return views
+    derived, rest = divmod(examples, objects * backgrounds)
+    if rest or derived < 1:
+        raise InputError(
+            f"augment.examples={examples} is not a multiple of {objects} meshes × {backgrounds} backgrounds: "
+            f"set it to a multiple of {objects * backgrounds}"
+        )
+    if views is not None and views != derived:
+        raise InputError(
+            f"augment.examples={examples} is not {objects} meshes × {views} views × {backgrounds} backgrounds = "
+            f"{objects * views * backgrounds}: change one of them, or set scene.views=null to derive the views"
+        )
+    return derived

@@ -8,9 +8,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from augment.build import count_views
 from augment.objects import CompanionSettings, ObjectSettings
 from augment.placed_lights import LampsSettings, ProjectorSettings
-from augment.scene import count_views
 from augment.service import AugmentationSettings
 from renderer.cache import OperatorCache, cache_folder
 from renderer.errors import FACTOR, InputError, require_range

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from augment import scene as scene_module
+from augment import reshading
 from augment.descent import DescentSettings, Goal, descend
 from augment.parameters import KINDS, STEPS, Albedo, Geometry, Kind, Lighting, Pixels, Skylight, StepSettings, direction
 from augment.perturbation import Perturbation
@@ -59,14 +59,14 @@ def test_a_kind_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scen
 @pytest.fixture
 def fixed_visibility(monkeypatch) -> None:
     """Whatever moves, each camera sees what it saw first, which is what the analytic gradient assumes."""
-    build, seen = scene_module.build_fragments, {}
+    build, seen = reshading.build_fragments, {}
 
     def still(vertices, faces, cameras, settings, backend, closed=False):
         if cameras[0] not in seen:
             seen[cameras[0]] = build(vertices, faces, cameras, settings, backend, closed=closed)
         return seen[cameras[0]]
 
-    monkeypatch.setattr(scene_module, "build_fragments", still)
+    monkeypatch.setattr(reshading, "build_fragments", still)
 
 
 COMBINATIONS = [

@@ -7,16 +7,16 @@ import torch
 import trimesh
 
 import renderer
-from augment import scene as scene_module
+from augment import relighting
 from augment.backgrounds import load_backgrounds
-from augment.build import build_scene
+from augment.build import build_scene, count_views
 from augment.descent import DescentSettings, Goal, descend
 from augment.held_transport import NEAR
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
-from augment.scene import STACKED, Conditions, Example, Scene, count_views
+from augment.scene import Conditions, Example, Scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera, ring
@@ -310,7 +310,7 @@ def test_under_grace_a_plate_is_brighter_from_above_than_from_below():
 # ---------------------------------------------------------------------------------------- rows of every kind
 
 
-@pytest.fixture(scope="module", params=[STACKED, 1], ids=["one stack", "a stack per view"])
+@pytest.fixture(scope="module", params=[relighting.STACKED, 1], ids=["one stack", "a stack per view"])
 def mixed(request) -> Iterator[Scene]:
     """Two meshes of different sizes in no order, two views per row, own lights, exposures and backgrounds."""
     views, draws = ring(3, 2.2), torch.Generator().manual_seed(3)
@@ -323,7 +323,7 @@ def mixed(request) -> Iterator[Scene]:
     lights = 0.3 * probe("grace").double() + 0.01 * torch.randn(4, 49, 3, generator=draws).double()
     behind = 0.2 + 0.6 * torch.rand(3, 3, 8, 8, generator=draws)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_module, "STACKED", request.param)
+        patch.setattr(relighting, "STACKED", request.param)
         yield Scene([load_object(item) for item in TWO], rows, behind, lights, SETTINGS, BACKEND)
 
 
