@@ -39,10 +39,12 @@ class ProjectorSettings:
 
 @dataclass
 class LampsSettings:
-    """`Lamps` at places [x, y, z]. start: the powers that attacks begin with, a number or [r, g, b] of each lamp."""
+    """`Lamps` at places [x, y, z], points or discs of a radius. start: the powers that attacks begin with, a number or
+    [r, g, b] of each lamp."""
 
     places: list[Any] = field(default_factory=lambda: [[2.0, 2.0, 2.0], [-2.0, 2.0, 2.0], [2.0, -2.0, 2.0]])
     power: float = 10.0
+    radius: float = 0.0
     start: Any = 0.0
 
     def build(self) -> tuple[Lamps, Tensor]:
@@ -54,5 +56,5 @@ class LampsSettings:
             raise InputError(
                 f"scene.lamps: give places [x, y, z] and, as start, a number or [r, g, b]s ({error})"
             ) from error
-        basis = Lamps(places, self.power)
+        basis = Lamps(places, self.power, self.radius)
         return basis, basis.nearest_physical(start)

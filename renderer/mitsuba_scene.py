@@ -70,6 +70,10 @@ _LAMP = """    <emitter type="point">
         <point name="position" x="{}" y="{}" z="{}"/>
         <rgb name="intensity" value="{} {} {}"/>
     </emitter>"""
+_DISC = """    <shape type="disk">
+        <transform name="to_world"><matrix value="{pose}"/></transform>
+        <emitter type="area"><rgb name="radiance" value="{red} {green} {blue}"/></emitter>
+    </shape>"""
 _SENSOR = """    <sensor type="{kind}">
         {angle}
         <transform name="to_world"><matrix value="{pose}"/></transform>
@@ -162,7 +166,7 @@ def _emitters(folder: Path, basis: Distant | Placed, coefficients: torch.Tensor,
     """The scales make up for what `write_mitsuba_scene` says of the sky's; a projector's radiance is over π already."""
     if isinstance(basis, Lamps):
         for place, power in zip(basis.places, (math.pi * gain * coefficients).tolist(), strict=True):
-            yield _LAMP.format(*place, *power)
+            yield _LAMP.format(*place, *power) if not basis.radius else _disc(place, basis.radius, power)
     elif isinstance(basis, Projector):
         write_map(folder / "pattern.exr", coefficients.view(basis.pixels, basis.pixels, 3))
         camera = PerspectiveCamera(basis.polar, basis.azimuth, 1.0, distance=basis.distance)
@@ -172,6 +176,14 @@ def _emitters(folder: Path, basis: Distant | Placed, coefficients: torch.Tensor,
             scale=gain * basis.distance**2,
             pose=_pose(camera, 1.0),
         )
+
+
+def _disc(place: Sequence[float], radius: float, power: Sequence[float]) -> str:
+    """Mitsuba's disks have radius 1 and shine along +z. The radiance is that of a far point's intensity on the area."""
+    x, y, z = place
+    camera = PerspectiveCamera(math.atan2(math.hypot(x, y), z), math.atan2(y, x), 1.0, distance=math.hypot(x, y, z))
+    red, green, blue = (channel / (math.pi * radius**2) for channel in power)
+    return _DISC.format(pose=_pose(camera, radius), red=red, green=green, blue=blue)
 
 
 def _pose(camera: Camera, scale: float) -> str:

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -69,12 +70,15 @@ def test_patterns_and_powers_keep_to_what_is_possible_and_to_their_ball(norm):
             assert reach.max() <= 0.4 * (1 + 1e-5)
 
 
-def test_an_adversary_with_lights_in_the_scene_is_read_back_and_seen_by_mitsuba(tmp_path):
-    """Within 2/255 at the median: Mitsuba draws one of the lights for each ray, and outlines have four samples here."""
+@pytest.mark.parametrize("radius", [0.0, 0.1])
+def test_an_adversary_with_lights_in_the_scene_is_read_back_and_seen_by_mitsuba(radius, tmp_path):
+    """Within 2/255 at the median: Mitsuba draws one of the lights for each ray, where a disc is in the way of others, and
+    outlines have four samples here."""
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
     steps = StepSettings("linf", None, "unit", 0.5)
     settings = augment.AttackSettings(projector=steps, lamps=steps, max_steps=3)
-    done = augment.attack(classifier, scene(exposure=0.3), settings=settings, force=True)
+    shown = scene(exposure=0.3, lamps=replace(LAMPS, radius=radius))
+    done = augment.attack(classifier, shown, settings=settings, force=True)
     assert (done.images - done.images_before).abs().max() > 0.05
     written = Adversary.of(done.problem.scene, 0, done.conditions, done.images_before[0], done.images[0])
     write_adversary(written, tmp_path)
@@ -140,6 +144,7 @@ def test_training_draws_and_attacks_patterns_beside_the_light(arm):
         (lambda: LampsSettings([[0, 0, 0]]).build(), r"none at the origin"),
         (lambda: LampsSettings([[math.nan, 0, 3]]).build(), r"a coordinate of lamps\.places=nan"),
         (lambda: LampsSettings([[1e30, 0, 3]]).build(), r"a coordinate of lamps\.places=1e\+30"),
+        (lambda: LampsSettings(radius=-0.1).build(), r"lamps\.radius=-0\.1"),
         (lambda: LampsSettings([[1, 0]]).build(), r"scene\.lamps: give places"),
         (lambda: LampsSettings(start=[[1], [2]]).build(), r"scene\.lamps: give places"),
         (lambda: scene(ground=[0.5, 2.0, 0.5]), r"scene\.ground=.* must be red, green and blue"),
