@@ -72,7 +72,7 @@ def test_patterns_and_powers_keep_to_what_is_possible_and_to_their_ball(norm):
 
 @pytest.mark.parametrize("radius", [0.0, 0.1])
 def test_an_adversary_with_lights_in_the_scene_is_read_back_and_seen_by_mitsuba(radius, tmp_path):
-    """Within 2/255 at the median: Mitsuba draws one of the lights for each ray, where a disc is in the way of others, and
+    """Within 2/255 at the median: in Mitsuba rays draw one of the lights, a disc is in the way of others, and
     outlines have four samples here."""
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
     steps = StepSettings("linf", None, "unit", 0.5)
