@@ -118,8 +118,8 @@ class PerspectiveCamera(Camera):
         depths = self.distance - points @ self.axes()[2]
         if not (depths >= NEAREST * self.distance).all():
             raise InputError(
-                f"a camera at distance {self.distance:g} is within the mesh, or the mesh behind it: give a larger "
-                "distance (a smaller scene.perspective or a larger scene.field_of_view), or normalise the mesh"
+                f"the mesh reaches to a camera at distance {self.distance:g}, or beyond: give a larger distance "
+                "(a smaller scene.perspective or a larger scene.field_of_view), or normalise the mesh"
             )
         return depths
 

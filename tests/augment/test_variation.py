@@ -9,6 +9,7 @@ import trimesh
 from PIL import Image
 from torch import Tensor, nn
 
+import augment
 from augment.backgrounds import load_background, load_backgrounds
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.phases import Phases
@@ -72,6 +73,16 @@ def test_a_scale_magnifies_about_the_middle(scene):
     factors = extents / extents_before
     assert 0.4 < factors.min() < 0.8 and 1.2 < factors.max() < 1.6
     torch.testing.assert_close(middles, before, rtol=0, atol=2 / SIZE)
+
+
+def test_in_perspective_rows_are_zoomed_and_aside_and_turned_from_where_their_camera_stands():
+    scene = augment.build_scene([("solid:orange", "orange")], 16, 6, visibility="software", perspective=40.0)
+    rows = drawn(scene, place=0.3, scale=[0.5, 1.5], turn=20.0)
+    (before,), cameras = {view.distance for (view,) in scene.cameras}, [view for (view,) in rows.cameras]
+    origins = np.concatenate([camera.project(np.zeros((1, 3))) for camera in cameras])[:, :2]
+    assert {camera.distance for camera in cameras} == {before} and len({camera.angle for camera in cameras}) == 6
+    assert 0.3 < np.abs(origins).max() <= 0.6
+    assert len(torch.unique(images(rows), dim=0)) == 6
 
 
 def test_an_exposure_multiplies_the_light_and_builds_no_operator_that_a_cache_has(scene):

@@ -1,5 +1,6 @@
 """A scene in which a classifier recognises a mesh, so that there is something to attack."""
 
+import math
 from dataclasses import replace
 from itertools import product
 
@@ -16,6 +17,7 @@ from train.attacks.scene import scene_of
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 
 POLAR, FIELD_OF_VIEW = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
+CLOSEST = 2.0  # world units from the middle of a mesh, which all of it is within
 EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)  # times the scene's own
 SURE = 0.5  # confidence, in every image, at which the search ends
 
@@ -69,13 +71,17 @@ def _confidence(scene: Scene, settings: AttackExperimentSettings, classifier: Cl
 
 
 def _drawn(scene: AttackSceneSettings, draws: torch.Generator) -> AttackSceneSettings:
-    """The scene from another side and another distance."""
+    """The scene from another side and another distance, through the same lens."""
     polar, azimuth, field = torch.rand(3, generator=draws).tolist()
+    least, most = FIELD_OF_VIEW
+    if scene.perspective is not None:
+        narrowest = 2 * CLOSEST * math.tan(math.radians(scene.perspective) / 2)
+        least, most = max(least, narrowest), max(most, 2 * narrowest)
     return replace(
         scene,
         polar=round(POLAR[0] + (POLAR[1] - POLAR[0]) * polar, 1),
         azimuth=round(360 * azimuth, 1),
-        field_of_view=round(FIELD_OF_VIEW[0] + (FIELD_OF_VIEW[1] - FIELD_OF_VIEW[0]) * field, 2),
+        field_of_view=round(least + (most - least) * field, 2),
     )
 
 

@@ -147,6 +147,10 @@ DAMAGES = {
     "no faces of its own": (described(own_faces=0), "own_faces=0 must be at least 1"),
     "more than all faces": (described(own_faces=10**6), "own_faces=1000000 must be at least 1 and at most"),
     "no number of faces": (described(own_faces="all"), "does not describe an adversary"),
+    "a camera at the origin": (
+        described(cameras=[{"polar": 0, "azimuth": 0, "field_of_view": 2, "distance": 0}]),
+        "distance=0 must be at least",
+    ),
     "no gain": (described(gain=0), "gain=0.0 must be at least"),
     "no mesh": (described(mesh="absent.glb"), "absent.glb does not exist"),
     "no light": (described(light="absent.json"), "absent.json does not exist"),

@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.classifiers import Classifier
 from renderer.errors import InputError
 from train.attacks.experiment import attacks
-from train.attacks.search import overrides, search
+from train.attacks.search import _drawn, overrides, search
 from train.attacks.settings import AttackExperimentSettings
 from train.configuration import read_settings
 from train.settings import read_object
@@ -49,7 +49,9 @@ def test_a_scene_that_is_recognised_stays_as_it_is():
     assert chosen == settings.scene
 
 
-@pytest.mark.parametrize("more", [[], ["scene.views=2"], ["scene.views=2", "attack.shared=true"]])
+@pytest.mark.parametrize(
+    "more", [[], ["scene.views=2"], ["scene.views=2", "attack.shared=true"], ["scene.perspective=40"]]
+)
 def test_a_camera_and_a_light_are_found_under_which_all_views_are_recognised(more):
     settings, chosen = found("scene.search=40", *more)
     assert chosen != settings.scene
@@ -57,6 +59,12 @@ def test_a_camera_and_a_light_are_found_under_which_all_views_are_recognised(mor
     settings = replace(settings, scene=replace(chosen, search=0))
     ((_, _, attacked),) = attacks(settings, by_size(), CPU)
     assert attacked.recognised.all()
+
+
+def test_cameras_of_a_wide_lens_are_drawn_from_where_all_of_the_mesh_lies_before_them():
+    scene, draws = configured("scene.perspective=90").scene, torch.Generator().manual_seed(0)
+    widths = [_drawn(scene, draws).field_of_view for _ in range(50)]
+    assert min(widths) >= 4 and max(widths) > 7
 
 
 def test_what_was_found_is_told_as_overrides_and_follows_from_the_seed():
