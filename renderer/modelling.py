@@ -16,7 +16,8 @@ def revolve(*strokes: np.ndarray | Sequence[tuple[float, float]]) -> tuple[np.nd
     """Vertices (V, 3), faces (F, 3) and the stroke (F,) of each face of a surface of revolution.
 
     Its profile is drawn in strokes, each a list of (radius, height) points with a paint of its own; a stroke starts
-    where the one before it ended. The whole runs from the axis back to the axis, counter-clockwise around the half section.
+    where the one before it ended. The whole runs from the axis back to the axis, counter-clockwise around the solid's
+    half section.
     """
     corners = np.concatenate(strokes)
     stroke_of_corner = np.repeat(np.arange(len(strokes)), [len(stroke) for stroke in strokes])

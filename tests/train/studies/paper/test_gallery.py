@@ -19,6 +19,7 @@ from renderer.mesh import Mesh
 from train.studies.page import wrapped
 from train.studies.paper import gallery, run_time
 from train.studies.paper.adversaries import ATTACKS
+from train.studies.paper.iterations import Setup, Stopwatch, stubborn
 from train.studies.paper.rendering_quality import (
     View,
     bootstrap,
@@ -29,7 +30,7 @@ from train.studies.paper.rendering_quality import (
     share_recognised,
     views_of,
 )
-from train.studies.paper.run_time import Attack, RunTimeSettings, Setup, Stopwatch
+from train.studies.paper.run_time import Attack, RunTimeSettings
 from train.studies.paper.section import Study
 from train.studies.paper.study import with_section
 from train.studies.paper.subjects import GREYS, Subject, scene_of
@@ -151,7 +152,7 @@ def test_a_section_takes_the_place_of_its_title_in_the_order_of_the_page():
 def test_an_iteration_holds_its_time_in_the_classifier_and_the_pixels_it_covers(subject, kind, views, backgrounds):
     """A ball looks the same from all sides."""
     setup = Setup("ball", subject, 2, "smooth", views, backgrounds)
-    measured = run_time.stubborn(setup, kind, bright(), "grace", 4.0, passes=2, turns=3)
+    measured = stubborn(setup, kind, bright(), "grace", 4.0, passes=2, turns=3)
     assert len(measured.whole) == len(measured.bare) == len(measured.inside) == 3
     assert (measured.renderer > 0).all() and min(measured.inside) > 0
     # The unit ball fills π/16 of an image that is 4 wide; its outline of 6π pixels counts whole.

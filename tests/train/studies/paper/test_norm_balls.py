@@ -7,8 +7,9 @@ import trimesh
 from augment.classifiers import Classifier
 from renderer.camera import OrthographicCamera
 from renderer.mesh import Mesh
-from train.studies.paper import norm_balls, subjects
-from train.studies.paper.norm_balls import LEVELS, SPACES, Outcome, attack_ball, most_comparable, parts
+from train.studies.paper import balls, norm_balls, subjects
+from train.studies.paper.balls import LEVELS, SPACES, Outcome, attack_ball, parts
+from train.studies.paper.norm_balls import most_comparable
 from train.studies.paper.subjects import Subject, scene_of
 
 SIZE = 12
@@ -61,7 +62,7 @@ def test_draws_of_a_larger_ball_go_further_and_a_search_holds_its_first_draw(sce
 
 
 def test_parts_hold_all_examples_in_order(scene, subject, monkeypatch):
-    monkeypatch.setattr(norm_balls, "PART", 2)
+    monkeypatch.setattr(balls, "PART", 2)
     split = list(parts(subject, scene, mean_above(0), "st_peters"))
     assert [len(part) for part in split] == [2, 1]
     assert [camera for part in split for camera in part.cameras] == scene.cameras
