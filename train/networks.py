@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import nearest
+from augment.classifiers.adapter import Normalised, nearest
 from augment.classifiers.python_function import call_python
 from augment.model_state import eval_mode
 from renderer.errors import InputError
@@ -15,22 +15,6 @@ from train.wideresnet import WideResNet
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
 _WITHOUT_AUXILIARY = {"aux_logits": False, "init_weights": True}
 _OPTIONS = {"googlenet": _WITHOUT_AUXILIARY, "inception_v3": _WITHOUT_AUXILIARY}
-
-
-class Normalised(nn.Module):
-    """A network behind the data's own normalisation: takes (N, 3, H, W) RGB in [0, 1]."""
-
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, network: nn.Module, mean: Sequence[float], std: Sequence[float]):
-        super().__init__()
-        self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
-        self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
-        self.network = network
-
-    def forward(self, images: Tensor) -> Tensor:
-        return self.network((images - self.mean) / self.std)
 
 
 def build_network(

@@ -96,6 +96,11 @@ class TrainingSceneSettings(SceneSettings):
 
     look_alikes: list[Any] = field(default_factory=list)
 
+    @property
+    def objects(self) -> int:
+        """How many; none where there is no mesh that look-alikes could be told from."""
+        return len(self.meshes) + len(self.look_alikes) if self.meshes else 0
+
 
 @dataclass
 class RendererSettings:
@@ -187,17 +192,14 @@ class ExperimentSettings:
     def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)
         if self.augment.renders:
-            scene = self.scene
-            objects = len(scene.meshes) + len(scene.look_alikes)
-            self.augment.examples = self.views * objects * len(scene.backgrounds)
+            self.augment.examples = self.views * self.scene.objects * len(self.scene.backgrounds)
             require_range("meshes × views × backgrounds", self.augment.examples, 1, MOST_IMAGES)
 
     @property
     def views(self) -> int:
         """Views per mesh; see `count_views`."""
         scene = self.scene
-        objects = len(scene.meshes) + len(scene.look_alikes) if scene.meshes else 0
-        return count_views(self.augment.examples, objects, len(scene.backgrounds), scene.views)
+        return count_views(self.augment.examples, scene.objects, len(scene.backgrounds), scene.views)
 
     @property
     def objects(self) -> dict[str, ObjectSettings]:

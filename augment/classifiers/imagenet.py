@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import Classifier, Normalise, nearest
+from augment.classifiers.adapter import Classifier, Normalised, nearest
 from renderer.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     fill(network, _current_keys(model, state), weights or published.url, name)
     transforms = published.transforms()
     return Classifier(
-        nn.Sequential(Normalise(transforms.mean, transforms.std), network),
+        Normalised(network, transforms.mean, transforms.std),
         _size(published),
         published.meta["categories"],
         name,
@@ -117,8 +117,8 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
     network = architecture.EfficientNet.from_name(f"efficientnet-lite{version}")
     path = weights or _path_in_wheel(version)
     fill(network, read_weights(path), path, name)
-    normalise = Normalise(mean=[127 / 255] * 3, std=[128 / 255] * 3)
-    return Classifier(nn.Sequential(normalise, network), network.input_image_size, imagenet_classes(), name)
+    normalised = Normalised(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
+    return Classifier(normalised, network.input_image_size, imagenet_classes(), name)
 
 
 def _path_in_wheel(version: int) -> Path:
@@ -148,8 +148,8 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # in Caffe's definition, but not in torchvision's
     fill(network, read_weights(weights), weights, SQUEEZENET_CAFFE)
-    normalise = Normalise(mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
-    return Classifier(nn.Sequential(normalise, network), _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
+    normalised = Normalised(network, mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
+    return Classifier(normalised, _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
 
 
 def _require_not_caffes(state: Mapping[str, Tensor], source: str | Path, name: str) -> None:

@@ -16,7 +16,7 @@ from torch import nn
 from torchvision.models import WeightsEnum, get_model, get_model_weights, list_models, squeezenet1_0, squeezenet1_1
 
 from augment.classifiers import Classifier, load_classifier
-from augment.classifiers.adapter import Normalise, nearest
+from augment.classifiers.adapter import Normalised, nearest
 from augment.classifiers.imagenet import build_network, imagenet_classes, published_weights
 from renderer.errors import InputError
 
@@ -74,7 +74,7 @@ def first_input(classifier: Classifier, images: torch.Tensor) -> torch.Tensor:
 def test_the_pixel_gradient_of_a_linear_network_is_its_weight_over_std_back_in_rgb(bgr):
     mean, std = (0.1, 0.4, 0.6), (0.2, 0.5, 3.0)
     layer = nn.Linear(3 * 5 * 5, 2)
-    classifier = Classifier(nn.Sequential(Normalise(mean, std, bgr), nn.Flatten(), layer), 5, ["fig", "lime"]).double()
+    classifier = Classifier(Normalised(nn.Sequential(nn.Flatten(), layer), mean, std, bgr), 5, ["fig", "lime"]).double()
     images = random_images(5).double().requires_grad_()
     logits = classifier(images)
     (gradient,) = torch.autograd.grad(logits[:, 1].sum(), images)
@@ -310,7 +310,7 @@ def test_every_published_set_of_weights_is_found_by_its_files_name():
 
 
 def test_efficientnet_lite_takes_weights_of_a_file_too(lite, tmp_path):
-    state = lite.function[1].state_dict()
+    state = lite.function.network.state_dict()
     torch.save(state | {"_fc.bias": state["_fc.bias"] + 1}, tmp_path / "tuned.pth")
     tuned, images = load_classifier("efficientnet_lite0", tmp_path / "tuned.pth"), random_images(224, 1)
     torch.testing.assert_close(tuned(images), lite(images) + 1, rtol=0, atol=16 * EPS32)  # logits of order ten
@@ -409,7 +409,7 @@ def test_weights_older_than_the_batch_counters_fit(tmp_path):
     assert len(old) < len(state)
     torch.save(old, tmp_path / "old.pth")
     classifier = load_classifier("torchvision:mobilenet_v3_small", tmp_path / "old.pth")
-    for name, value in classifier.function[1].state_dict().items():
+    for name, value in classifier.function.network.state_dict().items():
         assert name not in old or torch.equal(value, old[name])
 
 
