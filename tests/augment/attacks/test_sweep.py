@@ -24,7 +24,7 @@ def attacked(make_scene, make_linear) -> Attacked:
 
 def test_a_ball_fools_from_the_radius_on_at_which_a_linear_classifier_gives_way(attacked):
     """By hand: within L∞ of ε, the gap of two logits w₀, w₁ falls by ε |w₀ - w₁|₁ at most."""
-    weight = attacked.classifier.function.network.weight
+    weight = attacked.classifier.function[1].weight
     most = (weight[0] - weight[1]).abs().sum()
     gap = attacked.logits_before[..., 0] - attacked.logits_before[..., 1]
     needed = (gap / most).amax(1)  # of the worse of two views, each of which has pixels of its own
