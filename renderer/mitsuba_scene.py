@@ -22,6 +22,7 @@ from renderer.basis import Distant, Placed
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.environment import write_map
 from renderer.errors import InputError
+from renderer.harmonics import basis, equirectangular
 from renderer.image import ImageSettings, bounces, decode
 from renderer.lamps import Lamps
 from renderer.mesh import Mesh
@@ -125,6 +126,16 @@ def write_mitsuba_scene(
         shapes="\n".join(_write_parts(folder, mesh, settings)),
     )
     (folder / SCENE).write_text(scene, encoding="utf-8")
+
+
+def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
+    """Radiance (height, 2 · height, 3) float64 of a light's coefficients at the texels as Mitsuba's `envmap` places
+    them: its outermost rows are the poles. At 256 rows those of `to_map` would be taken for light 0.2 % dimmer."""
+    directions, _ = equirectangular(1, 2 * height)
+    around, polar = directions[0, :, :2], torch.linspace(0, math.pi, height, dtype=torch.float64)  # z is 0, the mean
+    rows = (torch.cat([at.sin() * around, at.cos().expand(len(around), 1)], dim=1) for at in polar)
+    degree = math.isqrt(len(coefficients)) - 1
+    return torch.stack([basis(row, degree) @ coefficients.to(row) for row in rows])
 
 
 def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:

@@ -17,10 +17,11 @@ from renderer.albedo import surface_albedo
 from renderer.basis import Distant
 from renderer.fragments import Fragments
 from renderer.mesh import Mesh
-from renderer.rays import Looks, Rays
+from renderer.rays import Looks, Rays, sphere
 from renderer.subdivision import refine
 from renderer.surface import Surface
 
+DIRECTIONS = 2**9  # over the whole sphere, in which a patch looks
 PATCHES = 2**11  # the mesh's area over that is about the area of a patch
 MIDDLE = [[-1.0, -1.0], [1.0, -1.0], [0.0, 2.0]]  # a triangle around the only sample of an image
 
@@ -115,8 +116,9 @@ def _first_bounce(patches: Patches, rays: Rays, basis: Distant) -> tuple[Tensor,
     surface = Surface(patches.view, torch.from_numpy(patches.pieces.vertices))
     from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
     from_sky[:, basis.live] = patches.mean(basis.irradiance(surface.planes))
-    receiving, links, radiance = [], [], basis.radiance(rays.directions)
-    for looks in rays.looks(surface):
+    directions = sphere(DIRECTIONS)
+    receiving, links, radiance = [], [], basis.radiance(directions)
+    for looks in rays.looks(surface, directions):
         weights = looks.blocked() * patches.shares[looks.sample, 0]
         from_sky[looks.pixels] -= weights @ radiance
         receiving.append(looks.pixels)

@@ -50,16 +50,15 @@ class Looks:
 class Rays:
     """Rays among the faces of one mesh. InputError, when a ray is cast, where Embree is not installed.
 
-    directions: (D, 3), equally far apart. offset: of where a ray starts above its surface.
+    offset: of where a ray starts above its surface.
     """
 
     def __init__(self, mesh: Mesh):
-        self.directions = sphere(DIRECTIONS)
         self.offset = OFFSET * float(np.abs(mesh.vertices).max())
         self._mesh = mesh
 
-    def looks(self, surface: Surface) -> Iterator[Looks]:
-        """Those of a view's pixels that see any other surface, some at a time.
+    def looks(self, surface: Surface, directions: Tensor) -> Iterator[Looks]:
+        """Those of a view's pixels that see any other surface, some at a time, in directions (D, 3) of a `sphere`.
 
         No ray is cast into a sample's own face, on which smooth normals shade the light nevertheless.
         """
@@ -70,7 +69,7 @@ class Rays:
         planes, normals = surface.planes, surface.normals
         count = fragments.pixel.bincount(minlength=len(fragments.pixels))
         first = count.cumsum(0) - count
-        directions, solid_angle = self.directions, 4 * math.pi / len(self.directions)
+        solid_angle = 4 * math.pi / len(directions)
         for some in pixels.split(max(1, BLOCK // len(directions))):
             of_pixel = count[some, None]
             sample = first[some, None] + (_shuffled(len(directions)) + some[:, None]) % of_pixel

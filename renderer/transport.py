@@ -7,12 +7,13 @@ what the surface there sends instead (`renderer.radiosity`).
 import torch
 from torch import Tensor
 
+from renderer import rays
 from renderer.basis import Basis, Distant, Placed, parts_of
 from renderer.errors import InputError
 from renderer.image import ImageSettings, bounces
 from renderer.mesh import Mesh
 from renderer.radiosity import Patches, Radiosity
-from renderer.rays import Rays
+from renderer.rays import Rays, sphere
 from renderer.surface import Surface
 
 
@@ -28,7 +29,8 @@ class Transport:
         patches = Patches.of(mesh) if count else None
         self.rays = Rays(patches.pieces if patches else mesh)
         self._radiosity = Radiosity(patches, self.rays, settings.encoding, gain, basis, count) if patches else None
-        self._sky = basis.radiance(self.rays.directions)
+        self._directions = sphere(rays.DIRECTIONS)
+        self._sky = basis.radiance(self._directions)
         self.colors = self._radiosity is not None and self._radiosity.colors
 
     def change(self, surface: Surface, albedo: Tensor) -> Tensor | None:
@@ -37,7 +39,7 @@ class Transport:
         """
         change, fragments = None, surface.fragments
         weights = albedo.T / fragments.samples**2
-        for looks in self.rays.looks(surface):
+        for looks in self.rays.looks(surface, self._directions):
             blocked = looks.blocked()
             if not blocked.any():
                 continue

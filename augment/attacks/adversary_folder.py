@@ -26,7 +26,7 @@ from renderer.image import ImageSettings, to_bytes
 from renderer.lights import load_light, save_light
 from renderer.mesh import load_mesh
 from renderer.mesh_export import export_mesh
-from renderer.mitsuba_scene import write_mitsuba_scene
+from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.placed_files import load_placed, save_placed
 
 DESCRIPTION, MESH, LIGHT, BACKGROUND, PIXELS = (
@@ -83,7 +83,7 @@ def _write_radiance(adversary: Adversary, folder: Path) -> dict[str, float]:
     shown, placed = adversary.shown, [(basis, adversary.light[own]) for own, basis in parts_of(adversary.basis)[1:]]
     cameras, settings = adversary.cameras, adversary.settings
     write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.gain, cameras, settings, "light.exr", placed)
-    write_map(folder / MITSUBA / "light.exr", radiance.clamp(min=0))
+    write_map(folder / MITSUBA / "light.exr", mitsuba_map(adversary.light[where], MAP_HEIGHT).clamp(min=0))
     return {"negative_light": negative_share(radiance)}
 
 

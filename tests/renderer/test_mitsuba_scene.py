@@ -1,5 +1,6 @@
 """A scene's files, rendered by Mitsuba, against our image of the same."""
 
+import math
 import os
 import subprocess
 import sys
@@ -11,12 +12,13 @@ import torch
 import trimesh
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
-from renderer.environment import to_map, write_map
+from renderer.environment import write_map
 from renderer.errors import InputError
+from renderer.harmonics import basis, unit_vectors
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, normalise
-from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
+from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.transfer import build_operators
 from renderer.visibility import choose
 
@@ -43,13 +45,29 @@ def ball() -> Mesh:
     )
 
 
+def test_a_map_for_mitsuba_is_the_light_in_every_direction(tmp_path):
+    """But for the interpolation between texels."""
+    light, settings = load_light("grace").double(), ImageSettings(8)
+    write_mitsuba_scene(tmp_path, normalise(ball()), 1.0, CAMERAS, settings, "light.exr")
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 128))
+    directions = unit_vectors(torch.randn(3, 50, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))[0].T
+    with mitsuba() as mi:
+        sky, seen = mi.load_file(str(tmp_path / SCENE)).environment(), []
+        for direction in directions.tolist():
+            interaction = mi.SurfaceInteraction3f()
+            interaction.wi = [-each for each in direction]
+            seen.append(np.array(sky.eval(interaction)))
+    expected = math.pi * basis(directions, 6) @ light
+    torch.testing.assert_close(torch.from_numpy(np.array(seen)).double(), expected, rtol=0, atol=4e-4 * expected.max())
+
+
 @pytest.mark.parametrize(("encoding", "normals"), [("linear", "smooth"), ("srgb", "flat")])
 def test_the_files_look_in_mitsuba_as_the_scene_does_here(tmp_path, encoding, normals):
     """Inside the outline, on average to half of a 255th and in root mean square to a 200th, which is Mitsuba's noise at
     the texels' edges. The probe is positive all round."""
     mesh, light, settings = normalise(ball()), load_light("st_peters"), ImageSettings(24, 8, encoding, normals)
     write_mitsuba_scene(tmp_path / "mitsuba", mesh, 2.0, CAMERAS, settings, "../light.exr")
-    write_map(tmp_path / "light.exr", to_map(light, 256))
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
     theirs = render_mitsuba_scene(tmp_path / "mitsuba" / SCENE, len(CAMERAS)).double()
     for operator, seen in zip(build_operators(mesh, CAMERAS, settings, choose("software"), 2.0), theirs, strict=True):
         ours = torch.zeros(4, 24 * 24, dtype=torch.float64)
@@ -70,7 +88,7 @@ def test_a_bowl_is_as_dark_or_bright_within_as_its_transport_says(tmp_path, tran
     bowl, settings = Mesh.plain(shell.vertices, shell.faces[lower], (0.8, 0.7, 0.5)), ImageSettings(24, 4)
     camera, light = OrthographicCamera(0.3, 0.0, 2.2), load_light("st_peters")
     write_mitsuba_scene(tmp_path, bowl, 1.0, [camera], replace(settings, transport=transport), "light.exr")
-    write_map(tmp_path / "light.exr", to_map(light, 128))
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 128))
     theirs = render_mitsuba_scene(tmp_path / SCENE, 1)[0].flatten(1)
     for chosen, close in ((transport, True), ("direct", False)):
         [operator] = build_operators(bowl, [camera], replace(settings, transport=chosen), choose("software"))

@@ -16,10 +16,10 @@ from augment.objects import SceneObject
 from augment.parameters import StepSettings
 from augment.scene import Scene
 from renderer.camera import Camera
-from renderer.environment import to_map, write_map
+from renderer.environment import write_map
 from renderer.image import ImageSettings, behind, develop_composite
 from renderer.lights import ambient
-from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
+from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.transfer import build_operators
 from renderer.visibility import choose
 from train.studies.paper.section import Section, SectionSettings, Study
@@ -122,7 +122,7 @@ def path_traced(scene: Scene, lights: Tensor) -> tuple[Tensor, Tensor]:
         shown, settings = scene.objects[row.object], replace(scene.settings, transport=TRACED)
         with TemporaryDirectory() as folder:
             write_mitsuba_scene(Path(folder), shown.mesh, shown.gain, row.cameras, settings, "light.exr")
-            write_map(Path(folder, "light.exr"), to_map(light.double(), MAP_ROWS).clamp(min=0))
+            write_map(Path(folder, "light.exr"), mitsuba_map(light, MAP_ROWS).clamp(min=0))
             seen = render_mitsuba_scene(Path(folder, SCENE), len(row.cameras))
         radiance, coverage = seen[:, :3], seen[:, 3:]
         added = behind(coverage, scene.images_behind[row.background], settings.encoding)

@@ -14,20 +14,22 @@ import trimesh
 from torch import Tensor
 
 from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object, on_ground
+from renderer import radiosity, rays
 from renderer.camera import OrthographicCamera
-from renderer.environment import to_map, write_map
+from renderer.environment import write_map
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, concatenate, normalise
-from renderer.mitsuba_scene import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, write_mitsuba_scene
+from renderer.mitsuba_scene import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.shapes import solid
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
 from train.tables import markdown
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
-SIZE, SEEDS = 32, 3  # Mitsuba's images, whose spread tells its noise
-MAP_ROWS = 512  # Mitsuba takes the outermost for the poles, which are half a row further out
+SIZE, SEEDS = 32, 8  # Mitsuba's images, whose spread tells its noise
+MAP_ROWS = 512
+SAMPLES, CONVERGED = 16, (2**14, 2**15, 2**8)  # of a pixel's side; a pixel's directions, patches, their directions
 TRANSPORTS = ("shadows", "bounces:3")
 
 
@@ -59,23 +61,43 @@ def meshes() -> dict[str, Mesh]:
 
 def table() -> str:
     rows = [[name, transport, *row(mesh, transport)] for name, mesh in meshes().items() for transport in TRANSPORTS]
-    errors = (f"{what}: {whose}" for what in ("image", "gradient") for whose in ("error", "noise", "direct"))
-    return markdown(["mesh", "transport", *errors], rows)
+    whose = ("error", "converged", "noise", "direct")
+    head = [f"{what}: {each}" for what in ("image", "gradient") for each in whose]
+    return markdown(["mesh", "transport", *head], rows)
 
 
 def row(mesh: Mesh, transport: str) -> list[str]:
-    """Of the image, and of the gradient by the light of its sum with random weights: the error, Mitsuba's own noise,
-    and the error of direct light."""
-    shaped, direct = (operator(mesh, ImageSettings(SIZE, transport=each)) for each in (transport, "direct"))
-    theirs, noise = mitsuba_image(mesh, shaped.settings)
+    return [f"{each:.2%}" for each in errors(mesh, transport)]
+
+
+def errors(mesh: Mesh, transport: str) -> list[float]:
+    """Of the image, and of the gradient by the light of its sum with random weights: the error, that with the numbers
+    of `converged`, Mitsuba's own noise, and the error of direct light."""
+    settings = ImageSettings(SIZE, transport=transport)
+    with converged():
+        finest = operator(mesh, replace(settings, samples=SAMPLES))
+    seen = operator(mesh, settings), finest, operator(mesh, replace(settings, transport="direct"))
+    theirs, noise = mitsuba_image(mesh, settings)
     inside, brightest = theirs[3] > 0.999, theirs[:3].max()
-    off = (seen - theirs for seen in (image(shaped), image(direct)))
-    errors = (each[:3, inside].square().mean().sqrt() / brightest for each in (next(off), noise, next(off)))
+    default, finest_off, direct = (image(each) - theirs for each in seen)
+    found = [
+        float(each[:3, inside].square().mean().sqrt() / brightest) for each in (default, finest_off, noise, direct)
+    ]
     upstream = inside * torch.rand(3, SIZE**2, generator=torch.Generator().manual_seed(0))
-    slope, its_noise = mitsuba_gradient(mesh, shaped.settings, upstream)
-    ours, without = (each.light_gradient(upstream[:, each.pixels]) for each in (shaped, direct))
-    gradients = (each.norm() / slope.norm() for each in (ours - slope, its_noise, without - slope))
-    return [f"{each:.2%}" for each in (*errors, *gradients)]
+    slope, noise = mitsuba_gradient(mesh, settings, upstream)
+    default, finest_off, direct = (each.light_gradient(upstream[:, each.pixels]) - slope for each in seen)
+    return found + [float(each.norm() / slope.norm()) for each in (default, finest_off, noise, direct)]
+
+
+@contextmanager
+def converged() -> Iterator[None]:
+    """Transport by so many more rays and patches that what is left of its error is little beside Mitsuba's noise."""
+    chosen = rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS
+    try:
+        rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS = CONVERGED
+        yield
+    finally:
+        rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS = chosen
 
 
 def operator(mesh: Mesh, settings: ImageSettings) -> Operator:
@@ -100,7 +122,7 @@ def light() -> Tensor:
 def light_and_map() -> tuple[Tensor, Tensor]:
     """Its coefficients, and the map's texels with their graph."""
     coefficients = light().double().requires_grad_()
-    return coefficients, to_map(coefficients, MAP_ROWS)
+    return coefficients, mitsuba_map(coefficients, MAP_ROWS)
 
 
 def mitsuba_image(mesh: Mesh, settings: ImageSettings) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ import torch
 from augment.held_transport import NEAR
 from renderer.mesh import normalise
 from renderer.mitsuba_scene import DIFFERENTIABLE, mitsuba
+from renderer.radiosity import PATCHES
 from renderer.rays import DIRECTIONS
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
@@ -69,9 +70,9 @@ The same mesh at {size}² in the same environment map (St. Peter's, positive all
 and 8² samples here, and {seeds} × 256 paths per pixel of depth N + 2 there. An image's errors are root mean squares
 over the brightest value, inside the outline. The gradient is that by the light, all 49 × 3 coefficients, of the sum of
 these pixels with random weights, and Mitsuba's is its integrator's in reverse mode; errors are L2 norms over that of
-the gradient. *Noise* is Mitsuba's own standard error, *direct* the error without transport. What is left beside the
-noise is the quadrature over directions, for bounces the size of the patches, and up to 0.4 % of a gradient the map's
-rows.
+the gradient. *Noise* is Mitsuba's own standard error, which is in every error; *direct* the error without transport.
+What the default adds to the noise is the quadrature: *converged* has {fine[0]:,} directions, {samples}² samples, and
+for bounces {fine[1]:,} patches in place of {patches:,}.
 
 {beside}
 """
@@ -117,6 +118,9 @@ def run(settings: TransportSettings) -> None:
         radius=held.STEP.radius,
         held=held.table(coarse, load_classifier("run:pretrained/none", None)),
         seeds=beside_mitsuba.SEEDS,
+        fine=beside_mitsuba.CONVERGED,
+        samples=beside_mitsuba.SAMPLES,
+        patches=PATCHES,
         beside=beside_mitsuba.table(),
     )
     write(out, joined([wrapped(text.strip())]))
