@@ -1,11 +1,9 @@
-"""Figures on disk. Needs matplotlib."""
+"""Figures on disk."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
-
-from renderer.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -13,11 +11,9 @@ if TYPE_CHECKING:
 
 
 def pyplot() -> ModuleType:
-    """matplotlib.pyplot without a display; InputError where it is not installed."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise InputError("matplotlib is not installed: pip install '.[benchmark]'") from error
+    """matplotlib.pyplot without a display."""
+    import matplotlib
+
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 

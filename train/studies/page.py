@@ -33,9 +33,11 @@ def _filled(paragraph: str) -> str:
     )
 
 
-def write(path: Path, text: str) -> None:
-    """Print a page, which is not lost then where it cannot be written, write it, and say where."""
+def write(path: Path | None, text: str) -> None:
+    """Print a page, which is not lost then where it cannot be written, and write it where a path says."""
     print(text)
+    if path is None:
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
     print(f"written: {path}")

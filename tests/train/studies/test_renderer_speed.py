@@ -206,7 +206,6 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def test_a_quick_run_writes_every_file(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("matplotlib")
     monkeypatch.setattr(study, "_backends", lambda: (choose("software"),))
     monkeypatch.setattr(sys, "argv", ["scripts/benchmark_renderer.py", "quick=true"])
     settings = study.RendererSpeedSettings(str(tmp_path), "cpu", False, True, None, study.SceneSettings([]))

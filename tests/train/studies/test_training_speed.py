@@ -256,7 +256,6 @@ def one_thread():
 
 
 def test_a_tiny_run_writes_the_page_and_its_figure(tmp_path, npz, monkeypatch, capsys, one_thread):
-    pytest.importorskip("matplotlib")
     monkeypatch.setitem(peak.SIZES, "cpu", (32,))
     monkeypatch.setattr(peak, "BURST", 1e-9)
     monkeypatch.setattr(

@@ -56,10 +56,7 @@ def run(settings: InterruptionSettings) -> list[str]:
             started = [pool.submit(_conduct, case, bench, settings.seed, number) for number, case in enumerate(cases)]
         outcomes = merged([future.result() for future in started])
     text = page(outcomes, bench, command_line())
-    if out:
-        write(out, text)
-    else:
-        print(text)
+    write(out, text)
     return failures(outcomes)
 
 

@@ -99,54 +99,28 @@ def cases(lamp: ObjectSettings, orange: ObjectSettings, targets: Sequence[str], 
     """targets: a class per view of the illusion; the attack on the pixels takes the first."""
     noon = SkylightSettings("linf", None, "unit", 0.2)
     evening = SkylightSettings("linf", None, "unit", 0.2, zenith=75.0, turbidity=8.0)
-    several: dict[str, Any] = dict(shared=True, max_steps=steps)
+
+    def case(name: str, title: str, views: int = 1, target: Sequence[str] | None = None, **kinds: Any) -> Case:
+        attack = AttackCommandSettings(**kinds, shared=views > 1, shorten="geometry" in kinds, max_steps=steps)
+        return Case(name, title, lamp, attack, views, target=target)
+
     return [
-        Case("lighting", "light", lamp, AttackCommandSettings(lighting=LIGHT, max_steps=steps)),
-        Case(
-            "skylight",
-            "skylight, orange",
-            orange,
-            AttackCommandSettings(skylight=evening, max_steps=steps),
-            background=0.0,
-        ),
-        Case("skylight_lamp", "skylight, lamp", lamp, AttackCommandSettings(skylight=noon, max_steps=steps)),
-        Case(
-            "lighting_views",
-            "one light for three views",
-            lamp,
-            AttackCommandSettings(lighting=LIGHT, **several),
-            views=3,
-        ),
-        Case("geometry", "shape", lamp, AttackCommandSettings(geometry=SHAPE, shorten=True, max_steps=steps)),
-        Case(
-            "geometry_views",
-            "one shape for three views",
-            lamp,
-            AttackCommandSettings(geometry=WIDER_SHAPE, shorten=True, **several),
-            views=3,
-        ),
-        Case(
+        case("lighting", "light", lighting=LIGHT),
+        replace(case("skylight", "skylight, orange", skylight=evening), item=orange, background=0.0),
+        case("skylight_lamp", "skylight, lamp", skylight=noon),
+        case("lighting_views", "one light for three views", views=3, lighting=LIGHT),
+        case("geometry", "shape", geometry=SHAPE),
+        case("geometry_views", "one shape for three views", views=3, geometry=WIDER_SHAPE),
+        case(
             "illusion",
             "optical illusion: one shape, a target for each view",
-            lamp,
-            AttackCommandSettings(geometry=FREE_SHAPE, shorten=True, **several),
             views=len(targets),
             target=targets,
+            geometry=FREE_SHAPE,
         ),
-        Case("albedo", "albedo of each face", lamp, AttackCommandSettings(albedo=ALBEDO, max_steps=steps)),
-        Case(
-            "pixels",
-            f"pixels, target {targets[0]}",
-            lamp,
-            AttackCommandSettings(pixels=PIXELS, max_steps=steps),
-            target=targets[:1],
-        ),
-        Case(
-            "lighting_geometry",
-            "light and shape at once",
-            lamp,
-            AttackCommandSettings(lighting=LIGHT, geometry=SHAPE, shorten=True, max_steps=steps),
-        ),
+        case("albedo", "albedo of each face", albedo=ALBEDO),
+        case("pixels", f"pixels, target {targets[0]}", target=targets[:1], pixels=PIXELS),
+        case("lighting_geometry", "light and shape at once", lighting=LIGHT, geometry=SHAPE),
     ]
 
 

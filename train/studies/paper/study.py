@@ -16,7 +16,6 @@ from train.configuration import read_settings
 from train.outputs import writable_folder
 from train.run_classifier import load_classifier
 from train.settings import SceneSettings, read_object
-from train.studies.figures import pyplot
 from train.studies.page import joined, versions, wrapped, write
 from train.studies.paper import (
     gallery,
@@ -69,7 +68,6 @@ class PaperSettings:
 def run(settings: PaperSettings) -> None:
     """Measure a section, write its data and its figures to out/paper, and put its text into out/paper.md."""
     out = writable_folder(settings.out, "out")
-    pyplot()  # a run without matplotlib would fail only at its end
     name = settings.section.get("name")
     if name not in SECTIONS:
         raise InputError(f"section.name={name}: choose section={', '.join(SECTIONS)}")

@@ -57,10 +57,7 @@ def run(settings: ReliabilitySettings) -> list[str]:
             outcomes[number] = outcome(trials[number], corpus, runner)
     ordered = [outcomes[number] for number in sorted(outcomes)]
     text = page(ordered, command_line(), len(trials), min(settings.started, len(ordered)), PATIENCE)
-    if out:
-        write(out, text)
-    else:
-        print(text)
+    write(out, text)
     return failures(outcomes.values())
 
 

@@ -1,4 +1,4 @@
-"""The figures: fronts of time and error, and how time and memory grow. Needs matplotlib."""
+"""The figures: fronts of time and error, and how time and memory grow."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

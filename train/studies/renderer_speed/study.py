@@ -15,7 +15,6 @@ from train.cli import command_line
 from train.device import choose_device
 from train.outputs import writable_folder
 from train.settings import SceneSettings, read_object
-from train.studies.figures import pyplot
 from train.studies.page import machine, write
 from train.studies.renderer_speed import (
     comparison,
@@ -60,7 +59,6 @@ def run(settings: RendererSpeedSettings) -> None:
         raise InputError(f"only={settings.only}: choose vertices, or null for the whole page")
     if settings.only and not (out / PAGE).is_file():
         raise InputError(f"only={settings.only}: there is no {out / PAGE} to put the section into")
-    pyplot()  # a run without matplotlib would fail only at its end
     torch.set_num_threads(1)
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software OpenGL, too, on the one thread
     device, plan = choose_device(settings.device), QUICK if settings.quick else Plan()

@@ -1,4 +1,4 @@
-"""The page that a run leaves in docs/, and its figure. Needs matplotlib."""
+"""The page that a run leaves in docs/, and its figure."""
 
 from pathlib import Path
 

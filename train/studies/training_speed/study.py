@@ -10,7 +10,6 @@ from train.device import choose_device, compiles, set_deterministic, set_threads
 from train.networks import model_title
 from train.outputs import writable_file
 from train.settings import ExperimentSettings
-from train.studies.figures import pyplot
 from train.studies.page import machine, write
 from train.studies.training_speed.contest import BenchmarkSettings, load, measure
 from train.studies.training_speed.page import draw, page
@@ -18,7 +17,6 @@ from train.studies.training_speed.page import draw, page
 
 def run(config: DictConfig) -> None:
     """Measure, and write the page and its figure. config: of an experiment, and BenchmarkSettings' keys."""
-    pyplot()  # a run without matplotlib would fail only at its end
     own = [field.name for field in fields(BenchmarkSettings)]
     settings = read_settings(BenchmarkSettings, OmegaConf.masked_copy(config, own))
     out = writable_file(settings.out, "out")

@@ -12,7 +12,6 @@ from train.studies.paper import study
 @pytest.fixture
 def reproduce(monkeypatch) -> Callable:
     """`python scripts/reproduce_paper.py` in this process, with a classifier in place of the one that is named."""
-    pytest.importorskip("matplotlib")
 
     def run(classifier, *overrides: str) -> None:
         monkeypatch.setattr(study, "load_classifier", lambda *_: classifier)
