@@ -16,7 +16,7 @@ from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import basis, basis_gradient
 from renderer.image import ImageSettings, develop
 from renderer.mesh import Mesh
-from renderer.rays import Rays
+from renderer.rays import DIRECTIONS, Rays, sphere
 from renderer.shading import radiance
 from renderer.surface import Surface
 from renderer.transfer import build_operators
@@ -128,7 +128,7 @@ def by_shadows(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     [operator] = build_operators(mesh, [setup.camera], settings, setup.backend, dtype=dtype)
     view, light = setup.view(), setup.light.to(dtype)
     surface, rays = Surface.of(mesh, setup.fragments(), settings), Rays(mesh)
-    points, directions = (surface.points + rays.offset * surface.planes).numpy(), rays.directions.numpy()
+    points, directions = (surface.points + rays.offset * surface.planes).numpy(), sphere(DIRECTIONS).numpy()
     places = extended(points), extended(mesh.vertices[mesh.faces]), extended(directions)
     lost, upstream = reference.shadow(view, *places, setup.degree), _upstream(len(view.pixels))
     lit, above = extended(light.double().numpy()), extended(upstream.double().numpy())
