@@ -12,18 +12,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import torch
-import trimesh
 from numpy.typing import ArrayLike
-from PIL import Image
-from trimesh.visual.base import Visuals
-from trimesh.visual.material import Material, PBRMaterial, empty_material
 
 from renderer.errors import LARGEST, InputError
-from renderer.image import encode
-from renderer.mesh_files import open_mesh
 
-ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}  # not read: what is in them is to be seen before
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 
@@ -98,13 +90,15 @@ class Mesh:
         That is, each edge is run through once in either direction, and the volume within the faces that edges connect
         is positive.
         """
+        from trimesh.graph import connected_component_labels  # trimesh takes half a second
+
         edges = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         forth, back = edges @ [len(self.vertices), 1], edges @ [1, len(self.vertices)]
         by_forth, by_back = np.argsort(forth), np.argsort(back)
         if (np.diff(forth[by_forth]) == 0).any() or not np.array_equal(forth[by_forth], back[by_back]):
             return False
         neighbours = np.stack([by_forth, by_back], axis=1) // 3
-        part = trimesh.graph.connected_component_labels(neighbours, node_count=len(self.faces))
+        part = connected_component_labels(neighbours, node_count=len(self.faces))
         a, b, c = (self.vertices[self.faces[:, corner]] - self.vertices.mean(axis=0) for corner in range(3))
         return bool((np.bincount(part, np.einsum("fi,fi->f", a, np.cross(b, c))) > 0).all())
 
@@ -145,11 +139,13 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
     are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area.
     """
+    from renderer.mesh_reading import read_parts
+
     path = Path(path)
     if up not in ("auto", "y", "z"):
         raise InputError(f"up={up} for {path}: choose auto, y or z")
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
-    placed = _read(path, linear=is_gltf)
+    placed = [transformed(*part) for part in read_parts(path, linear=is_gltf)]
     if not placed:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
     mesh = _weld(concatenate(placed))
@@ -157,7 +153,7 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
         raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
     if not mesh.face_areas().sum() > 0:
         raise InputError(f"{path} has a surface of zero area: give a mesh with faces of some extent")
-    return _transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
+    return transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
 
 
 def normalise(mesh: Mesh) -> Mesh:
@@ -175,83 +171,7 @@ def normalise(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=scaled.astype(np.float32).astype(np.float64))
 
 
-def _read(path: Path, linear: bool) -> list[Mesh]:
-    """Every part of a file where its node puts it. `linear`: the file's colours, textures aside, are linear."""
-    if not path.is_file():
-        raise InputError(f"{path} does not exist: give the path of a mesh file")
-    formats = set(trimesh.available_formats()) - ARCHIVES
-    suffix = path.suffix.lower().lstrip(".")
-    if suffix not in formats:
-        raise InputError(f"{path} has no known mesh format: use one of {', '.join(sorted(formats))}")
-    try:
-        file, companions = open_mesh(path)
-        scene = trimesh.load(file, file_type=suffix, resolver=companions, force="scene", process=False)
-        parts = {
-            name: _part(geometry, linear)
-            for name, geometry in scene.geometry.items()
-            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)
-        }
-    except InputError:
-        raise
-    except Exception as error:  # each of trimesh's readers raises its own
-        raise InputError(f"{path} cannot be read as a mesh ({error}): export it again") from error
-    nodes = [scene.graph[node] for node in scene.graph.nodes_geometry]
-    return [_transformed(parts[name], matrix) for matrix, name in nodes if name in parts]
-
-
-def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
-    """One geometry of a file, in its own coordinates. Raises whatever its contents make numpy or Pillow raise."""
-    vertices, faces, uvs = geometry.vertices, np.asarray(geometry.faces), getattr(geometry.visual, "uv", None)
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise IndexError("faces name vertices that are not there")
-    colors, image = _corner_colors(geometry.visual, faces)
-    for name, values in {"coordinates": vertices, "texture coordinates": uvs, "colours": colors}.items():
-        if values is not None and not (np.abs(values) <= LARGEST).all():  # NaN is not
-            raise ValueError(f"{name} are not finite or beyond {LARGEST:g}")
-    colors = encode(torch.from_numpy(colors), "srgb").numpy() if linear else colors
-    mesh = replace(Mesh.plain(vertices, faces), corner_colors=colors.astype(np.float32))
-    if image is None or uvs is None:
-        return mesh
-    return replace(
-        mesh,
-        corner_uvs=uvs[faces, :2].astype(np.float32),
-        texture_ids=np.zeros(len(faces), dtype=np.int32),
-        textures=(np.array(image.convert("RGB")),),
-    )
-
-
-def _corner_colors(visual: Visuals, faces: np.ndarray) -> tuple[np.ndarray, Image.Image | None]:
-    """(F, 3, 3) colours in [0, 1] as the file has them, and the texture if there is one."""
-    colors, image = np.ones((len(faces), 3, 3)), None
-    if visual.kind == "vertex":
-        colors *= _unit_rgb(visual.vertex_colors)[faces]
-    elif visual.kind == "face":
-        colors *= _unit_rgb(visual.face_colors)[:, None]
-    elif visual.kind == "texture":
-        color, image = _material(visual.material)
-        colors *= color
-        if "color" in visual.vertex_attributes:
-            colors *= _unit_rgb(visual.vertex_attributes["color"])[faces]
-    return colors, image
-
-
-def _material(material: Material) -> tuple[np.ndarray, Image.Image | None]:
-    """A material's colour (3,) in [0, 1], white where the file gives none, and its image."""
-    if isinstance(material, PBRMaterial):
-        factor, image = material.baseColorFactor, material.baseColorTexture
-        return np.ones(3) if factor is None else _unit_rgb(factor), image
-    # trimesh puts a grey colour, or a grey image, where the file has none; what it has is under its own name.
-    image = None if material.image == empty_material().image else material.image
-    return np.clip(material.kwargs.get("kd", np.ones(3)), 0, 1), image
-
-
-def _unit_rgb(colors: np.ndarray) -> np.ndarray:
-    """Red, green and blue in [0, 1], from integers of any width or from numbers that are so already."""
-    rgb = np.asarray(colors)[..., :3]
-    return rgb / np.iinfo(rgb.dtype).max if rgb.dtype.kind in "ui" else rgb
-
-
-def _transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
     """The mesh under an affine matrix (4, 4). A mirroring one turns the faces round, so that outside stays out."""
     order = [0, 1, 2] if np.linalg.det(matrix[:3, :3]) >= 0 else [0, 2, 1]
     return replace(

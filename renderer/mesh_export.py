@@ -3,21 +3,21 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import trimesh
 from PIL import Image
 from torch.nn.functional import grid_sample
-from trimesh.visual.material import PBRMaterial
-from trimesh.visual.texture import TextureVisuals
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import NORMALS, decode, encode
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh
 from renderer.normals import vertex_normals
+
+if TYPE_CHECKING:
+    import trimesh  # takes half a second: imported where it is used
 
 # glTF's names for colours and normals after an underscore, under which trimesh writes any attribute.
 _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
@@ -65,6 +65,8 @@ def corner_normals(mesh: Mesh, normals: str) -> np.ndarray:
 
 
 def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int | None) -> bytes:
+    import trimesh
+
     later = np.arange(len(mesh.faces)) >= (len(mesh.faces) if first is None else first)
     order = np.stack([later, mesh.texture_ids], axis=1)
     parts = [_textured_part(mesh, normals, part[1], (order == part).all(1)) for part in np.unique(order, axis=0)]
@@ -72,8 +74,12 @@ def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int 
     return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=finish)
 
 
-def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int, here: np.ndarray) -> trimesh.Trimesh:
+def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int, here: np.ndarray) -> "trimesh.Trimesh":
     """The faces (F,) bool that are `here`, of one texture or of none, y up."""
+    import trimesh
+    from trimesh.visual.material import PBRMaterial
+    from trimesh.visual.texture import TextureVisuals
+
     corners = np.concatenate([mesh.corner_colors[here], mesh.corner_uvs[here], normals[here]], axis=-1)
     ids, values, faces = _split(mesh.faces[here], corners)
     colors, uvs, normals = values[:, :3], values[:, 3:5], values[:, 5:]
@@ -127,6 +133,8 @@ def _camera_node(camera: Camera, index: int) -> dict[str, Any]:
 
 
 def _ply(mesh: Mesh, normals: np.ndarray) -> bytes:
+    import trimesh
+
     ids, values, faces = _split(mesh.faces, np.concatenate([_baked_colors(mesh), normals], axis=-1))
     colors, normals = values[:, :3].astype(np.uint8), values[:, 3:]
     part = trimesh.Trimesh(mesh.vertices[ids], faces, vertex_normals=normals, vertex_colors=colors, process=False)

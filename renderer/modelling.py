@@ -12,6 +12,14 @@ SEGMENTS = 48  # faces around an axis of revolution
 STEP = 0.1  # longest edge along a profile, in world units
 
 
+def sphere(subdivisions: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of a unit sphere of 20·4^subdivisions faces."""
+    from trimesh.creation import icosphere  # trimesh takes half a second
+
+    ball = icosphere(subdivisions=subdivisions)
+    return np.array(ball.vertices), np.array(ball.faces)
+
+
 def revolve(*strokes: np.ndarray | Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3), faces (F, 3) and the stroke (F,) of each face of a surface of revolution.
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-import trimesh
 from numpy.typing import NDArray
 
 from renderer.harmonics import bands, gradient_matrices, monomial_coefficients, per_degree
@@ -99,7 +98,9 @@ def _derivatives(degree: int) -> Array:
 @per_degree
 def _grid(degree: int) -> tuple[Array, Array, Array]:
     """(directions (N, 3), harmonics (K, N), indices (6, N) of the neighbours) of an icosphere's vertices."""
-    sphere = trimesh.creation.icosphere(_SUBDIVISIONS)
+    from trimesh.creation import icosphere  # trimesh takes half a second
+
+    sphere = icosphere(_SUBDIVISIONS)
     around = [[*near, *near[:1]][:6] for near in sphere.vertex_neighbors]  # twelve vertices have five
     directions = np.array(sphere.vertices)
     return directions, np.ascontiguousarray(_harmonics(directions, degree).T), np.array(around).T

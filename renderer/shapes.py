@@ -10,11 +10,10 @@ from collections.abc import Callable
 from difflib import get_close_matches
 
 import numpy as np
-import trimesh
 
 from renderer.errors import InputError
 from renderer.mesh import Mesh, concatenate
-from renderer.modelling import arc, bump, choose, loft, mix, paint, revolve, ripples, surface_of_cells
+from renderer.modelling import arc, bump, choose, loft, mix, paint, revolve, ripples, sphere, surface_of_cells
 
 STALK = (0.36, 0.27, 0.15)
 LEAF_GREEN = (0.25, 0.42, 0.12)
@@ -31,8 +30,7 @@ def solid(name: str, seed: int = 0) -> Mesh:
 
 def orange(rng: np.random.Generator, subdivisions: int = 4) -> Mesh:
     """An oblate sphere of 20·4^subdivisions faces, with pores and a green-brown navel in a dimple on top."""
-    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
-    directions = np.array(sphere.vertices)
+    directions, faces = sphere(subdivisions)
     from_top = np.arccos(np.clip(directions[:, 2], -1, 1))
     pores = ripples(rng, directions, wavelength=0.2)
     dents = 0.01 * ripples(rng, directions, wavelength=2.0) - 0.04 * bump(from_top / 0.25)
@@ -44,7 +42,7 @@ def orange(rng: np.random.Generator, subdivisions: int = 4) -> Mesh:
     )
     navel = choose(rng, (0.33, 0.36, 0.13), (0.38, 0.28, 0.12))
     vertices = 0.95 * (1 + 0.004 * pores + dents)[:, None] * directions * [1, 1, flattening]
-    return Mesh.plain(vertices, sphere.faces, mix(peel, navel, 1.2 * bump(from_top / 0.15)))
+    return Mesh.plain(vertices, faces, mix(peel, navel, 1.2 * bump(from_top / 0.15)))
 
 
 def apple(rng: np.random.Generator) -> Mesh:
@@ -194,8 +192,7 @@ def table(rng: np.random.Generator) -> Mesh:
 
 def lemon(rng: np.random.Generator) -> Mesh:
     """An ellipsoid with a nipple at either end and pores; yellow, greener towards one end or not."""
-    sphere = trimesh.creation.icosphere(subdivisions=4)
-    directions = np.array(sphere.vertices)
+    directions, faces = sphere()
     from_pole = np.arccos(np.clip(np.abs(directions[:, 2]), 0, 1))
     pores = ripples(rng, directions, wavelength=0.2)
     relief = 1 + 0.004 * pores + 0.015 * ripples(rng, directions, wavelength=2.0)
@@ -206,13 +203,12 @@ def lemon(rng: np.random.Generator) -> Mesh:
         choose(rng, (0.74, 0.76, 0.20), (0.95, 0.74, 0.10)),
         0.3 + 0.5 * rng.uniform(-1, 1) * directions[:, 2] + 0.15 * pores,
     )
-    return Mesh.plain(vertices, sphere.faces, peel)
+    return Mesh.plain(vertices, faces, peel)
 
 
 def peach(rng: np.random.Generator) -> Mesh:
     """A sphere with a furrow down one side into a dimple on top; yellow or pale with a red cheek."""
-    sphere = trimesh.creation.icosphere(subdivisions=4)
-    directions = np.array(sphere.vertices)
+    directions, faces = sphere()
     from_top = np.arccos(np.clip(directions[:, 2], -1, 1))
     furrow = bump(directions[:, 1] / 0.12) * np.sqrt(np.clip(directions[:, 0], 0, 1))
     relief = 1 + 0.015 * ripples(rng, directions, wavelength=2.0) - 0.06 * furrow - 0.15 * bump(from_top / 0.3)
@@ -223,13 +219,12 @@ def peach(rng: np.random.Generator) -> Mesh:
         choose(rng, (0.78, 0.22, 0.18), (0.86, 0.38, 0.26)),
         rng.uniform(0.1, 0.6) + 0.5 * cheek + 0.2 * ripples(rng, directions, wavelength=0.6),
     )
-    return Mesh.plain(0.95 * relief[:, None] * directions * [1, 1, rng.uniform(0.88, 0.98)], sphere.faces, skin)
+    return Mesh.plain(0.95 * relief[:, None] * directions * [1, 1, rng.uniform(0.88, 0.98)], faces, skin)
 
 
 def ball(rng: np.random.Generator) -> Mesh:
     """A rubber ball of one colour, or a tennis ball: yellow or green with the white curve of its seam."""
-    sphere = trimesh.creation.icosphere(subdivisions=5)
-    directions = np.array(sphere.vertices)
+    directions, faces = sphere(5)
     if rng.random() < 0.5:
         x, y, z = directions.T
         seam = np.abs(z - 1.2 * (x**2 - y**2)) / np.sqrt(1 + 5.76 * (x**2 + y**2))
@@ -237,13 +232,12 @@ def ball(rng: np.random.Generator) -> Mesh:
         skin = mix(felt, (0.92, 0.92, 0.88), (0.07 - seam) / 0.02)
     else:
         skin = choose(rng, (0.80, 0.12, 0.12), (0.93, 0.40, 0.10), (0.15, 0.35, 0.75), (0.93, 0.90, 0.85))
-    return Mesh.plain(0.95 * directions, sphere.faces, skin)
+    return Mesh.plain(0.95 * directions, faces, skin)
 
 
 def fruit(rng: np.random.Generator) -> Mesh:
     """A made-up fruit: between a ball, a lemon and an apple, of two shades of any hue but an orange's."""
-    sphere = trimesh.creation.icosphere(subdivisions=4)
-    directions = np.array(sphere.vertices)
+    directions, faces = sphere()
     from_pole = np.arccos(np.clip(np.abs(directions[:, 2]), 0, 1))
     length = rng.uniform(0.75, 1.35)
     pores = ripples(rng, directions, wavelength=0.2)
@@ -258,7 +252,7 @@ def fruit(rng: np.random.Generator) -> Mesh:
     ]
     weight = 0.5 + 0.3 * ripples(rng, directions, rng.uniform(0.3, 2.0)) + 0.1 * pores
     first, second = map(np.array, shades)
-    return Mesh.plain(0.95 * vertices / np.abs(vertices).max(), sphere.faces, mix(first, second, weight))
+    return Mesh.plain(0.95 * vertices / np.abs(vertices).max(), faces, mix(first, second, weight))
 
 
 SOLIDS: dict[str, Callable[[np.random.Generator], Mesh]] = {
