@@ -3,16 +3,14 @@
 import json
 import re
 import shlex
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
-from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
 from augment.parameters import KINDS
 from train.cli import quoted
+from train.composition import composed
 from train.configuration import as_dict, dotted
 
 CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "out", "train.resume", "data.images")
@@ -34,24 +32,13 @@ def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapp
     chosen = [f"{group}=[{','.join(kinds)}]"] if kinds else []
     if config.get("data", {}).get("name") in DATA:
         chosen.append(f"data={config.data.name}")
-    with _no_other_hydra(), initialize_config_module("conf", version_base="1.3"):
-        defaults = dict(dotted(as_dict(compose(name, chosen))))
+    defaults = dict(dotted(as_dict(composed(name, chosen))))
     own = dict(dotted(as_dict(config)))
     if own.get("evaluate.photos") and own.get("evaluate.photos") == own.get("data.images"):
         del own["evaluate.photos"]  # the run's own renders, which it makes again
     changed = {key: value for key, value in own.items() if key in defaults and value != defaults[key]}
     overrides = [f"{key}={_value(value)}" for key, value in changed.items() if not _is_circumstance(key)]
     return shlex.join([*start.split(), *chosen, *overrides])
-
-
-@contextmanager
-def _no_other_hydra() -> Iterator[None]:
-    """The one of the command that writes the report steps aside."""
-    other, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
-    try:
-        yield
-    finally:
-        GlobalHydra.instance().hydra = other
 
 
 def _is_circumstance(key: str) -> bool:

@@ -1,50 +1,42 @@
 """What becomes of adversaries outside of the floats that they were found in, as `attack.verify` counts it."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from augment.attacks.run import Attacked, attack
-from augment.attacks.settings import AttackSettings
-from augment.attacks.verification import RENDERERS, Verdict
-from augment.objects import SceneObject
-from augment.parameters import StepSettings
-from augment.placed_lights import LampsSettings, ProjectorSettings
-from augment.scene import Scene
-from renderer.basis import with_placed
-from renderer.lamps import Lamps
+from augment.attacks.verification import RENDERERS
+from augment.objects import ObjectSettings
 from renderer.mitsuba_scene import SAMPLES
-from renderer.projector import Projector
-from train.studies.paper.adversaries import LIGHT, SHAPE
+from train.attacks.experiment import attacks
+from train.attacks.search import overrides
+from train.attacks.settings import AttackExperimentSettings
+from train.composition import composed
+from train.configuration import read_settings
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
-from train.studies.paper.subjects import Subject, recognised_scene
 from train.tables import markdown
 
-ALBEDO = StepSettings("linf", 0.1, "sign", 0.02)
-ATTACKS: dict[str, dict[str, Any]] = {
-    "light": {"lighting": LIGHT},
-    "projector": {"projector": StepSettings("linf", None, "unit", 1.0)},
-    "lamps": {"lamps": StepSettings("linf", None, "unit", 0.2)},
-    "shape": {"geometry": SHAPE},
-    "albedo": {"albedo": ALBEDO},
-    "light, shape and albedo": {"lighting": LIGHT, "geometry": SHAPE, "albedo": ALBEDO},
+ATTACKS = {  # by their names in the tables, as `attack=` of scripts/attack.py
+    "light": "lighting",
+    "projector": "projector",
+    "lamps": "lamps",
+    "shape": "geometry",
+    "albedo": "albedo",
+    "light, shape and albedo": "lighting,geometry,albedo",
+    "projector and shape": "projector,geometry",
 }
-PLACED: dict[str, ProjectorSettings | LampsSettings] = {"projector": ProjectorSettings(), "lamps": LampsSettings()}
-MARGIN, BATCH = 2.0, 8
 TEXT = """
-Adversaries of {classifier}, found as `scripts/attack.py` does unless told otherwise: images of 8 bits, physical light,
-and {margin:g} more in the logit of what fools than in any other; {steps} steps at most. Views at random azimuths,
-distances and greys of {meshes}, in the nearest light to `{probe}` without negative radiance, {examples} of each mesh
-that are recognised in `{probe}` itself; the projector and the lamps, dark to begin with, add to it. Each adversary is
-written as a folder; *reload* and *mitsuba* render it from these files alone, the latter by direct illumination, in
-which meshes shade themselves and here do not, with {samples} samples a pixel. The shares that still fool are of those
-that fooled:
+Adversaries of {classifier}, found by what `python scripts/attack.py attack=...` runs: views of {meshes}, {examples} of
+each mesh and attack, {around}° apart in azimuth and with a `seed` each, in a scene that is searched for where the
+classifier is not right in it (`scene.search`: {searched} of {total} were). They have to fool in {rounding} by a margin
+of {margin:g} in the logit, after at most {steps} steps, in {light} light; projectors and lamps are dark to begin with.
+Each is written as a folder; *reload* and *mitsuba* render it from these files alone, the latter by direct illumination,
+in which meshes shade themselves and here do not, with {samples} samples a pixel. The shares that still fool are of
+those that fooled:
 
 {table}
 
@@ -58,29 +50,32 @@ Adversaries that are reloaded to the same image within 1/255: {same} of {total}.
 
 @dataclass
 class SurvivalSettings(SectionSettings):
-    """examples: of each mesh and attack. steps: of a descent at most."""
+    """examples: of each mesh and attack. overrides: of scripts/attack.py, such as attack.max_steps=10."""
 
     examples: int
-    steps: int
+    overrides: list[str]
 
 
 def measure(study: Study, settings: SurvivalSettings) -> Section:
     """Every attack on every mesh."""
-    records = [record for subject in study.subjects for record in _outcomes(subject, study, settings)]
+    records = [record for item in study.items for record in _outcomes(item, study, settings)]
     versions = list(records[0]["versions"])
     fooled = [record for record in records if record["fooled"]]
+    meshes = dict.fromkeys(record["mesh"] for record in records)
+    command = _command(study.items[0], "lighting", 0, study, settings)
     text = TEXT.format(
         classifier=study.classifier.name,
-        margin=MARGIN,
-        steps=settings.steps,
-        meshes=", ".join(f"{subject.name} (`{subject.label}`)" for subject in study.subjects),
-        probe=study.light,
+        meshes=", ".join(f"{_name(item)} (`{item.label}`)" for item in study.items),
         examples=settings.examples,
+        around=f"{360 / settings.examples:g}",
+        searched=sum(record["scene"] is not None for record in records),
+        rounding="8 bits" if command.attack.rounded else "floats",
+        margin=command.attack.margin,
+        steps=command.attack.max_steps,
+        light=command.attack.light,
         samples=SAMPLES,
         table=markdown(["attack", "fooled", *versions], (_row("attack", name, records, versions) for name in ATTACKS)),
-        by_mesh=markdown(
-            ["mesh", "fooled", *versions], (_row("mesh", each.name, records, versions) for each in study.subjects)
-        ),
+        by_mesh=markdown(["mesh", "fooled", *versions], (_row("mesh", name, records, versions) for name in meshes)),
         differences=markdown(
             ["values differ from ours, in 255ths", *ATTACKS], (_differences(version, fooled) for version in versions)
         ),
@@ -90,36 +85,39 @@ def measure(study: Study, settings: SurvivalSettings) -> Section:
     return Section(text, records, {})
 
 
-def _outcomes(subject: Subject, study: Study, settings: SurvivalSettings) -> Iterator[dict[str, Any]]:
-    """A record per attack and example that was recognised where the attack began."""
-    scene = recognised_scene(subject, study.classifier, study.light, settings.examples, study.seed)
+def _outcomes(item: ObjectSettings, study: Study, settings: SurvivalSettings) -> Iterator[dict[str, Any]]:
+    """A record per attack and example."""
     for name, kinds in ATTACKS.items():
-        chosen = AttackSettings(
-            **kinds,
-            max_steps=settings.steps,
-            shorten="geometry" in kinds,
-            margin=MARGIN,
-            rounded=True,
-            batch_size=BATCH,
-        )
-        shown = _shown(scene, subject, [PLACED[kind].build() for kind in kinds if kind in PLACED])
-        done = attack(study.classifier, shown, settings=chosen, seed=study.seed, force=True)
-        with TemporaryDirectory() as folder:
-            verdicts = done.save(Path(folder), verify=RENDERERS)
-        for example in torch.nonzero(done.recognised).flatten().tolist():
-            yield {"mesh": subject.name, "attack": name, **_record(done, verdicts, example)}
+        for example in range(settings.examples):
+            command = _command(item, kinds, example, study, settings)
+            ((_, scene, done),) = attacks(command, study.classifier, torch.device("cpu"))
+            with TemporaryDirectory() as folder:
+                verdicts = done.save(Path(folder), verify=RENDERERS)
+            yield {
+                "mesh": _name(item),
+                "attack": name,
+                "example": example,
+                "scene": None if scene == command.scene else overrides(scene),
+                "steps": int(done.steps[0]),
+                "fooled": bool(done.success[0]),
+                "versions": {each.version: each.of(0, done.classifier.classes) for each in verdicts},
+            }
 
 
-def _shown(scene: Scene, subject: Subject, placed: Sequence[tuple[Projector | Lamps, Tensor]]) -> Scene:
-    """The subject by its name and class, with lights that stand in the scene; all examples begin in the same light."""
-    shown = SceneObject(subject.label, subject.mesh, subject.gain, subject.name)
-    basis, light = with_placed(scene.lights[0], placed)
-    return scene.with_rows(scene.examples, objects=[shown], basis=basis, light=light)
+def _command(
+    item: ObjectSettings, kinds: str, example: int, study: Study, settings: SurvivalSettings
+) -> AttackExperimentSettings:
+    """What scripts/attack.py is told: its own configuration, but for the mesh, the side that it is seen from, the light
+    and the section's overrides."""
+    azimuth = 360 * example / settings.examples
+    chosen = [f"attack=[{kinds}]", f"scene.azimuth={azimuth}", f"seed={study.seed + example}"]
+    config = composed("attack", [*chosen, *settings.overrides])
+    config.scene.meshes, config.scene.light = [asdict(item)], study.light
+    return read_settings(AttackExperimentSettings, config)
 
 
-def _record(done: Attacked, verdicts: Sequence[Verdict], example: int) -> dict[str, Any]:
-    versions = {each.version: each.of(example, done.classifier.classes) for each in verdicts}
-    return {"example": example, "fooled": bool(done.success[example]), "versions": versions}
+def _name(item: ObjectSettings) -> str:
+    return Path(item.mesh).stem
 
 
 def _row(column: str, name: str, records: Sequence[dict[str, Any]], versions: Sequence[str]) -> list[str]:

@@ -31,7 +31,7 @@ def test_the_table_counts_what_still_fools_of_what_fooled(tmp_path, reproduce, m
     export_mesh(Mesh.plain(ball.vertices, ball.faces, (0.6, 0.5, 0.5)), tmp_path / "ball.glb")
     monkeypatch.setattr(survival, "ATTACKS", {name: survival.ATTACKS[name] for name in ("light", "albedo")})
     overrides = [f"out={tmp_path / 'docs'}", f"scene.meshes=[{tmp_path / 'ball.glb'}]", "section.examples=2"]
-    reproduce(by_brightness(), "section=survival", *overrides, "section.steps=10")
+    reproduce(by_brightness(), "section=survival", *overrides, 'section.overrides=["attack.max_steps=10"]')
     page = (tmp_path / "docs" / "paper.md").read_text()
     records = [json.loads(line) for line in (tmp_path / "docs" / "paper" / "survival.jsonl").read_text().splitlines()]
     assert {record["attack"] for record in records} == {"light", "albedo"}
