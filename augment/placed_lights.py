@@ -39,10 +39,10 @@ class ProjectorSettings:
 
 @dataclass
 class LampsSettings:
-    """`Lamps` at places [x, y, z], points or discs of a radius. start: the powers that attacks begin with, a number or
-    [r, g, b] of each lamp."""
+    """`Lamps` at places [x, y, z], above four corners unless told otherwise, points or discs of a radius. start: the
+    powers that attacks begin with, a number or [r, g, b] of each lamp."""
 
-    places: list[Any] = field(default_factory=lambda: [[2.0, 2.0, 2.0], [-2.0, 2.0, 2.0], [2.0, -2.0, 2.0]])
+    places: list[Any] = field(default_factory=lambda: [[x, y, 2.0] for x in (2.0, -2.0) for y in (2.0, -2.0)])
     power: float = 10.0
     radius: float = 0.0
     start: Any = 0.0
