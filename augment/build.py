@@ -11,6 +11,7 @@ from augment.backgrounds import load_backgrounds
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Scene
+from renderer.arguments import as_device, checked
 from renderer.basis import with_placed
 from renderer.cache import OperatorCache
 from renderer.camera import ring
@@ -25,6 +26,7 @@ Shown = str | Path | Mesh
 Member = ObjectSettings | tuple[Shown, str]
 
 
+@checked
 def build_scene(
     meshes: Sequence[Member],
     size: int,
@@ -60,6 +62,7 @@ def build_scene(
     orthographic camera. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility:
     as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
+    settings, device = ImageSettings(size, samples, encoding, normals, transport), as_device(device)
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
     basis, lights = with_placed(sky, [each.build() for each in (projector, lamps) if each is not None])
     angle = None if perspective is None else math.radians(perspective)
@@ -68,7 +71,7 @@ def build_scene(
         ring(views, field_of_view, math.radians(polar), math.radians(azimuth), angle),
         load_backgrounds(backgrounds, size),
         lights.to(device),
-        ImageSettings(size, samples, encoding, normals, transport),
+        settings,
         choose(visibility) if isinstance(visibility, str) else visibility,
         operators,
         shared=shared,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from renderer.arguments import require_fields
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, concatenate, load_mesh, normalise
 from renderer.shapes import solid
@@ -27,6 +28,7 @@ class MeshSettings:
     color: list[float] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        require_fields(self)
         if not self.mesh:
             raise InputError("scene.meshes: a mesh is '': give a file or solid:NAME")
         if self.color is not None and (len(self.color) != 3 or not all(0 <= each <= 1 for each in self.color)):

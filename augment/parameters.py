@@ -18,6 +18,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.norm_ball import NormBall, anywhere
 from augment.scene import Conditions, Scene
+from renderer.arguments import require_fields
 from renderer.basis import Distant, Placed, parts_of
 from renderer.convex import Ball, nearest_in_box
 from renderer.errors import FACTOR, LARGEST, InputError, require_range
@@ -43,6 +44,7 @@ class StepSettings:
     step_size: float = 0.05
 
     def __post_init__(self) -> None:
+        require_fields(self)
         NormBall(self.norm, self.radius)
         check_step(self.step, self.step_size, "attack: ")
 

@@ -17,6 +17,7 @@ from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
 from augment.relighting import Relighting
 from augment.reshading import Reshading
+from renderer.arguments import checked
 from renderer.basis import HARMONICS, Basis, parts_of
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
@@ -72,6 +73,7 @@ class Scene:
     (A, V, 3, size, size) of examples (A,), differentiable; see `Snapshot`.
     """
 
+    @checked
     def __init__(
         self,
         objects: Sequence[SceneObject],
@@ -88,6 +90,11 @@ class Scene:
             raise InputError("nothing is to be rendered: name one mesh, one view and one background or more")
         if light.shape[-2:] != (basis.size, 3):
             raise InputError(f"light of shape {tuple(light.shape)} is not of {basis}: give {basis.size} rows")
+        size = settings.size
+        if not (backgrounds.is_floating_point() and backgrounds.shape[1:] in ((1, size, size), (3, size, size))):
+            raise InputError(
+                f"backgrounds of {backgrounds.dtype} {tuple(backgrounds.shape)}: give images (B, 3, {size}, {size})"
+            )
         if not (backgrounds.min() >= 0 and backgrounds.max() <= 1):
             raise InputError("scene.backgrounds: give values in [0, 1]")
         self.objects, self.examples = list(objects), list(examples)
@@ -117,6 +124,7 @@ class Scene:
         self._reshading = Reshading(self.objects, settings, backend, basis, self.lights)
 
     @classmethod
+    @checked
     def grid(
         cls,
         objects: Sequence[SceneObject],
@@ -137,6 +145,7 @@ class Scene:
         return cls(objects, examples, backgrounds, light, settings, backend, operators, basis)
 
     @classmethod
+    @checked
     def of_mesh(
         cls,
         mesh: Mesh,

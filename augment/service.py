@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from augment.scene import Conditions, Scene
 from augment.seeding import generator, stream_seed
 from augment.specimens import Specimens, choose_specimens
 from augment.variation import VariationSettings, vary
+from renderer.arguments import checked, require_fields
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.lights import perturb
 
@@ -52,6 +54,7 @@ class RandomLights:
     candidates: int = 1
 
     def __post_init__(self) -> None:
+        require_fields(self)
         require_range("augment.random.candidates", self.candidates, 1, MOST_CANDIDATES)
         for name in ("amplitude", "radius"):  # no radius: null
             require_range(f"augment.random.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
@@ -71,6 +74,7 @@ class TrainingAttackSettings(AttackSettings):
     batch_size: int = 128
 
     def __post_init__(self) -> None:
+        require_fields(self)
         check_step(self.step, self.step_size, "augment.attack.")
         self._light = StepSettings(step=self.step, step_size=self.step_size)
         super().__post_init__()
@@ -100,6 +104,7 @@ class AugmentationSettings:
     attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
 
     def __post_init__(self) -> None:
+        require_fields(self)
         for name, value, choices in [
             ("arm", self.arm, ARMS),
             ("start", self.start, STARTS),
@@ -153,6 +158,7 @@ class AugmentationService:
     Where several processes train together, each attacks its share of the examples, and all get all renders.
     """
 
+    @checked
     def __init__(
         self,
         settings: AugmentationSettings,
@@ -178,6 +184,7 @@ class AugmentationService:
         self._continued: Tensor | None = None
 
     @classmethod
+    @checked
     def from_meshes(
         cls,
         meshes: Sequence[tuple[Shown, int]],
@@ -206,12 +213,14 @@ class AugmentationService:
         """Examples per regeneration."""
         return len(self._labels) if self.settings.renders else 0
 
+    @checked
     def regenerate(self, model: nn.Module, number: int) -> Renders:
         """Fresh examples for the model's current weights; the model is left as it was found.
 
         number: counts the regenerations of a run from 0. The draw depends on it and the seed alone, so a resumed run
         repeats it.
         """
+        require_range("number", number, 0, math.inf)
         if self._scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
         random = self.settings.arm == "random"

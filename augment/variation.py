@@ -13,6 +13,7 @@ from torch import Tensor
 from augment.objects import SceneObject, another_individual
 from augment.scene import Example, Scene
 from augment.snapshot import SnapshotSettings, draw_snapshot
+from renderer.arguments import require_fields
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
@@ -53,6 +54,7 @@ class VariationSettings:
     snapshot: SnapshotSettings = field(default_factory=SnapshotSettings)
 
     def __post_init__(self) -> None:
+        require_fields(self)
         if not 0 <= self.place <= 1:
             raise InputError(f"augment.vary.place={self.place} must be a share of the frame's width, from 0 to 1")
         require_range("augment.vary.turn", self.turn, 0, 180)

@@ -11,6 +11,7 @@ from renderer.convex import Ball
 from renderer.harmonics import basis, irradiance_basis, live_coefficients
 
 
+@runtime_checkable
 class Functions(Protocol):
     """`size` functions of light; a light is a coefficient (size, 3) of each, RGB. Equal ones have equal fields."""
 

@@ -10,9 +10,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from renderer.arguments import checked, require_fields
 from renderer.errors import LARGEST, InputError, require_range
 
 REACH = 2.0  # world units from the origin along the view within which surface is seen: a normalised mesh's radius is √3
+MOST_VIEWS = 10**5
 NEAREST = 0.01  # of its distance: what comes nearer to a camera than that is no view of a mesh
 
 
@@ -35,6 +37,7 @@ class Camera(ABC):
     distance: ClassVar[float]
 
     def __post_init__(self) -> None:
+        require_fields(self)
         require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
@@ -124,6 +127,7 @@ class PerspectiveCamera(Camera):
         return depths
 
 
+@checked
 def ring(
     views: int,
     field_of_view: float,
@@ -136,6 +140,7 @@ def ring(
     perspective: the angle between opposite sides of the image, in radians, which says how far off perspective cameras
     are; None of orthographic ones.
     """
+    require_range("views", views, 1, MOST_VIEWS)
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
     if perspective is None:
         return [OrthographicCamera(polar, each, field_of_view) for each in azimuths]

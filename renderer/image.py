@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from renderer.arguments import require_fields
 from renderer.errors import InputError, require_bounded, require_range, require_whole
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class ImageSettings:
     transport: str = "direct"
 
     def __post_init__(self) -> None:
+        require_fields(self)
         require_whole("size", self.size)
         require_whole("renderer.samples", self.samples)
         if self.size < 1:

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from renderer.arguments import checked
 from renderer.basis import HARMONICS, Basis
 from renderer.environment import SUFFIXES, read_map
 from renderer.errors import FACTOR, InputError, require_bounded
@@ -36,6 +37,7 @@ PROBES = tuple(_PUBLISHED_PROBES)
 _Y_UP_TO_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 
 
+@checked
 def load_light(light: str) -> Tensor:
     """Coefficients (49, 3) float32 of a named probe, of an environment map's file (.npy, .hdr, .exr) or of a file of
     coefficients (.json, as `save_light` writes it).
@@ -57,13 +59,20 @@ def load_light(light: str) -> Tensor:
     )
 
 
+@checked
 def save_light(path: Path, coefficients: Tensor, basis: Basis = HARMONICS) -> None:
     """Write the name of a basis and coefficients (size, 3), a row [r, g, b] each, as JSON.
 
-    `load_light` reads float32 back to the bit.
+    `load_light` reads float32 back to the bit. InputError: another shape, NaN, or a file that cannot be written.
     """
+    require_bounded(coefficients=coefficients)
+    if coefficients.shape != (basis.size, 3):
+        raise InputError(f"coefficients {tuple(coefficients.shape)} are not of {basis}: give {(basis.size, 3)}")
     rows = ",\n".join(json.dumps(row, allow_nan=False) for row in coefficients.tolist())
-    path.write_text(f'{{"basis": {json.dumps(basis.name)}, "coefficients": [\n{rows}\n]}}\n', encoding="utf-8")
+    try:
+        path.write_text(f'{{"basis": {json.dumps(basis.name)}, "coefficients": [\n{rows}\n]}}\n', encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"light {path} cannot be written: {error}") from error
 
 
 def probe(name: str) -> Tensor:

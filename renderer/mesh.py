@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from renderer.arguments import checked, require_fields
 from renderer.errors import LARGEST, InputError
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
@@ -29,6 +30,8 @@ class Mesh:
     corner_uvs     (F, 3, 2) float32, origin at the bottom left of the texture; zeros where there is none
     texture_ids    (F,) int32, index into `textures`, -1 where there is none
     textures       tuple of (H, W, 3) uint8, sRGB-encoded, row 0 at the top
+
+    InputError: arrays of other shapes, faces of vertices that are not there.
     """
 
     vertices: np.ndarray
@@ -38,13 +41,27 @@ class Mesh:
     texture_ids: np.ndarray
     textures: tuple[np.ndarray, ...] = ()
 
+    def __post_init__(self) -> None:
+        require_fields(self)
+        count = self.faces.shape[:1]
+        _require_shape("vertices", self.vertices, (*self.vertices.shape[:1], 3))
+        _require_shape("faces", self.faces, (*count, 3), "iu")
+        _require_shape("corner_colors", self.corner_colors, (*count, 3, 3))
+        _require_shape("corner_uvs", self.corner_uvs, (*count, 3, 2))
+        _require_shape("texture_ids", self.texture_ids, count, "iu")
+        _require_indices(self.faces, len(self.vertices))
+
     @staticmethod
     def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
         """An untextured mesh. `color` is one RGB (3,) or one per vertex (V, 3), sRGB-encoded in [0, 1]."""
-        vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
-        if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
-            raise InputError(f"faces name vertices that are not there: give indices from 0 to {len(vertices) - 1}")
-        vertex_colors = np.broadcast_to(np.asarray(color, dtype=np.float32), vertices.shape)
+        try:
+            vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
+            vertex_colors = np.broadcast_to(np.asarray(color, dtype=np.float32), vertices.shape)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)") from error
+        _require_shape("vertices", vertices, (*vertices.shape[:1], 3))
+        _require_shape("faces", faces, (*faces.shape[:1], 3))
+        _require_indices(faces, len(vertices))
         return Mesh(
             vertices=vertices,
             faces=faces,
@@ -107,6 +124,17 @@ class Mesh:
         return np.cross(b - a, c - a)
 
 
+def _require_shape(name: str, values: np.ndarray, shape: tuple[int, ...], kinds: str = "fiu") -> None:
+    """kinds: NumPy's letters of the types that will do."""
+    if values.shape != shape or values.dtype.kind not in kinds:
+        raise InputError(f"{name} of {values.dtype} {values.shape} make no mesh: give numbers {shape}")
+
+
+def _require_indices(faces: np.ndarray, vertices: int) -> None:
+    if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
+        raise InputError(f"faces name vertices that are not there: give indices from 0 to {vertices - 1}")
+
+
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh with the faces of all, in order; vertices are not merged."""
     vertices_before = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])[:-1]
@@ -126,6 +154,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
+@checked
 def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     """Read a mesh with its colours and textures from .glb, .gltf, .obj, .ply, .stl or what else trimesh reads.
 
@@ -156,6 +185,7 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     return transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
 
 
+@checked
 def normalise(mesh: Mesh) -> Mesh:
     """Move the area-weighted centroid of the faces to the origin and scale the largest |coordinate| to 1, rounded to
     float32: so files hold the vertices exactly, and what is read back covers the same pixels.

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from torch.nn.functional import grid_sample
 
+from renderer.arguments import checked
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import NORMALS, decode, encode
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
 
 
+@checked
 def export_mesh(
     mesh: Mesh,
     path: str | Path,

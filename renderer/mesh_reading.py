@@ -32,17 +32,25 @@ def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
     try:
         file, companions = open_mesh(path)
         scene = trimesh.load(file, file_type=suffix, resolver=companions, force="scene", process=False)
-        parts = {
-            name: _part(geometry, linear)
-            for name, geometry in scene.geometry.items()
-            if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)
-        }
     except InputError:
         raise
     except Exception as error:  # each of trimesh's readers raises its own
-        raise InputError(f"{path} cannot be read as a mesh ({error}): export it again") from error
+        raise _unreadable(path, error) from error
+    surfaces = {
+        name: geometry
+        for name, geometry in scene.geometry.items()
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)
+    }
+    try:
+        parts = {name: _part(geometry, linear) for name, geometry in surfaces.items()}
+    except Exception as error:  # of NumPy and Pillow
+        raise _unreadable(path, error) from error
     nodes = [scene.graph[node] for node in scene.graph.nodes_geometry]
     return [(parts[name], matrix) for matrix, name in nodes if name in parts]
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path} cannot be read as a mesh ({error}): export it again")
 
 
 def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:

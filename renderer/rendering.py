@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.arguments import checked
 from renderer.basis import Harmonics
 from renderer.camera import Camera
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 _choose = cache(choose)  # "auto" asks the driver, which takes longer than an image
 
 
+@checked
 def render(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],
@@ -58,6 +60,7 @@ def render(
     InputError: NaN, shapes that do not fit, unknown choices.
     """
     settings = ImageSettings(size, samples, encoding, normals, transport)
+    require_range("gain", gain, 0, FACTOR)
     vertices = _matching(vertices, mesh.vertices.shape, "vertices", torch.from_numpy(mesh.vertices)).to(light)
     positions = vertices.detach().cpu().double().numpy()
     views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(visibility), closed=mesh.closed)
@@ -77,6 +80,7 @@ def render(
     return torch.stack(images)
 
 
+@checked
 def operators(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],
@@ -94,6 +98,7 @@ def operators(
     `operator.image(light, background)` is the image that `render` makes, to rounding. Keywords as there.
     """
     settings = ImageSettings(size, samples, encoding, normals, transport)
+    require_range("gain", gain, 0, FACTOR)
     return build_operators(mesh, _listed(cameras), settings, _choose(visibility), gain)
 
 

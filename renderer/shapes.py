@@ -11,7 +11,8 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from renderer.errors import InputError
+from renderer.arguments import checked
+from renderer.errors import InputError, require_range
 from renderer.mesh import Mesh, concatenate
 from renderer.modelling import arc, bump, choose, loft, mix, paint, revolve, ripples, sphere, surface_of_cells
 
@@ -19,8 +20,10 @@ STALK = (0.36, 0.27, 0.15)
 LEAF_GREEN = (0.25, 0.42, 0.12)
 
 
+@checked
 def solid(name: str, seed: int = 0) -> Mesh:
     """The individual that `seed` picks of the solid `name`; InputError for a name that is in neither registry."""
+    require_range("seed", seed, 0, 2**63 - 1)
     known = SOLIDS | LOOK_ALIKES
     if name not in known:
         nearest = get_close_matches(name, known, n=1, cutoff=0)[0]

@@ -5,13 +5,17 @@ from typing import Any
 
 import numpy as np
 
+from renderer.arguments import checked
+from renderer.errors import require_range
 from renderer.mesh import Mesh
 
+MOST_VERTICES = 10**7  # some 5 GB
 PER_FACE = ("faces", "corner_colors", "corner_uvs", "texture_ids")
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and the middles of the edges as 3 to 5
 
 
+@checked
 def subdivide(mesh: Mesh, vertices: int) -> Mesh:
     """The same surface with more than so many vertices: each face becomes four, as often as it takes.
 
@@ -19,6 +23,7 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
     colours (as they are stored, sRGB-encoded) and texture coordinates are interpolated. The old vertices keep their
     indices, and the quarters of face f are the faces 4f to 4f + 3. A mesh with enough vertices comes back as it is.
     """
+    require_range("vertices", vertices, 0, MOST_VERTICES)
     while len(mesh.vertices) <= vertices:
         mesh = _quartered(mesh)
     return mesh

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer.albedo import surface_albedo
+from renderer.arguments import as_device, checked
 from renderer.basis import HARMONICS, Basis, Distant, Placed, parts_of
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
@@ -64,6 +65,7 @@ class Operator:
     basis: Basis = HARMONICS
     sparse: Sparse | None = None
 
+    @checked
     def image(
         self, lights: Float[Tensor, "*lights coefficients 3"], background: float | Tensor = 0.5
     ) -> Float[Tensor, "*lights 3 size size"]:
@@ -98,6 +100,11 @@ class Operator:
         Exactly zero for the coefficients that reach no pixel. InputError: NaN.
         """
         require_bounded(radiance_gradient=radiance_gradient)
+        if radiance_gradient.shape[-2:] != (3, len(self.pixels)):
+            raise InputError(
+                f"radiance_gradient of shape {tuple(radiance_gradient.shape)} does not fit the operator: "
+                f"give (3, {len(self.pixels)})"
+            )
         upstream = radiance_gradient.to(self.transfer.dtype)
         if self._shared is not None:
             product = linear(upstream * self.albedo, self._shared)
@@ -110,8 +117,10 @@ class Operator:
             gradient = gradient + entries.light_gradient(upstream, image, self.basis.size).view_as(gradient)
         return gradient.to(radiance_gradient.dtype)
 
+    @checked
     def to(self, device: torch.device | str) -> Operator:
         """The same on another device."""
+        device = as_device(device)
         sparse = self.sparse and self.sparse.to(device)
         return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS}, sparse=sparse)
 

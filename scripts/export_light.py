@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from renderer.environment import check_map_name, negative_share, to_map, write_map
-from renderer.errors import require_range
+from renderer.errors import InputError, require_range
 from renderer.lights import load_light
 from train.cli import script
 from train.outputs import writable_file
@@ -27,7 +27,10 @@ class Settings:
 def main(settings: Settings) -> None:
     light, out = load_light(settings.light), Path(settings.out)
     writable_file(out, "out")
-    check_map_name(out)
+    try:
+        check_map_name(out)
+    except InputError as error:
+        raise InputError(f"out: {error}") from error
     radiance = to_map(light, settings.height)
     write_map(out, radiance)
     fate = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from augment import processes
 from augment.labels import is_right, label_loss, ranking_loss
+from renderer.arguments import as_device
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.logs import console
@@ -32,11 +33,10 @@ def choose_device(name: str) -> torch.device:
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and "LOCAL_RANK" in os.environ:
         name = f"cuda:{os.environ['LOCAL_RANK']}"
-    try:
-        (made := torch.zeros(1, device=name)).item()  # which meta's tensors have none of
-        return made.device
-    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
-        raise InputError(f"device={name} is not available here: use auto or cpu") from error
+    device = as_device(name)
+    if device.type == "meta":
+        raise InputError("device=meta is not available here: it computes nothing, use auto or cpu")
+    return device
 
 
 def set_threads(threads: int | None) -> None:

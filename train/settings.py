@@ -13,8 +13,10 @@ from augment.objects import CompanionSettings, ObjectSettings
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.service import AugmentationSettings
 from renderer.cache import OperatorCache, cache_folder
+from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import LARGEST_SIZE
+from renderer.subdivision import MOST_VERTICES
 from renderer.visibility import choose
 from train.configuration import as_dict, dotted, read_settings
 from train.networks import WIDERESNET
@@ -30,8 +32,7 @@ OTHER = "other"  # in place of the class of a look-alike that the classifier has
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
 SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
-MOST_IMAGES, MOST_VIEWS, LARGEST_SEED = 10**6, 10**5, 2**63 - 1
-MOST_VERTICES = 10**7  # some 5 GB
+MOST_IMAGES, LARGEST_SEED = 10**6, 2**63 - 1
 COUNTED = ("meshes", "views")  # what a scene shows and how often; the rest says how
 
 

@@ -2,15 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from augment.classifiers.adapter import Classifier
+from renderer.arguments import require_fields
 from renderer.errors import InputError
 
 
+@runtime_checkable
 class Criterion(Protocol):
     """Anything with this method."""
 
@@ -31,6 +33,9 @@ class Targeted:
     """A class by name for all images, or a list of them, one for each of the views that share what is attacked."""
 
     classes: str | Sequence[str]
+
+    def __post_init__(self) -> None:
+        require_fields(self)
 
     def targets(self, logits: Tensor, classifier: Classifier) -> Tensor:
         views = logits.shape[1]

@@ -21,6 +21,7 @@ from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
 from augment.seeding import generator
+from renderer.arguments import checked
 from renderer.errors import InputError
 
 if TYPE_CHECKING:
@@ -90,12 +91,14 @@ class Attacked:
 
         return check(self, self.settings.descent(), self.seed)
 
+    @checked
     def sweep(self, scales: Sequence[float]) -> Sweep:
         """Success against the radius of the norm-balls: see `augment.attacks.sweep.sweep`."""
         from augment.attacks.sweep import sweep
 
         return sweep(self, scales)
 
+    @checked
     def transfer(
         self,
         classifiers: Sequence[Classifier] = (),
@@ -107,6 +110,7 @@ class Attacked:
 
         return transfer(self, classifiers, azimuths, objects)
 
+    @checked
     def save(
         self, folder: str | Path, checks: Checks | None = None, verify: Sequence[str] = ("reload",)
     ) -> list[Verdict]:
@@ -119,6 +123,7 @@ class Attacked:
         return write_files(self, checks, Path(folder), verify)
 
 
+@checked
 def attack(
     classifier: Classifier,
     scene: Scene,

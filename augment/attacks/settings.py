@@ -11,6 +11,7 @@ from augment.parameters import KINDS, Kind, Lighting, Skylight, StepSettings
 from augment.perturbation import Perturbation
 from augment.scene import Scene
 from augment.seeding import generator
+from renderer.arguments import require_fields
 from renderer.errors import InputError, require_range
 
 PHYSICAL, SIGNED = "physical", "signed"
@@ -54,6 +55,7 @@ class AttackSettings:
     expectation: TransformationSettings = field(default_factory=TransformationSettings)
 
     def __post_init__(self) -> None:
+        require_fields(self)
         if self.lighting and self.skylight:
             raise InputError("attack: lighting and skylight both set the light: choose one of them")
         if self.light not in LIGHTS:

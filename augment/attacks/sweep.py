@@ -15,6 +15,7 @@ from augment.descent import Part, descend
 from augment.phases import Phases
 from augment.progress import progress
 from augment.seeding import generator
+from renderer.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ def sweep(attacked: Attacked, scales: Sequence[float]) -> Sweep:
     scales: times the radius of each kind, or where that is None, times 1. In each ball, examples that are not fooled
     yet go on from where they ended in the one before, for `max_steps` more, or get as many uniform draws.
     """
+    if not scales:
+        raise InputError("scales is empty: give what to multiply the radii by")
     settings, problem, goal = attacked.settings, attacked.problem, attacked.goal
     kinds = settings.kinds
     seen, draws = settings.observed(attacked.classifier, attacked.seed), generator(attacked.seed, "sweep")

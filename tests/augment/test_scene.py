@@ -53,7 +53,7 @@ def random_operator(seed: int, count: int) -> Operator:
     )
 
 
-class Given:
+class Given(OperatorCache):
     """In place of an `OperatorCache`: these operators, whatever the mesh."""
 
     def __init__(self, *operators: Operator):
@@ -391,6 +391,9 @@ class Lamps:
     def irradiance(self, normals: torch.Tensor) -> torch.Tensor:
         return normals.clamp(min=0)
 
+    def radiance(self, directions: torch.Tensor) -> torch.Tensor:
+        raise NotImplementedError  # lamps are points
+
     def nearest_physical(self, coefficients: torch.Tensor, within=None) -> torch.Tensor:
         return nearest_in_box(coefficients, 0, 1, within)
 
@@ -518,5 +521,5 @@ def test_a_shadow_goes_with_the_colour_of_its_pixel():
 
 @pytest.mark.parametrize("nothing", [{"meshes": []}, {"views": 0}, {"backgrounds": ()}])
 def test_a_scene_of_nothing_is_refused(nothing):
-    with pytest.raises(InputError, match=r"nothing is to be rendered|backgrounds is empty"):
+    with pytest.raises(InputError, match=r"nothing is to be rendered|backgrounds is empty|views=0 must be"):
         build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "visibility": "software"} | nothing)

@@ -438,7 +438,7 @@ def test_the_script_takes_coefficients_as_they_are(tmp_path, export):
     ("arguments", "message"),
     [
         (["light=graze", "out=x.hdr"], "light 'graze' is not known: choose grace"),
-        (["light=grace", "out=x.png"], "x.png is no name for an environment map"),
+        (["light=grace", "out=x.png"], "out: x.png is no name for an environment map"),
         (["light=grace", "out=x.hdr", "height=0"], "height=0 must be at least 1 and at most 8192"),
         (
             ["light=grace", "out=x.hdr", "height=2.5"],

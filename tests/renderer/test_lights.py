@@ -246,7 +246,7 @@ def test_saved_coefficients_come_back_to_the_bit_and_unscaled(tmp_path):
 
 
 def test_coefficients_that_are_not_finite_are_not_saved(tmp_path):
-    with pytest.raises(ValueError, match="not JSON compliant"):
+    with pytest.raises(InputError, match="coefficients holds NaN"):
         save_light(tmp_path / "light.json", torch.full((49, 3), math.nan))
     assert not list(tmp_path.iterdir())
 

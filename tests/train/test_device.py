@@ -16,7 +16,7 @@ def as_it_was():
 
 def test_a_device_that_is_not_there_is_one_error():
     for name in ("abacus", "cuda:99"):
-        with pytest.raises(InputError, match=f"device={name} is not available here: use auto or cpu"):
+        with pytest.raises(InputError, match=f"device={name} is not available here: use cpu"):
             choose_device(name)
 
 

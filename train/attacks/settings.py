@@ -7,8 +7,9 @@ from augment.attacks.settings import AttackSettings
 from augment.attacks.transfer import require_transferable
 from augment.attacks.verification import require_renderers
 from augment.placed_lights import LampsSettings, ProjectorSettings
+from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
-from train.settings import LARGEST_SEED, MOST_VIEWS, RendererSettings, SceneSettings
+from train.settings import LARGEST_SEED, RendererSettings, SceneSettings
 
 MOST_RADII = 100
 LIT = 2.0  # power of the default lamps whose places alone are attacked

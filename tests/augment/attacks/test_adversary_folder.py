@@ -160,7 +160,7 @@ DAMAGES = {
     "images cut short": (lambda folder: (folder / "after.npy").write_bytes(b"\\x93NUMPY"), "after.npy cannot be read"),
     "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy does not exist"),
     "a pipe for images": (piped("after.npy"), "after.npy is no file"),
-    "a size of NaN": (described(image={"size": float("nan")}), "size=nan must be a whole number"),
+    "a size of NaN": (described(image={"size": float("nan")}), "size is nan: give int"),
     "no such lamps": (described(placed_lights=["lamps.json"]), "lamps.json does not exist"),
 }
 
