@@ -44,7 +44,9 @@ def found(*more: str, classifier: Classifier | None = None):
 
 
 def test_a_scene_that_is_recognised_stays_as_it_is():
-    always = Classifier(lambda images: torch.stack([images.mean((1, 2, 3)) + 1, images.mean((1, 2, 3))], 1), 16, "ab")
+    always = Classifier(
+        lambda images: torch.stack([images.mean((1, 2, 3)) + 1, images.mean((1, 2, 3))], 1), 16, list("ab")
+    )
     settings, chosen = found("label=a", classifier=always)
     assert chosen == settings.scene
 
@@ -77,6 +79,8 @@ def test_what_was_found_is_told_as_overrides_and_follows_from_the_seed():
 
 
 def test_where_nothing_is_found_the_mesh_is_refused_with_the_classifiers_answers():
-    never = Classifier(lambda images: torch.stack([0 * images.sum((1, 2, 3)), images.mean((1, 2, 3)) + 1], 1), 16, "ab")
+    never = Classifier(
+        lambda images: torch.stack([0 * images.sum((1, 2, 3)), images.mean((1, 2, 3)) + 1], 1), 16, list("ab")
+    )
     with pytest.raises(InputError, match="1 of 1 images of solid:orange:0 are not recognised as 'a' before any attack"):
         list(attacks(configured("scene.search=2", "label=a"), never, CPU))
