@@ -46,7 +46,7 @@ def main(config: DictConfig) -> None:
     with sole_writer("out", out):
         for index, (name, scene, attacked) in enumerate(attacks(settings, classifier, device, adversary)):
             if scene != settings.scene:
-                print(f"{name} is not recognised in the scene as it is, but is with {overrides(scene)}")
+                print(f"{name} is not recognised in the scene as it is, but is with {overrides(scene, settings.scene)}")
             checks = attacked.check() if settings.attack.checks else None
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
             verdicts = attacked.save(folder, checks, settings.attack.renderers)

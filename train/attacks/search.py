@@ -1,6 +1,8 @@
 """A scene in which a classifier recognises a mesh, so that there is something to attack."""
 
 import math
+import shlex
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 
@@ -18,6 +20,8 @@ from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 
 POLAR, FIELD_OF_VIEW = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
 CLOSEST = 2.0  # world units from the middle of a mesh, which all of it is within
+LENS = 45.0  # degrees, of every other camera that is drawn where the scene is orthographic
+LIGHT_GREY = 0.9  # as things are shown in catalogues
 EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)  # times the scene's own
 SURE = 0.5  # confidence, in every image, at which the search ends
 
@@ -26,21 +30,31 @@ def search(
     item: ObjectSettings, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
 ) -> AttackSceneSettings:
     """The settings as they are, where every image is recognised, or else the ones most surely recognised among
-    `scene.search` cameras, the first of them the scene's own, each under the scene's light and the probes at several
-    exposures; the settings as they are, where none is recognised. Greys behind the mesh stay as they are, and what a
-    classifier hardly knows from anywhere, such as smooth fruit of one plain colour, may not be found."""
+    `_candidates`, each under the scene's light and the probes at several exposures; the settings as they are, where
+    none is recognised. What a classifier hardly knows from anywhere, such as smooth fruit of one plain colour, may not
+    be found."""
     scene, draws = settings.scene, generator(settings.seed, item.mesh, "search")
     if _confidence(scene_of(item, settings, classifier.size, device), settings, classifier).item() > 0:
         return scene
-    best, chosen, camera = 0.0, scene, scene
-    for _ in range(scene.search):
-        found, candidate = _brightest(item, replace(settings, scene=camera), classifier, device)
+    best, chosen = 0.0, scene
+    for candidate in _candidates(scene, draws):
+        found, lit = _brightest(item, replace(settings, scene=candidate), classifier, device)
         if found > best:
-            best, chosen = found, candidate
+            best, chosen = found, lit
         if best >= SURE:
             break
-        camera = _drawn(scene, draws)
     return chosen
+
+
+def _candidates(scene: AttackSceneSettings, draws: torch.Generator) -> Iterator[AttackSceneSettings]:
+    """The scene from `scene.search` cameras, the first of them its own, before its backgrounds and, in place of a grey
+    one, before light grey."""
+    for index in range(scene.search):
+        lens = LENS if scene.perspective is None and index % 2 else scene.perspective
+        camera = _drawn(replace(scene, perspective=lens), draws) if index else scene
+        yield camera
+        if len(scene.backgrounds) == 1 and not isinstance(scene.backgrounds[0], str):
+            yield replace(camera, backgrounds=[LIGHT_GREY])
 
 
 def _brightest(
@@ -85,9 +99,8 @@ def _drawn(scene: AttackSceneSettings, draws: torch.Generator) -> AttackSceneSet
     )
 
 
-def overrides(found: AttackSceneSettings) -> str:
-    """What the command line would say for this camera and this light."""
-    names = ["polar", "azimuth", "field_of_view", "light", "exposure"]
-    if found.perspective is not None:
-        names.insert(3, "perspective")
-    return " ".join(f"scene.{name}={getattr(found, name)}" for name in names)
+def overrides(found: AttackSceneSettings, scene: AttackSceneSettings) -> str:
+    """What the command line would say to find this in the place of a scene."""
+    names = ("polar", "azimuth", "field_of_view", "perspective", "backgrounds", "light", "exposure")
+    changed = (name for name in names if getattr(found, name) != getattr(scene, name))
+    return " ".join(shlex.quote(f"scene.{name}={getattr(found, name)}") for name in changed)

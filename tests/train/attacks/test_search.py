@@ -1,6 +1,7 @@
 """Where a classifier does not recognise a mesh, a scene is found in which it does."""
 
 import math
+import shlex
 from dataclasses import replace
 
 import pytest
@@ -11,13 +12,13 @@ from torch import Tensor
 from augment.classifiers import Classifier
 from renderer.errors import InputError
 from train.attacks.experiment import attacks
-from train.attacks.search import _drawn, overrides, search
+from train.attacks.search import LENS, LIGHT_GREY, _candidates, overrides, search
 from train.attacks.settings import AttackExperimentSettings
 from train.configuration import read_settings
 from train.settings import read_object
 
 CPU = torch.device("cpu")
-CHANGED = ("polar", "azimuth", "field_of_view", "light", "exposure")
+CHANGED = ("polar", "azimuth", "field_of_view", "perspective", "light", "exposure")
 
 
 def configured(*more: str) -> AttackExperimentSettings:
@@ -64,16 +65,34 @@ def test_a_camera_and_a_light_are_found_under_which_all_views_are_recognised(mor
 
 
 def test_cameras_of_a_wide_lens_are_drawn_from_where_all_of_the_mesh_lies_before_them():
-    scene, draws = configured("scene.perspective=90").scene, torch.Generator().manual_seed(0)
-    widths = [_drawn(scene, draws).field_of_view for _ in range(50)]
+    scene = configured("scene.perspective=90", "scene.search=50").scene
+    _, *drawn = _candidates(replace(scene, backgrounds=["behind.png"]), torch.Generator().manual_seed(0))
+    assert len(drawn) == 49 and {each.perspective for each in drawn} == {90}
+    widths = [each.field_of_view for each in drawn]
     assert min(widths) >= 4 and max(widths) > 7
 
 
+def test_every_other_camera_has_perspective_and_a_grey_gives_way_to_a_light_one():
+    own, lighter, *drawn = _candidates(configured("scene.search=5").scene, torch.Generator().manual_seed(0))
+    assert own == configured("scene.search=5").scene and lighter == replace(own, backgrounds=[LIGHT_GREY])
+    assert [each.perspective for each in drawn] == [LENS, LENS, None, None] * 2
+    assert [each.backgrounds for each in drawn] == [[0.5], [LIGHT_GREY]] * 4
+
+
+def test_what_is_recognised_before_light_grey_alone_is_found_there():
+    def before_light(images: Tensor) -> Tensor:
+        score = 100 * (images[..., 0, 0].mean(1) - 0.8)
+        return torch.stack([score, -score], dim=1)
+
+    settings, chosen = found(classifier=Classifier(before_light, 16, ("orange", "other"), "before_light"))
+    assert overrides(chosen, settings.scene) == f"'scene.backgrounds=[{LIGHT_GREY}]'"
+
+
 def test_what_was_found_is_told_as_overrides_and_follows_from_the_seed():
-    _, chosen = found("scene.search=40")
+    settings, chosen = found("scene.search=40")
     _, again = found("scene.search=40")
     assert again == chosen
-    _, told = found("scene.search=0", *overrides(chosen).split())
+    _, told = found("scene.search=0", *shlex.split(overrides(chosen, settings.scene)))
     assert replace(told, search=40) == chosen
     assert math.isclose(told.exposure, chosen.exposure)
 
