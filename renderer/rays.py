@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from renderer.errors import InputError
@@ -125,6 +124,8 @@ def _shuffled(count: int) -> Tensor:
 
 def _outermost(vertices: np.ndarray) -> np.ndarray:
     """Vertices (N, 3) in whose convex hull all of them are: those of the hull itself, unless they lie in a plane."""
+    from scipy.spatial import ConvexHull, QhullError  # takes long to import
+
     try:
         return vertices[ConvexHull(vertices).vertices]
     except QhullError:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from renderer.errors import InputError
-from train.epoch import PHASES
+from train.logs import PHASES
 from train.photographs import FIGURES, figure_title, format_interval
 from train.photographs.answers import Answer
 from train.photographs.answers_table import ANSWERS, read_answers

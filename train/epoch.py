@@ -22,7 +22,6 @@ from train.distributed import summed
 PADDING = 4
 CHUNK_BYTES = 2**28  # holds a whole epoch of CIFAR-100; larger data sets are cropped in several chunks
 FLIPS = ("random", "alternating")
-PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; others are parts of these, or once a run
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from train.data import Split
 from train.device import PRECISIONS, MixedPrecision
 from train.distributed import summed
 from train.epoch import (
-    PHASES,
     EpochUnderWay,
     Round,
     batch_count,
@@ -35,7 +34,7 @@ from train.epoch import (
 )
 from train.interruption import Interruption
 from train.learner import Learner
-from train.logs import Log, console
+from train.logs import PHASES, Log, console
 from train.recipe import TrainSettings
 
 BATCH = 512  # of images when a network is scored

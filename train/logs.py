@@ -10,9 +10,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from PIL import Image
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from tensorboard.compat.proto.summary_pb2 import Summary
-from tensorboard.summary.writer.record_writer import RecordWriter
 from torch import Tensor
 
 from augment.specimens import Specimens
@@ -21,6 +18,7 @@ from train.run_folder import read_numbers
 from train.specimens import SUFFIX, write_specimens
 
 METRICS = "metrics.jsonl"
+PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; others are parts of these, or once a run
 console = logging.getLogger("train")
 logging.raiseExceptions = False  # where a disk is full, train.log lacks lines, and the run's own error is all one sees
 
@@ -35,6 +33,8 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
+        from tensorboard.compat.proto.event_pb2 import SessionLog  # half a second, which readers of metrics are spared
+
         self._metrics = folder / METRICS
         self._renders = folder / "renders"
         self._board = folder / f"events.out.tfevents.{time.time():010.0f}.{socket.gethostname()}.{os.getpid()}"
@@ -48,6 +48,8 @@ class RunLog:
 
         TensorBoard shows those one step after the last epoch, where a resumed run replaces them.
         """
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
         line = values if epoch is None else {"epoch": epoch, **values}
         with open(self._metrics, "a") as file:
             file.write(json.dumps(line) + "\n")
@@ -57,6 +59,7 @@ class RunLog:
 
     def renders(self, images: Tensor, epoch: int) -> None:
         """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
         from torchvision.utils import make_grid
 
         grid = to_bytes(make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0))
@@ -75,6 +78,9 @@ class RunLog:
 
     def _show(self, step: int, **content: object) -> None:
         """Write an event for TensorBoard, at once; torch's SummaryWriter has a thread, whose errors nobody catches."""
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
         with open(self._board, "ab") as file:
             RecordWriter(file).write(Event(wall_time=time.time(), step=step, **content).SerializeToString())
 

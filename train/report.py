@@ -15,8 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from renderer.errors import InputError
 from train import checkpoint
-from train.epoch import PHASES
-from train.logs import METRICS, read_metrics
+from train.logs import METRICS, PHASES, read_metrics
 from train.networks import PYTHON, model_title
 from train.photographs import FIGURES, SUMMARY, figure_title, find_figure, format_interval
 from train.run_folder import CONFIG, read_config, read_json

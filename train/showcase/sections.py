@@ -5,7 +5,7 @@ from itertools import islice
 
 from omegaconf import OmegaConf
 
-from train.epoch import PHASES
+from train.logs import PHASES
 from train.report import RunSummary, headline_tables, spread_tables, varied_settings
 from train.showcase import images, photographs, plots
 from train.showcase.arms import Arms, drawn, settings_table

@@ -6,7 +6,8 @@ from functools import cached_property
 from statistics import median
 from typing import Any
 
-from train.epoch import PHASES, batch_count
+from train.epoch import batch_count
+from train.logs import PHASES
 from train.studies.targets import Target
 from train.studies.training_speed.arm import EPOCH
 from train.studies.training_speed.peak import TRAINING

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from train.epoch import PHASES
+from train.logs import PHASES
 from train.studies.figures import pyplot, save
 from train.studies.page import joined
 from train.studies.targets import table_of
