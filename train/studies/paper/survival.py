@@ -97,7 +97,7 @@ def _outcomes(item: ObjectSettings, study: Study, settings: SurvivalSettings) ->
                 "mesh": _name(item),
                 "attack": name,
                 "example": example,
-                "scene": None if scene == command.scene else overrides(scene),
+                "scene": overrides(scene, command.scene) or None,
                 "steps": int(done.steps[0]),
                 "fooled": bool(done.success[0]),
                 "versions": {each.version: each.of(0, done.classifier.classes) for each in verdicts},

@@ -1,1 +1,1 @@
-"""What shadows and bounces cost, how right they are, and what becomes of adversaries that are found without them."""
+"""What shadows and bounces cost, and how right they are: beside direct light, beside more rays, and beside Mitsuba."""
