@@ -62,7 +62,7 @@ class Reach:
 
 @runtime_checkable
 class Placed(Functions, Protocol):
-    """Light from places, which throws hard shadows. Outside of it there is none, so that no coefficient is negative."""
+    """Light from places, which throws shadows. Outside of it there is none, so that no coefficient is negative."""
 
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
         """All ways to surface points (S, 3) of unit normals (S, 3), were nothing in between."""
