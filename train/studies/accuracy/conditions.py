@@ -14,12 +14,14 @@ from renderer.mesh import Mesh, normalise
 from train.studies.accuracy import shapes
 from train.studies.accuracy.measure import (
     CAMERA,
+    SETTINGS,
     Errors,
     Setup,
     by_both,
     by_geometry,
     by_operator,
-    by_shadows,
+    by_transport,
+    coarse_patches,
     light,
     of_development,
     of_harmonics,
@@ -173,12 +175,30 @@ def shadows() -> Iterator[Row]:
         "open, its inside seen": shapes.opened(shapes.sphere(1)),
         "not manifold": shapes.non_manifold(),
     }.items():
-        yield Row(condition, by_shadows(Setup(mesh, light())), cast)
-    yield Row("convex", by_shadows(Setup(shapes.box(), light())), "no ray is cast; the operator of direct light")
+        yield Row(condition, by_transport(Setup(mesh, light())), cast)
+    yield Row("convex", by_transport(Setup(shapes.box(), light())), "no ray is cast; the operator of direct light")
     small = replace(lumpy, vertices=1e-3 * lumpy.vertices)
     framed = Setup(small, light(), camera=framing(1e-3 * CAMERA.field_of_view))
-    yield Row("scaled by 10⁻³, not normalised", by_shadows(framed), "rays start 1e-5 of the mesh's extent above it")
-    yield Row("float64", by_shadows(Setup(lumpy, light()), torch.float64), cast)
+    yield Row("scaled by 10⁻³, not normalised", by_transport(framed), "rays start 1e-5 of the mesh's extent above it")
+    yield Row("float64", by_transport(Setup(lumpy, light()), dtype=torch.float64), cast)
+
+
+def bounces() -> Iterator[Row]:
+    lumpy, gathered = shapes.lumpy(), "what patches send in float64"
+    conditions: list[tuple[str, Mesh, int, torch.dtype]] = [
+        ("closed and lumpy, one bounce", lumpy, 1, torch.float32),
+        ("closed and lumpy, three bounces", lumpy, 3, torch.float32),
+        ("open, self-touching, of several parts, three bounces", shapes.heap(), 3, torch.float32),
+        ("thin boards, 0.03 apart, three bounces", shapes.boards(), 3, torch.float32),
+        ("open, its inside seen, three bounces", shapes.opened(shapes.sphere(1)), 3, torch.float32),
+        ("not manifold, three bounces", shapes.non_manifold(), 3, torch.float32),
+        ("float64, three bounces", lumpy, 3, torch.float64),
+    ]
+    for condition, mesh, count, dtype in conditions:
+        setup = Setup(mesh, light(), settings=replace(SETTINGS, size=8))
+        with coarse_patches():
+            errors = by_transport(setup, count, dtype)
+        yield Row(condition, errors, gathered)
 
 
 def thin_faces(count: int) -> Iterator[Row]:

@@ -1,6 +1,7 @@
 """The renderer's largest errors against the wide reference, quantity by quantity."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from renderer import radiosity
 from renderer.albedo import surface_albedo
 from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
@@ -21,12 +23,13 @@ from renderer.shading import radiance
 from renderer.surface import Surface
 from renderer.transfer import build_operators
 from renderer.visibility import Backend, choose
-from train.studies.accuracy import reference
+from train.studies.accuracy import reference, reference_transport
 from train.studies.accuracy.reference import exact, extended
 
 BACKEND = choose("software")
 CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, field_of_view=2.2)
 SETTINGS = ImageSettings(size=16, samples=2)
+COARSE = 2**6, 2**6  # patches, and directions of each
 IMAGE, LIGHT_GRADIENT = "image", "light gradient"  # of an operator
 GEOMETRY, VERTEX_GRADIENT = "image by geometry", "vertex gradient"  # of `renderer.shading`
 
@@ -120,17 +123,21 @@ def by_operator(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
     }
 
 
-def by_shadows(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
-    """Of the image and its gradient by the light under transport=shadows, one sample per pixel, which then casts all
-    rays: these, and where they start, the reference takes as they are."""
-    mesh, settings = setup.mesh, replace(setup.settings, samples=1, transport="shadows")
+def by_transport(setup: Setup, bounces: int = 0, dtype: torch.dtype = torch.float32) -> Errors:
+    """Of the image and its gradient by the light under transport=shadows or bounces:N, one sample per pixel, which then
+    casts all rays: these, and where they start, the reference takes as they are; and of bounces the patches."""
+    mesh = setup.mesh
+    settings = replace(setup.settings, samples=1, transport=f"bounces:{bounces}" if bounces else "shadows")
     setup = replace(setup, settings=settings)
     [operator] = build_operators(mesh, [setup.camera], settings, setup.backend, dtype=dtype)
     view, light = setup.view(), setup.light.to(dtype)
-    surface, rays = Surface.of(mesh, setup.fragments(), settings), Rays(mesh)
-    points, directions = (surface.points + rays.offset * surface.planes).numpy(), sphere(DIRECTIONS).numpy()
-    places = extended(points), extended(mesh.vertices[mesh.faces]), extended(directions)
-    lost, upstream = reference.shadow(view, *places, setup.degree), _upstream(len(view.pixels))
+    surface, directions = Surface.of(mesh, setup.fragments(), settings), extended(sphere(DIRECTIONS).numpy())
+    points, upstream = _starts(surface, Rays(mesh)), _upstream(len(view.pixels))
+    lost = reference_transport.shadow(view, points, extended(mesh.vertices[mesh.faces]), directions, setup.degree)
+    if bounces:
+        patches, looked = _patches(mesh)
+        sent = reference_transport.radiosity(patches, looked, setup.degree, bounces)
+        lost = lost - reference_transport.bounced(view, points, patches, sent, directions)
     lit, above = extended(light.double().numpy()), extended(upstream.double().numpy())
     image = reference.image(view, lit) - (lost * lit).sum(axis=1)
     gradient = reference.light_gradient(view, above, setup.degree) - (lost * above[:, None]).sum(axis=0)
@@ -138,6 +145,43 @@ def by_shadows(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
         IMAGE: error(operator.radiance(light).T, image),
         LIGHT_GRADIENT: error(operator.light_gradient(upstream.to(dtype).T), gradient),
     }
+
+
+@contextmanager
+def coarse_patches() -> Iterator[None]:
+    """So few that the reference's rays take seconds."""
+    chosen = radiosity.PATCHES, radiosity.DIRECTIONS
+    try:
+        radiosity.PATCHES, radiosity.DIRECTIONS = COARSE
+        yield
+    finally:
+        radiosity.PATCHES, radiosity.DIRECTIONS = chosen
+
+
+def _starts(surface: Surface, rays: Rays) -> np.ndarray:
+    """(S, 3) of the rays from a surface's samples."""
+    return extended((surface.points + rays.offset * surface.planes).numpy())
+
+
+def _patches(mesh: Mesh) -> tuple[reference_transport.Patches, np.ndarray]:
+    """A mesh's, and the directions in which they look."""
+    made, directions = radiosity.Patches.of(mesh), sphere(radiosity.DIRECTIONS)
+    view, pieces, rays = made.view, made.pieces, Rays(made.pieces)
+    surface = Surface(view, torch.from_numpy(pieces.vertices))
+    looks = list(rays.looks(surface, directions))
+    patches = reference_transport.Patches(
+        corners=extended(pieces.vertices[pieces.faces]),
+        albedo=extended(pieces.corner_colors[:, 0]),
+        points=_starts(surface, rays),
+        face=view.faces[view.face].numpy(),
+        side=view.facing[view.face, 0].numpy(),
+        patch=view.pixel.numpy(),
+        share=extended(made.shares[:, 0].numpy()),
+        looking=np.concatenate([each.pixels.numpy() for each in looks]),
+        dealt=np.concatenate([each.sample.numpy() for each in looks]),
+        of_side=made.of_side.numpy(),
+    )
+    return patches, extended(directions.numpy())
 
 
 def by_geometry(setup: Setup) -> Errors:

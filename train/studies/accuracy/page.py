@@ -33,8 +33,9 @@ face a sample sees as the rasteriser says, which has tests of its own.
   harmonics are each over its own largest component.
 
 Unless the row says otherwise: images of 16² pixels and 4 samples, a light of degree 6 with random coefficients in all
-49 places, a colour per face; under "Lights" the geometry is float32, and under "Shadows" (`renderer.transport`) a pixel
-has one sample, whose 512 rays the reference casts, too. Made by
+49 places, a colour per face; under "Lights" the geometry is float32, and under "Shadows" and "Bounces"
+(`renderer.transport`) a pixel has one sample, whose 512 rays the reference casts, too, and bounces are between some 64
+patches, which look in 64 directions each, in images of 8². Made by
 
 ```bash
 {command}

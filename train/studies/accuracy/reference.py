@@ -66,27 +66,27 @@ def view(
     seen, face = np.unique(ids[row, column][order], return_inverse=True)
     pixels, pixel = np.unique(place[order], return_inverse=True)
     corners = faces[seen]
-    facing = (_cross(*_edges(lift(placed), corners)) * lift(towards)[:, None]).sum(axis=0)
+    facing = (cross(*_edges(lift(placed), corners)) * lift(towards)[:, None]).sum(axis=0)
     side = np.where(facing < 0, -1, 1)
     return View(*_edges(lift(vertices), corners), side, albedo[seen], corners, pixel, face, pixels, samples**2)
 
 
 def unit_normals(corners: np.ndarray) -> np.ndarray:
     """(3, F) of corners (3 corners, 3, F), in the arithmetic of their dtype."""
-    return _unit(_cross(corners[1] - corners[0], corners[2] - corners[0]))
+    return unit(cross(corners[1] - corners[0], corners[2] - corners[0]))
 
 
 def image(view: View, light: np.ndarray) -> np.ndarray:
     """(P, 3) radiance under a light ((degree + 1)², 3)."""
-    radiance = irradiance(_normals(view), light) * view.albedo
-    return _add(len(view.pixels), view.pixel, radiance[view.face]) / view.samples
+    radiance = irradiance(normals_of(view), light) * view.albedo
+    return added(len(view.pixels), view.pixel, radiance[view.face]) / view.samples
 
 
 def light_gradient(view: View, upstream: np.ndarray, degree: int) -> np.ndarray:
     """((degree + 1)², 3) of Σ upstream (P, 3) × image."""
     weight = _face_weight(view, upstream)
     gradient = np.zeros(((degree + 1) ** 2, 3), dtype=weight.dtype)
-    for index, value in _reflected(_normals(view), degree).items():
+    for index, value in reflected(normals_of(view), degree).items():
         gradient[index] = (value[:, None] * weight).sum(axis=0)
     return gradient
 
@@ -96,25 +96,13 @@ def vertex_gradient(view: View, upstream: np.ndarray, light: np.ndarray, vertice
     weight = _face_weight(view, upstream)
 
     def loss(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return (irradiance(_unit(_cross(first, second)) * view.side, light) * weight).sum(axis=1)
+        return (irradiance(unit(cross(first, second)) * view.side, light) * weight).sum(axis=1)
 
-    area = (_cross(view.first, view.second) ** 2).sum(axis=0)
+    area = (cross(view.first, view.second) ** 2).sum(axis=0)
     by_first = np.stack([derivative(loss(stepped(view.first, axis), view.second)) for axis in AXES], axis=1)
     by_second = np.stack([derivative(loss(view.first, stepped(view.second, axis))) for axis in AXES], axis=1)
     by_corner = np.stack([-by_first - by_second, by_first, by_second], axis=1) * (area != 0)[:, None, None]
-    return _add(vertices, view.corners.ravel(), by_corner.reshape(-1, 3))
-
-
-def shadow(view: View, points: np.ndarray, corners: np.ndarray, directions: np.ndarray, degree: int) -> np.ndarray:
-    """(P, (degree + 1)², 3) what an image loses, per unit of each coefficient, since faces of corners (F, 3 corners, 3)
-    are in the way of rays from the samples (S, 3) in directions (D, 3), which share the sphere equally."""
-    sky = basis(directions.T, degree)
-    lost = np.zeros((len(view.pixels), sky.shape[1], 3), dtype=points.dtype)
-    normals, solid_angle = _normals(view).T[view.face], _as_in(points, 4 * MP.pi) / len(directions)
-    for pixel, face, point, normal in zip(view.pixel, view.face, points, normals, strict=True):
-        cosine = (directions @ normal).clip(0) * _meets(point, directions, corners)
-        lost[pixel] += np.outer(cosine @ sky, view.albedo[face]) * solid_angle / view.samples
-    return lost
+    return added(vertices, view.corners.ravel(), by_corner.reshape(-1, 3))
 
 
 def smooth_image(
@@ -122,17 +110,17 @@ def smooth_image(
 ) -> np.ndarray:
     """(P, 3) radiance with vertex normals, weighted with areas and interpolated to the samples (S, 3)."""
     first, second = _edges(vertices, faces)
-    around = _add(len(vertices), faces.ravel(), _cross(first, second).T.repeat(3, axis=0))
-    corner = _unit(around.T).T[view.corners] * view.side[:, None, None]
+    around = added(len(vertices), faces.ravel(), cross(first, second).T.repeat(3, axis=0))
+    corner = unit(around.T).T[view.corners] * view.side[:, None, None]
     normal = (barycentric[:, :, None] * corner[view.face]).sum(axis=1)
-    radiance = irradiance(_unit(normal.T), light) * view.albedo[view.face]
-    return _add(len(view.pixels), view.pixel, radiance) / view.samples
+    radiance = irradiance(unit(normal.T), light) * view.albedo[view.face]
+    return added(len(view.pixels), view.pixel, radiance) / view.samples
 
 
 def irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
     """(N, 3) on surfaces with unit normals (3, N)."""
     degree = round(len(light) ** 0.5) - 1
-    return sum(value[:, None] * light[index] for index, value in _reflected(normals, degree).items())
+    return sum(value[:, None] * light[index] for index, value in reflected(normals, degree).items())
 
 
 def develop(
@@ -156,7 +144,7 @@ def develop(
 
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """(N, (degree + 1)²) harmonics of directions (3, N) of any length."""
-    values = harmonics(_unit(directions), range(degree + 1))
+    values = harmonics(unit(directions), range(degree + 1))
     return np.stack([values[index] for index in range(len(values))], axis=1)
 
 
@@ -177,7 +165,7 @@ def harmonics(unit: np.ndarray, bands: Sequence[int]) -> dict[int, np.ndarray]:
     values = {}
     for l in bands:
         for m in range(l + 1):
-            legendre = sum(_as_in(unit, factor) * powers[power] for power, factor in _legendre(l, m))
+            legendre = sum(as_in(unit, factor) * powers[power] for power, factor in _legendre(l, m))
             values[l * l + l - m], values[l * l + l + m] = legendre * sine[m], legendre * cosine[m]
     return values
 
@@ -196,29 +184,21 @@ def derivative(values: np.ndarray) -> np.ndarray:
     return _imag(values) / MP.mpf(STEP) if values.dtype == object else values.imag / np.longdouble(STEP)
 
 
-def _reflected(normals: np.ndarray, degree: int) -> dict[int, np.ndarray]:
+def reflected(normals: np.ndarray, degree: int) -> dict[int, np.ndarray]:
     """{l² + l + m: A_l Y_lm(n)}, without the bands whose A_l is zero."""
     live = [l for l in range(degree + 1) if lambertian(l)]
-    factors = {l: _as_in(normals, 2 * MP.pi * _number(lambertian(l))) for l in live}
+    factors = {l: as_in(normals, 2 * MP.pi * _number(lambertian(l))) for l in live}
     return {index: value * factors[int(index**0.5)] for index, value in harmonics(normals, live).items()}
-
-
-def _meets(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(D,) whether rays from a point (3,) meet a face: they pass all its edges on the side that the face is on."""
-    a, b, c = (corners[:, corner] - point for corner in range(3))
-    passed = np.stack([directions @ np.cross(first, second).T for first, second in ((a, b), (b, c), (c, a))])
-    volume = (a * np.cross(b, c)).sum(axis=1)
-    return (passed * np.sign(volume) > 0).all(axis=0).any(axis=1)
 
 
 def _face_weight(view: View, upstream: np.ndarray) -> np.ndarray:
     """(G, 3) what Σ upstream × image gives for each unit of a face's irradiance."""
-    return _add(len(view.corners), view.face, upstream[view.pixel]) / view.samples * view.albedo
+    return added(len(view.corners), view.face, upstream[view.pixel]) / view.samples * view.albedo
 
 
-def _normals(view: View) -> np.ndarray:
+def normals_of(view: View) -> np.ndarray:
     """(3, G) unit normals, on the side that is seen."""
-    return _unit(_cross(view.first, view.second)) * view.side
+    return unit(cross(view.first, view.second)) * view.side
 
 
 def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -226,20 +206,20 @@ def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
     return second - first, third - first
 
 
-def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: np.ndarray) -> np.ndarray:
     """(3, N), zero where they are."""
     square = (vectors * vectors).sum(axis=0)
     length = _sqrt(square) if vectors.dtype == object else np.sqrt(square)
     return vectors / np.where(length == 0, 1, length)
 
 
-def _add(count: int, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(count, 3) sums of rows by index."""
-    total = np.zeros((count, 3), dtype=rows.dtype)
+def added(count: int, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(count, ...) sums of rows by index."""
+    total = np.zeros((count, *rows.shape[1:]), dtype=rows.dtype)
     np.add.at(total, index, rows)
     return total
 
@@ -261,6 +241,6 @@ def _number(fraction: Fraction) -> Any:
     return MP.mpf(fraction.numerator) / fraction.denominator
 
 
-def _as_in(like: np.ndarray, number: Any) -> Any:
+def as_in(like: np.ndarray, number: Any) -> Any:
     """A 256-bit number as the entries of an array are."""
     return number if like.dtype == object else np.longdouble(MP.nstr(number, 25))

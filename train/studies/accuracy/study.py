@@ -55,6 +55,7 @@ def measure(settings: AccuracySettings) -> list[Table]:
         "Images and cameras": conditions.images(settings.size),
         "Radiance to image": conditions.development(),
         "Shadows": conditions.shadows(),
+        "Bounces": conditions.bounces(),
     }
     if settings.only not in (None, *rows):
         raise InputError(f"only={settings.only}: choose one of {', '.join(rows)}")
