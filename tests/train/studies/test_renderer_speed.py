@@ -220,7 +220,8 @@ def test_a_quick_run_writes_every_file(tmp_path, monkeypatch, capsys):
     assert list(rows[0]) == [*(field.name for field in fields(Row)), "front"]
     assert all(float(each["time_ms"]) > 0 for each in rows)
     chosen = {each["panel"] for each in rows if each["default"] == "True"}
-    assert chosen == {"light step, 8²", "light step, 12²", "building an operator, 8²", "vertex step, 8²"}
+    builds = {f"building an operator{transport}, 8²" for transport in ("", " with shadows", " with bounces:3")}
+    assert chosen == {"light step, 8²", "light step, 12²", "vertex step, 8²"} | builds
     for panel in chosen:
         assert any(each["front"] == "True" for each in rows if each["panel"] == panel)
     assert len(points) == 3 and all(float(point["memory_mb"]) > 0 for point in points)
@@ -229,7 +230,7 @@ def test_a_quick_run_writes_every_file(tmp_path, monkeypatch, capsys):
     page = (tmp_path / "performance_renderer.md").read_text()
     assert page.startswith("# Time against error\n\n`python scripts/benchmark_renderer.py quick=true` measures ")
     assert page in capsys.readouterr().out
-    assert page.count("The default, ") == 4 and "| not measured | — |" in page
+    assert page.count("The default, ") == 6 and "| not measured | — |" in page
 
 
 def test_a_section_is_put_in_place_of_the_one_before():

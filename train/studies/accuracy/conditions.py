@@ -21,7 +21,6 @@ from train.studies.accuracy.measure import (
     by_geometry,
     by_operator,
     by_transport,
-    coarse_patches,
     light,
     of_development,
     of_harmonics,
@@ -29,6 +28,7 @@ from train.studies.accuracy.measure import (
     worst,
 )
 from train.studies.accuracy.reference import exact, unit_normals
+from train.studies.quadrature import quadrature
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 TOWARDS = CAMERA.axes()[2]
@@ -196,7 +196,7 @@ def bounces() -> Iterator[Row]:
     ]
     for condition, mesh, count, dtype in conditions:
         setup = Setup(mesh, light(), settings=replace(SETTINGS, size=8))
-        with coarse_patches():
+        with quadrature(patches=2**6, of_patch=2**6):  # so few that the reference takes seconds
             errors = by_transport(setup, count, dtype)
         yield Row(condition, errors, gathered)
 

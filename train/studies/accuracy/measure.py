@@ -1,7 +1,6 @@
 """The renderer's largest errors against the wide reference, quantity by quantity."""
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
@@ -29,7 +28,6 @@ from train.studies.accuracy.reference import exact, extended
 BACKEND = choose("software")
 CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, field_of_view=2.2)
 SETTINGS = ImageSettings(size=16, samples=2)
-COARSE = 2**6, 2**6  # patches, and directions of each
 IMAGE, LIGHT_GRADIENT = "image", "light gradient"  # of an operator
 GEOMETRY, VERTEX_GRADIENT = "image by geometry", "vertex gradient"  # of `renderer.shading`
 
@@ -145,17 +143,6 @@ def by_transport(setup: Setup, bounces: int = 0, dtype: torch.dtype = torch.floa
         IMAGE: error(operator.radiance(light).T, image),
         LIGHT_GRADIENT: error(operator.light_gradient(upstream.to(dtype).T), gradient),
     }
-
-
-@contextmanager
-def coarse_patches() -> Iterator[None]:
-    """So few that the reference's rays take seconds."""
-    chosen = radiosity.PATCHES, radiosity.DIRECTIONS
-    try:
-        radiosity.PATCHES, radiosity.DIRECTIONS = COARSE
-        yield
-    finally:
-        radiosity.PATCHES, radiosity.DIRECTIONS = chosen
 
 
 def _starts(surface: Surface, rays: Rays) -> np.ndarray:

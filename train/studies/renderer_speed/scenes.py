@@ -76,9 +76,10 @@ class View:
     size: int
     backend: Backend
     device: torch.device
+    transport: str = "direct"
 
     def settings(self, samples: int) -> ImageSettings:
-        return ImageSettings(self.size, samples)
+        return ImageSettings(self.size, samples, transport=self.transport)
 
     def operator(self, samples: int, degree: int = 6, dtype: torch.dtype = torch.float32) -> Operator:
         (operator,) = build_operators(

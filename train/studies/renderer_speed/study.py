@@ -23,6 +23,7 @@ from train.studies.renderer_speed import (
     panels,
     results,
     scaling,
+    shaped,
     skipping,
     targets,
     vertices,
@@ -106,6 +107,7 @@ def _measure(bench: Bench, meshes: list[Mesh], peers: bool) -> Findings:
         panels.light_steps(bench, plan.large),
         panels.builds(bench),
         panels.vertex_steps(bench),
+        *shaped.builds(bench),
     ]
     print("measured: choices", flush=True)
     compared = [

@@ -14,7 +14,6 @@ import trimesh
 from torch import Tensor
 
 from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object, on_ground
-from renderer import radiosity, rays
 from renderer.camera import OrthographicCamera
 from renderer.environment import write_map
 from renderer.image import ImageSettings
@@ -24,6 +23,7 @@ from renderer.mitsuba_scene import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mits
 from renderer.shapes import solid
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
+from train.studies.quadrature import quadrature
 from train.tables import markdown
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
@@ -71,10 +71,10 @@ def row(mesh: Mesh, transport: str) -> list[str]:
 
 
 def errors(mesh: Mesh, transport: str) -> list[float]:
-    """Of the image, and of the gradient by the light of its sum with random weights: the error, that with the numbers
-    of `converged`, Mitsuba's own noise, and the error of direct light."""
+    """Of the image, and of the gradient by the light of its sum with random weights: the error, that with many
+    more samples, rays and patches, Mitsuba's own noise, and the error of direct light."""
     settings = ImageSettings(SIZE, transport=transport)
-    with converged():
+    with quadrature(*CONVERGED):
         finest = operator(mesh, replace(settings, samples=SAMPLES))
     seen = operator(mesh, settings), finest, operator(mesh, replace(settings, transport="direct"))
     theirs, noise = mitsuba_image(mesh, settings)
@@ -87,17 +87,6 @@ def errors(mesh: Mesh, transport: str) -> list[float]:
     slope, noise = mitsuba_gradient(mesh, settings, upstream)
     default, finest_off, direct = (each.light_gradient(upstream[:, each.pixels]) - slope for each in seen)
     return found + [float(each.norm() / slope.norm()) for each in (default, finest_off, noise, direct)]
-
-
-@contextmanager
-def converged() -> Iterator[None]:
-    """Transport by so many more rays and patches that what is left of its error is little beside Mitsuba's noise."""
-    chosen = rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS
-    try:
-        rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS = CONVERGED
-        yield
-    finally:
-        rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS = chosen
 
 
 def operator(mesh: Mesh, settings: ImageSettings) -> Operator:

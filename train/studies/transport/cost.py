@@ -16,6 +16,7 @@ from renderer.lights import load_light
 from renderer.mesh import Mesh
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
+from train.studies.quadrature import quadrature
 from train.studies.renderer_speed.measure import Clock
 from train.tables import markdown
 
@@ -85,17 +86,15 @@ def depth_maps(mesh: Mesh) -> float:
 
 def errors_by_rays(mesh: Mesh, size: int) -> str:
     """Time for 20 views, and the root mean square error of two of them, by the number of directions."""
-    light, chosen, rows = load_light("grace"), rays.DIRECTIONS, []
-    try:
-        rays.DIRECTIONS = CONVERGED
+    light, rows = load_light("grace"), []
+    with quadrature(CONVERGED):
         exact = [view.radiance(light) for view in operators(mesh, "shadows", size, 2)]
-        for count in DIRECTIONS:
-            rays.DIRECTIONS = count
+    for count in DIRECTIONS:
+        with quadrature(count):
             taken = seconds(lambda: operators(mesh, "shadows", size))
             seen = operators(mesh, "shadows", size, 2)
-            off = [view.radiance(light) - true for view, true in zip(seen, exact, strict=True)]
-            error = torch.cat(off, dim=1).square().mean().sqrt() / torch.cat(exact, dim=1).max()
-            rows.append([str(count), f"{taken:.2f}", f"{error:.2%}", "default" if count == chosen else ""])
-    finally:
-        rays.DIRECTIONS = chosen
+        off = [view.radiance(light) - true for view, true in zip(seen, exact, strict=True)]
+        error = torch.cat(off, dim=1).square().mean().sqrt() / torch.cat(exact, dim=1).max()
+        chosen = "default" if count == rays.DIRECTIONS else ""
+        rows.append([str(count), f"{taken:.2f}", f"{error:.2%}", chosen])
     return markdown(["directions", f"s for {VIEWS} views", "error", ""], rows)
