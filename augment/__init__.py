@@ -12,8 +12,10 @@ __getattr__, __dir__, __all__ = attach(
         "classifiers": ["Classifier", "load_classifier"],
         "objects": ["CompanionSettings", "ObjectSettings"],
         "parameters": ["StepSettings"],
+        "placed_lights": ["LampsSettings", "ProjectorSettings"],
         "scene": ["Conditions", "Example", "Scene"],
         "service": ["AugmentationService", "AugmentationSettings"],
+        "snapshot": ["SnapshotSettings"],
         "variation": ["VariationSettings"],
     },
 )

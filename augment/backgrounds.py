@@ -1,6 +1,7 @@
 """What is behind a mesh: grey values and image files."""
 
 import math
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,12 +27,12 @@ def load_background(choice: float | str | Path, size: int, key: str = "scene.bac
         return _image(choice, size, key)
     try:
         grey = float(choice)
-    except ValueError:
-        return _image(Path(str(choice)), size, key)
-    except TypeError:
+    except (ValueError, TypeError, OverflowError):
+        if isinstance(choice, str):
+            return _image(Path(choice), size, key)
         grey = math.nan
     if not 0 <= grey <= 1:
-        raise InputError(f"{key}={choice}: give grey values in [0, 1] or image files")
+        raise InputError(f"{key}={reprlib.repr(choice)}: give grey values in [0, 1] or image files")
     return torch.full((1, size, size), grey)
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from augment.backgrounds import load_background
+from renderer.arguments import require_fields
 from renderer.errors import InputError, require_range
 from renderer.lamps import Lamps
 from renderer.projector import Projector
@@ -25,6 +26,9 @@ class ProjectorSettings:
     field_of_view: float = 30.0
     power: float = 1.0
     pattern: Any = 0.0
+
+    def __post_init__(self) -> None:
+        require_fields(self)
 
     def build(self) -> tuple[Projector, Tensor]:
         """The basis, and the pattern (pixels², 3)."""
@@ -47,12 +51,15 @@ class LampsSettings:
     radius: float = 0.0
     start: Any = 0.0
 
+    def __post_init__(self) -> None:
+        require_fields(self)
+
     def build(self) -> tuple[Lamps, Tensor]:
         """The basis, and the powers (L, 3)."""
         try:
             places = tuple((float(x), float(y), float(z)) for x, y, z in self.places)
             start = torch.tensor(self.start, dtype=torch.float32).expand(len(places), 3)
-        except (TypeError, ValueError, RuntimeError) as error:
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise InputError(
                 f"scene.lamps: give places [x, y, z] and, as start, a number or [r, g, b]s ({error})"
             ) from error

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from augment.patterns import draw_patterns
+from renderer.arguments import require_fields
 from renderer.errors import require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
 
@@ -28,6 +29,7 @@ class SnapshotSettings:
     noise: float = 0.0
 
     def __post_init__(self) -> None:
+        require_fields(self)
         for name, most in (("patterns", 1), ("white_balance", 5), ("blur", REACH / 2), ("noise", 1)):
             require_range(f"augment.vary.snapshot.{name}", getattr(self, name), 0, most)
         require_limits("augment.vary.snapshot.ambient", self.ambient, 0, 1)

@@ -51,6 +51,9 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
     def fields(settings: object) -> dict[str, object]:
         return dict(vars(settings))
 
+    def built(settings: Callable[..., Any]) -> Callable[..., object]:
+        return lambda **given: settings(**given).build()
+
     return {
         "render": (renderer.render, {"mesh": mesh, "cameras": cameras, "light": light, "size": 8, "background": 0.5}
                    | {"vertices": None, "albedo": None, "gain": 1.0} | SMALL),
@@ -85,7 +88,7 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
         "Targeted": (augment.Targeted, {"classes": "b"}),
         "Attacked.sweep": (attacked.sweep, {"scales": [1.0]}),
         "Attacked.transfer": (attacked.transfer, {"classifiers": [], "azimuths": [], "objects": []}),
-        "Attacked.save": (attacked.save, {"folder": Path("saved"), "verify": ()}),
+        "Attacked.save": (attacked.save, {"folder": Path("saved"), "checks": None, "verify": ()}),
         "AttackSettings": (augment.AttackSettings, fields(settings)),
         "SkylightSettings": (augment.SkylightSettings, {"zenith": 45.0, "azimuth": 0.0, "turbidity": 3.0}),
         "StepSettings": (augment.StepSettings, fields(augment.StepSettings())),
@@ -96,6 +99,9 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
         "AugmentationService.from_meshes": (augment.AugmentationService.from_meshes, {"meshes": [(mesh, 0)], "size": 8}
                                             | {"settings": None, "views": 1, "backgrounds": [0.5], "seed": 0} | SMALL),
         "AugmentationService.regenerate": (service.regenerate, {"model": network, "number": 0}),
+        "LampsSettings": (built(augment.LampsSettings), fields(augment.LampsSettings())),
+        "ProjectorSettings": (built(augment.ProjectorSettings), fields(augment.ProjectorSettings())),
+        "SnapshotSettings": (augment.SnapshotSettings, fields(augment.SnapshotSettings())),
         "ObjectSettings": (augment.ObjectSettings, {"mesh": "solid:plate", "label": "a", "gain": 1.0, "color": None}),
         "CompanionSettings": (augment.CompanionSettings, fields(augment.CompanionSettings("solid:plate", [1.0, 1.0]))),
         "Example": (augment.Example, {"object": 0, "cameras": tuple(cameras), "background": 0, "exposure": 1.0}),

@@ -14,8 +14,9 @@ from augment.attacks.adversary_folder import write_adversary
 from augment.attacks.checks import Checks
 from augment.attacks.figure import Exhibit, answer_caption, save_figure
 from augment.attacks.run import Attacked
-from augment.attacks.verification import Verdict, verify
+from augment.attacks.verification import Verdict, require_renderers, verify
 from augment.scene import Conditions, Scene
+from renderer.arguments import checked
 from renderer.basis import Basis
 from renderer.light_sphere import light_sphere
 from renderer.mesh_damage import mesh_damage
@@ -24,6 +25,7 @@ LINES = "attack.jsonl"  # a line per example, and a last one with the checks
 SPHERE = 192
 
 
+@checked
 def write_files(
     attacked: Attacked, checks: Checks | None, folder: Path, renderers: Sequence[str] = ("reload",)
 ) -> list[Verdict]:
@@ -31,6 +33,7 @@ def write_files(
 
     renderers: what is to render the adversaries anew from these; see `verify`.
     """
+    require_renderers(renderers)
     folder.mkdir(parents=True, exist_ok=True)
     everything = attacked.problem.everything
     after = attacked.conditions
