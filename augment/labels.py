@@ -39,6 +39,12 @@ def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
     return (F.softplus(odds - odds[:, None]) * pairs).sum() / pairs.sum().clamp(min=1)
 
 
+def divergence(logits: Tensor, answers: Tensor) -> Tensor:
+    """(N,) Kullback–Leibler divergence Σ q log(q / p) of a network's probabilities p from another's q, by their logits
+    (N, classes): what distillation lessens (Hinton et al. 2015, at temperature 1)."""
+    return F.kl_div(logits.log_softmax(1), answers.log_softmax(1), reduction="none", log_target=True).sum(1)
+
+
 def is_right(predicted: Tensor, labels: Tensor) -> Tensor:
     """Whether classes agree with labels, both (N,) int64; boolean."""
     return (predicted == _subject(labels)) != (labels < 0)

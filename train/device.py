@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from augment import processes
-from augment.labels import is_right, label_loss, ranking_loss
+from augment.labels import divergence, is_right, label_loss, ranking_loss
 from renderer.arguments import as_device
 from renderer.errors import InputError
 from renderer.image import to_unit
@@ -144,17 +144,29 @@ def compiler_works(device: torch.device) -> bool:
 
 
 def training_pass(
-    model: nn.Module, label_smoothing: float, compiled: bool, ranking: float = 0.0, label: int | None = None
-) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """A function of uint8 images (B, 3, H, W) and labels (B,): the mean `label_loss`, and how many are right.
+    model: nn.Module,
+    label_smoothing: float,
+    compiled: bool,
+    ranking: float = 0.0,
+    label: int | None = None,
+    distillation: float = 0.0,
+    teacher: nn.Module | None = None,
+) -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the mean `label_loss`, and
+    how many are right.
 
-    ranking: the weight of the class `label`'s `ranking_loss` beside it. compiled: torch forgets what it compiled
-    before, since its limit counts the graphs of all runs of a process.
+    Beside the loss stand, by their weights, the class `label`'s `ranking_loss` and, for images that are no renders, the
+    `divergence` from the teacher's answers. compiled: torch forgets what it compiled before, since its limit counts the
+    graphs of all runs of a process.
     """
 
-    def loss_and_hits(images: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    def loss_and_hits(images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
         logits = model(to_unit(images))
         loss = label_loss(logits, labels, label_smoothing).mean()
+        if teacher is not None:
+            with torch.no_grad():
+                answers = teacher(to_unit(images))
+            loss = loss + distillation * (divergence(logits, answers) * ~rendered).mean()
         if label is not None and ranking:
             loss = loss + ranking * ranking_loss(logits, labels, label)
         return loss, is_right(logits.detach().argmax(1), labels).sum()

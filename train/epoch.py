@@ -29,11 +29,13 @@ class Round:
     """What is trained on between two regenerations of the renders: an epoch, or a part of one.
 
     number: counts a run's rounds from 0. epoch: the one it is of. rows: (N,) int64, ascending, which images it shows.
+    renders: how many of these, the last, are renders.
     """
 
     number: int
     epoch: int
     rows: Tensor
+    renders: int = 0
 
 
 def batch_count(images: int, batch_size: int) -> int:
@@ -43,8 +45,9 @@ def batch_count(images: int, batch_size: int) -> int:
 
 def training_batches(
     images: Tensor, labels: Tensor, batch_size: int, seed: int, now: Round, flips: str = "random", first: int = 0
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """One shuffled round of (images (B, 3, H, W) uint8, labels (B,)): this process's share of every batch.
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """One shuffled round of (images (B, 3, H, W) uint8, labels (B,), which are renders (B,)): this process's share of
+    every batch.
 
     Reflect-pads by 4 and crops, then flips half of the images: "random" ones, or "alternating", each image in every
     other epoch. All batches have one shape, as the device's graphs need; the last one is filled up with the round's
@@ -62,7 +65,8 @@ def training_batches(
         rows = slice(begin, begin + batches_at_once)
         chosen = order[rows].flatten()
         cropped = crop_and_flip(images, chosen, shifts[:, rows].flatten(1), flipped[rows].flatten())
-        yield from zip(cropped.split(share), labels[chosen].split(share), strict=True)
+        rendered = chosen >= len(images) - now.renders
+        yield from zip(*(each.split(share) for each in (cropped, labels[chosen], rendered)), strict=True)
 
 
 def _order(rows: Tensor, batch_size: int, draws: torch.Generator) -> Tensor:
@@ -123,7 +127,7 @@ def rounds_of_epoch(
     parts = drawn.split(every or len(drawn))
     last = torch.arange(images, images + renders)
     return [
-        Round(epoch * len(parts) + index, epoch, torch.cat([part.sort().values, last]))
+        Round(epoch * len(parts) + index, epoch, torch.cat([part.sort().values, last]), renders)
         for index, part in enumerate(parts)
     ]
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -19,7 +20,8 @@ class Learner:
     graphs."""
 
     def __init__(self, settings: TrainSettings, model: MixedPrecision, seed: int, label: int | None = None):
-        """label: the class that is ranked above look-alikes; InputError for a ranking without them."""
+        """model: as the run begins, which a distillation holds to. label: the class that is ranked above look-alikes;
+        InputError for a ranking without them."""
         if settings.ranking and label is None:
             raise InputError(f"train.ranking={settings.ranking} ranks look-alikes: name some in scene.look_alikes")
         self.settings = settings
@@ -36,7 +38,13 @@ class Learner:
         )
         compiled = compiles(settings.compile, self.device)
         self._training_pass = training_pass(
-            replicated(model), settings.label_smoothing, compiled, settings.ranking, label
+            replicated(model),
+            settings.label_smoothing,
+            compiled,
+            settings.ranking,
+            label,
+            settings.distillation,
+            deepcopy(model).eval().requires_grad_(False) if settings.distillation else None,
         )
         self._distort = distortion(settings.distortion, model, seed)
         self.attacked, self.scored = (FixedSizes(each) if compiled else each for each in (model, self.selected))
@@ -51,8 +59,9 @@ class Learner:
         """Of the last step."""
         return self.optimizer.param_groups[0]["lr"]
 
-    def step(self, images: Tensor, labels: Tensor, progress: float, number: int) -> Tensor:
-        """Learn from uint8 images (B, 3, H, W) and labels (B,): (2,) the sum of their losses, and how many were right.
+    def step(self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int) -> Tensor:
+        """Learn from uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: (2,) the sum of their
+        losses, and how many were right.
 
         progress: the share of the run that is over, which the learning rate follows. number: the run's step.
         InputError where memory runs out.
@@ -62,7 +71,7 @@ class Learner:
         images = self._distort(images, labels, number)
         self.optimizer.zero_grad(set_to_none=True)
         with _one_error_out_of_memory(f"train.batch_size={self.settings.batch_size}"):
-            loss, hits = self._training_pass(images, labels)
+            loss, hits = self._training_pass(images, labels, rendered)
             loss.backward()
         self.optimizer.step()
         if self._average:

@@ -87,6 +87,7 @@ class TrainSettings:
     distortion: str = "none"
     label_smoothing: float = 0.0
     ranking: float = 0.0
+    distillation: float = 0.0
     averaging: float = 0.0
     precision: str = "auto"
     device: str = "auto"
@@ -106,7 +107,12 @@ class TrainSettings:
         for name in ("momentum", "label_smoothing", "averaging"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")
-        require_range("train.ranking", self.ranking, 0, FACTOR)
+        for name in ("ranking", "distillation"):
+            require_range(f"train.{name}", getattr(self, name), 0, FACTOR)
+        if self.distillation and not self.init_from:
+            raise InputError(
+                f"train.distillation={self.distillation} holds to the network begun with: name one in train.init_from"
+            )
         if not 0 < self.learning_rate < math.inf:
             raise InputError(f"train.learning_rate={self.learning_rate} must be positive")
         if not 0 <= self.weight_decay < math.inf:

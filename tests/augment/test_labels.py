@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 import torch
-from scipy.special import log_softmax, logit, softmax
+from scipy.special import log_softmax, logit, rel_entr, softmax
 
-from augment.labels import anything_but, is_right, label_loss, log_odds, ranking_loss
+from augment.labels import anything_but, divergence, is_right, label_loss, log_odds, ranking_loss
 
 EPS = torch.finfo(torch.float64).eps
 LOGITS = 3 * torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -39,6 +39,12 @@ def test_what_is_right(predicted, label, right):
 def test_log_odds_are_the_probability_s_logit():
     expected = logit(softmax(LOGITS.numpy(), axis=1)[:, 2])
     torch.testing.assert_close(log_odds(LOGITS, 2), torch.from_numpy(expected), rtol=64 * EPS, atol=64 * EPS)
+
+
+def test_divergence_is_the_relative_entropy_of_the_answers():
+    answers = LOGITS.flip(0) / 2
+    expected = rel_entr(softmax(answers.numpy(), axis=1), softmax(LOGITS.numpy(), axis=1)).sum(1)
+    torch.testing.assert_close(divergence(LOGITS, answers), torch.from_numpy(expected), rtol=64 * EPS, atol=64 * EPS)
 
 
 def test_ranking_is_the_mean_logistic_loss_of_all_pairs_of_the_class_and_another():

@@ -117,7 +117,7 @@ def test_the_training_pass_is_the_mean_cross_entropy_and_the_number_of_hits(netw
     images = torch.randint(0, 256, (9, 3, 8, 8), dtype=torch.uint8)
     labels = torch.arange(9) % 3
     network.float()
-    loss, hits = training_pass(network, smoothing, compiled=False)(images, labels)
+    loss, hits = training_pass(network, smoothing, compiled=False)(images, labels, labels == 0)
     logits = network(images / 255)
     uniform = -F.log_softmax(logits, 1).mean(1)
     expected = (1 - smoothing) * F.cross_entropy(logits, labels) + smoothing * uniform.mean()
@@ -128,9 +128,21 @@ def test_the_training_pass_is_the_mean_cross_entropy_and_the_number_of_hits(netw
 def test_the_training_pass_adds_the_weighted_ranking(network):
     images, labels = torch.randint(0, 256, (9, 3, 8, 8), dtype=torch.uint8), torch.arange(9) % 3 - 1  # one "no class 0"
     network.float().eval()
-    alone, _ = training_pass(network, 0.0, compiled=False)(images, labels)
-    both, _ = training_pass(network, 0.0, compiled=False, ranking=4.0, label=1)(images, labels)
+    alone, _ = training_pass(network, 0.0, compiled=False)(images, labels, labels == 0)
+    both, _ = training_pass(network, 0.0, compiled=False, ranking=4.0, label=1)(images, labels, labels == 0)
     torch.testing.assert_close(both, alone + 4 * ranking_loss(network(images / 255), labels, 1))
+
+
+def test_the_training_pass_adds_the_weighted_divergence_from_the_teacher_on_images_that_are_no_renders(network):
+    """The teacher's probabilities are a constant."""
+    images, labels = torch.randint(0, 256, (9, 3, 8, 8), dtype=torch.uint8), torch.arange(9) % 3
+    rendered = torch.arange(9) < 4
+    network.float()
+    teacher = WideResNet(3, 10, 1, dropout=0.0).eval().requires_grad_(False)
+    alone, _ = training_pass(network, 0.0, compiled=False)(images, labels, rendered)
+    both, _ = training_pass(network, 0.0, compiled=False, distillation=4.0, teacher=teacher)(images, labels, rendered)
+    learned, held = (each(images[4:] / 255).softmax(1) for each in (network, teacher))
+    torch.testing.assert_close(both, alone + 4 * (held * (held / learned).log()).sum() / 9)
 
 
 @pytest.mark.slow
@@ -138,11 +150,13 @@ def test_compiled_passes_give_the_same_gradients_and_logits(network):
     """Through the compiler of the CPU; there are no graphs to record there."""
     network.float()
     images, labels = torch.randint(0, 256, (9, 3, 8, 8), dtype=torch.uint8), torch.arange(9) % 3
+    teacher = WideResNet(3, 10, 1, dropout=0.0).eval().requires_grad_(False)
     gradients = []
     for compiled in (False, True):
         network.zero_grad()
         network.train()
-        training_pass(network, 0.1, compiled, ranking=1.0, label=1)(images, labels)[0].backward()
+        step = training_pass(network, 0.1, compiled, ranking=1.0, label=1, distillation=1.0, teacher=teacher)
+        step(images, labels, labels == 0)[0].backward()
         gradients.append({name: parameter.grad.clone() for name, parameter in network.named_parameters()})
     torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-5)
     network.eval()

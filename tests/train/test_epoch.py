@@ -15,7 +15,7 @@ def whole_epoch(images: torch.Tensor, epoch: int) -> Round:
     return Round(epoch, epoch, torch.arange(len(images)))
 
 
-def epoch_of(count: int, seed: int = 0, epoch: int = 0, batch_size: int = 7) -> list[tuple[torch.Tensor, torch.Tensor]]:
+def epoch_of(count: int, seed: int = 0, epoch: int = 0, batch_size: int = 7) -> list[tuple[torch.Tensor, ...]]:
     """Batches of plain images, each of its own value, which is its label too."""
     rows = torch.arange(count)
     images = rows.view(-1, 1, 1, 1).expand(-1, 3, 8, 8).to(torch.uint8)
@@ -40,16 +40,22 @@ def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flippe
 
 def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last_batch_with_the_first():
     shown = epoch_of(100)
-    assert [len(labels) for _, labels in shown] == [7] * 15
-    order = torch.cat([labels for _, labels in shown]).tolist()
+    assert [len(labels) for _, labels, _ in shown] == [7] * 15
+    order = torch.cat([labels for _, labels, _ in shown]).tolist()
     assert sorted(order[:100]) == list(range(100)) and order[100:] == order[:5]
-    for images, labels in shown:
+    for images, labels, _ in shown:
         assert images.dtype == torch.uint8 and images.shape == (len(labels), 3, 8, 8)
         assert torch.equal(images, labels.to(torch.uint8).view(-1, 1, 1, 1).expand_as(images))
 
 
+def test_batches_tell_which_of_their_images_are_renders():
+    rows = torch.arange(30)
+    shown = training_batches(noise(30, 3, 8, 8), rows, 7, 0, Round(0, 0, rows[5:], renders=4))
+    assert all(torch.equal(rendered, labels >= 26) for _, labels, rendered in shown)
+
+
 def test_fewer_images_than_a_batch_fill_it_several_times():
-    ((_, labels),) = epoch_of(3)
+    ((_, labels, _),) = epoch_of(3)
     assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
 
 
@@ -71,7 +77,8 @@ def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
 
     def mirrored(epoch: int) -> torch.Tensor:
         """By image."""
-        ((images, labels),) = training_batches(ramp, torch.arange(40), 40, 0, whole_epoch(ramp, epoch), "alternating")
+        now = whole_epoch(ramp, epoch)
+        ((images, labels, _),) = training_batches(ramp, torch.arange(40), 40, 0, now, "alternating")
         flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
         return flipped[labels.argsort()]
 
@@ -86,7 +93,7 @@ def test_batches_are_a_function_of_seed_and_epoch_alone():
     for seed, epoch in [(0, 0), (0, 1), (1, 0)]:
         torch.manual_seed(len(drawn))
         first, again = (
-            torch.cat([x for x, _ in training_batches(images, labels, 16, seed, whole_epoch(images, epoch))])
+            torch.cat([x for x, *_ in training_batches(images, labels, 16, seed, whole_epoch(images, epoch))])
             for _ in range(2)
         )
         assert torch.equal(first, again)
@@ -97,7 +104,7 @@ def test_batches_are_a_function_of_seed_and_epoch_alone():
 def test_shifts_and_flips_are_all_drawn_about_equally_often():
     count, size, middle = 6000, 11, 5
     place = torch.arange(size * size).view(1, 1, size, size).expand(count, 3, -1, -1).to(torch.uint8)
-    (images, _), *_ = training_batches(place, torch.zeros(count), count, 0, whole_epoch(place, 0))
+    (images, *_), *_ = training_batches(place, torch.zeros(count), count, 0, whole_epoch(place, 0))
     seen = images[:, 0, middle].long()
     flipped = seen[:, middle - 1] > seen[:, middle + 1]
     assert abs(flipped.double().mean() - 0.5) < 4 * 0.5 / count**0.5  # four standard deviations

@@ -372,9 +372,11 @@ def test_resuming_for_more_epochs_and_under_other_circumstances_is_no_change(tin
 # ---------------------------------------------------------------------------------------- rounds and starts
 
 
-def test_a_signal_between_two_rounds_or_within_one_leads_to_the_same_end(tiny, tmp_path, monkeypatch):
-    """Bit for bit: 40 of 54 images an epoch, in rounds of 16, 16 and 8, each with 4 renders (2, 2 and 1 steps)."""
-    overrides = ("augment.every=16", "train.images_per_epoch=40", "train.resume=true")
+def test_a_signal_between_two_rounds_or_within_one_leads_to_the_same_end(tiny, finished, tmp_path, monkeypatch):
+    """Bit for bit: 40 of 54 images an epoch, in rounds of 16, 16 and 8, each with 4 renders (2, 2 and 1 steps); held to
+    the answers of the network begun with."""
+    rounds = ("augment.every=16", "train.images_per_epoch=40", "train.resume=true")
+    overrides = (*rounds, f"train.init_from={finished}", "train.distillation=2")
     run(tiny(*overrides), load_data(tiny()), tmp_path / "whole")
     folder = tmp_path / "stopped"
     for number, at in [(1, 2), (4, 1), (6, 2)]:

@@ -77,6 +77,8 @@ def test_a_ranking_without_look_alikes_is_refused(tmp_path):
         ({"learning_rate": math.inf}, "train.learning_rate=inf"),
         ({"learning_rate": math.nan}, "train.learning_rate=nan"),
         ({"ranking": -1.0}, "train.ranking=-1.0"),
+        ({"distillation": -1.0}, "train.distillation=-1.0"),
+        ({"distillation": 1.0}, r"train\.distillation=1\.0 holds to the network begun with: name one in train\.init"),
         ({"momentum": 1.0}, "train.momentum=1.0"),
         ({"momentum": -0.1}, "train.momentum=-0.1"),
         ({"weight_decay": -1.0}, "train.weight_decay=-1.0"),
@@ -175,7 +177,9 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
     images, labels = torch.rand(2, 4, 3, 2, 2), torch.tensor([[0, 1, 2, 0], [1, 1, 2, 0]])
     as_bytes = (images * 255).round().to(torch.uint8)
     images = as_bytes / 255
-    monkeypatch.setattr(fit, "training_batches", lambda *arguments, first: zip(as_bytes, labels, strict=True))
+    monkeypatch.setattr(
+        fit, "training_batches", lambda *arguments, first: zip(as_bytes, labels, labels < 0, strict=True)
+    )
     monkeypatch.setattr(fit, "evaluate", lambda *arguments: {"loss": 1.0, "accuracy": 0.0})
     torch.manual_seed(0)
     network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
@@ -302,8 +306,8 @@ def test_weights_that_are_not_finite_are_named_and_the_last_good_checkpoint_stay
     trainer, steps = make_trainer(tmp_path), itertools.count(1)
     whole = trainer.learner._training_pass
 
-    def spoilt(images, labels):
-        loss, hits = whole(images, labels)
+    def spoilt(*batch):
+        loss, hits = whole(*batch)
         if next(steps) < 5:  # the second of three steps of the second epoch
             return loss, hits
         if ended == "by a signal":
@@ -322,7 +326,7 @@ def test_weights_that_are_not_finite_are_named_and_the_last_good_checkpoint_stay
 def test_where_memory_runs_out_in_training_the_setting_is_named(tmp_path, monkeypatch, error):
     trainer = make_trainer(tmp_path)
 
-    def too_large(images, labels):
+    def too_large(*batch):
         raise error
 
     monkeypatch.setattr(trainer.learner, "_training_pass", too_large)

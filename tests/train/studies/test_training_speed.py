@@ -94,13 +94,13 @@ def test_the_baselines_loader_draws_the_same_images_as_ours():
     torch.manual_seed(0)
     theirs = list(build_loader(split, 128, mean, std, 0, CPU))
     ours = list(training_batches(split.images, split.labels, 128, 0, Round(0, 0, torch.arange(len(split)))))
-    assert [part.shape for part in theirs[0]] == [part.shape for part in ours[0]]
+    assert [part.shape for part in theirs[0]] == [part.shape for part in ours[0][:2]]
 
     scale, offset = (torch.tensor(values).view(3, 1, 1) for values in (std, mean))
     restored = [((images * scale + offset) * 255).round().to(torch.uint8) for images, _ in theirs]
     seen, expected = (
         {image.numpy().tobytes() for image in torch.cat(batches)}
-        for batches in (restored, [images for images, _ in ours])
+        for batches in (restored, [images for images, *_ in ours])
     )
     assert seen == expected and len(seen) == 9**2 * 2
 
