@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.image_files import read_image
+from renderer.files.image_files import read_image
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:

@@ -12,8 +12,8 @@ from renderer.camera import Camera
 from renderer.fragments import Fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
-from renderer.surface import Surface
-from renderer.transport import build_transport
+from renderer.transport.precomputed import build_transport
+from renderer.transport.surface import Surface
 
 NEAR = 0.001  # world units: shadows are found anew once a coordinate has moved by more since they were
 

@@ -7,9 +7,9 @@ from renderer.fragments import Fragments
 from renderer.image import ImageSettings
 from renderer.lamps import Lamps
 from renderer.mesh import Mesh
-from renderer.placed import lit, placed_radiance
-from renderer.rays import Rays
-from renderer.surface import Surface
+from renderer.transport.placed import lit, placed_radiance
+from renderer.transport.rays import Rays
+from renderer.transport.surface import Surface
 
 
 class PlacedView:

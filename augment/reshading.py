@@ -16,8 +16,8 @@ from renderer.basis import Basis, Placed, parts_of
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
-from renderer.rays import Rays
 from renderer.shading import radiance
+from renderer.transport.rays import Rays
 from renderer.visibility import Backend
 
 

@@ -17,9 +17,9 @@ from renderer.arguments import require_fields
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
+from renderer.files.image_files import SUFFIXES, read_image
 from renderer.harmonics import irradiance_basis, live_coefficients
 from renderer.image import clamp, decode, encode
-from renderer.image_files import SUFFIXES, read_image
 from renderer.lights import directional, load_light
 from renderer.transfer import DEGREE
 

@@ -10,7 +10,7 @@ __getattr__, __dir__, __all__ = attach(
         "image": ["ImageSettings"],
         "lights": ["load_light", "save_light"],
         "mesh": ["Mesh", "load_mesh", "normalise"],
-        "mesh_export": ["export_mesh"],
+        "files.mesh_export": ["export_mesh"],
         "rendering": ["operators", "render"],
         "shapes": ["solid"],
         "subdivision": ["subdivide"],

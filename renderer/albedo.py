@@ -67,7 +67,7 @@ def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, gain: float,
     what it was beyond; differentiable in what is added. InputError: NaN.
 
     It is kept within where it is stored, at corners and texels, and then interpolated, so that colours and textures can
-    hold it: see `renderer.albedo_bake`.
+    hold it: see `renderer.files.albedo_bake`.
     """
     there, faces = face_albedo(added, fragments), fragments.faces.cpu().numpy()
     corners = decode(torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(added), encoding) * gain

@@ -20,9 +20,9 @@ from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.shading import radiance
-from renderer.surface import Surface
 from renderer.transfer import Operator, build_operators
-from renderer.transport import build_transport
+from renderer.transport.precomputed import build_transport
+from renderer.transport.surface import Surface
 from renderer.visibility import choose
 
 if TYPE_CHECKING:

@@ -25,11 +25,11 @@ from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
-from renderer.placed import placed_transfer
-from renderer.rays import Rays
 from renderer.sparse import Sparse, joined
-from renderer.surface import Surface
-from renderer.transport import build_transport
+from renderer.transport.placed import placed_transfer
+from renderer.transport.precomputed import build_transport
+from renderer.transport.rays import Rays
+from renderer.transport.surface import Surface
 from renderer.visibility import Backend
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from augment.objects import SceneObject
 from augment.scene import Conditions, Example, Scene
-from renderer.albedo_bake import with_added_albedo
 from renderer.basis import Basis
 from renderer.camera import Camera
+from renderer.files.albedo_bake import with_added_albedo
 from renderer.image import ImageSettings
 from renderer.visibility import Backend
 

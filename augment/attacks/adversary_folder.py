@@ -22,12 +22,12 @@ from renderer.basis import parts_of, with_placed
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.environment import negative_share, to_map, write_map
 from renderer.errors import FACTOR, InputError, require_bounded, require_file, require_range
+from renderer.files.mesh_export import export_mesh
+from renderer.files.mitsuba_scene import mitsuba_map, write_mitsuba_scene
+from renderer.files.placed_lights import load_placed, save_placed
 from renderer.image import ImageSettings, to_bytes
 from renderer.lights import load_light, save_light
 from renderer.mesh import load_mesh
-from renderer.mesh_export import export_mesh
-from renderer.mitsuba_scene import mitsuba_map, write_mitsuba_scene
-from renderer.placed_files import load_placed, save_placed
 
 DESCRIPTION, MESH, LIGHT, BACKGROUND, PIXELS = (
     "adversary.json",

@@ -18,8 +18,8 @@ from augment.attacks.verification import Verdict, require_renderers, verify
 from augment.scene import Conditions, Scene
 from renderer.arguments import checked
 from renderer.basis import Basis
+from renderer.files.mesh_damage import mesh_damage
 from renderer.light_sphere import light_sphere
-from renderer.mesh_damage import mesh_damage
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
 SPHERE = 192

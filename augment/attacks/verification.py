@@ -13,8 +13,8 @@ from augment.attacks.adversary_folder import MITSUBA, read_adversary
 from augment.attacks.jpeg import as_jpeg
 from augment.attacks.run import Attacked, logits_of
 from renderer.errors import InputError
+from renderer.files.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.image import behind, clamp, develop_composite, to_bytes, to_unit
-from renderer.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.visibility import Backend
 
 JPEG_QUALITY = 90

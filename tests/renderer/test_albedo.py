@@ -10,8 +10,8 @@ import trimesh
 from scipy.ndimage import map_coordinates
 
 from renderer.albedo import face_albedo, painted_albedo, surface_albedo, textured_albedo
-from renderer.albedo_bake import with_added_albedo
 from renderer.camera import OrthographicCamera
+from renderer.files.albedo_bake import with_added_albedo
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ENCODINGS, ImageSettings
 from renderer.mesh import Mesh, concatenate

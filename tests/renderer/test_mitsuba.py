@@ -14,10 +14,10 @@ import torch
 import trimesh
 from scipy.special import sph_harm_y
 
-from renderer import rays
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.mesh import Mesh, concatenate
 from renderer.transfer import ImageSettings, build_operators
+from renderer.transport import rays
 from renderer.visibility import choose
 
 mi = pytest.importorskip("mitsuba")

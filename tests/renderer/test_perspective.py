@@ -15,8 +15,8 @@ from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh
-from renderer.surface import Surface
 from renderer.transfer import build_operators
+from renderer.transport.surface import Surface
 from renderer.visibility import choose
 
 SOFTWARE = choose("software")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from renderer.mitsuba_scene import TO_Z_UP, mitsuba
+from renderer.files.mitsuba_scene import TO_Z_UP, mitsuba
 from train.laboratory.props import Part
 from train.laboratory.shots import FIELD_OF_VIEW, Shot
 

@@ -15,7 +15,7 @@ import torch
 from augment.memory import require_memory
 from augment.progress import progress
 from renderer.errors import InputError
-from renderer.image_files import read_square
+from renderer.files.image_files import read_square
 from train.classes import class_index, nearest_class
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")

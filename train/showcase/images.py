@@ -7,7 +7,7 @@ from pathlib import Path
 from PIL import Image
 
 from renderer.errors import InputError
-from renderer.image_files import read_square
+from renderer.files.image_files import read_square
 from train.photographs.answers import Answer
 from train.photographs.contact_sheet import caption, evenly
 from train.showcase.blocks import Gallery, Illustration

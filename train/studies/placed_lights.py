@@ -17,13 +17,13 @@ from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.lamps import Lamps
 from renderer.mesh import Mesh, normalise
-from renderer.placed import lit, placed_radiance
 from renderer.projector import Projector
-from renderer.rays import Rays
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
-from renderer.surface import Surface
 from renderer.transfer import Operator, build_operators
+from renderer.transport.placed import lit, placed_radiance
+from renderer.transport.rays import Rays
+from renderer.transport.surface import Surface
 from renderer.visibility import choose
 from train.cli import command_line
 from train.outputs import writable_file

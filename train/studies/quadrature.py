@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from renderer import radiosity, rays
+from renderer.transport import radiosity, rays
 
 
 @contextmanager

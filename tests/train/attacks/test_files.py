@@ -16,10 +16,10 @@ from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
 from augment.descent import DescentSettings
 from renderer.environment import read_map, to_map
+from renderer.files.mesh_damage import mesh_damage
+from renderer.files.mitsuba_scene import mitsuba_map
 from renderer.lights import load_light
 from renderer.mesh import load_mesh
-from renderer.mesh_damage import mesh_damage
-from renderer.mitsuba_scene import mitsuba_map
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.configuration import read_settings

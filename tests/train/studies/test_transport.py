@@ -5,12 +5,12 @@ import torch
 import trimesh
 
 from augment import held_transport
-from renderer import rays
 from renderer.errors import InputError
+from renderer.files.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh, normalise
-from renderer.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.shapes import solid
+from renderer.transport import rays
 from train.run_classifier import load_classifier
 from train.studies.transport import beside_mitsuba, cost, held
 

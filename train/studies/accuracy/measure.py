@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer import radiosity
 from renderer.albedo import surface_albedo
 from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
@@ -17,10 +16,11 @@ from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import basis, basis_gradient
 from renderer.image import ImageSettings, develop
 from renderer.mesh import Mesh
-from renderer.rays import DIRECTIONS, Rays, sphere
 from renderer.shading import radiance
-from renderer.surface import Surface
 from renderer.transfer import build_operators
+from renderer.transport import radiosity
+from renderer.transport.rays import DIRECTIONS, Rays, sphere
+from renderer.transport.surface import Surface
 from renderer.visibility import Backend, choose
 from train.studies.accuracy import reference, reference_transport
 from train.studies.accuracy.reference import exact, extended

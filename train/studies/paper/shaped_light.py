@@ -17,9 +17,9 @@ from augment.parameters import StepSettings
 from augment.scene import Scene
 from renderer.camera import Camera
 from renderer.environment import write_map
+from renderer.files.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.image import ImageSettings, behind, develop_composite
 from renderer.lights import ambient
-from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.transfer import build_operators
 from renderer.visibility import choose
 from train.studies.paper.section import Section, SectionSettings, Study

@@ -10,7 +10,7 @@ import torch
 
 from augment.attacks.verification import RENDERERS
 from augment.objects import ObjectSettings
-from renderer.mitsuba_scene import SAMPLES
+from renderer.files.mitsuba_scene import SAMPLES
 from train.attacks.experiment import attacks
 from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings

@@ -7,8 +7,8 @@ import trimesh
 from PIL import Image
 
 from renderer.environment import to_map, write_map
+from renderer.files.mesh_export import export_mesh
 from renderer.lights import probe, save_light
-from renderer.mesh_export import export_mesh
 from renderer.shapes import solid
 from train.studies.interruptions.small_run import write_inputs
 

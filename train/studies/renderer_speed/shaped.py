@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
-from renderer import rays
 from renderer.mesh import normalise
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
 from renderer.transfer import Operator
+from renderer.transport import rays
 from train.studies.quadrature import quadrature
 from train.studies.renderer_speed.measure import relative_error
 from train.studies.renderer_speed.panels import SAMPLES, Bench, Entries, row_of

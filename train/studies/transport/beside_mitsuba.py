@@ -16,10 +16,10 @@ from torch import Tensor
 from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object, on_ground
 from renderer.camera import OrthographicCamera
 from renderer.environment import write_map
+from renderer.files.mitsuba_scene import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, concatenate, normalise
-from renderer.mitsuba_scene import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.shapes import solid
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose

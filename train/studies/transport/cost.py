@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer import rays
 from renderer.camera import OrthographicCamera, ring
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh
 from renderer.transfer import Operator, build_operators
+from renderer.transport import rays
 from renderer.visibility import choose
 from train.studies.quadrature import quadrature
 from train.studies.renderer_speed.measure import Clock

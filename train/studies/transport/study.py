@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import torch
 
 from augment.held_transport import NEAR
+from renderer.files.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.mesh import normalise
-from renderer.mitsuba_scene import DIFFERENTIABLE, mitsuba
-from renderer.radiosity import PATCHES
-from renderer.rays import DIRECTIONS
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
+from renderer.transport.radiosity import PATCHES
+from renderer.transport.rays import DIRECTIONS
 from train.cli import command_line
 from train.outputs import writable_file
 from train.run_classifier import load_classifier

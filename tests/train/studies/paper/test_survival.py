@@ -7,8 +7,8 @@ import torch
 import trimesh
 
 from augment.classifiers import Classifier
+from renderer.files.mesh_export import export_mesh
 from renderer.mesh import Mesh
-from renderer.mesh_export import export_mesh
 from train.studies.paper import survival
 
 SIZE = 12

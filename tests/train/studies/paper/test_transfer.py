@@ -12,8 +12,8 @@ from augment.parameters import Lighting, StepSettings
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
+from renderer.files.mesh_export import export_mesh
 from renderer.mesh import Mesh
-from renderer.mesh_export import export_mesh
 from train.studies.paper import adversaries, subjects, transfer, unseen_views
 from train.studies.paper.adversaries import ATTACKS, FURTHER, recognised_parts, with_random_signs
 from train.studies.paper.shares import percent

@@ -15,10 +15,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera, PerspectiveCamera, ring
 from renderer.errors import InputError
+from renderer.files.mesh_export import export_mesh
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh, concatenate, load_mesh, normalise
-from renderer.mesh_export import export_mesh
 from renderer.shading import radiance
 from renderer.shapes import solid
 from renderer.subdivision import subdivide

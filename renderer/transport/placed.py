@@ -6,9 +6,9 @@ from torch import Tensor
 from renderer.basis import Placed, Reach
 from renderer.fragments import Fragments
 from renderer.harmonics import unit_vectors
-from renderer.rays import Rays
 from renderer.sparse import Sparse
-from renderer.surface import Surface
+from renderer.transport.rays import Rays
+from renderer.transport.surface import Surface
 
 
 def placed_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: Placed) -> Sparse:

@@ -11,9 +11,9 @@ from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
 from renderer.errors import LARGEST, InputError
+from renderer.files.mesh_files import open_mesh
 from renderer.image import encode
 from renderer.mesh import Mesh
-from renderer.mesh_files import open_mesh
 
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}  # not read: what is in them is to be seen before
 

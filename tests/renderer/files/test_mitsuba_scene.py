@@ -14,11 +14,11 @@ import trimesh
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.environment import write_map
 from renderer.errors import InputError
+from renderer.files.mitsuba_scene import SCENE, mitsuba, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.harmonics import basis, unit_vectors
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, normalise
-from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.transfer import build_operators
 from renderer.visibility import choose
 
@@ -108,7 +108,7 @@ ON_ONE_CORE = """
 import os, sys
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 from pathlib import Path
-from renderer.mitsuba_scene import render_mitsuba_scene
+from renderer.files.mitsuba_scene import render_mitsuba_scene
 print(tuple(render_mitsuba_scene(Path(sys.argv[1]), 1).shape))
 """
 

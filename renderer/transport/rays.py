@@ -18,7 +18,7 @@ from torch import Tensor
 from renderer.errors import InputError
 from renderer.harmonics import per_degree
 from renderer.mesh import Mesh
-from renderer.surface import Surface
+from renderer.transport.surface import Surface
 
 DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
 OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32

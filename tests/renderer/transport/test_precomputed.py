@@ -11,7 +11,7 @@ import torch.nn.functional as F
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from renderer import radiosity, rays, reference
+from renderer import reference
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
@@ -19,9 +19,10 @@ from renderer.harmonics import basis, live_coefficients, rotate
 from renderer.image import ImageSettings
 from renderer.lights import ambient, load_light
 from renderer.mesh import Mesh, concatenate
-from renderer.rays import DIRECTIONS, sphere
 from renderer.rendering import operators, render
 from renderer.transfer import Operator, build_operators
+from renderer.transport import radiosity, rays
+from renderer.transport.rays import DIRECTIONS, sphere
 from renderer.visibility import choose
 
 BACKEND = choose("software")

@@ -17,9 +17,9 @@ from renderer.albedo import surface_albedo
 from renderer.basis import Distant
 from renderer.fragments import Fragments
 from renderer.mesh import Mesh
-from renderer.rays import Looks, Rays, sphere
 from renderer.subdivision import refine
-from renderer.surface import Surface
+from renderer.transport.rays import Looks, Rays, sphere
+from renderer.transport.surface import Surface
 
 DIRECTIONS = 2**9  # over the whole sphere, in which a patch looks
 PATCHES = 2**11  # the mesh's area over that is about the area of a patch

@@ -1,20 +1,20 @@
 """What a mesh does to its own light: precomputed radiance transfer (Sloan, Kautz and Snyder 2002), per pixel.
 
 A pixel's transfer is that under an open sky, in closed form, less the light from directions that the mesh blocks, plus
-what the surface there sends instead (`renderer.radiosity`).
+what the surface there sends instead (`renderer.transport.radiosity`).
 """
 
 import torch
 from torch import Tensor
 
-from renderer import rays
 from renderer.basis import Basis, Distant, Placed, parts_of
 from renderer.errors import InputError
 from renderer.image import ImageSettings, bounces
 from renderer.mesh import Mesh
-from renderer.radiosity import Patches, Radiosity
-from renderer.rays import Rays, sphere
-from renderer.surface import Surface
+from renderer.transport import rays
+from renderer.transport.radiosity import Patches, Radiosity
+from renderer.transport.rays import Rays, sphere
+from renderer.transport.surface import Surface
 
 
 class Transport:

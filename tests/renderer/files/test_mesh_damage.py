@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from renderer.mesh_damage import MeshDamage, mesh_damage
+from renderer.files.mesh_damage import MeshDamage, mesh_damage
 
 NONE = (0.0, 0.0, 0.0)
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float64)

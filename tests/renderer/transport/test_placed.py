@@ -14,16 +14,16 @@ from renderer.albedo import surface_albedo
 from renderer.basis import HARMONICS, Placed, Sum
 from renderer.camera import OrthographicCamera
 from renderer.convex import Ball
+from renderer.files.mitsuba_scene import mitsuba
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.lamps import Lamps, moved
 from renderer.mesh import Mesh, concatenate
-from renderer.mitsuba_scene import mitsuba
-from renderer.placed import lit, placed_radiance
 from renderer.projector import Projector
-from renderer.rays import Rays
-from renderer.surface import Surface
 from renderer.transfer import Operator, build_operators
+from renderer.transport.placed import lit, placed_radiance
+from renderer.transport.rays import Rays
+from renderer.transport.surface import Surface
 from renderer.visibility import choose
 
 CAMERA = OrthographicCamera(0.9, 0.4, 2.2)

@@ -17,16 +17,16 @@ import numpy as np
 import torch
 from PIL import Image
 
-from renderer.albedo_bake import with_added_albedo
 from renderer.basis import Distant, Placed
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.environment import write_map
 from renderer.errors import InputError
+from renderer.files.albedo_bake import with_added_albedo
+from renderer.files.mesh_export import corner_normals
 from renderer.harmonics import basis, equirectangular
 from renderer.image import ImageSettings, bounces, decode
 from renderer.lamps import Lamps
 from renderer.mesh import Mesh
-from renderer.mesh_export import corner_normals
 from renderer.projector import Projector
 
 SCENE = "scene.xml"

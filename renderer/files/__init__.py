@@ -1,0 +1,1 @@
+"""Meshes, images, lights and whole scenes as files, in and out."""

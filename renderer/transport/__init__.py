@@ -1,0 +1,1 @@
+"""Light between surfaces: rays among them, shadows and bounces, folded into operators."""
