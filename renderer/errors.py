@@ -1,7 +1,6 @@
 """The one exception for what a user can mend, and the checks that keep NaN and the absurd out."""
 
 from collections.abc import Sequence
-from numbers import Integral
 from pathlib import Path
 
 import torch
@@ -27,12 +26,6 @@ def require_file(path: Path, advice: str) -> None:
     """InputError naming what is no regular file: a pipe would be waited for."""
     if not path.is_file():
         raise InputError(f"{path} {'is no file' if path.exists() else 'does not exist'}: {advice}")
-
-
-def require_whole(name: str, value: object) -> None:
-    """InputError naming a setting that is no whole number."""
-    if not isinstance(value, Integral) or isinstance(value, bool):
-        raise InputError(f"{name}={value!r} must be a whole number")
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.arguments import require_fields
-from renderer.errors import InputError, require_bounded, require_range, require_whole
+from renderer.errors import InputError, require_bounded, require_range
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
@@ -41,8 +41,6 @@ class ImageSettings:
 
     def __post_init__(self) -> None:
         require_fields(self)
-        require_whole("size", self.size)
-        require_whole("renderer.samples", self.samples)
         if self.size < 1:
             raise InputError(f"the size {self.size} must be at least 1 pixel per side")
         require_range("renderer.samples", self.samples, 1, FINEST)

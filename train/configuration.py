@@ -9,25 +9,28 @@ from omegaconf.errors import OmegaConfBaseException
 from renderer.errors import InputError
 
 Settings = TypeVar("Settings")
+_PLAIN = "give a plain value, no list or mapping"
 
 
 def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") -> Settings:
     """The dataclass from its configuration; InputError naming the key that is unknown, unset or of the wrong type."""
     try:
         merged = OmegaConf.merge(OmegaConf.structured(kind), config)
+        for nested in _nested(merged):
+            raise InputError(f"{'.'.join(filter(None, (parent, nested)))}: {_PLAIN}")
         if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
             key = ".".join(filter(None, (parent, min(unset))))
             raise InputError(f"{key} is not set: give {key}=...")
-        for nested in _nested(merged):
-            raise InputError(f"{'.'.join(filter(None, (parent, nested)))}: give a plain value, no list or mapping")
         return cast(Settings, OmegaConf.to_object(merged))
     except OmegaConfBaseException as error:
-        within = error.full_key or ""
+        within, said = error.full_key or "", str(error.msg).splitlines()[0]
+        if said.startswith(("Cannot convert 'DictConfig'", "Cannot convert 'ListConfig'")):
+            raise InputError(f"{'.'.join(filter(None, (parent, within)))}: {_PLAIN}") from error
         at_fault = (
             key for key, value in dotted(as_dict(config)) if key.startswith(within) and not _fits(kind, key, value)
         )
         key = ".".join(filter(None, (parent, next(at_fault, within))))
-        said = "give a list, as in [a,b]" if "is not a ListConfig" in str(error.msg) else str(error.msg).splitlines()[0]
+        said = "give a list, as in [a,b]" if "is not a ListConfig" in said else said
         raise InputError(f"{key}: {said}") from error
 
 

@@ -28,6 +28,7 @@ class Learner:
         self.model = model
         self.device = next(model.parameters()).device
         self._average = MovingAverage(model, settings.averaging) if settings.averaging else None
+        replica = replicated(model)  # whose parameters the optimiser is to have
         self.optimizer = torch.optim.SGD(
             model.parameters(),
             lr=settings.learning_rate,
@@ -38,7 +39,7 @@ class Learner:
         )
         compiled = compiles(settings.compile, self.device)
         self._training_pass = training_pass(
-            replicated(model),
+            replica,
             settings.label_smoothing,
             compiled,
             settings.ranking,
