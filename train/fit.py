@@ -201,9 +201,9 @@ class Trainer:
         batches = training_batches(
             mixed.images, mixed.labels, settings.batch_size, self.seed, now, settings.flips, first=first
         )
-        for batch in _progress(batches, so_far.step, total, f"epoch {self.epoch + 1}"):
+        for images, labels, rendered in _progress(batches, so_far.step, total, f"epoch {self.epoch + 1}"):
             progress = (self.epoch + so_far.step / total) / settings.epochs
-            so_far.sums += self.learner.step(*batch, progress, self.epoch * total + so_far.step)
+            so_far.sums += self.learner.step(images, labels, rendered, progress, self.epoch * total + so_far.step)
             so_far.step += 1
             if interruption.requested():
                 break
