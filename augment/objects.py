@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -98,6 +99,11 @@ class SceneObject:
         """(V,) bool: all but those of company and table."""
         others = self.mesh.faces[~self.own_faces]
         return ~np.isin(np.arange(len(self.mesh.vertices)), others)
+
+    @cached_property
+    def radius(self) -> float:
+        """Around the origin, within which all of it lies, company and table, too."""
+        return float(np.linalg.norm(self.mesh.vertices, axis=1)[self.mesh.faces].max())
 
     def among(self, others: Sequence[Mesh]) -> SceneObject:
         """The same with more in its mesh."""

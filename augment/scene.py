@@ -97,7 +97,8 @@ class Scene:
             )
         if not (backgrounds.min() >= 0 and backgrounds.max() <= 1):
             raise InputError("scene.backgrounds: give values in [0, 1]")
-        self.objects, self.examples = list(objects), list(examples)
+        self.objects = list(objects)
+        self.examples = [_seen_whole(example, self.objects[example.object].radius) for example in examples]
         self.settings, self.backend, self.basis, self._taken = settings, backend, basis, taken
         self.backgrounds = backgrounds.flatten(2).to(light)
         self.lights = light.expand(len(examples), *light.shape[-2:])
@@ -113,7 +114,7 @@ class Scene:
             f"{images} renders of {settings.size} pixels per side (augment.examples, scene.views, scene.backgrounds)"
         )
         require_memory(asked, 24 * images * pixels, self.lights.device)
-        seen = [(example.object, camera) for example in examples for camera in example.cameras]
+        seen = [(example.object, camera) for example in self.examples for camera in example.cameras]
         cache, dtype = self._cache, self.lights.dtype  # without the scene, which each epoch replaces, tied to itself
 
         def build(item: SceneObject, cameras: Sequence[Camera]) -> Sequence[Operator]:
@@ -292,3 +293,9 @@ class Scene:
 
     def _column(self, values: Iterable[int]) -> Tensor:
         return torch.tensor(list(values), device=self.lights.device)
+
+
+def _seen_whole(row: Example, radius: float) -> Example:
+    """The row, whose cameras see all that lies within a radius of the origin, near and far."""
+    cameras = tuple(camera.seeing(radius) for camera in row.cameras)
+    return row if cameras == row.cameras else replace(row, cameras=cameras)

@@ -5,15 +5,15 @@ World axes are right-handed with z up.
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 import numpy as np
 
 from renderer.arguments import checked, require_fields
 from renderer.errors import LARGEST, InputError, require_range
 
-REACH = 2.0  # world units from the origin along the view within which surface is seen: a normalised mesh's radius is √3
+REACH = 2.0  # enough for a normalised mesh, whose radius is at most √3
 MOST_VIEWS = 10**5
 NEAREST = 0.01  # of its distance: what comes nearer to a camera than that is no view of a mesh
 
@@ -24,7 +24,8 @@ class Camera(ABC):
 
     field_of_view: width of the image in world units, at the origin; a normalised mesh spans at most [-1, 1] per axis.
     right, up: where the origin lies in the image, in world units from its middle: by so much the camera stands aside.
-    distance: of its plane from the origin. InputError where a width or distance is not positive, an angle is not
+    reach: world units from the origin along the view within which surface is seen. distance: of its plane from the
+    origin. InputError where a width or distance is not positive, an angle is not
     finite, or any is too large.
     """
 
@@ -33,12 +34,14 @@ class Camera(ABC):
     field_of_view: float
     right: float = 0.0
     up: float = 0.0
+    reach: float = field(default=REACH, kw_only=True)
 
     distance: ClassVar[float]
 
     def __post_init__(self) -> None:
         require_fields(self)
         require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
+        require_range("a camera's reach", self.reach, 1 / LARGEST, LARGEST)
         if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
             raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
         if not (abs(self.right) <= LARGEST and abs(self.up) <= LARGEST):  # NaN is not
@@ -47,11 +50,15 @@ class Camera(ABC):
     @property
     def near(self) -> float:
         """Distance from which on it sees surface, up to `far`."""
-        return max(self.distance - REACH, NEAREST * self.distance)
+        return max(self.distance - self.reach, NEAREST * self.distance)
 
     @property
     def far(self) -> float:
-        return self.distance + REACH
+        return self.distance + self.reach
+
+    def seeing(self, radius: float) -> Self:
+        """The same, with a reach that holds what lies within a radius around the origin."""
+        return self if radius <= self.reach else replace(self, reach=math.floor(radius) + 1.0)
 
     def axes(self) -> np.ndarray:
         """(3, 3) float64, rows: right, up and back (from the origin to the camera), in world coordinates."""
@@ -83,10 +90,13 @@ class Camera(ABC):
 class OrthographicCamera(Camera):
     """A parallel projection."""
 
-    distance: ClassVar[float] = 4.0  # in files: in an image it shows nowhere
+    @property
+    def distance(self) -> float:  # type: ignore[override]
+        """In files: in an image it shows nowhere."""
+        return 2 * self.reach
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        scale = np.array([2 / self.field_of_view, 2 / self.field_of_view, -1 / REACH])
+        scale = np.array([2 / self.field_of_view, 2 / self.field_of_view, -1 / self.reach])
         return points @ (self.axes() * scale[:, None]).T + np.array([self.right, self.up, 0.0]) * scale
 
     def depths(self, points: np.ndarray) -> None:

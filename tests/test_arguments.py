@@ -30,7 +30,7 @@ SMALL = {"samples": 1, "encoding": "linear", "normals": "smooth", "transport": "
 OF_SCENE = {"views": 1, "shared": False, "backgrounds": [0.5], "light": "grace", "exposure": 1.0, "projector": None}
 OF_SCENE |= {"lamps": None, "ground": None, "polar": 60.0, "azimuth": 0.0, "field_of_view": 2.0, "perspective": None}
 ARRAYS = ("vertices", "faces", "corner_colors", "corner_uvs", "texture_ids", "textures")
-CAMERA = {"polar": 1.0, "azimuth": 0.0, "field_of_view": 2.0, "right": 0.0, "up": 0.0}
+CAMERA = {"polar": 1.0, "azimuth": 0.0, "field_of_view": 2.0, "right": 0.0, "up": 0.0, "reach": 2.0}
 
 
 @cache

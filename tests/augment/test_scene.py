@@ -12,7 +12,7 @@ from augment.backgrounds import load_backgrounds
 from augment.build import build_scene, count_views
 from augment.descent import DescentSettings, Goal, descend
 from augment.held_transport import NEAR
-from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
@@ -523,3 +523,22 @@ def test_a_shadow_goes_with_the_colour_of_its_pixel():
 def test_a_scene_of_nothing_is_refused(nothing):
     with pytest.raises(InputError, match=r"nothing is to be rendered|backgrounds is empty|views=0 must be"):
         build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "visibility": "software"} | nothing)
+
+
+def with_apple(*at: float, **more: float) -> torch.Tensor:
+    """From +x, the image of an orange, and of an apple beside it if places are given."""
+    beside = [CompanionSettings("solid:apple", list(at), 0.5)] if at else []
+    orange, seen = ObjectSettings("solid:orange", "orange", beside=beside), {"polar": 90.0, "field_of_view": 5.0}
+    scene = build_scene([orange], 16, samples=1, visibility=BACKEND, **seen | more)
+    return scene.render(scene.conditions(torch.arange(1)), torch.arange(1))
+
+
+@pytest.mark.parametrize("along", [-10.0, 10.0])
+def test_parallel_rays_show_company_alike_however_near_or_far_it_is(along):
+    there = with_apple(0.0, 1.6)
+    assert not torch.equal(there, with_apple())
+    torch.testing.assert_close(with_apple(along, 1.6), there, rtol=0, atol=64 * EPS32)
+
+
+def test_in_perspective_company_far_behind_is_seen():
+    assert not torch.equal(with_apple(-10.0, 4.0, perspective=40.0), with_apple(perspective=40.0))

@@ -63,6 +63,16 @@ def test_depth_is_smaller_where_nearer_and_fits_every_normalised_mesh(camera):
     assert np.abs(camera.project(corners)[:, 2]).max() <= math.sqrt(3) / 2 + EPS
 
 
+@pytest.mark.parametrize("camera", [CAMERAS[1], PerspectiveCamera(1.0, -2.0, 2.4, distance=30.0)])
+def test_a_camera_that_sees_a_radius_has_it_between_its_planes_and_at_the_same_place(camera):
+    directions = np.random.default_rng(0).normal(size=(50, 3))
+    points = 7.0 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    far = camera.seeing(7.0)
+    np.testing.assert_allclose(far.project(points)[:, :2], camera.project(points)[:, :2], rtol=0, atol=16 * EPS)
+    assert np.abs(far.project(points)[:, 2]).max() < 1 < np.abs(camera.project(points)[:, 2]).max()
+    assert 0 < far.near < far.far and camera.seeing(2.0) is camera
+
+
 @pytest.mark.parametrize("width", [0.0, -2.0, math.nan])
 def test_a_image_without_width_is_refused(width):
     with pytest.raises(InputError, match="field_of_view"):
