@@ -7,6 +7,7 @@ before.npy, after.npy (V, 3, size, size) unrounded. mitsuba/scene.xml shows it i
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from renderer.files.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.files.placed_lights import load_placed, save_placed
 from renderer.image import ImageSettings, to_bytes
 from renderer.lights import load_light, save_light
-from renderer.mesh import load_mesh
+from renderer.mesh import Mesh, load_mesh
 
 DESCRIPTION, MESH, LIGHT, BACKGROUND, PIXELS = (
     "adversary.json",
@@ -103,12 +104,13 @@ def read_adversary(folder: Path) -> Adversary:
         placed = [load_placed(folder / str(file)) for file in description.get("placed_lights", [])]
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
         raise InputError(f"{path} does not describe an adversary ({error}): write it again") from error
     require_range(f"{path}: gain", gain, 1 / FACTOR, FACTOR)
     if not cameras:
         raise InputError(f"{path} has no cameras: write it again")
-    surface, shape = load_mesh(mesh), (len(cameras), 3, settings.size, settings.size)
+    surface = _before(cameras, load_mesh(mesh), path)
+    shape = (len(cameras), 3, settings.size, settings.size)
     if own is not None:
         require_range(f"{path}: own_faces", own, 1, len(surface.faces))
     basis, coefficients = with_placed(load_light(str(light)), placed)
@@ -117,7 +119,9 @@ def read_adversary(folder: Path) -> Adversary:
         cameras=cameras,
         light=coefficients,
         basis=basis,
-        background=load_background(folder / background if isinstance(background, str) else background, settings.size),
+        background=load_background(
+            folder / background if isinstance(background, str) else background, settings.size, f"{path}: background"
+        ),
         settings=settings,
         images_before=_read_images(folder / f"{BEFORE}.npy", shape),
         images=_read_images(folder / f"{AFTER}.npy", shape),
@@ -127,6 +131,16 @@ def read_adversary(folder: Path) -> Adversary:
 
 def _camera(**described: float) -> Camera:
     return PerspectiveCamera(**described) if "distance" in described else OrthographicCamera(**described)
+
+
+def _before(cameras: Sequence[Camera], mesh: Mesh, path: Path) -> Mesh:
+    """The mesh; InputError naming the description of a camera that is within it."""
+    try:
+        for camera in cameras:
+            camera.depths(mesh.vertices)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return mesh
 
 
 def _write_background(background: Tensor, folder: Path) -> float | str:
@@ -141,9 +155,13 @@ def _write_background(background: Tensor, folder: Path) -> float | str:
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
     require_file(path, "write the adversary again")
     try:
-        images = torch.from_numpy(np.load(path, allow_pickle=False)).float()
+        array = np.lib.format.open_memmap(path, mode="r")  # which makes no room for what a header only announces
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"it holds {array.dtype}")
+        with np.errstate(over="ignore"):  # beyond float32 is infinite, and refused as such
+            images = torch.from_numpy(array.astype(np.float32))
         require_bounded(images=images)
-    except (OSError, ValueError, TypeError, EOFError) as error:
+    except Exception as error:  # Python's parser raises many kinds for a damaged header
         raise InputError(f"{path} cannot be read ({error}): write the adversary again") from error
     if images.shape != shape:
         raise InputError(f"{path} has shape {tuple(images.shape)}, not {shape}: write the adversary again")

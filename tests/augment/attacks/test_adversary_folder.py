@@ -136,6 +136,13 @@ def piped(name):
     return change
 
 
+def announced(folder):
+    """10 TB by its header, which is all of the file."""
+    with open(folder / "after.npy", "wb") as file:
+        header = {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6, 3)}
+        np.lib.format.write_array_header_1_0(file, header)
+
+
 DAMAGES = {
     "no description": (lambda folder: (folder / DESCRIPTION).unlink(), "does not exist: give a folder that an attack"),
     "no JSON": (lambda folder: (folder / DESCRIPTION).write_text("{"), "does not describe an adversary"),
@@ -160,6 +167,16 @@ DAMAGES = {
     "images cut short": (lambda folder: (folder / "after.npy").write_bytes(b"\\x93NUMPY"), "after.npy cannot be read"),
     "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy does not exist"),
     "a pipe for images": (piped("after.npy"), "after.npy is no file"),
+    "a gain of 10⁴⁰⁰": (described(gain=10**400), "does not describe an adversary"),
+    "infinitely many faces": (described(own_faces=float("inf")), "does not describe an adversary"),
+    "a list for a background": (described(background=[1]), r"adversary\.json: background=\[1\]: give grey values"),
+    "a camera within the mesh": (
+        described(cameras=[{"polar": 0, "azimuth": 0, "field_of_view": 2, "distance": 0.5}]),
+        r"adversary\.json: the mesh reaches to a camera at distance 0\.5",
+    ),
+    "images of 10 TB": (announced, "after.npy cannot be read"),
+    "images of text": (lambda folder: np.save(folder / "after.npy", np.array(["a"])), "after.npy cannot be read"),
+    "images of 1e300": (lambda folder: np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300)), "cannot be read"),
     "a size of NaN": (described(image={"size": float("nan")}), "size is nan: give int"),
     "no such lamps": (described(placed_lights=["lamps.json"]), "lamps.json does not exist"),
 }

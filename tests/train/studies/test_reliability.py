@@ -102,6 +102,13 @@ def test_a_fault_is_counted_listed_and_fails_the_command():
     assert "Nothing was mishandled." in page(outcomes[:2], "x", 2, 0, 60)
 
 
+def test_a_network_of_other_classes_may_be_published_and_is_refused_at_every_other_door():
+    name = "best.pt: other classes"
+    taken = {each.door.name for door in DOORS for each in file_trials(door) if name in each.name and not each.refused}
+    asked = {each.door.name for door in DOORS for each in file_trials(door) if name in each.name}
+    assert taken == {"publish.py"} and {"attack.py", "evaluate_photos.py", "train data=npz"} <= asked
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("largest", [10, None])
 @pytest.mark.parametrize("light", ["light.npy", "gone.npy"])

@@ -23,7 +23,7 @@ class Door:
 
     config: the name of its configuration. inputs: what it reads, by an override in which {} stands for the file or its
     folder; the first file of each is the one that it is given unless told otherwise. out: the folder that it writes.
-    renewed: a file that it makes anew, whatever it holds.
+    renewed: a file that it makes anew, whatever it holds. meant: damages, by name, that it may take at their word.
     """
 
     name: str
@@ -32,6 +32,7 @@ class Door:
     inputs: dict[str, tuple[str, ...]]
     out: str | None = "out"
     renewed: str | None = None
+    meant: tuple[str, ...] = ()
 
     def command(self, *changed: str) -> list[str]:
         """For `started` and `forked`; changed overrides replace those that the door has for the same keys."""
@@ -107,6 +108,7 @@ DOORS = [
         "publish",
         ("out=out",),
         {"run={}": tuple(f"{RUN}/{name}" for name in ("best.pt", "config.yaml", "metrics.jsonl"))},
+        meant=("other classes",),  # a network may be published whatever its classes are called
     ),
     Door("report.py", "report", (f"runs=[{RUN}]", "out=out"), {}),
     Door(

@@ -133,6 +133,7 @@ REFUSED: dict[str, dict[str, Edit]] = {
         "width in words": in_checkpoint("architecture", "width", value="wide"),
         "depth NaN": in_checkpoint("architecture", "depth", value=float("nan")),
         "no classes": in_checkpoint("architecture", "classes", value=[]),
+        "other classes": in_checkpoint("architecture", "classes", value=["a", "b", "c"]),
         "later version": in_checkpoint("architecture", "version", value=99),
         "size 10⁹": in_checkpoint("architecture", "size", value=10**9),
         "no weights": in_checkpoint("model", value=[]),
@@ -199,10 +200,7 @@ EITHER: dict[str, dict[str, Edit]] = {  # odd, but what is meant may be clear
         "a negative colour": swapped("Kd 1 0.5 0", "Kd -1 0 0"),
     },
     ".gltf": {"a node in itself": in_json("nodes", 0, "children", value=[0])},
-    ".pt": {
-        "an unknown key": in_checkpoint("architecture", "unknown", value="x"),
-        "other classes": in_checkpoint("architecture", "classes", value=["a", "b", "c"]),  # publish.py needs no label
-    },
+    ".pt": {"an unknown key": in_checkpoint("architecture", "unknown", value="x")},
     "config.yaml": {"an interpolation": swapped("label: orange", "label: ${oc.env:HOME}")},
     "metrics.jsonl": {"NaN": content('{"epoch": NaN, "test/accuracy": NaN}\n')},
     "photos.csv": {

@@ -88,7 +88,7 @@ def file_trials(door: Door) -> Iterator[Trial]:
                 def prepare(folder: Path, edit: Callable[[Path], object] = damage.edit, file: str = file) -> None:
                     edit(folder / file)
 
-                refused = damage.refused and file != door.renewed
+                refused = damage.refused and file != door.renewed and damage.name not in door.meant
                 yield Trial(door, damage.kind, f"{file}: {damage.name}", command, named, refused, prepare)
 
 
