@@ -28,6 +28,7 @@ class Learner:
         self.model = model
         self.device = next(model.parameters()).device
         self._average = MovingAverage(model, settings.averaging) if settings.averaging else None
+        teacher = deepcopy(model).eval().requires_grad_(False) if settings.distillation else None
         replica = replicated(model)  # whose parameters the optimiser is to have
         self.optimizer = torch.optim.SGD(
             model.parameters(),
@@ -45,7 +46,7 @@ class Learner:
             settings.ranking,
             label,
             settings.distillation,
-            deepcopy(model).eval().requires_grad_(False) if settings.distillation else None,
+            teacher,
         )
         self._distort = distortion(settings.distortion, model, seed)
         self.attacked, self.scored = (FixedSizes(each) if compiled else each for each in (model, self.selected))
