@@ -36,17 +36,20 @@ MAP_ROWS = 128
 
 @dataclass
 class ShapedLightSettings(SectionSettings):
-    """examples: of each mesh, which the network recognises in direct light. steps: of a descent at most."""
+    """examples: of each mesh, which the network recognises in direct light. steps: of a descent at most. margin: in the
+    logit, that it goes on to, as `AttackSettings` has it."""
 
     examples: int
     steps: int
+    margin: float
 
 
 TEXT = """
-A light that fools {classifier} is found by {steps} steps at most of {size_of_step} of unit length, nowhere negative,
-for each of {examples} random views of each mesh, with what `renderer.transport` has of shadows and bounces. The mesh is
-then rendered by Mitsuba's path tracer in the lights before and after. *Fools here*: of the images that the network
-recognises in the light before, here and there. *Path-traced*: of these adversaries, those that fool it there.
+A light that fools {classifier} by a margin of {margin:g} in the logit is looked for in {steps} steps at most of
+{size_of_step} of unit length, nowhere negative, for each of {examples} random views of each mesh, with what
+`renderer.transport` has of shadows and bounces. The mesh is then rendered by Mitsuba's path tracer in the lights before
+and after. *Fools here*: of the images that the network recognises in the light before, here and there. *Path-traced*:
+of these adversaries, those that fool it there.
 
 {table}
 
@@ -64,6 +67,7 @@ def measure(study: Study, settings: ShapedLightSettings) -> Section:
     text = TEXT.format(
         classifier=study.classifier.name,
         steps=settings.steps,
+        margin=settings.margin,
         size_of_step=LIGHT.step_size,
         examples=settings.examples,
         table=results(records),
@@ -83,7 +87,8 @@ def adversaries(subject: Subject, study: Study, settings: ShapedLightSettings) -
     kept, before = kept_from_itself(subject, drawn.cameras[0], image), None
     for transport in TRANSPORTS:
         scene = drawn.with_rows(drawn.examples, objects=shown, settings=replace(image, transport=transport))
-        attacked = attack(network, scene, settings=AttackSettings(lighting=LIGHT, max_steps=settings.steps), force=True)
+        stepping = AttackSettings(lighting=LIGHT, max_steps=settings.steps, margin=settings.margin)
+        attacked = attack(network, scene, settings=stepping, force=True)
         if before is None:  # the light is the same under every transport
             start = attacked.problem.conditions(attacked.problem.start, attacked.problem.everything).light
             before = said(network, path_traced(scene, start)[0])
