@@ -13,7 +13,7 @@ __getattr__, __dir__, __all__ = attach(
         "objects": ["CompanionSettings", "ObjectSettings"],
         "parameters": ["StepSettings"],
         "placed_lights": ["LampsSettings", "ProjectorSettings"],
-        "scene": ["Conditions", "Example", "Scene"],
+        "scene": ["Scene"],
         "service": ["AugmentationService", "AugmentationSettings"],
         "snapshot": ["SnapshotSettings"],
         "variation": ["VariationSettings"],

@@ -25,7 +25,7 @@ MANY = [
     *(torch.tensor(1), torch.zeros(0), torch.full((49, 3), math.nan)),
     *(torch.zeros(49, 3, dtype=torch.int64), torch.zeros(49, 3, dtype=torch.complex64)),
 ]
-RESULTS = {"Attacked", "Conditions", "InputError", "Operator"}  # which nobody makes; their methods are below
+RESULTS = {"Attacked", "InputError", "Operator"}  # which nobody makes; their methods are below
 SMALL = {"samples": 1, "encoding": "linear", "normals": "smooth", "transport": "direct", "visibility": "software"}
 OF_SCENE = {"views": 1, "shared": False, "backgrounds": [0.5], "light": "grace", "exposure": 1.0, "projector": None}
 OF_SCENE |= {"lamps": None, "ground": None, "polar": 60.0, "azimuth": 0.0, "field_of_view": 2.0, "perspective": None}
@@ -104,7 +104,6 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
         "SnapshotSettings": (augment.SnapshotSettings, fields(augment.SnapshotSettings())),
         "ObjectSettings": (augment.ObjectSettings, {"mesh": "solid:plate", "label": "a", "gain": 1.0, "color": None}),
         "CompanionSettings": (augment.CompanionSettings, fields(augment.CompanionSettings("solid:plate", [1.0, 1.0]))),
-        "Example": (augment.Example, {"object": 0, "cameras": tuple(cameras), "background": 0, "exposure": 1.0}),
     }  # fmt: skip
 
 
