@@ -10,6 +10,7 @@ from renderer.errors import InputError
 
 Settings = TypeVar("Settings")
 _PLAIN = "give a plain value, no list or mapping"
+_UNREADABLE = (OmegaConfBaseException, OverflowError)  # the latter for a whole number that no float holds
 
 
 def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") -> Settings:
@@ -22,8 +23,9 @@ def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") ->
             key = ".".join(filter(None, (parent, min(unset))))
             raise InputError(f"{key} is not set: give {key}=...")
         return cast(Settings, OmegaConf.to_object(merged))
-    except OmegaConfBaseException as error:
-        within, said = error.full_key or "", str(error.msg).splitlines()[0]
+    except _UNREADABLE as error:
+        within = getattr(error, "full_key", None) or ""
+        said = str(getattr(error, "msg", error)).splitlines()[0]
         if said.startswith(("Cannot convert 'DictConfig'", "Cannot convert 'ListConfig'")):
             raise InputError(f"{'.'.join(filter(None, (parent, within)))}: {_PLAIN}") from error
         at_fault = (
@@ -52,7 +54,7 @@ def _fits(kind: type, key: str, value: object) -> bool:
     OmegaConf.update(alone, key, value, force_add=True)
     try:
         OmegaConf.merge(OmegaConf.structured(kind), alone)
-    except OmegaConfBaseException:
+    except _UNREADABLE:
         return False
     return True
 

@@ -75,6 +75,7 @@ WRONG = [
     (["publish", "run=[a]", "out=out"], "run: "),
     (["fit_skylight", "zenith_degree=many", "out=a.safetensors"], "zenith_degree: "),
     (["check_accuracy", "degree=-1", "out=a.md"], "degree=-1 must be at least"),
+    (["attack", f"scene.field_of_view={10**400}"], "scene.field_of_view: int too large to convert to float"),
     (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
     (["check_interruptions", "jobs=0", "out=a.md"], "jobs=0 must be at least 1"),
     (["lab", "size=0", "out=a"], "size=0 must be at least 1"),
