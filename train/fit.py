@@ -82,7 +82,7 @@ class Trainer:
         return f" and {self._under_way.step} steps" if self._under_way else ""
 
     def fit(self, train: Split, validation: Split, log: Log) -> None:
-        """Train to the last epoch; best.pt holds the network of the best validation.
+        """Train to the last epoch; best.pt holds the network of the best validation, or a soup's last.
 
         InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked for it.
         """
@@ -91,6 +91,7 @@ class Trainer:
             while self.epoch < self.settings.epochs:
                 rounds = self._rounds(len(train))
                 if self._under_way is None:
+                    self.learner.begin_epoch()
                     self._under_way = EpochUnderWay.begun(self._regenerate(rounds[0], log))
                 else:
                     restore_random_state(self._random_state)
@@ -119,11 +120,12 @@ class Trainer:
                 f"the checkpoint in {self.folder} is from another architecture or other classes: resume with the "
                 f"settings of {self.folder / 'config.yaml'}, or start in another folder with run="
             )
-        if self.settings.averaging and not state["average"]:
-            raise InputError(
-                f"train.averaging={self.settings.averaging}, and the checkpoint in {self.folder} has no average: "
-                "resume with train.averaging=0"
-            )
+        for key, kept, without in [("averaging", "average", "0"), ("soup", "soup", "false")]:
+            if (value := getattr(self.settings, key)) and not state[kept]:
+                raise InputError(
+                    f"train.{key}={value}, and the checkpoint in {self.folder} has no {kept}: resume with "
+                    f"train.{key}={without}"
+                )
         if problem:
             console.warning("%s: going on from the one before", problem)
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or the next one would take the place of the whole
@@ -197,12 +199,13 @@ class Trainer:
         """The rest of a round. before: the epoch's steps in earlier rounds; total: in all."""
         self.learner.model.train()
         settings = self.settings
+        cycle = 1 if settings.soup else settings.epochs
         first = so_far.step - before
         batches = training_batches(
             mixed.images, mixed.labels, settings.batch_size, self.seed, now, settings.flips, first=first
         )
         for images, labels, rendered in _progress(batches, so_far.step, total, f"epoch {self.epoch + 1}"):
-            progress = (self.epoch + so_far.step / total) / settings.epochs
+            progress = (self.epoch % cycle + so_far.step / total) / cycle
             so_far.sums += self.learner.step(images, labels, rendered, progress, self.epoch * total + so_far.step)
             so_far.step += 1
             if interruption.requested():
@@ -212,6 +215,7 @@ class Trainer:
         seen = now.step * self.settings.batch_size
         loss_sum, hits = summed(now.sums).tolist()
         trained = {"loss": loss_sum / seen, "accuracy": hits / seen}
+        self.learner.end_epoch()
         with self.phases("evaluation"):
             validated = evaluate(self.learner.scored, validation)
         self.epoch += 1
@@ -228,8 +232,8 @@ class Trainer:
         return self._under_way is None and (self.epoch % every == 0 or self.epoch == last)
 
     def _select(self, accuracy: float) -> None:
-        """Remember the network where its validation accuracy is the best so far."""
-        if accuracy > self.best_accuracy:
+        """Remember the network where its validation accuracy is the best so far, and a soup with all epochs in it."""
+        if accuracy > self.best_accuracy or self.settings.soup:
             self.best_accuracy, self.best_epoch = accuracy, self.epoch
             weights = self.learner.selected.network.state_dict()
             weights = {name: value.to("cpu", copy=True) for name, value in weights.items()}

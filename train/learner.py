@@ -12,7 +12,7 @@ from renderer.errors import InputError, is_out_of_memory
 from train.device import FixedSizes, MixedPrecision, compiles, training_pass
 from train.distortions import distortion
 from train.distributed import replicated
-from train.recipe import SCHEDULES, MovingAverage, TrainSettings
+from train.recipe import SCHEDULES, Average, TrainSettings
 
 
 class Learner:
@@ -20,14 +20,16 @@ class Learner:
     graphs."""
 
     def __init__(self, settings: TrainSettings, model: MixedPrecision, seed: int, label: int | None = None):
-        """model: as the run begins, which a distillation holds to. label: the class that is ranked above look-alikes;
-        InputError for a ranking without them."""
+        """model: as the run begins, which a distillation holds to and each epoch of a soup begins with. label: the
+        class that is ranked above look-alikes; InputError for a ranking without them."""
         if settings.ranking and label is None:
             raise InputError(f"train.ranking={settings.ranking} ranks look-alikes: name some in scene.look_alikes")
         self.settings = settings
         self.model = model
         self.device = next(model.parameters()).device
-        self._average = MovingAverage(model, settings.averaging) if settings.averaging else None
+        self._average = Average(model, settings.averaging) if settings.averaging else None
+        self._soup = Average(model) if settings.soup else None
+        self._begun = deepcopy(model.state_dict()) if settings.soup else None
         teacher = deepcopy(model).eval().requires_grad_(False) if settings.distillation else None
         replica = replicated(model)  # whose parameters the optimiser is to have
         self.optimizer = torch.optim.SGD(
@@ -53,7 +55,12 @@ class Learner:
 
     @property
     def selected(self) -> MixedPrecision:
-        """The network that is validated and kept: the average over steps, where there is one."""
+        """The network that is validated and kept: a soup or the average over steps, where there is one."""
+        return self._soup.module if self._soup else self._trained
+
+    @property
+    def _trained(self) -> MixedPrecision:
+        """What the epoch under way has made."""
         return self._average.module if self._average else self.model
 
     @property
@@ -61,11 +68,24 @@ class Learner:
         """Of the last step."""
         return self.optimizer.param_groups[0]["lr"]
 
+    def begin_epoch(self) -> None:
+        """Of a soup: from the weights that the run began with, as if nothing had been learned."""
+        if self._begun:
+            self.model.load_state_dict(self._begun)
+            self.optimizer.state.clear()
+            if self._average:
+                self._average.restart()
+
+    def end_epoch(self) -> None:
+        """Take the epoch's network into the soup, if there is one."""
+        if self._soup:
+            self._soup.update(self._trained)
+
     def step(self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int) -> Tensor:
         """Learn from uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: (2,) the sum of their
         losses, and how many were right.
 
-        progress: the share of the run that is over, which the learning rate follows. number: the run's step.
+        progress: the share of the schedule that is over, which the learning rate follows. number: the run's step.
         InputError where memory runs out.
         """
         for group in self.optimizer.param_groups:
@@ -102,6 +122,7 @@ class Learner:
             "optimizer": self.optimizer.state_dict(),
             "schedule": self.settings.schedule,
             "average": self._average.state_dict() if self._average else None,
+            "soup": self._soup.state_dict() if self._soup else None,
             "precision": self.model.precision,
         }
 
@@ -111,6 +132,8 @@ class Learner:
         self.optimizer.load_state_dict(state["optimizer"])
         if self._average:
             self._average.load_state_dict(state["average"])
+        if self._soup:
+            self._soup.load_state_dict(state["soup"])
         self.model.precision = self.selected.precision = state["precision"]
 
 

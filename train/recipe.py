@@ -37,33 +37,39 @@ def one_cycle(progress: float) -> float:
 SCHEDULES = {"step": step, "cosine": cosine, "one_cycle": one_cycle}
 
 
-class MovingAverage(Generic[Network]):
-    """A copy of a model whose weights and statistics are the exponential moving average over its steps.
+class Average(Generic[Network]):
+    """A copy of a model whose weights and statistics are the average of those it has taken in: the exponential moving
+    one, or the mean where there is no decay.
 
     As `torch.optim.swa_utils.AveragedModel`, which makes a GPU wait at every step, since it counts them on the CPU.
     """
 
-    def __init__(self, model: Network, decay: float):
+    def __init__(self, model: Network, decay: float | None = None):
         self.module = deepcopy(model)
         self._decay = decay
-        self._begun = False
+        self._taken = 0
 
     def update(self, model: Network) -> None:
-        """Take in what the model has become by a step; the first one counts whole."""
-        average = get_ema_multi_avg_fn(self._decay if self._begun else 0.0)
+        """Take in what the model has become; the first one counts whole."""
+        mean = self._taken / (self._taken + 1)
+        average = get_ema_multi_avg_fn(self._decay if self._decay is not None and self._taken else mean)
         own, latest = _tensors(self.module), _tensors(model)
         for dtype in {tensor.dtype for tensor in own}:
             kept, new = ([tensor for tensor in tensors if tensor.dtype == dtype] for tensors in (own, latest))
             average(kept, new, None)
-        self._begun = True
+        self._taken += 1
+
+    def restart(self) -> None:
+        """Forget what it has taken in."""
+        self._taken = 0
 
     def state_dict(self) -> dict[str, Any]:
-        return {"module": self.module.state_dict(), "begun": self._begun}
+        return {"module": self.module.state_dict(), "taken": self._taken}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """What `state_dict` gave."""
         self.module.load_state_dict(state["module"])
-        self._begun = state["begun"]
+        self._taken = state["taken"]
 
 
 def _tensors(model: nn.Module) -> list[Tensor]:
@@ -89,6 +95,7 @@ class TrainSettings:
     ranking: float = 0.0
     distillation: float = 0.0
     averaging: float = 0.0
+    soup: bool = False
     precision: str = "auto"
     device: str = "auto"
     threads: int | None = None
@@ -109,10 +116,11 @@ class TrainSettings:
                 raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")
         for name in ("ranking", "distillation"):
             require_range(f"train.{name}", getattr(self, name), 0, FACTOR)
-        if self.distillation and not self.init_from:
-            raise InputError(
-                f"train.distillation={self.distillation} holds to the network begun with: name one in train.init_from"
-            )
+        for name, use in {"distillation": "holds to", "soup": "comes back to"}.items():
+            if getattr(self, name) and not self.init_from:
+                raise InputError(
+                    f"train.{name}={getattr(self, name)} {use} the network begun with: name one in train.init_from"
+                )
         if not 0 < self.learning_rate < math.inf:
             raise InputError(f"train.learning_rate={self.learning_rate} must be positive")
         if not 0 <= self.weight_decay < math.inf:

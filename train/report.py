@@ -30,6 +30,10 @@ RECIPE = (
     "momentum",
     "weight_decay",
     "schedule",
+    "ranking",
+    "distillation",
+    "averaging",
+    "soup",
     "precision",
 )
 

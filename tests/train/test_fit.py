@@ -79,6 +79,7 @@ def test_a_ranking_without_look_alikes_is_refused(tmp_path):
         ({"ranking": -1.0}, "train.ranking=-1.0"),
         ({"distillation": -1.0}, "train.distillation=-1.0"),
         ({"distillation": 1.0}, r"train\.distillation=1\.0 holds to the network begun with: name one in train\.init"),
+        ({"soup": True}, r"train\.soup=True comes back to the network begun with: name one in train\.init_from"),
         ({"momentum": 1.0}, "train.momentum=1.0"),
         ({"momentum": -0.1}, "train.momentum=-0.1"),
         ({"weight_decay": -1.0}, "train.weight_decay=-1.0"),
@@ -381,21 +382,58 @@ def test_the_average_follows_the_steps_and_is_what_is_validated_and_kept(tmp_pat
     assert validated["accuracy"] == read_metrics(tmp_path)[-1]["validation/accuracy"]
 
 
-def test_a_resumed_average_goes_on_bit_for_bit(tmp_path):
-    fit_noise(make_trainer(tmp_path, averaging=0.8))
+@pytest.mark.parametrize("soup", [False, True])
+def test_a_resumed_average_goes_on_bit_for_bit(tmp_path, soup):
+    settings = {"averaging": 0.8, "init_from": "base", "soup": soup}
+    fit_noise(make_trainer(tmp_path, **settings))
     whole = checkpoint.load(tmp_path / checkpoint.LAST)
     (tmp_path / checkpoint.LAST).unlink()  # the epoch before the last is left
-    resumed = make_trainer(tmp_path, averaging=0.8)
+    resumed = make_trainer(tmp_path, **settings)
     resumed.resume()
     assert resumed.epoch == 2
     fit_noise(resumed)
     again = checkpoint.load(tmp_path / checkpoint.LAST)
-    found, expected = again["average"]["module"], whole["average"]["module"]
+    kept = "soup" if soup else "average"
+    found, expected = again[kept]["module"], whole[kept]["module"]
     assert found.keys() == expected.keys()
     assert all(torch.equal(value, expected[name]) for name, value in found.items())
 
 
-def test_resuming_with_an_average_that_the_run_has_not_is_an_error(tmp_path):
+@pytest.mark.parametrize(
+    "key, value, message",
+    [("averaging", 0.8, r"averaging=0\.8, .* no average: .*averaging=0$"), ("soup", True, r"no soup: .*soup=false$")],
+)
+def test_resuming_with_an_average_that_the_run_has_not_is_an_error(tmp_path, key, value, message):
     fit_noise(make_trainer(tmp_path, epochs=1))
-    with pytest.raises(InputError, match=r"train.averaging=0.8, and the checkpoint in .* has no average"):
-        make_trainer(tmp_path, averaging=0.8).resume()
+    with pytest.raises(InputError, match=message):
+        make_trainer(tmp_path, init_from="base", **{key: value}).resume()
+
+
+@pytest.mark.parametrize("averaging", [0.0, 0.8])
+def test_a_soup_is_the_mean_of_epochs_that_each_begin_anew(tmp_path, averaging):
+    trainer = make_trainer(tmp_path, epochs=3, init_from="base", soup=True, averaging=averaging, schedule="one_cycle")
+    learner, begun, ends, rates = trainer.learner, [], [], []
+    begin, end = learner.begin_epoch, learner.end_epoch
+    learner.begin_epoch = lambda: (begin(), begun.append(copy.deepcopy(learner.model.state_dict())))
+    learner.end_epoch = lambda: (ends.append(copy.deepcopy(learner._trained.state_dict())), end())
+    learner.optimizer.register_step_post_hook(lambda *arguments: rates.append(learner.learning_rate))
+    whole = copy.deepcopy(learner.model.state_dict())
+    fit_noise(trainer)
+    for name, value in whole.items():
+        assert all(torch.equal(each[name], value) for each in begun)
+        mean = torch.stack([each[name].double() for each in ends]).mean(0)
+        kept = learner.selected.state_dict()[name]
+        torch.testing.assert_close(kept.double(), mean, rtol=0, atol=1e-6 if kept.is_floating_point() else 1)
+    assert rates == 3 * rates[: len(rates) // 3]
+    assert not torch.equal(ends[0]["network.head.weight"], ends[1]["network.head.weight"])
+
+
+def test_of_a_soup_the_last_is_kept_whatever_its_validation(tmp_path, monkeypatch):
+    accuracies = iter([0.9, 0.5])
+    monkeypatch.setattr("train.fit.evaluate", lambda *arguments: {"loss": 1.0, "accuracy": next(accuracies)})
+    trainer = make_trainer(tmp_path, epochs=2, init_from="base", soup=True)
+    fit_noise(trainer)
+    kept = checkpoint.load(tmp_path / checkpoint.BEST)
+    assert kept["epoch"] == 2
+    expected = trainer.learner.selected.network.state_dict()
+    assert all(torch.equal(value, expected[name]) for name, value in kept["model"].items())
