@@ -33,14 +33,14 @@ _PUBLISHED_PROBES = {
         (-0.05, -0.03, -0.01), (-0.09, -0.08, -0.07), (0.01, 0.00, 0.00), (-0.08, -0.03, 0.00),
     ],
 }  # fmt: skip
-PROBES = tuple(_PUBLISHED_PROBES)
+PROBES, UNIFORM = tuple(_PUBLISHED_PROBES), "uniform"
 _Y_UP_TO_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 
 
 @checked
 def load_light(light: str) -> Tensor:
-    """Coefficients (49, 3) float32 of a named probe, of an environment map's file (.npy, .hdr, .exr) or of a file of
-    coefficients (.json, as `save_light` writes it).
+    """Coefficients (49, 3) float32 of a named probe, of `uniform` light, in which a surface shows its albedo, of an
+    environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as `save_light` writes it).
 
     A map is scaled to the mean luminance of the grace probe, since maps come in any unit, and may be negative in
     places, as series are that were written as a map; coefficients stay as they are.
@@ -49,12 +49,14 @@ def load_light(light: str) -> Tensor:
     suffix = Path(light).suffix.lower()
     if light in _PUBLISHED_PROBES:
         return probe(light)
+    if light == UNIFORM:
+        return ambient(torch.full((3,), 1 / math.pi))
     if suffix == ".json":
         return _read_coefficients(Path(light))
     if suffix in SUFFIXES:
         return _read_light_map(Path(light)).float()
     raise InputError(
-        f"light {light!r} is not known: choose {', '.join(PROBES)} or the path of an environment map "
+        f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or the path of an environment map "
         f"({', '.join(SUFFIXES)}) or of coefficients (.json)"
     )
 

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from augment.attacks.verification import Verdict
 
 
+class NotRecognisedError(InputError):
+    """The classifier is wrong before any attack."""
+
+
 @dataclass(frozen=True)
 class Attacked:
     """What was attacked and what came of it, for E examples of V views.
@@ -138,7 +142,8 @@ def attack(
     criterion: `Misclassification` (the default), `Targeted`, `LeastLikely`. settings: what is changed, within which
     norm-balls; by default the light, without a limit. seed: of the restarts. force: also where the classifier is wrong
     to begin with. The scene lies on the classifier's device.
-    InputError where an example is not recognised before, the classifier lacks a class, or a target is the right one.
+    NotRecognisedError where an example is not recognised before; InputError where the classifier lacks a class, or a
+    target is the right one.
     """
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_kinds()
@@ -171,7 +176,7 @@ def logits_of(classifier: nn.Module, images: Tensor, batch_size: int) -> Tensor:
 
 
 def require_recognised(scene: Scene, logits: Tensor, labels: Tensor, classifier: Classifier) -> None:
-    """InputError, with the classifier's five best answers, unless every image (E, V) is given its label (E,)."""
+    """NotRecognisedError, with the classifier's five best answers, unless every image (E, V) has its label (E,)."""
     wrong = (logits.argmax(2) != labels[:, None]).nonzero().tolist()
     if wrong:
         example, view = wrong[0]
@@ -181,7 +186,7 @@ def require_recognised(scene: Scene, logits: Tensor, labels: Tensor, classifier:
             f"{classifier.classes[index]} {share:.1%}"
             for share, index in zip(best.values.tolist(), best.indices.tolist(), strict=True)
         )
-        raise InputError(
+        raise NotRecognisedError(
             f"{len(wrong)} of {logits.shape[0] * logits.shape[1]} images of {shown.name} are not recognised as "
             f"{shown.label!r} before any attack (the first: {answers}): change the scene, or set attack.force=true"
         )

@@ -137,7 +137,10 @@ def _embree_scene(mesh: Mesh) -> Any:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
     except ImportError as error:
-        raise InputError("shadows are found by rays that Embree casts: pip install embreex") from error
+        raise InputError(
+            "shadows are found by rays that Embree casts: pip install embreex, or choose renderer.transport=direct and "
+            "no lights that stand in the scene"
+        ) from error
     scene = EmbreeScene(robust=True)
     TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
     return scene

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.special import eval_legendre
 
+from renderer.camera import OrthographicCamera
 from renderer.environment import SUFFIXES, to_map, write_map
 from renderer.errors import InputError
 from renderer.harmonics import basis, irradiance_basis, live_coefficients
@@ -21,6 +23,8 @@ from renderer.lights import (
     project_environment,
     save_light,
 )
+from renderer.mesh import Mesh
+from renderer.rendering import render
 
 HDRI = Path(__file__).parents[3] / "shared" / "data" / "hdri"
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -91,6 +95,13 @@ def test_probes_are_float32_and_end_at_band_2(name):
     light = load_light(name)
     assert light.shape == (49, 3) and light.dtype == torch.float32
     assert not light[9:].any()
+
+
+def test_a_surface_shows_its_albedo_in_uniform_light():
+    ball, albedo = trimesh.creation.icosphere(), (0.8, 0.4, 0.1)
+    mesh = Mesh.plain(ball.vertices, ball.faces, albedo)
+    (image,) = render(mesh, [OrthographicCamera(1.0, 2.0, 1.0)], load_light("uniform"), 8)
+    torch.testing.assert_close(image.flatten(1).T, torch.tensor(albedo).expand(64, 3), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", PROBES)
@@ -230,7 +241,7 @@ def test_a_missing_light_is_refused_by_name(tmp_path, suffix):
 
 @pytest.mark.parametrize("name", ["graze", "", "sky.jpg", "grace/"])
 def test_an_unknown_light_is_refused_with_what_is_known(name):
-    known = "choose grace, eucalyptus, st_peters or the path of an environment map (.npy, .hdr, .exr) or of"
+    known = "choose grace, eucalyptus, st_peters, uniform or the path of an environment map (.npy, .hdr, .exr) or of"
     with pytest.raises(InputError, match=re.escape(known)):
         load_light(name)
 

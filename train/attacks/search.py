@@ -14,7 +14,7 @@ from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
 from augment.scene import Scene
 from augment.seeding import generator
-from renderer.lights import PROBES, load_light
+from renderer.lights import PROBES, UNIFORM, load_light
 from train.attacks.scene import scene_of
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 
@@ -30,9 +30,8 @@ def search(
     item: ObjectSettings, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
 ) -> AttackSceneSettings:
     """The settings as they are, where every image is recognised, or else the ones most surely recognised among
-    `_candidates`, each under the scene's light and the probes at several exposures; the settings as they are, where
-    none is recognised. What a classifier hardly knows from anywhere, such as smooth fruit of one plain colour, may not
-    be found."""
+    `_candidates`, each under the scene's light, the probes and uniform light at several exposures; the settings as they
+    are, where none is recognised. What a classifier hardly knows from anywhere may not be found."""
     scene, draws = settings.scene, generator(settings.seed, item.mesh, "search")
     if _confidence(scene_of(item, settings, classifier.size, device), settings, classifier).item() > 0:
         return scene
@@ -62,7 +61,7 @@ def _brightest(
 ) -> tuple[float, AttackSceneSettings]:
     """Of lights and exposures, what is recognised most surely, with its confidence; 0 where none is."""
     scene = scene_of(item, settings, classifier.size, device)
-    lights = list(product(dict.fromkeys([settings.scene.light, *PROBES]), EXPOSURES))
+    lights = list(product(dict.fromkeys([settings.scene.light, *PROBES, UNIFORM]), EXPOSURES))
     exposures = [settings.scene.exposure * factor for _, factor in lights]
     coefficients = [load_light(name) * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
     sky = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(device)

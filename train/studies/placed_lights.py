@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ from renderer.basis import HARMONICS, Basis, Sum
 from renderer.camera import OrthographicCamera
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
-from renderer.lamps import Lamps
+from renderer.lamps import RAYS, Lamps
 from renderer.mesh import Mesh, normalise
 from renderer.projector import Projector
 from renderer.shapes import solid
@@ -35,9 +35,11 @@ from train.tables import markdown
 CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
 SIZES, SAMPLES, REFERENCE = (32, 224), (2, 8), 64  # pixels per side, and samples
 LAMPS = Lamps(((2.0, 2.0, 2.0), (-2.0, 2.0, 2.0), (2.0, -2.0, 2.0)))
+DISCS = replace(LAMPS, radius=0.5)
 BASES: dict[str, Basis] = {
     "harmonics": HARMONICS,
     "3 lamps": LAMPS,
+    "3 discs": DISCS,
     "projector of 16²": Projector(16),
     "projector of 32²": Projector(32),
     "harmonics and projector of 16²": Sum((HARMONICS, Projector(16))),
@@ -55,9 +57,9 @@ said otherwise, from one side; time is the process's own, on one thread.
 ## A light step
 
 Image, clamp and the gradient of a loss by the light; the median of rounds in which all take turns, and as a multiple of
-the harmonics'. An operator is built once: rasterised, and a ray cast from each sample to each place. *All entries* is
-the same operator with what is zero in it: of more than {small_operator:,} entries a channel, if less than 1/{fewer} are
-not zero, these alone are stored and multiplied.
+the harmonics'. An operator is built once: rasterised, and a ray cast from each sample to each place, or to {rays}
+points of each disc, of radius {radius:g}. *All entries* is the same operator with what is zero in it: of more than
+{small_operator:,} entries a channel, if less than 1/{fewer} are not zero, these alone are stored and multiplied.
 
 {steps}
 
@@ -100,6 +102,8 @@ def run(settings: PlacedLightSettings) -> None:
         vertices=len(cup.vertices),
         small_operator=sparse.SMALL,
         fewer=round(1 / sparse.SPARSE),
+        rays=RAYS,
+        radius=DISCS.radius,
         steps=_steps(cup, clock),
         small=SIZES[0],
         reference=REFERENCE,

@@ -203,7 +203,7 @@ def test_the_gradient_of_light_is_the_transposed_of_all_49_rows():
 
 def test_missing_embree_is_told_in_a_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
-    with pytest.raises(InputError, match="pip install embreex"):
+    with pytest.raises(InputError, match=r"pip install embreex, or choose renderer\.transport=direct"):
         operator_of(dented())
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from augment.attacks.run import NotRecognisedError
 from augment.attacks.verification import RENDERERS
 from augment.objects import ObjectSettings
 from renderer.files.mitsuba_scene import SAMPLES
@@ -32,11 +33,11 @@ ATTACKS = {  # by their names in the tables, as `attack=` of scripts/attack.py
 TEXT = """
 Adversaries of {classifier}, found by what `python scripts/attack.py attack=...` runs: views of {meshes}, {examples} of
 each mesh and attack, {around}° apart in azimuth and with a `seed` each, in a scene that is searched for where the
-classifier is not right in it (`scene.search`: {searched} of {total} were). They have to fool in {rounding} by a margin
-of {margin:g} in the logit, after at most {steps} steps, in {light} light; projectors and lamps are dark to begin with.
-Each is written as a folder; *reload* and *mitsuba* render it from these files alone, the latter by direct illumination,
-in which meshes shade themselves and here do not, with {samples} samples a pixel. The shares that still fool are of
-those that fooled:
+classifier is not right in it (`scene.search`: {searched} of {total} were); *recognised* are those with a scene. They
+have to fool in {rounding} by a margin of {margin:g} in the logit, after at most {steps} steps, in {light} light, which
+meshes shape as `renderer.transport={transport}` has it; projectors and lamps are dark to begin with. Each is written as
+a folder; *reload* and *mitsuba* render it from these files alone, the latter with {samples} samples a pixel. The shares
+that still fool are of those that fooled:
 
 {table}
 
@@ -44,7 +45,7 @@ those that fooled:
 
 {differences}
 
-Adversaries that are reloaded to the same image within 1/255: {same} of {total}.
+Adversaries that are reloaded to the same image within 1/255: {same} of {attacked}.
 """
 
 
@@ -59,44 +60,52 @@ class SurvivalSettings(SectionSettings):
 def measure(study: Study, settings: SurvivalSettings) -> Section:
     """Every attack on every mesh."""
     records = [record for item in study.items for record in _outcomes(item, study, settings)]
-    versions = list(records[0]["versions"])
-    fooled = [record for record in records if record["fooled"]]
+    recognised = [record for record in records if record["recognised"]]
+    versions = list(dict.fromkeys(version for record in recognised for version in record["versions"]))
+    fooled = [record for record in recognised if record["fooled"]]
     meshes = dict.fromkeys(record["mesh"] for record in records)
+    head = ["recognised", "fooled", *versions]
     command = _command(study.items[0], "lighting", 0, study, settings)
     text = TEXT.format(
         classifier=study.classifier.name,
         meshes=", ".join(f"{_name(item)} (`{item.label}`)" for item in study.items),
         examples=settings.examples,
         around=f"{360 / settings.examples:g}",
-        searched=sum(record["scene"] is not None for record in records),
+        searched=sum(not record["recognised"] or record["scene"] is not None for record in records),
         rounding="8 bits" if command.attack.rounded else "floats",
         margin=command.attack.margin,
         steps=command.attack.max_steps,
         light=command.attack.light,
+        transport=command.renderer.transport,
         samples=SAMPLES,
-        table=markdown(["attack", "fooled", *versions], (_row("attack", name, records, versions) for name in ATTACKS)),
-        by_mesh=markdown(["mesh", "fooled", *versions], (_row("mesh", name, records, versions) for name in meshes)),
+        table=markdown(["attack", *head], (_row("attack", name, records, versions) for name in ATTACKS)),
+        by_mesh=markdown(["mesh", *head], (_row("mesh", name, records, versions) for name in meshes)),
         differences=markdown(
             ["values differ from ours, in 255ths", *ATTACKS], (_differences(version, fooled) for version in versions)
         ),
-        same=sum(record["versions"]["reload"]["largest_difference"] <= 1 / 255 for record in records),
+        same=sum(record["versions"]["reload"]["largest_difference"] <= 1 / 255 for record in recognised),
+        attacked=len(recognised),
         total=len(records),
     )
     return Section(text, records, {})
 
 
 def _outcomes(item: ObjectSettings, study: Study, settings: SurvivalSettings) -> Iterator[dict[str, Any]]:
-    """A record per attack and example."""
+    """A record per attack and example, of which there is no more where no scene was found."""
     for name, kinds in ATTACKS.items():
         for example in range(settings.examples):
             command = _command(item, kinds, example, study, settings)
-            ((_, scene, done),) = attacks(command, study.classifier, torch.device("cpu"))
+            record = {"mesh": _name(item), "attack": name, "example": example}
+            try:
+                ((_, scene, done),) = attacks(command, study.classifier, torch.device("cpu"))
+            except NotRecognisedError:
+                yield {**record, "recognised": False}
+                continue
             with TemporaryDirectory() as folder:
                 verdicts = done.save(Path(folder), verify=RENDERERS)
             yield {
-                "mesh": _name(item),
-                "attack": name,
-                "example": example,
+                **record,
+                "recognised": True,
                 "scene": overrides(scene, command.scene) or None,
                 "steps": int(done.steps[0]),
                 "fooled": bool(done.success[0]),
@@ -122,9 +131,11 @@ def _name(item: ObjectSettings) -> str:
 
 def _row(column: str, name: str, records: Sequence[dict[str, Any]], versions: Sequence[str]) -> list[str]:
     here = [record for record in records if record[column] == name]
-    fooled = [record for record in here if record["fooled"]]
+    recognised = [record for record in here if record["recognised"]]
+    fooled = [record for record in recognised if record["fooled"]]
     kept = [percent([record["versions"][version]["fooled"] for record in fooled]) for version in versions]
-    return [name, percent([record["fooled"] for record in here]), *kept]
+    count = f"{len(recognised)} of {len(here)}"
+    return [name, count, percent([record["fooled"] for record in recognised]), *kept]
 
 
 def _differences(version: str, fooled: Sequence[dict[str, Any]]) -> list[str]:
