@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from augment.attacks.adversary import Adversary
 from augment.attacks.criteria import Criterion, Misclassification, Targeted
 from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier
@@ -39,8 +40,9 @@ class NotRecognisedError(InputError):
 class Attacked:
     """What was attacked and what came of it, for E examples of V views.
 
-    images_before: (E, V, 3, size, size); those after are `images`, neither of them rounded. logits_before, logits:
-    (E, V, C) of either, rounded where the settings say so. result: where the descent ended. seconds: of the descent.
+    images_before, images: (E, V, 3, size, size), neither of them rounded, with the shadows and bounces of each shape in
+    its own colours; logits_before, logits: (E, V, C) of them, rounded where the settings say so. result: where the
+    descent ended, which holds shadows and bounces while shape and colours change. seconds: of the descent.
     """
 
     problem: Perturbation
@@ -49,15 +51,11 @@ class Attacked:
     settings: AttackSettings
     seed: int
     images_before: Tensor
+    images: Tensor
     logits_before: Tensor
     logits: Tensor
     result: AttackResult
     seconds: dict[str, float]
-
-    @property
-    def images(self) -> Tensor:
-        """(E, V, 3, size, size) that the attack ended with."""
-        return self.result.images
 
     @property
     def judge(self) -> nn.Module:
@@ -148,8 +146,8 @@ def attack(
     settings = settings or AttackSettings(lighting=StepSettings())
     settings.require_kinds()
     problem = settings.problem(scene)
-    images = problem.images(problem.start)
-    before = logits_of(settings.judge(classifier), images, settings.batch_size)
+    images_before = problem.images(problem.start)
+    before = logits_of(settings.judge(classifier), images_before, settings.batch_size)
     labels = torch.tensor([classifier.label(label) for label in scene.labels], device=before.device)
     if not force:
         require_recognised(scene, before, labels, classifier)
@@ -163,8 +161,19 @@ def attack(
     with phases("attack"):
         seen = settings.observed(classifier, seed)
         result = descend_in_parts(seen, problem, goal, settings.descent(), phases, starts, scene.at_once)
-    after = logits_of(settings.judge(classifier), result.images, settings.batch_size)
-    return Attacked(problem, classifier, goal, settings, seed, images, before, after, result, phases.take())
+        images = _with_own_transport(problem, result)
+    after = logits_of(settings.judge(classifier), images, settings.batch_size)
+    seconds = phases.take()
+    return Attacked(problem, classifier, goal, settings, seed, images_before, images, before, after, result, seconds)
+
+
+def _with_own_transport(problem: Perturbation, result: AttackResult) -> Tensor:
+    """`Attacked.images` of a result."""
+    scene, after = problem.scene, problem.conditions(result.values, problem.everything)
+    if scene.settings.transport == "direct" or (after.vertices is None and after.albedo is None):
+        return result.images
+    left = (Adversary.of(scene, example, after, each, each) for example, each in enumerate(result.images))
+    return torch.stack([each.render(scene.backend) for each in left]).to(result.images)
 
 
 @torch.no_grad()

@@ -48,6 +48,18 @@ def test_shared_views_may_each_have_a_target(classifier, target):
     assert attacked.goal.increase.tolist() == [[CLASSES.index(name) for name in names]]
 
 
+@pytest.mark.parametrize("transport", ["shadows", pytest.param("bounces:1", marks=pytest.mark.slow)])
+def test_what_is_judged_has_the_shadows_of_the_shape_and_the_colours_that_leave(classifier, tmp_path, transport):
+    scene = augment.build_scene([("solid:cup:3", "orange")], 8, 2, shared=True, transport=transport, **SMALL)
+    moved = {name: augment.StepSettings("linf", 0.05, "sign", 0.03) for name in ("geometry", "albedo")}
+    settings = augment.AttackSettings(**moved, max_steps=2)
+    attacked = augment.attack(classifier, scene, settings=settings, force=True)
+    held = attacked.problem.images(attacked.result.values)
+    verdicts = {each.version: each for each in attacked.save(tmp_path)}
+    assert (held - attacked.images).abs().max() > 0.5 / 255
+    assert verdicts["reload"].largest.max() < 0.1 / 255
+
+
 def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifier, tmp_path):
     kinds = {name: augment.StepSettings("linf", 0.01, "sign", 0.004) for name in KINDS.keys() - OTHER_LIGHTS}
     scene = augment.build_scene([("solid:orange", "orange")], 8, **SMALL)
