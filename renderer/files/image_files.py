@@ -30,14 +30,21 @@ def read_square(path: Path, size: int) -> np.ndarray:
         # A large JPEG is decoded at 1/2, 1/4 or 1/8 of its size, several times faster.
         image.draft(None, (DECODED_SIZES * size, DECODED_SIZES * size))
         upright = ImageOps.exif_transpose(image)
-    return np.asarray(ImageOps.fit(_to_rgb(upright), (size, size), Image.Resampling.LANCZOS))
+    return np.asarray(ImageOps.fit(_over_white(upright), (size, size), Image.Resampling.LANCZOS))
 
 
-def _to_rgb(image: Image.Image) -> Image.Image:
+def eight_bits(image: Image.Image) -> Image.Image:
+    """The image with channels of 8 bits. ValueError where its white is unknown; whatever Pillow raises at damage."""
     if image.mode == "F":
         raise ValueError("floating-point pixels have no agreed white")
     if image.mode.startswith("I"):  # 16 bits per pixel, which Pillow would clip rather than scale
-        image = Image.fromarray(np.clip(np.asarray(image) // 256, 0, 255).astype(np.uint8))
+        return Image.fromarray(np.clip(np.asarray(image) // 256, 0, 255).astype(np.uint8))
+    image.load()
+    return image
+
+
+def _over_white(image: Image.Image) -> Image.Image:
+    image = eight_bits(image)
     if image.has_transparency_data:
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)

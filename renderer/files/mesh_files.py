@@ -3,20 +3,19 @@
 trimesh leaves out, without a word, what it cannot find or decode; here that is an InputError before it reads.
 """
 
-import base64
+import codecs
 import io
-import json
 import re
-import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from trimesh.resolvers import Resolver
 
 from renderer.errors import InputError
+from renderer.files.gltf_images import gltf_images
+from renderer.files.image_files import eight_bits
 
 MATERIALS = "materials.mtl"  # the name under which trimesh is given all materials of an .obj file
 LIBRARY, USED = (re.compile(rf"^[ \t]*{key}[ \t]+(.*?)[ \t\r]*$", re.MULTILINE) for key in ("mtllib", "usemtl"))
@@ -56,7 +55,8 @@ class Companions(Resolver):  # type: ignore[misc]  # trimesh counts as untyped, 
     def _locate(self, name: str) -> Path:
         file = self._find(name)
         if file is None:
-            raise InputError(f"{self.path} names {name}, which is not there: put it beside, or take its name out")
+            named = name or "a file without a name"
+            raise InputError(f"{self.path} names {named}, which is not there: put it beside, or take its name out")
         return file
 
     def _find(self, name: str) -> Path | None:
@@ -81,7 +81,9 @@ class Companions(Resolver):  # type: ignore[misc]  # trimesh counts as untyped, 
 
 
 def decoded(content: bytes) -> str:
-    """Text in UTF-8, or else in Latin-1, in which every byte is a character."""
+    """Text in UTF-8, or in UTF-16 with its mark, or else in Latin-1, in which every byte is a character."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16", errors="replace")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -105,7 +107,7 @@ def open_mesh(path: Path) -> tuple[io.BytesIO, Companions]:
             content = text.encode() + end + body
             images = ((name, companions.read(name)) for name in IMAGE.findall(text))
         case ".gltf" | ".glb":
-            images = _gltf_images(content, companions.read)
+            images = gltf_images(content, companions.read)
         case ".off" | ".stl" if not _is_binary_stl(content):
             content = decoded(content).encode()
     for name, image in images:
@@ -120,9 +122,14 @@ def _is_binary_stl(content: bytes) -> bool:
 
 def _require_image(path: Path, name: str, content: bytes) -> None:
     try:
-        Image.open(io.BytesIO(content)).close()
-    except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(f"{path} names {name}, which is no image that can be read: save it as PNG or JPEG") from error
+        with Image.open(io.BytesIO(content)) as image:
+            eight_bits(image)
+    except Exception as error:  # Pillow's decoders raise almost anything at a broken file
+        reason = "" if isinstance(error, UnidentifiedImageError) else f" ({error})"
+        raise InputError(
+            f"{path} names {name}, which is no image that can be read{reason}: save it as PNG or JPEG of 8 bits, and "
+            "of fewer than 10⁸ pixels"
+        ) from error
 
 
 def _obj_images(text: str, companions: Companions) -> Iterator[tuple[str, bytes]]:
@@ -136,34 +143,17 @@ def _obj_images(text: str, companions: Companions) -> Iterator[tuple[str, bytes]
             missing.discard(material)
         elif key.lower() == "map_kd" and material in used:
             yield value.strip(), companions.read(value)
+        elif key.lower() == "kd" and material in used and not _is_colour(value):
+            raise ValueError(
+                f"the material {material} has the colour {value.strip()!r}, which is no red, green and blue"
+            )
     if missing:
         raise InputError(f"{companions.path} uses the material {min(missing)}, which no file that it names has: add it")
 
 
-def _gltf_images(content: bytes, read: Callable[[str], bytes]) -> Iterator[tuple[str, bytes]]:
-    """Of the base colours of the materials that are used, inside the file or beside it (glTF 2.0, section 4.4)."""
-    binary = b""
-    if content.startswith(b"glTF"):
-        (length,) = struct.unpack_from("<I", content, 12)
-        content, binary = content[20 : 20 + length], content[28 + length :]
-    tree = json.loads(content)
-
-    def data(source: dict[str, Any]) -> bytes:
-        if "bufferView" in source:
-            view = tree["bufferViews"][source["bufferView"]]
-            start = view.get("byteOffset", 0)
-            return data(tree["buffers"][view["buffer"]])[start : start + view["byteLength"]]
-        uri = source.get("uri")
-        if uri is None:
-            return binary
-        return base64.b64decode(uri.partition(",")[2]) if uri.startswith("data:") else read(uri)
-
-    parts = [part for mesh in tree.get("meshes", []) for part in mesh["primitives"]]
-    for number in {part["material"] for part in parts if "material" in part}:
-        reference = tree["materials"][number].get("pbrMetallicRoughness", {}).get("baseColorTexture")
-        if reference is not None:
-            texture = tree["textures"][reference["index"]]
-            choices = (texture, *texture.get("extensions", {}).values())
-            source = next(each["source"] for each in choices if "source" in each)
-            image = tree["images"][source]
-            yield image.get("name") or image.get("uri", "")[:40] or f"image {source}", data(image)
+def _is_colour(value: str) -> bool:
+    """Whether it is red, green and blue, or one number for all three."""
+    try:
+        return len([float(word) for word in value.split()]) in (1, 3)
+    except ValueError:
+        return False

@@ -11,6 +11,7 @@ from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
 from renderer.errors import LARGEST, InputError
+from renderer.files.image_files import eight_bits
 from renderer.files.mesh_files import open_mesh
 from renderer.image import encode
 from renderer.mesh import Mesh
@@ -64,13 +65,15 @@ def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
             raise ValueError(f"{name} are not finite or beyond {LARGEST:g}")
     colors = encode(torch.from_numpy(colors), "srgb").numpy() if linear else colors
     mesh = replace(Mesh.plain(vertices, faces), corner_colors=colors.astype(np.float32))
-    if image is None or uvs is None:
+    if image is None:
         return mesh
+    if uvs is None:
+        raise ValueError("an image has no texture coordinates")
     return replace(
         mesh,
         corner_uvs=uvs[faces, :2].astype(np.float32),
         texture_ids=np.zeros(len(faces), dtype=np.int32),
-        textures=(np.array(image.convert("RGB")),),
+        textures=(np.array(eight_bits(image).convert("RGB")),),
     )
 
 

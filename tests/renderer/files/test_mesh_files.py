@@ -22,6 +22,7 @@ from renderer.mesh import Mesh, load_mesh
 
 TEXTURE = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl peel\nf 1/1 2/2 3/3\n"
+GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 PLY = """ply
 format ascii 1.0
 comment by {author}
@@ -152,9 +153,10 @@ def test_a_byte_of_latin_1_in_a_name_or_comment_is_no_fault(tmp_path, suffix):
     assert_array_equal(load_mesh(tmp_path / f"mesh{suffix}").vertices, [[0, 0, 0], [0, 1, 0], [1, 0, 0]])
 
 
-def test_materials_in_latin_1_are_read_with_their_texture(tmp_path):
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_materials_in_another_encoding_are_read_with_their_texture(tmp_path, encoding):
     path = obj(tmp_path)
-    (tmp_path / "peel.mtl").write_bytes("# Müller\nnewmtl peel\nmap_Kd peel.png\n".encode("latin-1"))
+    (tmp_path / "peel.mtl").write_bytes("# Müller\nnewmtl peel\nmap_Kd peel.png\n".encode(encoding))
     (tmp_path / "peel.png").write_bytes(png())
     assert has_texture(load_mesh(path))
 
@@ -210,6 +212,67 @@ def test_a_damaged_image_in_a_glb_is_refused(tmp_path):
         load_mesh(glb_with_damaged_image(tmp_path))
 
 
+def test_a_texture_of_16_bits_is_scaled_and_not_clipped(tmp_path):
+    Image.fromarray(TEXTURE[..., 0].astype(np.uint16) * 256).save(tmp_path / "peel.png")
+    (texture,) = load_mesh(obj(tmp_path)).textures
+    assert_array_equal(texture, np.repeat(TEXTURE[..., :1], 3, axis=2))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda path: path.write_bytes(png()[:-40]), "truncated"),
+        (lambda path: Image.fromarray(np.ones((2, 2), np.float32)).save(path, "TIFF"), "no agreed white"),
+        (lambda path: Image.new("1", (20_000, 10_000)).save(path), "exceeds limit"),
+    ],
+)
+def test_a_texture_that_cannot_be_decoded_is_named_with_the_reason(tmp_path, damage, reason):
+    damage(tmp_path / "peel.png")
+    with pytest.raises(InputError, match=rf"names peel\.png, which is no image .*{reason}.*: save it as PNG or JPEG"):
+        load_mesh(obj(tmp_path))
+
+
+def test_an_image_without_texture_coordinates_is_refused(tmp_path):
+    path = obj(tmp_path)
+    path.write_text(re.sub(r"/\d", "", path.read_text()))
+    (tmp_path / "peel.png").write_bytes(png())
+    with pytest.raises(InputError, match=r"mesh\.obj cannot be read as a mesh \(an image has no texture coordinates"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize("color", ["1 0.5", "spectral peel.rfl", "red"])
+def test_a_colour_that_trimesh_passes_over_is_refused(tmp_path, color):
+    path = obj(tmp_path)
+    (tmp_path / "peel.mtl").write_text(f"newmtl peel\nKd {color}\n")
+    with pytest.raises(InputError, match=rf"mesh\.obj .*the material peel has the colour '{color}'"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "reason"),
+    [
+        (("extensionsRequired",), ["KHR_draco_mesh_compression"], "needs KHR_draco"),
+        (("textures", 0, "source"), -1, "source is -1"),
+        (("textures", 0), {"extensions": {"KHR_texture_basisu": {"source": 0}}}, "no image as PNG"),
+        (("materials", 0, "pbrMetallicRoughness", "baseColorTexture", "texCoord"), 1, "second set of coordinates"),
+        (("materials", 0, "pbrMetallicRoughness", "baseColorFactor"), [float("nan")] * 4, "NaN is no number"),
+        (("materials", 0, "extensions"), {GLOSSY: {"diffuseTexture": {"index": 7}}}, "index out of range"),
+        (("accessors", 0, "sparse"), {"count": 1}, "sparse accessors"),
+        (("accessors", "TEXCOORD_0", "componentType"), 5123, "TEXCOORD_0 are whole numbers"),
+    ],
+)
+def test_what_trimesh_takes_otherwise_than_gltf_means_it_is_refused(tmp_path, keys, value, reason):
+    path = gltf(tmp_path)
+    (tmp_path / "peel.png").write_bytes(png())
+    node = tree = json.loads(path.read_text())
+    for key in keys[:-1]:
+        node = node[tree["meshes"][0]["primitives"][0]["attributes"][key] if key == "TEXCOORD_0" else key]
+    node[keys[-1]] = value
+    path.write_text(json.dumps(tree))
+    with pytest.raises(InputError, match=rf"mesh\.gltf cannot be read as a mesh \(.*{reason}"):
+        load_mesh(path)
+
+
 @pytest.mark.parametrize("value", ["1e200", "-1e13", "nan"])
 @pytest.mark.parametrize("line", ["v {} 0 0", "vt {} 0"])
 def test_coordinates_beyond_reason_name_the_file(tmp_path, value, line):
@@ -232,7 +295,7 @@ def test_a_colour_that_is_no_number_names_the_file(tmp_path, color):
 
 
 @pytest.mark.filterwarnings("ignore:.* encountered in:RuntimeWarning")  # trimesh's, on what is then refused
-@pytest.mark.parametrize("node", [{"scale": [1e30, 1, 1]}, {"matrix": [float("nan")] * 16}])
+@pytest.mark.parametrize("node", [{"scale": [1e30, 1, 1]}, {"matrix": [1e30] * 16}])
 def test_a_node_that_puts_its_mesh_beyond_reason_names_the_file(tmp_path, node):
     path = gltf(tmp_path)
     (tmp_path / "peel.png").write_bytes(png())

@@ -101,7 +101,6 @@ REFUSED: dict[str, dict[str, Edit]] = {
         "a vertex that is not there": content("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
         "vertex 10¹²": content("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 1000000000000\n"),
         "words": content("v a b c\nf 1 2 3\n"),
-        "UTF-16": replaced(lambda whole: whole.decode().encode("utf-16")),
         "no such library": swapped("mesh.mtl", "gone.mtl"),
         "a pipe for a library": swapped("mesh.mtl", "pipe.mtl", pipe="pipe.mtl"),
         "no such material": swapped("usemtl peel", "usemtl gone"),
@@ -193,7 +192,10 @@ EITHER: dict[str, dict[str, Edit]] = {  # odd, but what is meant may be clear
         "CMYK": image("CMYK", (9, 9), "JPEG"),
         "16 bits": _sixteen_bits,
     },
-    ".obj": {"Latin-1": replaced(lambda whole: b"# \xe4\n" + whole)},
+    ".obj": {
+        "Latin-1": replaced(lambda whole: b"# \xe4\n" + whole),
+        "UTF-16": replaced(lambda whole: whole.decode().encode("utf-16")),
+    },
     ".mtl": {
         "a colour in words": swapped("Kd 1 0.5 0", "Kd red"),
         "a colour of 1e30": swapped("Kd 1 0.5 0", "Kd 1e30 0 0"),
