@@ -12,7 +12,9 @@ from augment.seeding import generator
 from renderer.errors import InputError
 from train.classes import class_index
 from train.logs import console
-from train.photographs import find_photographs, left_out, load_photographs
+from train.photographs import find_photographs, is_hidden, left_out, load_photographs
+
+PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # no names of classes
 
 
 @dataclass(frozen=True)
@@ -120,10 +122,13 @@ def load_folder(path: str, size: int, test_share: float) -> DataSet:
     root = Path(path)
     if not root.is_dir():
         raise InputError(f"data.path={path} is not a folder: give a folder with one folder of images per class")
-    divided = (root / "train").is_dir() and (root / "test").is_dir()
-    train_root = root / "train" if divided else root
-    folders = [entry.name for entry in train_root.iterdir() if entry.is_dir() and not entry.name.startswith(".")]
-    classes = tuple(sorted(folders))
+    parts = [name for name in _folders(root) if name.lower() in PARTS]
+    if parts not in ([], ["test", "train"]):
+        raise InputError(
+            f"data.path={path} holds the folders {', '.join(parts)}: divide it into train and test alone, or not at all"
+        )
+    train_root = root / "train" if parts else root
+    classes = tuple(_folders(train_root))
     if len(classes) < 2:
         raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
     if passed_over := left_out(root):
@@ -131,9 +136,13 @@ def load_folder(path: str, size: int, test_share: float) -> DataSet:
     train = _folder_split(train_root, classes, size)
     if empty := set(range(len(classes))).difference(train.labels.tolist()):
         raise InputError(f"{train_root / classes[min(empty)]} holds no image: put some there or remove the folder")
-    if divided:
+    if parts:
         return DataSet(classes, train, _folder_split(root / "test", classes, size))
     return DataSet(classes, *stratified_split(train, test_share, seed=0, key="data.test_share"))
+
+
+def _folders(root: Path) -> list[str]:
+    return sorted(entry.name for entry in root.iterdir() if entry.is_dir() and not is_hidden(entry.name))
 
 
 def _folder_split(root: Path, classes: tuple[str, ...], size: int) -> Split:

@@ -183,6 +183,13 @@ def test_a_class_of_the_test_folder_alone_is_an_error(tmp_path):
         (None, 0.1, "is not a folder"),
         (["fig/a.png"], 0.1, "holds 1 class folders: it needs two or more"),
         (["fig/a.png", "lime/.a.png"], 0.1, "data/lime holds no image: put some there or remove the folder"),
+        (
+            ["train/fig/a.png", "val/fig/a.png"],
+            0.1,
+            "holds the folders train, val: divide it into train and test alone",
+        ),
+        (["Test/fig/a.png", "Train/fig/a.png"], 0.1, "holds the folders Test, Train: divide it"),
+        (["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"], 0.1, "holds the folders test, train, val: divide it"),
         (["fig/a.png", "lime/a.png"], 0.1, "data.test_share=0.1 of the 1 images of class 0"),
         (["fig/a.png", "lime/a.png"], 60, "data.test_share=60 must lie between 0 and 1"),
     ],

@@ -14,11 +14,13 @@ import torch
 
 from augment.memory import require_memory
 from augment.progress import progress
-from renderer.errors import InputError
+from renderer.errors import InputError, require_file
 from renderer.files.image_files import read_square
 from train.classes import class_index, nearest_class
+from train.logs import console
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
+MACS = "__MACOSX"  # what macOS puts into archives, for itself
 FOREIGN = "other_"  # starts the name of a folder whose class the model lacks
 TABLE = "photos.csv"
 DESCRIPTION = "lab.json"  # of a folder that scripts/lab.py made
@@ -56,15 +58,20 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
     things an image is ranked against.
 
     Raises InputError for a folder that is missing, unreadable, empty or mixes both layouts, for a sub-folder or `label`
-    that is no class, for a `photos.csv` without those columns or that names none of the images, and for look-alikes
-    of a source that is nowhere.
+    that is no class, for a `photos.csv` without those columns, that names no file of the folder, or one twice with
+    other words, and for look-alikes of a source that is nowhere.
     """
     class_index(classes, label, "label")
     paths = _image_paths(folder)
     has_class_folders = _check_layout(folder, paths, classes)
     rows = _read_table(folder / TABLE)
-    if rows and rows.keys().isdisjoint(paths):
-        raise InputError(f"{folder / TABLE} names none of the photographs: give paths such as {paths[0]}")
+    if nowhere := sorted(rows.keys() - set(_files(folder))):
+        said = (
+            f"{folder / TABLE} has {len(nowhere)} of {len(rows)} rows for no file of the folder: {nowhere[0]}, for one"
+        )
+        if len(nowhere) == len(rows):
+            raise InputError(f"{said}; give paths such as {paths[0]}")
+        console.warning(said)
     photographs = [
         Photograph(path, path.parts[0] if has_class_folders else label, *rows.get(path, (None, ()))) for path in paths
     ]
@@ -102,10 +109,10 @@ def _files(folder: Path) -> Iterator[PurePosixPath]:
         folders[:] = [
             name
             for name in folders
-            if not _is_hidden(name) and not Path(inside).is_relative_to(os.path.realpath(os.path.join(root, name)))
+            if not is_hidden(name) and not Path(inside).is_relative_to(os.path.realpath(os.path.join(root, name)))
         ]
         at = PurePosixPath(Path(root).relative_to(folder).as_posix())
-        yield from (at / name for name in files if not _is_hidden(name))
+        yield from (at / name for name in files if not is_hidden(name))
 
 
 def _is_image(folder: Path, path: PurePosixPath) -> bool:
@@ -113,13 +120,14 @@ def _is_image(folder: Path, path: PurePosixPath) -> bool:
     return path.suffix.lower() in SUFFIXES and ((folder / path).is_file() or not (folder / path).exists())
 
 
-def _is_hidden(name: str) -> bool:
-    return name.startswith(".")
+def is_hidden(name: str) -> bool:
+    """Whether a file or folder is none of the user's."""
+    return name.startswith(".") or name == MACS
 
 
 def _check_layout(folder: Path, paths: Sequence[PurePosixPath], classes: Sequence[str]) -> bool:
     """Whether the folder is made of class folders; InputError if a name among them is wrong."""
-    names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not _is_hidden(entry.name))
+    names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name))
     for name in names:
         if name not in classes and not name.startswith(FOREIGN):
             raise InputError(
@@ -134,22 +142,24 @@ def _check_layout(folder: Path, paths: Sequence[PurePosixPath], classes: Sequenc
 
 def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str, ...]]]:
     """Source and look-alikes by path; nothing without a table."""
-    if not table.is_file():
+    if not os.path.lexists(table):
         return {}
+    advice = "make it UTF-8 with the columns path and source_tag, separated by commas"
+    require_file(table, advice)
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
-            header, *lines = csv.reader(file)
+            header, *lines = csv.reader(file, strict=True)
         path, tag = header.index("path"), header.index("source_tag")
     except (ValueError, csv.Error, OSError) as error:  # no header, a column missing, not UTF-8, or not a table
-        raise InputError(f"{table} cannot be used: make it UTF-8 with the columns path and source_tag") from error
-    rows = [dict(zip(header, line, strict=False)) for line in lines if len(line) > max(path, tag)]
-    return {
-        PurePosixPath(row["path"].replace("\\", "/")): (
-            row["source_tag"] or None,
-            split_sources(row.get("look_alikes", "")),
-        )
-        for row in rows
-    }
+        raise InputError(f"{table} cannot be used: {advice}") from error
+    table_rows = [dict(zip(header, line, strict=False)) for line in lines if len(line) > max(path, tag)]
+    rows = {}
+    for row in table_rows:
+        place = PurePosixPath(row["path"].replace("\\", "/"))
+        told = row["source_tag"] or None, split_sources(row.get("look_alikes", ""))
+        if rows.setdefault(place, told) != told:
+            raise InputError(f"{table} has two rows for {place}, which differ: keep one")
+    return rows
 
 
 def split_sources(text: str) -> tuple[str, ...]:

@@ -1,4 +1,5 @@
 import errno
+import logging
 import os
 from pathlib import Path, PurePosixPath
 
@@ -99,7 +100,16 @@ def test_a_folder_that_cannot_be_read_is_refused_by_name(tmp_path, monkeypatch):
 
 
 def test_what_is_of_no_kind_that_is_read_is_told(tmp_path):
-    touch(tmp_path, "orange/a.JFIF", "orange/b.HEIC", "orange/c.avif", "orange/.d.heic", "photos.csv", "notes.txt")
+    touch(
+        tmp_path,
+        "orange/a.JFIF",
+        "orange/b.HEIC",
+        "orange/c.avif",
+        "orange/.d.heic",
+        "__MACOSX/a.jpg",
+        "photos.csv",
+        "notes.txt",
+    )
     touch(tmp_path, "lab.json")  # the project's own
     os.mkfifo(tmp_path / "orange" / "pipe.jpg")  # opened, it would be waited for
     (tmp_path / "photos.csv").write_text("path,source_tag\n")
@@ -119,7 +129,7 @@ def test_a_photos_csv_that_names_none_of_the_photographs_is_refused(tmp_path, ro
     touch(tmp_path, "orange/a.jpg")
     (tmp_path / "photos.csv").write_text(f"path,source_tag\n{rows}\n")
     with pytest.raises(
-        InputError, match=r"photos\.csv names none of the photographs: give paths such as orange/a\.jpg"
+        InputError, match=r"photos\.csv has 1 of 1 rows for no file of the folder: .*; give paths such as orange/a\.jpg"
     ):
         find_photographs(tmp_path, CLASSES, "orange")
 
@@ -130,13 +140,15 @@ def test_an_empty_class_folder_is_passed_over(tmp_path):
     assert [str(photograph.path) for photograph in find_photographs(tmp_path, CLASSES, "orange")] == ["orange/a.jpg"]
 
 
-def test_sources_come_from_photos_csv_whatever_its_other_columns_and_rows(tmp_path):
+def test_sources_come_from_photos_csv_whatever_its_other_columns_and_rows(tmp_path, caplog):
     touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "pear/c.jpg")
     rows = "orange/a.jpg,orange,web\norange/b.jpg,orange,\npear\\c.jpg,pear,shop\nfig/gone.jpg,fig,web\n\n"
     rows = "path,class,source_tag\n" + rows
     (tmp_path / "photos.csv").write_text("\ufeff" + rows, encoding="utf-8")
-    found = find_photographs(tmp_path, CLASSES, "orange")
+    with caplog.at_level(logging.WARNING):
+        found = find_photographs(tmp_path, CLASSES, "orange")
     assert [photograph.source for photograph in found] == ["web", None, "shop"]
+    assert "photos.csv has 1 of 4 rows for no file of the folder: fig/gone.jpg, for one" in caplog.text
 
 
 def test_look_alikes_are_the_sources_named_in_photos_csv(tmp_path):
@@ -163,7 +175,27 @@ def test_look_alikes_of_a_source_without_images_are_refused_by_name(tmp_path):
         find_photographs(tmp_path, CLASSES, "orange")
 
 
-@pytest.mark.parametrize("table", [b"", b"path,source\na.jpg,web\n", b"path,source_tag\n\xff.jpg,web\n"])
+def test_a_photos_csv_with_two_words_on_an_image_or_linked_to_nothing_is_refused(tmp_path):
+    touch(tmp_path, "a.jpg")
+    (tmp_path / "photos.csv").write_text("path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n")
+    with pytest.raises(InputError, match=r"photos\.csv has two rows for a\.jpg, which differ"):
+        find_photographs(tmp_path, CLASSES, "orange")
+    (tmp_path / "photos.csv").unlink()
+    (tmp_path / "photos.csv").symlink_to("nowhere.csv")
+    with pytest.raises(InputError, match=r"photos\.csv does not exist: make it UTF-8"):
+        find_photographs(tmp_path, CLASSES, "orange")
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        b"",
+        b"path,source\na.jpg,web\n",
+        b"path,source_tag\n\xff.jpg,web\n",
+        b'path,source_tag\na.jpg,"web\n',
+        b"path;source_tag\na.jpg;web\n",
+    ],
+)
 def test_a_photos_csv_without_its_columns_is_refused_by_name(tmp_path, table):
     touch(tmp_path, "a.jpg")
     (tmp_path / "photos.csv").write_bytes(table)
