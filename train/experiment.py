@@ -248,7 +248,7 @@ def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[
     if best["epoch"] != trainer.epoch:
         trainer.learner.selected.network.load_state_dict(best["model"])
         selected = evaluate(trainer.learner.selected, test)["accuracy"]
-    console.info("test accuracy %.4f (epoch %d, selected on validation), %.4f (last)", selected, best["epoch"], last)
+    console.info("test accuracy %.4f (what is kept, epoch %d), %.4f (last)", selected, best["epoch"], last)
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 
 

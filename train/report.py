@@ -228,6 +228,7 @@ def _card(run: RunSummary, name: str) -> str:
     count = config.augment.examples or f"{config.scene.views} × {len(config.scene.backgrounds)}"
     renders = f"{count} renders of {shown}" if run.arm != "none" else "none"
     start = config.train.get("init_from")
+    selection = "of which the mean is kept" if config.train.get("soup") else "selected on validation"
     rows = [
         ("network", architecture),
         ("data", f"{data}, {config.data.validation:.0%} of training for validation"),
@@ -235,7 +236,7 @@ def _card(run: RunSummary, name: str) -> str:
         ("augmentation", f"{run.arm}; renders {often}: {renders}"),
         ("recipe", ", ".join(f"{name} {config.train[name]}" for name in RECIPE if config.train.get(name))),
         ("seed", str(config.seed)),
-        ("epoch", f"{scores['test/epoch']}, selected on validation"),
+        ("epoch", f"{scores['test/epoch']}, {selection}"),
         ("test accuracy", f"{scores['test/accuracy']:.4f}"),
         *(
             (f"{folder}: {figure_title(name, config.label)}", format_interval(find_figure(summary, name)))

@@ -144,6 +144,15 @@ def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_ma
     assert str(finished.parent) not in card and str(tmp_path) not in card
 
 
+def test_the_card_of_a_soup_says_so(finished, tmp_path):
+    run = copytree(finished, tmp_path / "run")
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(text.replace("soup: false", "soup: true"))
+    for folder, words in [(finished, "selected on validation"), (run, "of which the mean is kept")]:
+        publish_run(folder, tmp_path / "out")
+        assert words in (tmp_path / "out" / "README.md").read_text()
+
+
 def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
     run = copytree(finished, tmp_path / "run")
     state = checkpoint.load(run / BEST)
