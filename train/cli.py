@@ -17,6 +17,7 @@ from typing import Any
 
 import hydra
 from hydra import compose, initialize_config_module
+from hydra._internal.hydra import Hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig
@@ -95,11 +96,16 @@ def run_command(main: Callable[[], None], config_name: str) -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors then; else it prints them, in several lines
+    Hydra.get_mode = _no_mode  # type: ignore[method-assign]
     try:
         _run(main, config_name)
     except KeyboardInterrupt:
         print("ended by SIGINT", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
+
+
+def _no_mode(*_: object, **__: object) -> None:
+    """Hydra's own composes the whole configuration once more, to read a hydra.mode that --multirun decides here."""
 
 
 @one_sentence_errors
@@ -124,13 +130,23 @@ def _refusal(error: Exception, arguments: list[str], config_name: str) -> str:
     said = " ".join(HYDRAS_ADVICE.split(str(error))[0].split())
     overrides, nearest = [argument for argument in arguments if not argument.startswith("-")], []
     with initialize_config_module("conf", version_base="1.3"):
-        others = [overrides[:place] + overrides[place + 1 :] for place in range(len(overrides))]
-        culprits = [override for override, rest in zip(overrides, others, strict=True) if _composes(config_name, rest)]
+        culprit = None if _names_one(said, overrides) else _culprit(config_name, overrides)
         with suppress(HydraException, ValueError):  # of a group without such a choice, whose choices Hydra lists
             nearest = list(_suggestions(overrides, config_name))
-    unnamed = [override for override in culprits if override.partition("=")[0] not in said]
-    named = ": ".join([*unnamed[:1], said])
+    named = ": ".join(filter(None, [culprit, said]))
     return "; ".join([named.removesuffix("."), *nearest])
+
+
+def _names_one(said: str, overrides: list[str]) -> bool:
+    """Whether the key of one of the overrides is said, as a word of its own."""
+    keys = (override.partition("=")[0] for override in overrides)
+    return any(re.search(rf"(?<![\w.]){re.escape(key)}(?![\w.])", said) for key in keys)
+
+
+def _culprit(config_name: str, overrides: list[str]) -> str | None:
+    """The first override without which the others compose."""
+    others = (overrides[:place] + overrides[place + 1 :] for place in range(len(overrides)))
+    return next((left for left, rest in zip(overrides, others, strict=True) if _composes(config_name, rest)), None)
 
 
 def _composes(config_name: str, overrides: list[str]) -> bool:
