@@ -1,6 +1,7 @@
 """A few of the hostile inputs of docs/reliability.md, and whether mishandling would be noticed."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,8 @@ from train.studies.reliability.damages import damages
 from train.studies.reliability.doors import BY_NAME, DOORS
 from train.studies.reliability.page import Outcome, failures, page
 from train.studies.reliability.process import Ending, Surroundings, forked, started
-from train.studies.reliability.study import outcome
-from train.studies.reliability.trials import Trial, all_trials, file_trials
+from train.studies.reliability.study import _keep, _kept, outcome
+from train.studies.reliability.trials import Trial, all_trials, file_trials, name_trials
 
 LIGHT = BY_NAME["export_light.py"]
 
@@ -97,9 +98,22 @@ def test_a_fault_is_counted_listed_and_fails_the_command():
         Outcome("attack.py", "forged", "c", None, "hung"),
     ]
     assert failures(outcomes) == ["attack.py: 'c': hung"]
-    written = page(outcomes, "python scripts/check_reliability.py", number=6, started=2, patience=60)
+    written = page(outcomes, "python scripts/check_reliability.py", number=6, patience=60)
     assert "| attack.py | forged | 3 | 1 | 1 | 1 |" in written and "- attack.py: 'c': hung" in written
-    assert "Nothing was mishandled." in page(outcomes[:2], "x", 2, 0, 60)
+    assert "Nothing was mishandled." in page(outcomes[:2], "x", 2, 60)
+
+
+def test_a_run_goes_on_with_the_outcomes_that_it_kept_and_the_last_of_each_counts(tmp_path):
+    file, trials = tmp_path / "new" / "outcomes.jsonl", list(name_trials(LIGHT))
+    found = [Outcome(each.door.name, each.kind, each.name, 2, "hung", started=True) for each in trials[::2]]
+    mended = replace(found[1], fault=None)
+    for each in [*found, mended, replace(mended, door="a door that is gone")]:
+        _keep(file, each)
+    assert _kept(file, trials) == {2 * place: each for place, each in enumerate(found)} | {2: mended}
+    for damage in ("x", "[1]", '{"door": 1}'):
+        file.write_text(damage)
+        with pytest.raises(InputError, match=r"outcomes=.*give a file of this command"):
+            _kept(file, trials)
 
 
 def test_a_network_of_other_classes_may_be_published_and_is_refused_at_every_other_door():

@@ -24,21 +24,23 @@ NO_FAULTS = "Nothing was mishandled."
 
 @dataclass(frozen=True)
 class Outcome:
-    """status: see `Ending`. fault: None where all was as it should be."""
+    """status: see `Ending`. fault: None where all was as it should be. started: whether its process was not forked."""
 
     door: str
     kind: str
     name: str
     status: int | None
     fault: str | None
+    started: bool = False
 
 
 def failures(outcomes: Iterable[Outcome]) -> list[str]:
     return [f"{each.door}: {each.name!r}: {each.fault}" for each in outcomes if each.fault]
 
 
-def page(outcomes: Sequence[Outcome], command: str, number: int, started: int, patience: float) -> str:
-    """Markdown. number: of the inputs there are; started: of the processes that were not forked."""
+def page(outcomes: Sequence[Outcome], command: str, number: int, patience: float) -> str:
+    """Markdown. number: of the inputs there are."""
+    started = sum(each.started for each in outcomes)
     introduction = INTRODUCTION.format(
         command=command, versions=versions(), tried=len(outcomes), all=number, started=started, patience=patience
     )

@@ -1,8 +1,10 @@
 """Hostile inputs tried at every door, and what became of them."""
 
+import json
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from shutil import rmtree
 from tempfile import TemporaryDirectory
@@ -27,6 +29,7 @@ class ReliabilitySettings:
     """conf/check_reliability.yaml."""
 
     out: str | None
+    outcomes: str | None
     draws: int | None
     started: int
     seed: int
@@ -43,20 +46,23 @@ class ReliabilitySettings:
 def run(settings: ReliabilitySettings) -> list[str]:
     """Print the page, and write it where it is asked for; everything that was mishandled, in words.
 
-    Ctrl-C ends the trials; the page tells of those that were conducted.
+    Ctrl-C ends the trials; the page tells of those that were conducted, the next call goes on with `outcomes`.
     """
     out = writable_file(settings.out, "out") if settings.out else None
+    file = writable_file(settings.outcomes, "outcomes") if settings.outcomes else None
     trials = [trial for name in settings.doors or BY_NAME for trial in all_trials(BY_NAME[name])]
     drawn = np.random.default_rng(settings.seed).permutation(len(trials))[: settings.draws]
     heed_interrupts()
-    outcomes: dict[int, Outcome] = {}
+    outcomes = _kept(file, trials) if file and file.exists() else {}
     with TemporaryDirectory(ignore_cleanup_errors=True) as folder, suppress(KeyboardInterrupt):
         corpus = prepare(Path(folder))
-        for number in tqdm(drawn, "trials", disable=not sys.stderr.isatty()):
-            runner = started if len(outcomes) < settings.started else forked
-            outcomes[number] = outcome(trials[number], corpus, runner)
+        for place, number in enumerate(tqdm(drawn, "trials", disable=not sys.stderr.isatty())):
+            if number not in outcomes:
+                runner = started if place < settings.started else forked
+                outcomes[number] = outcome(trials[number], corpus, runner)
+                _keep(file, outcomes[number])
     ordered = [outcomes[number] for number in sorted(outcomes)]
-    text = page(ordered, command_line(), len(trials), min(settings.started, len(ordered)), PATIENCE)
+    text = page(ordered, command_line(), len(trials), PATIENCE)
     write(out, text)
     return failures(outcomes.values())
 
@@ -80,4 +86,22 @@ def outcome(trial: Trial, corpus: Path, run: Runner = forked) -> Outcome:
     rmtree(folder)
     if fault:
         print(f"{trial.door.name}: {trial.name!r}: {fault}", file=sys.stderr)
-    return Outcome(trial.door.name, trial.kind, trial.name, ending.status, fault)
+    return Outcome(trial.door.name, trial.kind, trial.name, ending.status, fault, run is started)
+
+
+def _kept(file: Path, trials: Sequence[Trial]) -> dict[int, Outcome]:
+    """The outcomes in a file, by the numbers of their trials; the last of each counts. InputError for other files."""
+    numbers = {(trial.door.name, trial.kind, trial.name): number for number, trial in enumerate(trials)}
+    try:
+        outcomes = [Outcome(**json.loads(line)) for line in file.read_text().splitlines()]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"outcomes={file} holds something else: {error}: give a file of this command") from error
+    places = [numbers.get((each.door, each.kind, each.name)) for each in outcomes]
+    return {place: each for place, each in zip(places, outcomes, strict=True) if place is not None}
+
+
+def _keep(file: Path | None, found: Outcome) -> None:
+    if file:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("a") as lines:
+            print(json.dumps(asdict(found)), file=lines)
