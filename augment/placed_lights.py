@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from augment.backgrounds import load_background
 from renderer.arguments import require_fields
 from renderer.errors import InputError, require_range
+from renderer.files.placed_lights import load_placed
 from renderer.lamps import Lamps
 from renderer.projector import Projector
 
@@ -44,7 +46,8 @@ class ProjectorSettings:
 @dataclass
 class LampsSettings:
     """`Lamps` at places [x, y, z], above four corners unless told otherwise, points or discs of a radius. start: the
-    powers that attacks begin with, a number or [r, g, b] of each lamp."""
+    powers that attacks begin with, a number, [r, g, b] of each lamp, or the lamps.json of an adversary, whose places,
+    power and radius take the others' place."""
 
     places: list[Any] = field(default_factory=lambda: [[x, y, 2.0] for x in (2.0, -2.0) for y in (2.0, -2.0)])
     power: float = 10.0
@@ -56,6 +59,8 @@ class LampsSettings:
 
     def build(self) -> tuple[Lamps, Tensor]:
         """The basis, and the powers (L, 3)."""
+        if isinstance(self.start, str):
+            return _read_lamps(Path(self.start))
         try:
             places = tuple((float(x), float(y), float(z)) for x, y, z in self.places)
             start = torch.tensor(self.start, dtype=torch.float32).expand(len(places), 3)
@@ -65,3 +70,10 @@ class LampsSettings:
             ) from error
         basis = Lamps(places, self.power, self.radius)
         return basis, basis.nearest_physical(start)
+
+
+def _read_lamps(path: Path) -> tuple[Lamps, Tensor]:
+    basis, powers = load_placed(path)
+    if not isinstance(basis, Lamps):
+        raise InputError(f"scene.lamps.start={path} describes a {basis.name}: give lamps")
+    return basis, basis.nearest_physical(powers)

@@ -170,6 +170,10 @@ def test_lamps_are_moved_within_their_ball_and_stand_where_they_ended_when_read_
     (lamps,) = [part for _, part in parts_of(found.basis) if part.name == "lamps"]
     assert torch.equal(torch.tensor(lamps.places), done.conditions.places[1])
     torch.testing.assert_close(found.render(choose("software")), done.images[1], rtol=0, atol=1e-6)
+    standing, powers = LampsSettings(start=str(tmp_path / "lamps.json")).build()
+    assert standing == lamps and torch.equal(powers, after.light[-len(powers) :])
+    with pytest.raises(InputError, match=r"scene\.lamps\.start=.*projector\.json describes a projector: give lamps"):
+        LampsSettings(start=str(tmp_path / "projector.json")).build()
 
 
 def test_the_gradient_by_places_is_that_of_the_image_where_views_share_lamps():

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from augment import held_transport
-from augment.attacks.run import attack, logits_of
+from augment.attacks.run import attack
 from augment.attacks.settings import AttackSettings
 from augment.classifiers import Classifier
 from augment.descent import Goal, adversarial_cost
@@ -40,15 +40,15 @@ def table(mesh: Mesh, classifier: Classifier) -> str:
             images, slope = images_and_gradient(attacked.problem, classifier, attacked.goal, attacked.result.values)
             held_transport.NEAR = -1.0  # no shape is near
             exact, true = images_and_gradient(attacked.problem, classifier, attacked.goal, attacked.result.values)
-            fooled = attacked.goal.reached(logits_of(attacked.judge, exact, EXAMPLES).argmax(2))
+            fooled, still = (each & attacked.recognised for each in (attacked.result.fooled, attacked.success))
             rows.append(
                 [
                     held_for(every),
                     f"{1e3 * taken:.0f}",
                     f"{(images - exact).square().mean().sqrt() / exact.max():.2%}",
                     f"{((slope - true).norm(dim=1) / true.norm(dim=1)).mean():.1%}",
-                    f"{int((attacked.success & attacked.recognised).sum())} of {int(attacked.recognised.sum())}",
-                    f"{int((attacked.success & attacked.recognised & fooled).sum())}",
+                    f"{int(fooled.sum())} of {int(attacked.recognised.sum())}",
+                    f"{int((fooled & still).sum())}",
                 ]
             )
     finally:
