@@ -18,12 +18,12 @@ from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack, format_reloaded
 from train.attacks.transfers import format_transfers, load_others, write_transfers
-from train.cli import one_sentence_errors, script
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
+from train.command_line.entry_points import one_sentence_errors, script
+from train.command_line.outputs import writable_folder
 from train.device import choose_device
-from train.outputs import writable_folder
-from train.run_classifier import load_classifier
-from train.run_folder import sole_writer
+from train.run_folder.classifier import load_classifier
+from train.run_folder.files import sole_writer
 
 
 def main(config: DictConfig) -> None:

@@ -3,7 +3,7 @@
 Writes docs/performance_lights.md. Takes a minute or two on one CPU thread, and needs the extra `shadows`.
 """
 
-from train.cli import script
+from train.command_line.entry_points import script
 from train.studies.placed_lights import PlacedLightSettings, run
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Writes docs/performance_renderer.md with docs/renderer_pareto.{png,csv} and docs
 minutes on one CPU thread; peers=true adds Mitsuba 3.
 """
 
-from train.cli import script
+from train.command_line.entry_points import script
 from train.studies.renderer_speed.study import RendererSpeedSettings, run
 
 if __name__ == "__main__":

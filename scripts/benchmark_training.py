@@ -3,7 +3,7 @@
 Writes docs/performance.md and a figure beside it. conf/benchmark_training.yaml has the settings.
 """
 
-from train.cli import script
+from train.command_line.entry_points import script
 from train.studies.training_speed.study import run
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Writes docs/transport.md. Takes a few minutes on one CPU thread, and needs the e
 Mitsuba's gradients LLVM (`apt install libllvm19`).
 """
 
-from train.cli import script
+from train.command_line.entry_points import script
 from train.studies.transport.study import TransportSettings, run
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure the renderer's largest errors and write them as docs/accuracy.md: python scripts/check_accuracy.py"""
 
-from train.cli import script
+from train.command_line.entry_points import script
 from train.studies.accuracy.study import AccuracySettings, run
 
 if __name__ == "__main__":

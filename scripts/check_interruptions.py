@@ -3,7 +3,7 @@
 python scripts/check_interruptions.py; Linux only, since the size of a process's files is limited from outside.
 """
 
-from train.cli import script
+from train.command_line.entry_points import script
 from train.studies.interruptions.study import InterruptionSettings, run
 
 if __name__ == "__main__":

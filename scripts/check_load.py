@@ -3,7 +3,7 @@
 python scripts/check_load.py; a quarter of an hour on one free core.
 """
 
-from train.cli import script
+from train.command_line.entry_points import script
 from train.studies.load.study import LoadSettings, run
 
 if __name__ == "__main__":

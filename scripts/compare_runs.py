@@ -5,9 +5,9 @@ from pathlib import Path
 
 from augment.progress import progress
 from renderer.errors import InputError
-from train.cli import script
-from train.comparison import format_comparison
-from train.report import summarise
+from train.command_line.entry_points import script
+from train.report.comparison import format_comparison
+from train.report.summary import summarise
 
 
 @dataclass

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from augment.classifiers import Classifier
 from renderer.errors import InputError, require_range
-from train.cli import script
+from train.command_line.entry_points import script
+from train.command_line.outputs import writable_folder
 from train.device import MixedPrecision, choose_device, choose_precision
-from train.outputs import writable_folder
 from train.photographs import evaluate_photographs, format_summary
-from train.run_classifier import load_classifier, load_run
-from train.run_folder import sole_writer
+from train.run_folder.classifier import load_classifier, load_run
+from train.run_folder.files import sole_writer
 from train.settings import LARGEST_SIZE
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from renderer.environment import check_map_name, negative_share, to_map, write_map
 from renderer.errors import InputError, require_range
 from renderer.lights import load_light
-from train.cli import script
-from train.outputs import writable_file
+from train.command_line.entry_points import script
+from train.command_line.outputs import writable_file
 
 LARGEST_HEIGHT = 8192  # of a map that fits in memory: 3 GB
 

@@ -7,8 +7,8 @@ from safetensors.torch import save
 
 from renderer.errors import require_range
 from renderer.skylight import fit_error, fit_polynomials
-from train.cli import script
-from train.outputs import writable_file
+from train.command_line.entry_points import script
+from train.command_line.outputs import writable_file
 
 
 @dataclass

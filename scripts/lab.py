@@ -1,6 +1,6 @@
 """Path-trace photographs of oranges and look-alikes under a projector: python scripts/lab.py out=lab"""
 
-from train.cli import script
+from train.command_line.entry_points import script
 from train.laboratory.folder import write_laboratory
 from train.laboratory.settings import LabSettings
 

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from train.cli import script
-from train.outputs import writable_folder
-from train.report import publish_run
+from train.command_line.entry_points import script
+from train.command_line.outputs import writable_folder
+from train.report.summary import publish_run
 
 
 @dataclass

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from renderer.errors import InputError
-from train.cli import quoted, script
-from train.outputs import writable_folder
-from train.showcase import write_report
+from train.command_line.entry_points import quoted, script
+from train.command_line.outputs import writable_folder
+from train.report.write import write_report
 
 
 @dataclass

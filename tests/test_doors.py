@@ -16,12 +16,12 @@ from PIL import Image
 from renderer.environment import read_map, write_map
 from renderer.errors import InputError
 from renderer.lights import load_light, probe, save_light
-from train.checkpoint import BEST, PUBLISHED, describe, load_network, publish, save
 from train.data import load_npz
 from train.photographs import Photograph, find_photographs, load_photographs
 from train.photographs.answers import Answer
 from train.photographs.answers_table import ANSWERS, read_answers, write_answers
-from train.run_folder import read_config, read_json, read_numbers
+from train.run_folder.checkpoint import BEST, PUBLISHED, describe, load_network, publish, save
+from train.run_folder.files import read_config, read_json, read_numbers
 from train.wideresnet import WideResNet
 
 CLASSES = ["fig", "lime"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from train.cli import USER_ERROR
+from train.command_line.entry_points import USER_ERROR
 from train.studies.interruptions.small_run import ROOT
 from train.studies.reliability.corpus import write_corpus
 from train.studies.reliability.doors import BY_NAME

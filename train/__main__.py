@@ -14,15 +14,15 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
-from train.cli import one_sentence_errors, quoted, run_command
+from train.command_line.entry_points import one_sentence_errors, quoted, run_command
 from train.data import DataSet
 from train.distributed import announce, announced, first_process_first, process_group
 from train.experiment import load_data, prepare, write_images
 from train.interruption import Interrupted
-from train.logs import console
-from train.report import format_table, summarise
-from train.run_folder import sole_writer
-from train.showcase import report_of
+from train.report.summary import format_table, summarise
+from train.report.write import report_of
+from train.run_folder.files import sole_writer
+from train.run_folder.logs import console
 from train.sweep import check_launcher, run_cell
 
 NAMED_MODEL = re.compile(r"^model=(?!\{)")  # by its name alone

@@ -14,7 +14,7 @@ from augment.labels import divergence, is_right, label_loss, ranking_loss
 from renderer.arguments import as_device
 from renderer.errors import InputError
 from renderer.image import to_unit
-from train.logs import console
+from train.run_folder.logs import console
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
 PRECISIONS = ("auto", "bfloat16", "float32")

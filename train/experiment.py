@@ -24,10 +24,9 @@ from renderer.errors import InputError
 from renderer.harmonics import live_coefficients
 from renderer.image import LARGEST_SIZE
 from renderer.transfer import COEFFICIENTS, DEGREE
-from train import checkpoint
 from train.classes import class_index
-from train.cli import NO_ROOM
-from train.configuration import as_dict, read_settings
+from train.command_line.configuration import as_dict, read_settings
+from train.command_line.entry_points import NO_ROOM
 from train.data import (
     DataSet,
     channel_statistics,
@@ -38,8 +37,8 @@ from train.data import (
 )
 from train.device import MixedPrecision, choose_device, choose_precision, set_deterministic, set_threads
 from train.distributed import first_process_first
-from train.fit import Trainer, evaluate
-from train.logs import NoLog, RunLog, console
+from train.fit.evaluation import evaluate
+from train.fit.trainer import Trainer
 from train.networks import build_network
 from train.photographs import (
     FIGURES,
@@ -50,7 +49,9 @@ from train.photographs import (
     require_outside,
 )
 from train.rendered_shapes import load_shapes, write_held_out
-from train.run_folder import CONFIG
+from train.run_folder import checkpoint
+from train.run_folder.files import CONFIG
+from train.run_folder.logs import NoLog, RunLog, console
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, require_same_settings
 
 

@@ -29,7 +29,7 @@ from renderer.mesh import Mesh, normalise
 from renderer.shapes import SOLIDS, solid
 from renderer.visibility import Backend, choose
 from train.data import DataSet, Split
-from train.logs import console
+from train.run_folder.logs import console
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)

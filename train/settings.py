@@ -18,10 +18,10 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.subdivision import MOST_VERTICES
 from renderer.visibility import choose
-from train.configuration import as_dict, dotted, read_settings
+from train.command_line.configuration import as_dict, dotted, read_settings
+from train.fit.recipe import TrainSettings
 from train.networks import WIDERESNET
-from train.recipe import TrainSettings
-from train.run_folder import CONFIG, read_config
+from train.run_folder.files import CONFIG, read_config
 
 # Where, how and with what a run was made: these do not decide its result, nor name a sweep's cell.
 CIRCUMSTANCES = (

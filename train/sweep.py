@@ -27,14 +27,14 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
-from train import checkpoint
-from train.cli import one_sentence, one_sentence_errors
+from train.command_line.entry_points import one_sentence, one_sentence_errors
 from train.experiment import load_data, run, write_images
-from train.logs import console
-from train.report import format_spread, format_table, is_finished, summarise
-from train.run_folder import FAILURE, locked, state
+from train.report.summary import format_spread, format_table, is_finished, summarise
+from train.report.write import report_of
+from train.run_folder import checkpoint
+from train.run_folder.files import FAILURE, locked, state
+from train.run_folder.logs import console
 from train.settings import CIRCUMSTANCES, differing_settings
-from train.showcase import report_of
 
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 NEEDS = {  # launcher: its extra and the package in it

@@ -11,7 +11,7 @@ from PIL import Image
 
 from renderer.lights import load_light
 from renderer.mesh import load_mesh
-from train.cli import USER_ERROR
+from train.command_line.entry_points import USER_ERROR
 
 ROOT = Path(__file__).parents[2]
 SMALL = [

@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from train.checkpoint import BEST, save
-from train.cli import USER_ERROR
-from train.run_folder import LOCK, sole_writer
+from train.command_line.entry_points import USER_ERROR
+from train.run_folder.checkpoint import BEST, save
+from train.run_folder.files import LOCK, sole_writer
 from train.wideresnet import WideResNet
 
 CLASSES = ["fig", "lime", "orange"]
@@ -104,8 +104,8 @@ def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, ca
     def work(*arguments, **more):
         raise AssertionError("the work was begun")
 
-    for name in ("train.photographs.evaluate_photographs", "train.report.publish_run", "renderer.environment.to_map",
-                 "renderer.skylight.fit_polynomials"):  # fmt: skip
+    for name in ("train.photographs.evaluate_photographs", "train.report.summary.publish_run",
+                 "renderer.environment.to_map", "renderer.skylight.fit_polynomials"):  # fmt: skip
         monkeypatch.setattr(name, work)
     suffix = ".hdr" if command is EXPORT else ""
     assert call(*command, f"out={out}{suffix}") == USER_ERROR

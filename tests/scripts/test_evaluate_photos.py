@@ -10,8 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from train.checkpoint import BEST, describe, load_network, save
-from train.cli import USER_ERROR
+from train.command_line.entry_points import USER_ERROR
+from train.run_folder.checkpoint import BEST, describe, load_network, save
 from train.wideresnet import WideResNet
 
 CLASSES = ["lime", "orange"]

@@ -11,7 +11,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
 from train.settings import ExperimentSettings
 
 ROOT = Path(__file__).parents[2]

@@ -20,11 +20,12 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from augment import processes
-from train import checkpoint, fit
 from train.distributed import SyncBatchNormCPU, any_process, process_group, replicated, summed, synchronise_norms
 from train.experiment import load_data, run
+from train.fit import trainer
 from train.interruption import Interrupted
-from train.logs import read_metrics
+from train.run_folder import checkpoint
+from train.run_folder.logs import read_metrics
 from train.wideresnet import WideResNet
 
 ROOT = Path(__file__).parents[2]
@@ -164,7 +165,7 @@ def run_until_a_signal(config: Path, folder: Path) -> None:
 
 @contextmanager
 def interrupted_at(epoch: int, step: int, process: int) -> Iterator[None]:
-    training_batches = fit.training_batches
+    training_batches = trainer.training_batches
 
     def signalled(images, labels, batch_size, seed, now, *rest, **more):
         for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
@@ -173,7 +174,7 @@ def interrupted_at(epoch: int, step: int, process: int) -> Iterator[None]:
             yield batch
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fit, "training_batches", signalled)
+        patch.setattr(trainer, "training_batches", signalled)
         yield
 
 

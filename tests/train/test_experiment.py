@@ -20,12 +20,13 @@ from omegaconf import OmegaConf
 from augment.labels import anything_but
 from augment.variation import VariationSettings
 from renderer.errors import InputError
-from train import checkpoint, fit
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
 from train.data import DataSet
 from train.experiment import load_data, prepare, run
+from train.fit import trainer
 from train.interruption import Interrupted
-from train.logs import read_metrics
+from train.run_folder import checkpoint
+from train.run_folder.logs import read_metrics
 from train.settings import ExperimentSettings, require_same_settings
 
 
@@ -45,7 +46,7 @@ def metrics_without_times(folder: Path) -> list[dict]:
 
 def interrupt_in_the_second_epoch(monkeypatch) -> None:
     """After its first batch."""
-    training_batches = fit.training_batches
+    training_batches = trainer.training_batches
 
     def interrupted(images, labels, batch_size, seed, now, *rest, **more):
         for number, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more)):
@@ -53,7 +54,7 @@ def interrupt_in_the_second_epoch(monkeypatch) -> None:
                 raise KeyboardInterrupt
             yield batch
 
-    monkeypatch.setattr(fit, "training_batches", interrupted)
+    monkeypatch.setattr(trainer, "training_batches", interrupted)
 
 
 def interrupt_while_the_second_checkpoint_is_written(monkeypatch) -> None:
@@ -96,7 +97,7 @@ def test_an_interrupted_and_resumed_run_ends_as_an_uninterrupted_one(
 
 def run_with_signal(config, folder: Path, monkeypatch, round_number: int, step: int, number: signal.Signals) -> None:
     """The signal comes while the step is taken."""
-    training_batches = fit.training_batches
+    training_batches = trainer.training_batches
 
     def signalled(images, labels, batch_size, seed, now, *rest, **more):
         for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
@@ -105,7 +106,7 @@ def run_with_signal(config, folder: Path, monkeypatch, round_number: int, step: 
             yield batch
 
     with monkeypatch.context() as patch:
-        patch.setattr(fit, "training_batches", signalled)
+        patch.setattr(trainer, "training_batches", signalled)
         run(config, load_data(config), folder)
 
 
@@ -174,7 +175,7 @@ def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
         signal.raise_signal(signal.SIGINT)
         yield images[:1], labels[:1]
 
-    monkeypatch.setattr(fit, "training_batches", impatient)
+    monkeypatch.setattr(trainer, "training_batches", impatient)
     with pytest.raises(KeyboardInterrupt):
         run(tiny("augment=none"), load_data(tiny()), tmp_path)
     assert not checkpoint.exists(tmp_path)
@@ -215,10 +216,10 @@ def fail_with(number: int):
 @pytest.mark.parametrize(
     "writer, done",
     [
-        pytest.param("train.logs.RunLog._show", 0, id="TensorBoard"),
-        pytest.param("train.logs.RunLog.renders", 0, id="renders"),
-        pytest.param("train.logs.RunLog.scalars", 0, id="metrics"),
-        pytest.param("train.checkpoint.os.fsync", 0, id="checkpoint"),
+        pytest.param("train.run_folder.logs.RunLog._show", 0, id="TensorBoard"),
+        pytest.param("train.run_folder.logs.RunLog.renders", 0, id="renders"),
+        pytest.param("train.run_folder.logs.RunLog.scalars", 0, id="metrics"),
+        pytest.param("train.run_folder.checkpoint.os.fsync", 0, id="checkpoint"),
         pytest.param("train.experiment.evaluate_photographs", 1, id="photographs"),
     ],
 )
@@ -265,7 +266,7 @@ def test_a_run_on_a_small_disk_ends_in_one_error_and_goes_on_when_there_is_room(
 
 
 def test_an_error_of_the_system_that_room_would_not_mend_is_not_called_a_full_disk(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr("train.logs.RunLog.scalars", fail_with(errno.EIO))
+    monkeypatch.setattr("train.run_folder.logs.RunLog.scalars", fail_with(errno.EIO))
     with pytest.raises(OSError, match="Input/output error"):
         run(tiny("train.epochs=1"), load_data(tiny()), tmp_path)
 
@@ -288,9 +289,10 @@ KILLED = """
 import os, signal, sys
 import torch
 from omegaconf import OmegaConf
-from train import experiment, fit
+from train import experiment
+from train.fit import trainer
 
-training_batches = fit.training_batches
+training_batches = trainer.training_batches
 
 def kill_in_the_second_epoch(images, labels, batch_size, seed, now, *rest, **more):
     for number, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more)):
@@ -299,7 +301,7 @@ def kill_in_the_second_epoch(images, labels, batch_size, seed, now, *rest, **mor
         yield batch
 
 torch.set_num_threads(1)
-fit.training_batches = kill_in_the_second_epoch
+trainer.training_batches = kill_in_the_second_epoch
 config = OmegaConf.load(sys.argv[1])
 experiment.run(config, experiment.load_data(config), experiment.Path(sys.argv[2]))
 """
@@ -390,8 +392,8 @@ def test_a_signal_between_two_rounds_or_within_one_leads_to_the_same_end(tiny, f
 
 def test_every_round_is_trained_on_renders_made_for_its_own_weights(tiny, tmp_path, monkeypatch):
     trained = []
-    put_last = fit.put_last
-    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
+    put_last = trainer.put_last
+    monkeypatch.setattr(trainer, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
     config = tiny("train.epochs=1", "augment=random", "augment.every=20")
     run(config, load_data(config), tmp_path)
     assert len(trained) == 3  # 54 images
@@ -437,8 +439,8 @@ def test_a_run_is_a_function_of_its_seed(tiny, tmp_path, arm):
 
 def test_meshes_of_several_classes_are_rendered_with_their_own_labels(tiny, tmp_path, monkeypatch):
     trained = []
-    put_last = fit.put_last
-    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
+    put_last = trainer.put_last
+    monkeypatch.setattr(trainer, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
     meshes = "scene.meshes=[{mesh: 'solid:pear', label: pear}, 'solid:orange', {mesh: 'solid:apple:2', label: apple}]"
     config = tiny("train.epochs=1", meshes, "augment.examples=12")
     run(config, load_data(config), tmp_path)
@@ -452,8 +454,8 @@ def test_look_alikes_follow_the_meshes_and_are_anything_but_the_label_unless_the
     tiny, tmp_path, monkeypatch
 ):
     trained = []
-    put_last = fit.put_last
-    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
+    put_last = trainer.put_last
+    monkeypatch.setattr(trainer, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
     look_alikes = "scene.look_alikes=['solid:fruit', {mesh: 'solid:pear', label: pear}]"
     config = tiny("train.epochs=1", "scene.meshes=['solid:orange']", look_alikes, "augment.examples=6")
     run(config, load_data(config), tmp_path)
@@ -556,7 +558,7 @@ def test_training_and_validation_images_are_apart(tiny, tmp_path, monkeypatch):
         seen.update(train=train, validation=validation)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fit.Trainer, "fit", record)
+    monkeypatch.setattr(trainer.Trainer, "fit", record)
     data = load_data(tiny())
     with pytest.raises(KeyboardInterrupt):
         run(tiny(), data, tmp_path)
@@ -706,8 +708,8 @@ def test_the_papers_renders_are_as_they_are_and_have_no_look_alikes():
 
 def test_another_class_takes_a_label_meshes_and_look_alikes_alone(tiny, tmp_path, monkeypatch):
     trained = []
-    put_last = fit.put_last
-    monkeypatch.setattr(fit, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
+    put_last = trainer.put_last
+    monkeypatch.setattr(trainer, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
     meshes = ["label=pear", "scene.meshes=['solid:pear']", "scene.look_alikes=[{mesh: 'solid:apple', label: apple}]"]
     small = ["augment.examples=null", "scene.views=2", "augment.every=30", "augment.lights=restart", "train.epochs=1"]
     config = tiny("experiment=best", "train.init_from=null", *meshes, *small)

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from train import checkpoint
 from train.experiment import load_data, run
-from train.fit import Trainer
-from train.logs import read_metrics
+from train.fit.trainer import Trainer
+from train.run_folder import checkpoint
+from train.run_folder.logs import read_metrics
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 

@@ -7,9 +7,9 @@ import torch
 from torchvision.models import resnet18
 
 from renderer.errors import InputError
-from train import checkpoint
 from train.networks import build_network, model_title
-from train.run_classifier import load_run
+from train.run_folder import checkpoint
+from train.run_folder.classifier import load_run
 from train.wideresnet import WideResNet
 
 CLASSES = ("apple", "orange", "pear")

@@ -16,12 +16,14 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
-from train import checkpoint, fit, sweep
+from train import sweep
 from train.__main__ import main
-from train.checkpoint import LAST, content_hash
-from train.cli import USER_ERROR
-from train.logs import read_metrics
-from train.run_folder import FAILURE, LOCK, locked
+from train.command_line.entry_points import USER_ERROR
+from train.fit import trainer
+from train.run_folder import checkpoint
+from train.run_folder.checkpoint import LAST, content_hash
+from train.run_folder.files import FAILURE, LOCK, locked
+from train.run_folder.logs import read_metrics
 from train.settings import decisive_settings
 from train.sweep import cell_name, check_launcher, format_sweep, run_cell
 
@@ -162,7 +164,7 @@ def test_a_second_call_skips_finished_cells_and_shows_them_again(run_sweep, cell
 def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_none(
     run_sweep, cell, swept, tmp_path, monkeypatch, capsys, undone, number
 ):
-    evaluate, calls = fit.evaluate, []
+    evaluate, calls = trainer.evaluate, []
 
     def interrupted(*arguments):
         calls.append(arguments)
@@ -171,7 +173,7 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
         return evaluate(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fit, "evaluate", interrupted)
+        patch.setattr(trainer, "evaluate", interrupted)
         try:
             assert run_sweep(tmp_path, "seed=0,1") == 128 + number
         except KeyboardInterrupt:

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from augment.attacks.sweep import Sweep
 from train.photographs.shares import counted, share
-from train.showcase.plots import COLOURS, LINES, MARKERS
-from train.tables import aligned
+from train.report.plots import COLOURS, LINES, MARKERS
+from train.report.tables import aligned
 
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
 TABLE, FIGURE = "sweep.csv", "sweep.png"

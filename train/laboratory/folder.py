@@ -21,13 +21,13 @@ from renderer.environment import read_map
 from renderer.errors import InputError
 from renderer.image import encode
 from renderer.shapes import LOOK_ALIKES
+from train.command_line.outputs import writable_folder
 from train.laboratory.props import Part, split_parts
 from train.laboratory.settings import LabSettings, environment_name
 from train.laboratory.shots import Shot, draw_shots
 from train.laboratory.studio import photograph
-from train.outputs import writable_folder
 from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
-from train.run_folder import LOCK, sole_writer
+from train.run_folder.files import LOCK, sole_writer
 from train.settings import read_object
 
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may decide a pixel

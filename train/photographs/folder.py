@@ -17,7 +17,7 @@ from augment.progress import progress
 from renderer.errors import InputError, require_file
 from renderer.files.image_files import read_square
 from train.classes import class_index, nearest_class
-from train.logs import console
+from train.run_folder.logs import console
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 MACS = "__MACOSX"  # what macOS puts into archives, for itself

@@ -25,12 +25,12 @@ from renderer.transport.placed import lit, placed_radiance
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 from renderer.visibility import choose
-from train.cli import command_line
-from train.outputs import writable_file
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_file
+from train.report.tables import markdown
 from train.studies.page import joined, machine, wrapped, write
 from train.studies.renderer_speed.measure import Clock, relative_error
 from train.studies.transport.cost import light_step, seconds
-from train.tables import markdown
 
 CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
 SIZES, SAMPLES, REFERENCE = (32, 224), (2, 8), 64  # pixels per side, and samples

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from train.tables import markdown
+from train.report.tables import markdown
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from renderer.lights import probe
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
 from train.settings import read_object
 
 CPU = torch.device("cpu")

@@ -22,7 +22,7 @@ from renderer.lights import load_light
 from renderer.mesh import load_mesh
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
 from train.settings import read_object
 
 CLASSES = ("orange", "lime", "sky")

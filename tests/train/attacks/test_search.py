@@ -14,7 +14,7 @@ from renderer.errors import InputError
 from train.attacks.experiment import attacks
 from train.attacks.search import LENS, LIGHT_GREY, _candidates, overrides, search
 from train.attacks.settings import AttackExperimentSettings
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
 from train.settings import read_object
 
 CPU = torch.device("cpu")

@@ -12,10 +12,10 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import DictConfig
 
-from train import checkpoint
-from train.checkpoint import BEST, LAST, PREVIOUS
 from train.experiment import load_data, run
-from train.logs import METRICS, RunLog, read_metrics
+from train.run_folder import checkpoint
+from train.run_folder.checkpoint import BEST, LAST, PREVIOUS
+from train.run_folder.logs import METRICS, RunLog, read_metrics
 from train.studies.interruptions.bench import Bench, Outcome
 from train.studies.interruptions.comparison import compare, differences
 from train.studies.interruptions.disturbances import interrupted, kill

@@ -11,8 +11,8 @@ from torch import nn
 
 from renderer.errors import InputError
 from train.data import Split, load_npz
-from train.epoch import Round, training_batches
-from train.recipe import TrainSettings
+from train.fit.epoch import Round, training_batches
+from train.fit.recipe import TrainSettings
 from train.settings import ExperimentSettings
 from train.studies.training_speed import peak
 from train.studies.training_speed.baseline import Baseline, build_loader, use_plain_dropout

@@ -11,7 +11,7 @@ from renderer.image import ImageSettings
 from renderer.mesh import Mesh, normalise
 from renderer.shapes import solid
 from renderer.transport import rays
-from train.run_classifier import load_classifier
+from train.run_folder.classifier import load_classifier
 from train.studies.transport import beside_mitsuba, cost, held
 
 

@@ -9,11 +9,11 @@ import mpmath
 import numpy as np
 import torch
 
+from train.report.tables import markdown
 from train.studies.accuracy.conditions import Row
 from train.studies.accuracy.measure import Error
 from train.studies.accuracy.refusals import Refusal
 from train.studies.page import joined
-from train.tables import markdown
 
 INTRODUCTION = """# Accuracy
 

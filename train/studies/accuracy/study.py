@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 
 from renderer.errors import InputError, require_range
-from train.cli import command_line
-from train.outputs import writable_file
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_file
 from train.studies.accuracy import conditions
 from train.studies.accuracy.page import Table, failures, page, with_table
 from train.studies.accuracy.refusals import refusals

@@ -7,12 +7,12 @@ from itertools import chain
 import torch
 
 from renderer.errors import InputError, require_range
-from train.cli import command_line
-from train.outputs import writable_file
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_file
+from train.report.tables import markdown
 from train.studies.growth.cost import GREYS, Cost, Load, described, measure
 from train.studies.growth.imagenet import IMAGES, SIZE, Parts, added_share, measure_parts
 from train.studies.page import joined, machine, wrapped, write
-from train.tables import markdown
 
 INTRODUCTION = """\
 # How the cost of renders grows

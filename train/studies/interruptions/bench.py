@@ -11,7 +11,7 @@ from pathlib import Path
 
 from numpy.random import Generator
 
-from train import checkpoint
+from train.run_folder import checkpoint
 from train.studies.interruptions.comparison import compare
 from train.studies.interruptions.process import Ending, Moment, Process
 from train.studies.interruptions.small_run import SmallRun

@@ -11,9 +11,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor
 
 from renderer.errors import InputError
-from train import checkpoint
-from train.logs import METRICS, read_metrics
-from train.showcase.write import IMAGES
+from train.report.write import IMAGES
+from train.run_folder import checkpoint
+from train.run_folder.logs import METRICS, read_metrics
 
 SECONDS = "seconds/"
 logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it says of every resumed run that it was

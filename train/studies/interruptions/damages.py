@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from numpy.random import Generator
 
-from train import checkpoint
-from train.logs import METRICS
+from train.run_folder import checkpoint
+from train.run_folder.logs import METRICS
 from train.studies.interruptions.bench import Bench, Outcome, conclude, full_disk_faults
 from train.studies.interruptions.process import Ending, Process
 

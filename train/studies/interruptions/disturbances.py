@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from numpy.random import Generator
 
-from train import checkpoint
+from train.run_folder import checkpoint
 from train.studies.interruptions.bench import Bench, Outcome, conclude, full_disk_faults
 from train.studies.interruptions.process import FIT, START, Ending, Process
 

@@ -10,10 +10,11 @@ from functools import wraps
 from mmap import mmap
 from typing import Any
 
-from train import checkpoint, experiment
+from train import experiment
 from train.__main__ import start
-from train.fit import Trainer
-from train.logs import RunLog
+from train.fit.trainer import Trainer
+from train.run_folder import checkpoint
+from train.run_folder.logs import RunLog
 
 PHASES: dict[str, list[tuple[object, str]]] = {  # entered with a function, and left with it
     "attack": [(Trainer, "_regenerate")],

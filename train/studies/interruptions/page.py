@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import torch
 
+from train.report.tables import markdown
 from train.studies.interruptions.bench import Bench, Outcome
 from train.studies.interruptions.process import ORDER
 from train.studies.page import joined
-from train.tables import markdown
 
 CONCERNS = {  # of faults, and the heads of their columns
     "checkpoints": "weights, optimiser",

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
-from train.cli import USER_ERROR
-from train.logs import METRICS
+from train.command_line.entry_points import USER_ERROR
+from train.run_folder.logs import METRICS
 from train.studies.interruptions.observed import NAMES
 from train.studies.interruptions.small_run import SmallRun
 

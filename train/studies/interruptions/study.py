@@ -14,9 +14,9 @@ import numpy as np
 from numpy.random import Generator
 
 from renderer.errors import InputError, require_range
-from train.cli import command_line
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_file, writable_folder
 from train.interruption import heed_interrupts
-from train.outputs import writable_file, writable_folder
 from train.studies.interruptions.bench import Bench, Outcome, prepare
 from train.studies.interruptions.damages import DAMAGES, LIMITS, both_damaged, damaged, limited
 from train.studies.interruptions.disturbances import ask, ask_then_kill, disk_filled, interrupted, kill

@@ -9,14 +9,14 @@ from tempfile import TemporaryDirectory
 import torch
 
 from renderer.errors import require_range
-from train.cli import USER_ERROR, command_line
+from train.command_line.entry_points import USER_ERROR, command_line
+from train.command_line.outputs import writable_file
 from train.interruption import heed_interrupts
-from train.outputs import writable_file
+from train.report.tables import markdown
 from train.studies.load import loads
 from train.studies.load.observed import Observed, observe
 from train.studies.page import joined, machine, wrapped, write
 from train.studies.reliability.study import prepare
-from train.tables import markdown
 
 INTRODUCTION = """\
 # Load

@@ -19,11 +19,11 @@ from augment.parameters import StepSettings
 from renderer.errors import InputError
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackCommandSettings, AttackExperimentSettings, AttackSceneSettings
+from train.report.tables import markdown
 from train.settings import RendererSettings
 from train.studies.paper.adversaries import LIGHT, SHAPE
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.subjects import VERTICES
-from train.tables import markdown
 
 LIMIT = 150_000  # bytes of a committed image; above it the colours are reduced
 WIDER_SHAPE = StepSettings("linf", 0.01, "sign", 0.001)

@@ -24,12 +24,12 @@ from renderer.camera import ring
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.visibility import choose
-from train.run_classifier import load_classifier
+from train.report.tables import markdown
+from train.run_folder.classifier import load_classifier
 from train.studies.figures import panels_beside, save
 from train.studies.paper.adversaries import ATTACKS
 from train.studies.paper.section import Study
 from train.studies.paper.subjects import GREYS, Subject, scene_of
-from train.tables import markdown
 from train.wideresnet import WideResNet
 
 TARGETS = {"lighting": 1.05, "geometry": 1.3}

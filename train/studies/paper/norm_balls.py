@@ -15,12 +15,12 @@ from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
 from augment.seeding import generator
 from train.photographs.shares import share
+from train.report.tables import markdown
 from train.studies.figures import panels_beside, pyplot, save
 from train.studies.paper.balls import LEVELS, PART, SPACES, Outcome, attack_ball, joined, parts
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import draw_shares, interval
 from train.studies.paper.subjects import Subject, finer, recognised_scene
-from train.tables import markdown
 
 
 @dataclass

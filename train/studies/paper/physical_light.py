@@ -16,10 +16,10 @@ from augment.scene import Scene
 from renderer.harmonics import basis, project, quadrature
 from renderer.transfer import DEGREE
 from train.photographs.shares import share
+from train.report.tables import markdown
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import interval
 from train.studies.paper.subjects import recognised_scene
-from train.tables import markdown
 
 BATCH = 10  # examples in a pass through the classifier
 RADII = (0.02, 0.05, 0.1, 0.3, 1.0, None)

@@ -16,10 +16,10 @@ from augment.classifiers import Classifier
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
+from train.report.tables import markdown
 from train.studies.figures import panels_beside, save
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.subjects import FIELDS_OF_VIEW, GREYS, Subject, scene_of
-from train.tables import markdown
 
 LEAST_SHARE = 0.02  # recognised; below it the search for renders is given up
 BINS = np.linspace(0, 1, 21)

@@ -11,6 +11,7 @@ import torch
 from augment.descent import DescentSettings, Goal, descend
 from augment.objects import ObjectSettings, load_object
 from train.photographs.shares import share
+from train.report.tables import markdown
 from train.studies.paper.adversaries import ATTACKS
 from train.studies.paper.iterations import (
     BATCH,
@@ -28,7 +29,6 @@ from train.studies.paper.iterations import (
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import interval
 from train.studies.paper.subjects import Subject, finer, recognised_scene, scene_of
-from train.tables import markdown
 
 FIELDS = (2.0, 2.8, 4.0, 5.7, 8.0)  # each halves the pixels of the one before
 SOLID = ObjectSettings("solid:orange", "orange")

@@ -22,10 +22,10 @@ from renderer.image import ImageSettings, behind, develop_composite
 from renderer.lights import ambient
 from renderer.transfer import build_operators
 from renderer.visibility import choose
+from train.report.tables import markdown
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
 from train.studies.paper.subjects import Subject, recognised_scene
-from train.tables import markdown
 
 TRANSPORTS = ("direct", "shadows", "bounces:3")
 TRACED = "bounces:16"  # paths that go on for longer change no image

@@ -11,10 +11,10 @@ import torch
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
-from train.cli import command_line
-from train.configuration import read_settings
-from train.outputs import writable_folder
-from train.run_classifier import load_classifier
+from train.command_line.configuration import read_settings
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_folder
+from train.run_folder.classifier import load_classifier
 from train.settings import SceneSettings, read_object
 from train.studies.page import joined, versions, wrapped, write
 from train.studies.paper import (

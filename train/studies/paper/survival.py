@@ -15,11 +15,10 @@ from renderer.files.mitsuba_scene import SAMPLES
 from train.attacks.experiment import attacks
 from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings
-from train.composition import composed
-from train.configuration import read_settings
+from train.command_line.configuration import composed, read_settings
+from train.report.tables import markdown
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
-from train.tables import markdown
 
 ATTACKS = {  # by their names in the tables, as `attack=` of scripts/attack.py
     "light": "lighting",

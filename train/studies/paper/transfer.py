@@ -12,13 +12,13 @@ from torch import Tensor
 from augment.classifiers import Classifier
 from augment.descent import Part, Problem
 from augment.seeding import generator
-from train.run_classifier import load_classifier
+from train.report.tables import markdown
+from train.run_folder.classifier import load_classifier
 from train.studies.figures import pyplot, save
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, recognised_parts, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
 from train.studies.paper.subjects import Subject, finer, scene_of
-from train.tables import markdown
 
 
 @dataclass

@@ -17,12 +17,12 @@ from augment.perturbation import Perturbation
 from augment.scene import Scene
 from augment.seeding import generator, stream_seed
 from train.photographs.shares import share
+from train.report.tables import markdown
 from train.studies.figures import panels_beside, save
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, recognised_parts, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import draw_shares, percent
 from train.studies.paper.subjects import Subject, finer, recognised_scene
-from train.tables import markdown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from train import checkpoint
+from train.run_folder import checkpoint
 
 Edit = Callable[[Path], object]
 CODE_RAN = "CODE_RAN"  # a file that appears where a command runs code from its input

@@ -4,8 +4,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from train.report.tables import markdown
 from train.studies.page import joined, versions, wrapped
-from train.tables import markdown
 
 INTRODUCTION = """\
 # Reliability

@@ -13,9 +13,9 @@ import numpy as np
 from tqdm import tqdm
 
 from renderer.errors import InputError, require_range
-from train.cli import command_line
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_file
 from train.interruption import heed_interrupts
-from train.outputs import writable_file
 from train.studies.page import write
 from train.studies.reliability.corpus import PUBLISHED, RUN, write_corpus
 from train.studies.reliability.doors import BY_NAME

@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from train.cli import USER_ERROR
+from train.command_line.entry_points import USER_ERROR
 from train.studies.reliability.damages import damages
 from train.studies.reliability.doors import DOORS, Door, given
 from train.studies.reliability.edits import CODE_RAN

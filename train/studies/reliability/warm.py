@@ -9,10 +9,10 @@ import torch._inductor.config  # noqa: F401  # which the first optimiser of torc
 from hydra import compose, initialize_config_module
 
 import train.attacks.experiment
-import train.comparison
 import train.experiment
 import train.laboratory.folder
-import train.run_classifier
+import train.report.comparison
+import train.run_folder.classifier
 import train.sweep  # noqa: F401
 
 with initialize_config_module("conf", version_base="1.3"):

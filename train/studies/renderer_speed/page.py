@@ -3,13 +3,13 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from train.report.tables import markdown, shown
 from train.studies.page import joined
 from train.studies.renderer_speed.results import Row, compared, pareto_front, verdict
 from train.studies.renderer_speed.scaling import Point
 from train.studies.renderer_speed.skipping import Saving
 from train.studies.renderer_speed.vertices import Vertices, section
 from train.studies.targets import Target, table_of
-from train.tables import markdown, shown
 
 HEADER = """# Time against error
 

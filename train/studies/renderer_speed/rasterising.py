@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from train.report.tables import markdown, shown
 from train.studies.renderer_speed.panels import Bench
 from train.studies.renderer_speed.scenes import CAMERA, ellipsoid
 from train.studies.targets import Target
-from train.tables import markdown, shown
 
 COMPILED, PLAIN = "compiled", "software"
 MOST = 100_000  # vertices

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from train.tables import markdown, shown
+from train.report.tables import markdown, shown
 
 NOISE = 0.05  # of a median: times closer than that may change places from run to run
 

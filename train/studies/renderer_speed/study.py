@@ -11,9 +11,9 @@ from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.shapes import solid
 from renderer.visibility import NAMES, Backend, choose
-from train.cli import command_line
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_folder
 from train.device import choose_device
-from train.outputs import writable_folder
 from train.settings import SceneSettings, read_object
 from train.studies.page import machine, write
 from train.studies.renderer_speed import (

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 from renderer.cache import OperatorCache
 from renderer.mesh import Mesh
+from train.report.tables import shown
 from train.studies.renderer_speed import comparison, mitsuba_peer
 from train.studies.renderer_speed.panels import SAMPLES, Bench
 from train.studies.renderer_speed.results import Row
 from train.studies.renderer_speed.skipping import build_operators
 from train.studies.renderer_speed.steps import light_step, vertex_step
 from train.studies.targets import Target
-from train.tables import shown
 
 
 def by_light(small: Sequence[Row], large: Sequence[Row]) -> list[Target]:

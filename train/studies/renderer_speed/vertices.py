@@ -4,13 +4,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from train.report.tables import shown
 from train.studies.page import joined
 from train.studies.renderer_speed import comparison, rasterising, targets
 from train.studies.renderer_speed.panels import Bench
 from train.studies.renderer_speed.rasterising import Drawn
 from train.studies.renderer_speed.results import Row, compared
 from train.studies.targets import table_of
-from train.tables import shown
 
 WHY_NOT = """\
 Plain autograd sample by sample is `renderer.reference`; face by face it shades each face once, as the analytic

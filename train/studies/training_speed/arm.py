@@ -8,7 +8,7 @@ import torch
 from augment.phases import Phases
 from train.data import DataSet, Split
 from train.experiment import build_trainer
-from train.logs import RunLog
+from train.run_folder.logs import RunLog
 from train.settings import ExperimentSettings
 from train.wideresnet import WideResNet
 

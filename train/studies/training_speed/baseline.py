@@ -11,8 +11,8 @@ from torchvision import transforms
 
 from augment.phases import Phases
 from train.data import Split
-from train.epoch import PADDING
-from train.recipe import TrainSettings
+from train.fit.epoch import PADDING
+from train.fit.recipe import TrainSettings
 from train.wideresnet import Dropout
 
 Batches = DataLoader[tuple[Tensor, int]]

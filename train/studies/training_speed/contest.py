@@ -11,7 +11,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import require_range
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
 from train.data import DataSet, Split, channel_statistics, stratified_split
 from train.device import choose_precision
 from train.experiment import load_data

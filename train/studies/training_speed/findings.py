@@ -6,12 +6,12 @@ from functools import cached_property
 from statistics import median
 from typing import Any
 
-from train.epoch import batch_count
-from train.logs import PHASES
+from train.fit.epoch import batch_count
+from train.report.tables import shown
+from train.run_folder.logs import PHASES
 from train.studies.targets import Target
 from train.studies.training_speed.arm import EPOCH
 from train.studies.training_speed.peak import TRAINING
-from train.tables import shown
 
 PLAIN, ADVERSARIAL, BASELINE, PRODUCTS = "augment=none", "augment=adversarial", "baseline", "matrix products"
 REST = "everything else"

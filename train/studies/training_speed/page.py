@@ -4,13 +4,13 @@ from pathlib import Path
 
 import torch
 
-from train.logs import PHASES
+from train.report.tables import markdown, shown
+from train.run_folder.logs import PHASES
 from train.studies.figures import pyplot, save
 from train.studies.page import joined
 from train.studies.targets import table_of
 from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, REST, RUN, Findings, Spread, targets
 from train.studies.training_speed.peak import PRECISIONS
-from train.tables import markdown, shown
 
 HEADER = """# Training speed
 
@@ -20,7 +20,7 @@ HEADER = """# Training speed
 
 - **The network** is {network}: {multiply_adds:.1f} M multiply-adds in an image's forward pass, counted as they
   are called. A training step is taken as three forward passes. The data are {data}.
-- **Ours** is `train.fit.Trainer`, as `python -m train` runs it, in {precision}, {compiled}, in batches of {batch_size}.
+- **Ours** is `train.fit`, as `python -m train` runs it, in {precision}, {compiled}, in batches of {batch_size}.
 - **The baseline** is the loop that one writes with torchvision: PIL images, `RandomCrop`, `RandomHorizontalFlip`,
   `ToTensor` and `Normalize` in a `DataLoader` with {workers} workers, the same network with `nn.Dropout`, channels
   first, eager, in float32{on_gpu}, and `torch.optim.SGD`.

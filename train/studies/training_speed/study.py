@@ -4,11 +4,11 @@ from dataclasses import fields
 
 from omegaconf import DictConfig, OmegaConf
 
-from train.cli import command_line
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_file
 from train.device import choose_device, compiles, set_deterministic, set_threads
 from train.networks import model_title
-from train.outputs import writable_file
 from train.settings import ExperimentSettings
 from train.studies.page import machine, write
 from train.studies.training_speed.contest import BenchmarkSettings, load, measure

@@ -23,8 +23,8 @@ from renderer.mesh import Mesh, concatenate, normalise
 from renderer.shapes import solid
 from renderer.transfer import Operator, build_operators
 from renderer.visibility import choose
+from train.report.tables import markdown
 from train.studies.quadrature import quadrature
-from train.tables import markdown
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
 SIZE, SEEDS = 32, 8  # Mitsuba's images, whose spread tells its noise

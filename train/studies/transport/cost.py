@@ -16,9 +16,9 @@ from renderer.mesh import Mesh
 from renderer.transfer import Operator, build_operators
 from renderer.transport import rays
 from renderer.visibility import choose
+from train.report.tables import markdown
 from train.studies.quadrature import quadrature
 from train.studies.renderer_speed.measure import Clock
-from train.tables import markdown
 
 TRANSPORTS = ("direct", "shadows", "bounces:3")
 VIEWS, FIELD_OF_VIEW = 20, 2.2

@@ -16,8 +16,8 @@ from augment.objects import SceneObject
 from augment.parameters import StepSettings
 from augment.perturbation import Perturbation
 from renderer.mesh import Mesh
+from train.report.tables import markdown
 from train.studies.paper.subjects import Subject, recognised_scene
-from train.tables import markdown
 
 STEP = StepSettings("linf", 0.01, "sign", 0.0005)
 EVERY = (1, 2, 5, 10, math.inf)  # steps, each of which moves every coordinate by the step's size

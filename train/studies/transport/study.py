@@ -11,9 +11,9 @@ from renderer.shapes import solid
 from renderer.subdivision import subdivide
 from renderer.transport.radiosity import PATCHES
 from renderer.transport.rays import DIRECTIONS
-from train.cli import command_line
-from train.outputs import writable_file
-from train.run_classifier import load_classifier
+from train.command_line.entry_points import command_line
+from train.command_line.outputs import writable_file
+from train.run_folder.classifier import load_classifier
 from train.studies.page import joined, machine, wrapped, write
 from train.studies.renderer_speed.measure import Clock
 from train.studies.transport import beside_mitsuba, cost, held

@@ -5,7 +5,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from train.configuration import read_settings
+from train.command_line.configuration import read_settings
 from train.studies.paper import study
 
 

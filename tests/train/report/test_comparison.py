@@ -1,0 +1,202 @@
+import re
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+
+from renderer.errors import InputError
+from train.photographs.answers import Answer
+from train.photographs.answers_table import write_answers
+from train.photographs.folder import Photograph
+from train.report.comparison import format_comparison
+from train.report.summary import summarise
+
+TITLES = [
+    "Photographs: orange recognised", "Photographs: others called orange", "Photographs: AUC",
+    "Photographs: recall at 5% false alarms", "Photographs: recall at 10% false alarms",
+    "Photographs: recall at 20% false alarms",
+]  # fmt: skip
+
+
+def answer(index: int, label: str, source: str | None, score: float) -> Answer:
+    """Of a network that calls orange what scores above 0."""
+    orange = score > 0
+    photograph = Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source)
+    right = orange == (label == "orange")
+    rank = (1 if right else 2) if label == "orange" else None
+    return Answer(photograph, "orange" if orange else "pear", 0.5, None, rank, 0.5, 1 if orange else 2, score)
+
+
+@pytest.fixture
+def scored_run(tmp_path, made_up_run):
+    """Makes a finished run with scores: by source, those of oranges and of other things."""
+
+    def make(arm: str, scores: dict[str | None, tuple], *overrides: str, name: str = "photographs") -> Path:
+        summaries = {name: {"label": "orange"}}
+        folder = made_up_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", arm, summaries, *overrides)
+        kinds = [
+            (label, source, score)
+            for source, pair in scores.items()
+            for label, group in zip(("orange", "other_lime"), pair, strict=True)
+            for score in group
+        ]
+        answers = [answer(index, *kind) for index, kind in enumerate(kinds)]
+        write_answers(folder / name / "photographs.csv", answers, "orange")
+        return folder
+
+    return make
+
+
+def compare(read_markdown, folders: list[Path], exclude=(), **keys) -> dict[str, list[list[str]]]:
+    return read_markdown(format_comparison([summarise(folder) for folder in folders], exclude, **keys))
+
+
+STUDIO_AND_WEB = {"studio": ([1, 1, 1, 1], []), "web": ([1, -1, -1, -1, -1], [-2, 3]), None: ([1, -1], [])}
+
+
+def test_a_comparison_shows_every_source_and_pools_all_but_some(scored_run, made_up_run, tmp_path, read_markdown):
+    other = {**STUDIO_AND_WEB, "web": ([4, 4, 4, -1, -1], [-2, 3])}
+    folders = [scored_run("none", STUDIO_AND_WEB), scored_run("adversarial", other, "seed=1")]
+    tables = compare(read_markdown, [*folders, made_up_run(tmp_path / "c", "random")], ["studio"])
+    assert list(tables) == [
+        "Accuracy on the test set", *TITLES, "adversarial minus none, different seeds (1 and 1)", "Seconds per epoch",
+    ]  # fmt: skip
+    assert tables["Accuracy on the test set"][1:] == [
+        ["none", "0", "0.7654", "2", "0.7500"],
+        ["adversarial", "1", "0.7654", "2", "0.7500"],
+        ["random", "0", "0.7654", "2", "0.7500"],
+    ]
+    values = [[cell.partition(" ")[0] for cell in row] for row in tables["Photographs: orange recognised"][1:]]
+    assert tables["Photographs: orange recognised"][0] == ["source", "none, seed 0", "adversarial, seed 1"]
+    assert values == [["studio", "1.000", "1.000"], ["web", "0.200", "0.600"], ["all", "0.286", "0.571"]]
+    assert tables["Photographs: orange recognised"][-1][0] == "all but studio"
+    # the studio has nothing to rank oranges against
+    ranked = tables["Photographs: AUC"][1:]
+    assert [[cell.partition(" ")[0] for cell in row] for row in ranked] == [
+        ["web", "0.500", "0.800"],
+        ["all", "0.500", "0.714"],
+    ]
+    assert tables["Seconds per epoch"][1] == ["none", "0.75", "4.50", "1.50", "0.75", "50.0%", "10.0%", "7.00"]
+
+
+def test_without_exclusions_a_comparison_pools_all_photographs(scored_run, read_markdown):
+    table = compare(read_markdown, [scored_run("none", STUDIO_AND_WEB)])["Photographs: orange recognised"]
+    assert table[-1][0] == "all" and table[-1][1].startswith(f"{6 / 11:.3f} [")
+
+
+def test_a_mistyped_source_to_exclude_is_an_error(scored_run):
+    run = summarise(scored_run("none", STUDIO_AND_WEB))
+    with pytest.raises(InputError, match="exclude: no photograph is of source 'stdio'; the sources are studio, web"):
+        format_comparison([run], ["stdio"])
+
+
+def test_runs_without_photographs_are_compared_by_accuracy_and_time(made_up_run, tmp_path, read_markdown):
+    tables = compare(read_markdown, [made_up_run(tmp_path / "a")])
+    assert list(tables) == ["Accuracy on the test set", "Seconds per epoch"]
+
+
+def test_another_folder_of_photographs_is_compared_by_its_name(scored_run, read_markdown):
+    folders = [scored_run(arm, STUDIO_AND_WEB, name="lab") for arm in ("none", "random")]
+    assert "Photographs: AUC" not in compare(read_markdown, folders)
+    assert "Photographs: AUC" in compare(read_markdown, folders, photographs="lab")
+    with pytest.raises(InputError, match=r"^photographs=lib: no run has a sub-folder of that name"):
+        compare(read_markdown, folders, photographs="lib")
+
+
+def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run, read_markdown):
+    first = scored_run("none", STUDIO_AND_WEB)
+    for other in (
+        {**STUDIO_AND_WEB, "web": ([1], [0])},
+        {**STUDIO_AND_WEB, "wob": STUDIO_AND_WEB["web"], "web": ((), ())},
+    ):
+        second = scored_run("random", other)
+        with pytest.raises(InputError, match=f"{second}/photographs has other photographs or sources than {first}"):
+            compare(read_markdown, [first, second])
+
+
+def test_scores_of_another_class_are_refused(scored_run):
+    folder = scored_run("none", STUDIO_AND_WEB)
+    table = folder / "photographs" / "photographs.csv"
+    table.write_text(table.read_text().replace("orange_", "pear_"))
+    with pytest.raises(
+        InputError, match=r"photographs\.csv cannot be used: score the photographs again, with label=orange"
+    ):
+        format_comparison([summarise(folder)], [])
+
+
+def test_scores_from_before_the_ranking_are_compared_without_it(scored_run, read_markdown):
+    folders = [scored_run(arm, STUDIO_AND_WEB) for arm in ("none", "random")]
+    for folder in folders:
+        table = folder / "photographs" / "photographs.csv"
+        table.write_text("\n".join(line.rpartition(",")[0] for line in table.read_text().splitlines()) + "\n")
+    tables = compare(read_markdown, folders)
+    assert len(tables["Photographs: orange recognised"]) == 4 and len(tables["Photographs: AUC"]) == 1
+    assert tables["random minus none, one seed"][-1][3:] == ["-"] * 4
+
+
+# ---------------------------------------------------------------------------------------- differences
+
+
+def read_difference(cell: str) -> tuple[float, float, float]:
+    return tuple(map(float, re.fullmatch(r"([+-][\d.]+) \[([+-][\d.]+), ([+-][\d.]+)\]", cell).groups()))
+
+
+@pytest.fixture
+def arms(scored_run) -> tuple[list[Path], list[np.ndarray], list[np.ndarray]]:
+    """Three seeds of two arms on 60 oranges and 40 others: scores (arm, seed, image) of either kind."""
+    generator = np.random.default_rng(0)
+    seen = [generator.normal(1, 1, (1, 1, 60)), generator.normal(0, 1, (1, 1, 40))]  # easy and hard images
+    shift = np.array([0.0, 0.5])[:, None, None] + generator.normal(0, 0.2, (1, 3, 1))  # arm, and a seed's luck
+    oranges, others = (image + shift + generator.normal(0, 0.3, (2, 3, image.shape[2])) for image in seen)
+    folders = [
+        scored_run(arm, {"web": (oranges[row, seed], others[row, seed])}, f"seed={seed}")
+        for row, arm in enumerate(("none", "random"))
+        for seed in range(3)
+    ]
+    return folders, oranges, others
+
+
+def auc(oranges: np.ndarray, others: np.ndarray) -> float:
+    return (oranges[:, None] > others).mean()  # no two scores are equal
+
+
+def test_a_difference_is_that_of_the_means_over_seeds_with_the_interval_of_a_bootstrap_written_out(arms, read_markdown):
+    """The loop draws images and seeds one replicate at a time; 0.02 is the chance of 1,000 of them."""
+    folders, oranges, others = arms
+    tables = compare(read_markdown, folders)
+    header, web, pooled = tables["random minus none, 3 seeds in pairs"]
+    assert header[:4] == ["source", "orange recognised", "others called orange", "AUC"]
+    assert web[0] == "web" and pooled == ["all", *web[1:]]
+
+    generator, drawn = np.random.default_rng(1), []
+    for _ in range(1000):
+        seeds, orange, other = (generator.integers(n, size=n) for n in (3, 60, 40))
+        recall = (oranges[:, seeds][:, :, orange] > 0).mean(axis=(1, 2))
+        ranked = [
+            np.mean([auc(oranges[arm, seed, orange], others[arm, seed, other]) for seed in seeds]) for arm in (0, 1)
+        ]
+        drawn.append((recall[1] - recall[0], ranked[1] - ranked[0]))
+    intervals = np.quantile(drawn, (0.025, 0.975), axis=0).T
+    values = [
+        (oranges[1] > 0).mean() - (oranges[0] > 0).mean(),
+        np.mean([auc(oranges[1, seed], others[1, seed]) - auc(oranges[0, seed], others[0, seed]) for seed in range(3)]),
+    ]
+    for cell, value, reference in zip((web[1], web[3]), values, intervals, strict=True):
+        told, low, high = read_difference(cell)
+        assert told == pytest.approx(value, abs=5.1e-4)  # printed to three digits
+        assert (low, high) == pytest.approx(tuple(reference), abs=0.02)
+
+
+def test_an_arm_does_not_differ_from_itself(scored_run, read_markdown):
+    folders = [scored_run(arm, STUDIO_AND_WEB) for arm in ("none", "random")]
+    rows = compare(read_markdown, folders)["random minus none, one seed"][1:]
+    for row in rows:
+        assert {cell for cell in row[1:] if cell != "-"} <= {"+0.000 [+0.000, +0.000]"}
+
+
+def test_groups_of_an_arm_are_named_by_the_settings_in_which_they_differ(scored_run, read_markdown):
+    radii = [["augment.random.radius=1.5"], []]
+    folders = [scored_run("none", STUDIO_AND_WEB), *(scored_run("random", STUDIO_AND_WEB, *radius) for radius in radii)]
+    titles = list(compare(read_markdown, folders))
+    assert "random, augment.random.radius=1.5 minus none, one seed" in titles
+    assert "random, augment.random.radius=None minus none, one seed" in titles

@@ -1,0 +1,1 @@
+"""Training: epochs of data and renders, steps, schedules, distortions, validation, checkpoints."""

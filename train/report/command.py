@@ -1,0 +1,55 @@
+"""The command that trains a run, or makes an attack, again: what its configuration has otherwise than the defaults."""
+
+import json
+import re
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+from omegaconf import DictConfig
+
+from augment.parameters import KINDS
+from train.command_line.configuration import as_dict, composed, dotted
+from train.command_line.entry_points import quoted
+
+CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "out", "train.resume", "data.images")
+DATA = ("cifar100", "npz", "folder")  # besides the default
+PLAIN = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_/][\w./:-]*", re.ASCII | re.IGNORECASE)
+
+
+def training_command(config: DictConfig) -> str:
+    return _command("python -m train", "train", config, "attack@augment.attack", config.augment.attack)
+
+
+def attack_command(config: DictConfig) -> str:
+    return _command("python scripts/attack.py", "attack", config, "attack", config.attack)
+
+
+def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapping[str, Any]) -> str:
+    """Also of a run from another version, whose keys this one may lack; they are left out."""
+    kinds = [kind for kind in KINDS if kind in attack]
+    chosen = [f"{group}=[{','.join(kinds)}]"] if kinds else []
+    if config.get("data", {}).get("name") in DATA:
+        chosen.append(f"data={config.data.name}")
+    defaults = dict(dotted(as_dict(composed(name, chosen))))
+    own = dict(dotted(as_dict(config)))
+    if own.get("evaluate.photos") and own.get("evaluate.photos") == own.get("data.images"):
+        del own["evaluate.photos"]  # the run's own renders, which it makes again
+    changed = {key: value for key, value in own.items() if key in defaults and value != defaults[key]}
+    overrides = [f"{key}={_value(value)}" for key, value in changed.items() if not _is_circumstance(key)]
+    return shlex.join([*start.split(), *chosen, *overrides])
+
+
+def _is_circumstance(key: str) -> bool:
+    return any(key == each or key.startswith(f"{each}.") for each in CIRCUMSTANCES)
+
+
+def _value(value: object) -> str:
+    """In Hydra's grammar."""
+    if isinstance(value, str):
+        return value if PLAIN.fullmatch(value) else quoted(value)
+    if isinstance(value, list):
+        return f"[{','.join(map(_value, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_value(each)}" for key, each in value.items()) + "}"
+    return json.dumps(value)

@@ -1,0 +1,195 @@
+"""Finished runs side by side: accuracy, time, figures on photographs by source, and how far arms differ in them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from renderer.errors import InputError
+from train.photographs import FIGURES, figure_title, format_interval
+from train.photographs.answers import Answer
+from train.photographs.answers_table import ANSWERS, read_answers
+from train.photographs.bootstrap import interval, replicate_difference
+from train.photographs.figures import OVERALL, Pool, figures, find_figure, pool_all, pool_answers, replicate_figures
+from train.report.summary import RunSummary, complete, group_by_settings, name_among
+from train.report.tables import Table
+from train.run_folder.logs import PHASES
+from train.settings import PHOTOGRAPHS
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A run's answers about the class `label`, pooled by source; OVERALL, the last, lacks those of excluded sources."""
+
+    run: RunSummary
+    pools: dict[str, Pool]
+    label: str
+
+    @property
+    def seed(self) -> int:
+        return self.run.config.seed
+
+    @cached_property
+    def figures(self) -> dict[str, dict[str, Any]]:
+        """By source, as `train.photographs.figures.figures` returns them."""
+        return {source: figures(pool, self.label) for source, pool in self.pools.items()}
+
+    @cached_property
+    def replicates(self) -> dict[str, dict[str, np.ndarray]]:
+        """By source, as `replicate_figures` returns them."""
+        return {source: replicate_figures(pool, self.label) for source, pool in self.pools.items()}
+
+
+def read_evaluations(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str) -> list[Evaluation]:
+    """What is in the sub-folder `photographs` of the runs that were scored; exclude: sources to leave out of OVERALL.
+
+    InputError for a sub-folder (but the usual one) or source that is nowhere, and for runs that were scored on
+    different photographs.
+    """
+    scored = [run for run in runs if photographs in run.photographs]
+    if not scored and photographs != PHOTOGRAPHS:
+        raise InputError(f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files")
+    label = runs[0].config.label
+    answers = [read_answers(run.folder / photographs / ANSWERS, label) for run in scored]
+    for run, said in zip(scored, answers, strict=True):
+        if [answer.photograph for answer in said] != [answer.photograph for answer in answers[0]]:
+            raise InputError(
+                f"{run.folder / photographs} has other photographs or sources than {scored[0].folder / photographs}: "
+                "score both networks on the same folder with scripts/evaluate_photos.py"
+            )
+    return [Evaluation(run, _pool(said, label, exclude), label) for run, said in zip(scored, answers, strict=True)]
+
+
+def _pool(answers: Sequence[Answer], label: str, exclude: Sequence[str]) -> dict[str, Pool]:
+    by_source = pool_answers(answers, label)
+    del by_source[OVERALL]
+    if unknown := set(exclude).difference(by_source):
+        raise InputError(
+            f"exclude: no photograph is of source {min(unknown)!r}; the sources are {', '.join(by_source)}"
+        )
+    return by_source | {OVERALL: pool_all([item for item in answers if item.photograph.source not in exclude], label)}
+
+
+def have_same_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
+    return sorted(run.seed for run in group) == sorted(run.seed for run in reference)
+
+
+def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], source: str, name: str) -> dict[str, Any]:
+    """How far the mean of a figure over a group's seeds is from that over the reference's: value, low and high.
+
+    The interval is a 95 % bootstrap interval over images, of which each replicate has the same ones for all runs, and
+    over seeds, which are drawn in pairs where both groups have the same. Few seeds tell little of their spread: of n,
+    the bootstrap sees a variance too small by 1/n, and with one none at all. Empty where a run lacks the figure.
+    """
+    groups = [sorted(runs, key=lambda evaluation: evaluation.seed) for runs in (group, reference)]
+    if any(name not in evaluation.replicates[source] for runs in groups for evaluation in runs):
+        return {}
+    values = [np.mean([find_figure(run.figures[source], name)["value"] for run in runs]) for runs in groups]
+    replicates = [np.stack([run.replicates[source][name] for run in runs]) for runs in groups]
+    drawn = replicate_difference(replicates[0], replicates[1], paired=have_same_seeds(group, reference))
+    return {"value": float(values[0] - values[1]), **interval(drawn)}
+
+
+def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str = PHOTOGRAPHS) -> str:
+    """`comparison_tables` as Markdown."""
+    tables = comparison_tables(runs, exclude, photographs)
+    return "\n\n".join(f"### {table.title}\n\n{table}" for table in tables)
+
+
+def comparison_tables(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str) -> list[Table]:
+    """Tables of runs: accuracy, figures on photographs by source, and seconds per epoch and phase.
+
+    Runs that differ only in the seed are a group; a table for each group shows how far it is from the first one.
+    exclude: sources that the pooled figures leave out; photographs: the sub-folder of each run with its scores.
+
+    InputError as of `read_evaluations`, and for a run whose files lack what is shown.
+    """
+    for run in runs:
+        with complete(run.folder):
+            _accuracy_table([run]), _seconds_table([run])
+    tables = [_accuracy_table(runs), _seconds_table(runs)]
+    if evaluations := read_evaluations(runs, exclude, photographs):
+        pooled = f"all but {', '.join(exclude)}" if exclude else "all"
+        tables[1:1] = [
+            *(_figure_table(evaluations, name, pooled) for name in FIGURES),
+            *difference_tables(evaluations, pooled),
+        ]
+    return tables
+
+
+def _accuracy_table(runs: Sequence[RunSummary]) -> Table:
+    header = ["augment", "seed", "selected on validation", "at epoch", "last epoch"]
+    rows = [
+        [
+            run.arm,
+            str(run.config.seed),
+            f"{run.scores['test/accuracy']:.4f}",
+            str(run.scores["test/epoch"]),
+            f"{run.scores['test/accuracy_last']:.4f}",
+        ]
+        for run in runs
+    ]
+    return Table("Accuracy on the test set", header, rows)
+
+
+def _figure_table(evaluations: Sequence[Evaluation], name: str, pooled: str) -> Table:
+    """A figure by source, a column per run; without the sources that have none."""
+    rows = [
+        [source or pooled, *(format_interval(find_figure(run.figures[source], name)) for run in evaluations)]
+        for source in evaluations[0].pools
+    ]
+    header = ["source", *(f"{_name(run, evaluations)}, seed {run.seed}" for run in evaluations)]
+    title = f"Photographs: {figure_title(name, evaluations[0].label)}"
+    return Table(title, header, [row for row in rows if set(row[1:]) != {"-"}])
+
+
+def _name(evaluation: Evaluation, evaluations: Sequence[Evaluation]) -> str:
+    return name_among(evaluation.run, [other.run for other in evaluations])
+
+
+def difference_tables(evaluations: Sequence[Evaluation], pooled: str) -> list[Table]:
+    """A table for each group of runs but the first: how far it is from the first, by source and figure."""
+    by_folder = {evaluation.run.folder: evaluation for evaluation in evaluations}
+    groups = group_by_settings([evaluation.run for evaluation in evaluations])
+    reference, *others = [[by_folder[run.folder] for run in group] for group in groups]
+    tables = []
+    for group in others:
+        rows = [
+            [source or pooled, *(_format_difference(difference(group, reference, source, name)) for name in FIGURES)]
+            for source in evaluations[0].pools
+        ]
+        header = ["source", *(figure_title(name, evaluations[0].label) for name in FIGURES)]
+        names = f"{_name(group[0], evaluations)} minus {_name(reference[0], evaluations)}"
+        tables.append(Table(f"{names}, {_format_seeds(group, reference)}", header, rows))
+    return tables
+
+
+def _format_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> str:
+    if have_same_seeds(group, reference):
+        return f"{len(group)} seeds in pairs" if len(group) > 1 else "one seed"
+    return f"different seeds ({len(group)} and {len(reference)})"
+
+
+def _format_difference(figure: dict[str, Any]) -> str:
+    return f"{figure['value']:+.3f} [{figure['low']:+.3f}, {figure['high']:+.3f}]" if figure else "-"
+
+
+def _seconds_table(runs: Sequence[RunSummary]) -> Table:
+    """Means per epoch; the operators are built once a run. The own share is the attack outside the classifier."""
+    header = ["augment", *PHASES, "attack's own share", "attack's share of the epoch", "operators, once"]
+    return Table("Seconds per epoch", header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
+
+
+def _seconds_row(seconds: dict[str, float]) -> list[str]:
+    phases = [f"{seconds[phase]:.2f}" for phase in PHASES]
+    if "attack_classifier" not in seconds:
+        return [*phases, "-", "-", "-"]
+    own = 1 - seconds["attack_classifier"] / seconds["attack"]
+    return [
+        *phases,
+        f"{own:.1%}",
+        f"{seconds['attack'] / sum(seconds[phase] for phase in PHASES):.1%}",
+        f"{seconds['operators']:.2f}",
+    ]
