@@ -712,7 +712,7 @@ def test_another_class_takes_a_label_meshes_and_look_alikes_alone(tiny, tmp_path
     monkeypatch.setattr(trainer, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
     meshes = ["label=pear", "scene.meshes=['solid:pear']", "scene.look_alikes=[{mesh: 'solid:apple', label: apple}]"]
     small = ["augment.examples=null", "scene.views=2", "augment.every=30", "augment.lights=restart", "train.epochs=1"]
-    config = tiny("experiment=best", "train.init_from=null", *meshes, *small)
+    config = tiny("experiment=best", "train.init_from=null", "train.soup=false", *meshes, *small)
     run(config, load_data(config), tmp_path)
     first, second = trained
     apple, pear = 0, 2
