@@ -20,6 +20,7 @@ from renderer.errors import InputError
 from renderer.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")
+FEWEST_ROWS = 8  # fewer give even radiance from everywhere a direction, by 16 % at 4: see `to_map`
 LARGEST_MAP = 4096  # MB, which a damaged header may exceed
 
 
@@ -57,6 +58,19 @@ def read_map(path: Path) -> Tensor:
     return torch.from_numpy(radiance)
 
 
+def read_panorama(path: Path) -> Tensor:
+    """`read_map` of a map that can be one of the whole sphere. InputError where its shape says that it is another kind,
+    a mirror ball's or a cube's, say, or where it is too small to be told from its midpoints."""
+    radiance = read_map(path)
+    height, width = radiance.shape[:2]
+    if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
+        raise InputError(
+            f"environment map {path} has {width} × {height} texels: give an equirectangular one, twice as wide as "
+            f"high, of {FEWEST_ROWS} rows or more"
+        )
+    return radiance
+
+
 def check_map_name(path: Path) -> None:
     """InputError where the suffix is not one of `SUFFIXES`."""
     if path.suffix.lower() not in SUFFIXES:
@@ -86,12 +100,11 @@ def write_map(path: Path, radiance: Tensor) -> None:
 
 def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     try:
-        array: np.ndarray = np.lib.format.open_memmap(
-            path, mode="r"
-        )  # so that no header makes room for more than the file holds
-        if array.dtype.kind not in "fiu" or not array.size:
-            raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
         with np.errstate(over="ignore"):  # beyond float32 is infinite, and refused as such
+            # By a map, so that no header makes room for more than the file holds.
+            array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
+            if array.dtype.kind not in "fiu" or not array.size:
+                raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
             array = array.astype(np.float32)
     except Exception as error:  # Python's parser raises many kinds for a damaged header
         raise InputError(f"environment map {path} is not a readable .npy file: {_first_line(str(error))}") from error

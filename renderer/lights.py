@@ -12,7 +12,7 @@ from torch import Tensor
 
 from renderer.arguments import checked
 from renderer.basis import HARMONICS, Basis
-from renderer.environment import SUFFIXES, read_map
+from renderer.environment import SUFFIXES, read_panorama
 from renderer.errors import FACTOR, InputError, require_bounded
 from renderer.harmonics import basis, live_coefficients, project, rotate
 from renderer.transfer import COEFFICIENTS, DEGREE
@@ -129,7 +129,7 @@ def mean_luminance(coefficients: Tensor) -> float:
 
 def _read_light_map(path: Path) -> Tensor:
     """Coefficients (49, 3) float64 of a map, at the grace probe's mean luminance."""
-    coefficients = project_environment(read_map(path))
+    coefficients = project_environment(read_panorama(path))
     luminance = mean_luminance(coefficients)
     if not luminance > 0:
         raise InputError(f"environment map {path} has a mean luminance of {luminance:g}: give a map with light in it")
@@ -143,7 +143,7 @@ def _read_coefficients(path: Path) -> Tensor:
     if not path.is_file():
         raise InputError(f"light {path} does not exist: give the path of a .json file of coefficients")
     try:
-        light = json.loads(path.read_text(encoding="utf-8"))
+        light = json.loads(path.read_text(encoding="utf-8-sig"))
         if not isinstance(light, dict):  # the rows alone, of harmonics
             light = {"basis": HARMONICS.name, "coefficients": light}
         coefficients = torch.tensor(light["coefficients"], dtype=torch.float32)

@@ -70,9 +70,9 @@ class Door:
 
 
 DOORS = [
-    Door("map.npy", lambda path: write_map(path, torch.ones(2, 4, 3)), read_map),
-    Door("map.hdr", lambda path: write_map(path, torch.ones(2, 4, 3)), read_map),
-    Door("light.npy", lambda path: write_map(path, torch.ones(2, 4, 3)), lambda path: load_light(str(path))),
+    Door("map.npy", lambda path: write_map(path, torch.ones(8, 16, 3)), read_map),
+    Door("map.hdr", lambda path: write_map(path, torch.ones(8, 16, 3)), read_map),
+    Door("light.npy", lambda path: write_map(path, torch.ones(8, 16, 3)), lambda path: load_light(str(path))),
     Door("light.json", lambda path: save_light(path, probe("grace")), lambda path: load_light(str(path))),
     Door("data.npz", write_npz, lambda path: load_npz(str(path))),
     Door(BEST, lambda path: save(path, network_state()), load_network),

@@ -398,12 +398,19 @@ def test_without_openimageio_arrays_still_work_and_images_name_it(tmp_path, monk
             read_map(path)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (2, 2)])
-def test_a_map_of_few_texels_is_the_light_of_its_mean(tmp_path, size):
-    """The same radiance from everywhere: one coefficient, at the grace probe's luminance."""
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (4, 8), (8, 8), (1, 5000), (16, 8), (48, 64)])
+def test_a_map_of_few_texels_or_of_another_kind_is_refused(tmp_path, size):
+    """Of few rows, even radiance from everywhere would be light with a direction; a mirror ball's map is square."""
     np.save(tmp_path / "map.npy", np.ones((*size, 3)))
+    with pytest.raises(InputError, match=rf"map\.npy has {size[1]} × {size[0]} texels: give an equirectangular one"):
+        load_light(str(tmp_path / "map.npy"))
+
+
+def test_the_same_radiance_from_everywhere_is_one_coefficient_from_eight_rows_on(tmp_path):
+    np.save(tmp_path / "map.npy", np.ones((8, 16, 3)))
     light = load_light(str(tmp_path / "map.npy"))
-    assert light.isfinite().all() and float(light[0].min()) == pytest.approx(mean_luminance(probe("grace")), rel=1e-6)
+    assert float(light[0].min()) == pytest.approx(mean_luminance(probe("grace")), rel=1e-6)
+    assert float(light[1:].abs().max()) < 0.05 * float(light[0].min())
 
 
 # ---------------------------------------------------------------------------------------- the script

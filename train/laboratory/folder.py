@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from augment.objects import load_object
 from augment.seeding import stream_seed
-from renderer.environment import read_map
+from renderer.environment import read_panorama
 from renderer.errors import InputError
 from renderer.image import encode
 from renderer.shapes import LOOK_ALIKES
@@ -63,7 +63,7 @@ def write_laboratory(settings: LabSettings) -> int:
 
 def _read_environment(path: Path) -> np.ndarray:
     """Radiance (H, W, 3), which is nowhere negative; InputError otherwise, and where nothing falls from above."""
-    radiance = read_map(path).numpy()
+    radiance = read_panorama(path).numpy()
     if radiance.min() < 0 or not radiance[: len(radiance) // 2].max() > 0:
         raise InputError(f"environments: {path} is negative somewhere or dark above: give a map of what lamps emit")
     return radiance
