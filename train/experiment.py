@@ -51,6 +51,7 @@ from train.photographs import (
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import checkpoint
 from train.run_folder.files import CONFIG
+from train.run_folder.inputs import INPUTS, fingerprints, require_same_inputs
 from train.run_folder.logs import NoLog, RunLog, console
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, require_same_settings
 
@@ -163,6 +164,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
                 f"run={folder} holds a run already: set train.resume=true to go on, or choose another run="
             )
         require_same_settings(folder, config)
+        require_same_inputs(folder, config)
         trainer.resume()
         console.info("resumed %s after epoch %d%s", folder, trainer.epoch, trainer.part_of_epoch)
     elif trainer.settings.resume:
@@ -174,6 +176,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
 def _write_config(config: DictConfig, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     resolved = as_dict(config, resolve=True)
+    resolved[INPUTS] = fingerprints(config)
     resolved["versions"] = {
         "python": platform.python_version(),
         "torch": str(torch.__version__),

@@ -25,7 +25,7 @@ from train.run_folder.files import CONFIG, read_config
 
 # Where, how and with what a run was made: these do not decide its result, nor name a sweep's cell.
 CIRCUMSTANCES = (
-    *("run", "sweep", "launcher", "compare", "versions", "renderer.cache"),
+    *("run", "sweep", "launcher", "compare", "versions", "inputs", "renderer.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 OTHER = "other"  # in place of the class of a look-alike that the classifier has no class for

@@ -33,6 +33,7 @@ from train.report.summary import format_spread, format_table, is_finished, summa
 from train.report.write import report_of
 from train.run_folder import checkpoint
 from train.run_folder.files import FAILURE, locked, state
+from train.run_folder.inputs import require_same_inputs
 from train.run_folder.logs import console
 from train.settings import CIRCUMSTANCES, differing_settings
 
@@ -200,6 +201,7 @@ def _check_same_settings(folder: Path, cell: DictConfig) -> None:
         raise InputError(
             f"{folder} has {key}={found}, and {asked} is asked for: give another folder with sweep=, or remove this one"
         )
+    require_same_inputs(folder, own)
 
 
 def format_sweep(folders: Sequence[Path]) -> str:

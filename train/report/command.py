@@ -12,7 +12,7 @@ from augment.parameters import KINDS
 from train.command_line.configuration import as_dict, composed, dotted
 from train.command_line.entry_points import quoted
 
-CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "out", "train.resume", "data.images")
+CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "inputs", "out", "train.resume", "data.images")
 DATA = ("cifar100", "npz", "folder")  # besides the default
 PLAIN = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_/][\w./:-]*", re.ASCII | re.IGNORECASE)
 

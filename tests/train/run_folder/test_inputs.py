@@ -1,0 +1,59 @@
+import shutil
+
+import pytest
+from omegaconf import OmegaConf
+
+from renderer.errors import InputError
+from train.experiment import load_data, prepare
+from train.run_folder.inputs import INPUTS, fingerprints, require_same_inputs
+from train.sweep import _check_same_settings
+
+
+def test_a_run_knows_its_inputs_by_content(tiny, tiny_npz, finished):
+    assert OmegaConf.load(finished / "config.yaml")[INPUTS] == fingerprints(tiny())
+    assert [*fingerprints(tiny())] == [str(tiny_npz)]
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "scene.meshes=[{}]",
+        "scene.look_alikes=[{{mesh: {}, label: apple}}]",
+        "scene.meshes=[{{mesh: solid:orange, beside: [{{mesh: {}}}]}}]",
+        "scene.light={}",
+        "scene.backgrounds=[0.5,{}]",
+        "augment.vary.lights=[{}]",
+        "data.path={}",
+    ],
+)
+def test_a_file_that_changed_has_another_fingerprint(tiny, tmp_path, override):
+    file = tmp_path / "input.bin"
+    file.write_bytes(b"one")
+    config = tiny(override.format(file))
+    before = fingerprints(config)[str(file)]
+    file.write_bytes(b"two")
+    assert fingerprints(config)[str(file)] != before
+
+
+def test_a_folder_that_changed_has_another_fingerprint(tiny, tmp_path):
+    (tmp_path / "apple").mkdir()
+    config, found = tiny(f"data.path={tmp_path}"), set()
+    for name in ("apple/0.png", "apple/1.png"):
+        found.add(fingerprints(config)[str(tmp_path)])
+        (tmp_path / name).write_bytes(name.encode())
+    assert len(found | {fingerprints(config)[str(tmp_path)]}) == 3
+
+
+def test_going_on_with_another_file_of_the_same_name_is_refused_by_name(tiny, tiny_npz, finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    config = OmegaConf.load(folder / "config.yaml")
+    config[INPUTS][str(tiny_npz)] = "of another time"
+    OmegaConf.save(config, folder / "config.yaml")
+    asked = tiny("train.resume=true")
+    with pytest.raises(InputError, match=rf"{tiny_npz} is not what {folder} was trained with: put that back"):
+        prepare(asked, load_data(asked), folder)
+    with pytest.raises(InputError, match=rf"{tiny_npz} is not what"):  # nor is the cell of a sweep taken as it is
+        _check_same_settings(folder, config)
+    del config[INPUTS]
+    OmegaConf.save(config, folder / "config.yaml")
+    require_same_inputs(folder, asked)  # of a run that is older nothing is known
