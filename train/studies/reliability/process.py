@@ -21,7 +21,7 @@ from train.studies.interruptions.small_run import ROOT
 
 PATIENCE = 60  # seconds after which a command that should have ended has hung
 MEMORY = 12 * 2**30  # bytes of address space: what asks for more fails here, and not the machine
-PRELOADED = ["train.studies.reliability.warm", __name__]
+PRELOADED = ["train.studies.reliability.study", "train.studies.reliability.warm"]
 
 
 @dataclass(frozen=True)
