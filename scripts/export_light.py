@@ -31,6 +31,8 @@ def main(settings: Settings) -> None:
         check_map_name(out)
     except InputError as error:
         raise InputError(f"out: {error}") from error
+    if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):
+        raise InputError(f"out={out} is the light itself, which would be lost: choose another file")
     radiance = to_map(light, settings.height)
     write_map(out, radiance)
     fate = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"

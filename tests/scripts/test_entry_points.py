@@ -35,6 +35,7 @@ def here(tmp_path) -> Path:
 
 EVALUATE = ["evaluate_photos", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
 EXPORT = ["export_light", "light=grace", "height=4"]
+PAPER = ["reproduce_paper", "classifier=run:1.10", "scene.meshes=['solid:orange:0']"]
 
 
 def test_folders_whose_names_look_like_numbers_or_have_no_utf_8_are_scored(call, here, capsys):
@@ -79,6 +80,12 @@ WRONG = [
     (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
     (["check_interruptions", "jobs=0", "out=a.md"], "jobs=0 must be at least 1"),
     (["lab", "size=0", "out=a"], "size=0 must be at least 1"),
+    ([*PAPER, "section=run_time", "scene.meshes=[]"], "scene.meshes is empty: name a mesh to attack"),
+    ([*PAPER, "section=run_time", "section.name=[1]"], "section.name=[1]: choose section=norm_balls, "),
+    (
+        [*PAPER, "section=survival", "section.overrides=[abc]"],
+        "section.overrides=['abc']: Error parsing override 'abc'",
+    ),
     (["benchmark_training", "steps=-1", "out=a.md"], "steps=-1 must be at least 0"),
 ]
 
@@ -111,6 +118,15 @@ def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, ca
     assert call(*command, f"out={out}{suffix}") == USER_ERROR
     printed = capsys.readouterr()
     assert printed.err.startswith(f"error: out={out}{suffix} cannot be written") and printed.err.count("\n") == 1
+
+
+def test_a_light_is_not_written_over_itself(call, here, capsys):
+    assert call("export_light", "light=grace", "height=8", "out=a.npy") == 0
+    (here / "b.npy").symlink_to("a.npy")
+    whole = (here / "a.npy").read_bytes()
+    assert call("export_light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
+    assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself, which would be lost")
+    assert (here / "a.npy").read_bytes() == whole
 
 
 @pytest.mark.parametrize("out", ["/dev/full", "2024"])

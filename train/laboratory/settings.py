@@ -1,11 +1,10 @@
 """conf/lab.yaml as a dataclass: the types and ranges that a laboratory accepts."""
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.image import LARGEST_SIZE
 from train.laboratory.patterns import FAMILIES
 from train.settings import LARGEST_SEED
@@ -49,8 +48,7 @@ class LabSettings:
             )
         if repeated := next((name for name in kinds if kinds.count(name) > 1), None):
             raise InputError(f"patterns and environments: {repeated} is named twice, and names the photographs' source")
-        if len(self.brightness) != 2 or not 0 < self.brightness[0] <= self.brightness[1] < math.inf:
-            raise InputError(f"brightness={self.brightness} must be two positive numbers, the dimmer one first")
+        require_limits("brightness", self.brightness, 1 / FACTOR, FACTOR)
         require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
         require_range("seed", self.seed, 0, LARGEST_SEED)
         for name, most in {"lights": MOST_LIGHTS, "size": LARGEST_SIZE, "samples": 10**5, "bounces": 1000}.items():

@@ -7,9 +7,11 @@ from itertools import chain
 import torch
 
 from renderer.errors import InputError, require_range
+from renderer.image import LARGEST_SIZE
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
 from train.report.tables import markdown
+from train.settings import MOST_IMAGES
 from train.studies.growth.cost import GREYS, Cost, Load, described, measure
 from train.studies.growth.imagenet import IMAGES, SIZE, Parts, added_share, measure_parts
 from train.studies.page import joined, machine, wrapped, write
@@ -70,9 +72,10 @@ class GrowthSettings:
             raise InputError("renders and shared: give multiples of the 5 backgrounds, of renders two or more")
         if SIZE not in self.sizes:
             raise InputError(f"sizes: {SIZE} is what ImageNet on paper is made of; add it")
-        for name, most in {"meshes": 1000, "processes": 64}.items():
+        for name, most in {"renders": MOST_IMAGES, "sizes": LARGEST_SIZE, "meshes": 1000, "processes": 64}.items():
             for number in getattr(self, name):
                 require_range(name, number, 1, most)
+        require_range("shared", self.shared, 5, MOST_IMAGES)
         for name in ("steps", "rounds"):
             require_range(name, getattr(self, name), 1, 1000)
         for name, rate in self.rates.items():

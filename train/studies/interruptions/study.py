@@ -42,7 +42,7 @@ class InterruptionSettings:
 
     def __post_init__(self) -> None:
         for name, least in [("kills", 0), ("signals", 0), ("draws", 0), ("epochs", 1), ("seed", 0), ("jobs", 1)]:
-            require_range(name, getattr(self, name), least, 10**6)
+            require_range(name, getattr(self, name), least, 64 if name == "jobs" else 10**6)
 
 
 def run(settings: InterruptionSettings) -> list[str]:

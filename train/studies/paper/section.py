@@ -8,7 +8,11 @@ from typing import Any
 
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
+from renderer.errors import require_range
+from train.fit.recipe import MOST
 from train.studies.paper.subjects import Subject
+
+MOST_OF_EACH = 10**6
 
 
 @dataclass
@@ -17,6 +21,11 @@ class SectionSettings:
 
     name: str
     threads: int
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, int | float):  # whole numbers count something
+                require_range(f"section.{name}", value, int(isinstance(value, int)), MOST.get(name, MOST_OF_EACH))
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_range
 from train.command_line.configuration import read_settings
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_folder
 from train.run_folder.classifier import load_classifier
-from train.settings import SceneSettings, read_object
+from train.settings import LARGEST_SEED, SceneSettings, read_object
 from train.studies.page import joined, versions, wrapped, write
 from train.studies.paper import (
     gallery,
@@ -64,11 +64,16 @@ class PaperSettings:
     seed: int
     scene: SceneSettings
 
+    def __post_init__(self) -> None:
+        require_range("seed", self.seed, 0, LARGEST_SEED)
+        if not self.scene.meshes:
+            raise InputError("scene.meshes is empty: name a mesh to attack")
+
 
 def run(settings: PaperSettings) -> None:
     """Measure a section, write its data and its figures to out/paper, and put its text into out/paper.md."""
     out = writable_folder(settings.out, "out")
-    name = settings.section.get("name")
+    name = str(settings.section.get("name"))
     if name not in SECTIONS:
         raise InputError(f"section.name={name}: choose section={', '.join(SECTIONS)}")
     title, kind, measure = SECTIONS[name]

@@ -7,10 +7,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+from hydra.errors import HydraException
 
 from augment.attacks.run import NotRecognisedError
 from augment.attacks.verification import RENDERERS
 from augment.objects import ObjectSettings
+from renderer.errors import InputError
 from renderer.files.mitsuba_scene import SAMPLES
 from train.attacks.experiment import attacks
 from train.attacks.search import overrides
@@ -119,7 +121,10 @@ def _command(
     and the section's overrides."""
     azimuth = 360 * example / settings.examples
     chosen = [f"attack=[{kinds}]", f"scene.azimuth={azimuth}", f"seed={study.seed + example}"]
-    config = composed("attack", [*chosen, *settings.overrides])
+    try:
+        config = composed("attack", [*chosen, *settings.overrides])
+    except HydraException as error:
+        raise InputError(f"section.overrides={settings.overrides}: {str(error).splitlines()[0]}") from error
     config.scene.meshes, config.scene.light = [asdict(item)], study.light
     return read_settings(AttackExperimentSettings, config)
 

@@ -14,6 +14,7 @@ from torch.profiler import ProfilerActivity, profile
 
 Key = TypeVar("Key")
 BURST = 2e-3  # seconds: shorter calls are repeated for as long, since one call alone is the clock's noise
+MOST_ROUNDS = 1000
 LIMIT = 20.0  # seconds by the wall, after which a comparison goes no further than its third round
 
 

@@ -1,0 +1,89 @@
+"""Every number in every script's configuration has a range, and an error beyond it that names its key."""
+
+import runpy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from renderer.errors import InputError
+from train.command_line.configuration import as_dict, composed, dotted, read_settings
+from train.laboratory.settings import LabSettings
+from train.studies.accuracy.study import AccuracySettings
+from train.studies.growth.study import GrowthSettings
+from train.studies.interruptions.study import InterruptionSettings
+from train.studies.load.study import LoadSettings
+from train.studies.paper.study import SECTIONS, PaperSettings
+from train.studies.placed_lights import PlacedLightSettings
+from train.studies.reliability.study import ReliabilitySettings
+from train.studies.renderer_speed.study import RendererSpeedSettings
+from train.studies.transport.study import TransportSettings
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+SETTINGS = {
+    "benchmark_growth": GrowthSettings,
+    "benchmark_lights": PlacedLightSettings,
+    "benchmark_renderer": RendererSpeedSettings,
+    "benchmark_transport": TransportSettings,
+    "check_accuracy": AccuracySettings,
+    "check_interruptions": InterruptionSettings,
+    "check_load": LoadSettings,
+    "check_reliability": ReliabilitySettings,
+    "lab": LabSettings,
+}
+OWN = ("compare_runs", "evaluate_photos", "export_light", "fit_skylight", "publish", "report")  # in the script itself
+GIVEN = {  # without which a command is refused
+    "compare_runs": ["runs=[a]"],
+    "evaluate_photos": ["run=a", "photos=a"],
+    "export_light": ["light=grace", "out=a.hdr"],
+    "lab": ["out=a"],
+    "publish": ["run=a", "out=b"],
+    "report": ["runs=[a]"],
+}
+KINDS: dict[str, tuple[type, list[str]]] = {
+    **{name: (kind, [*GIVEN.get(name, [])]) for name, kind in SETTINGS.items()},
+    **{name: (runpy.run_path(str(SCRIPTS / f"{name}.py"))["Settings"], GIVEN.get(name, [])) for name in OWN},
+    "reproduce_paper": (PaperSettings, ["section=run_time", "scene.meshes=[a.obj]"]),
+}
+ELSEWHERE = ("train", "attack", "benchmark_training")  # whose numbers are tried with their meaning: docs/reliability.md
+
+
+def beyond(config: DictConfig) -> Iterator[tuple[str, Any]]:
+    """Every number, or the first of a list, as it can hardly be meant."""
+    for key, value in dotted(as_dict(config)):
+        number = value[0] if isinstance(value, list) and value else value
+        if isinstance(number, int | float) and not isinstance(number, bool):
+            for absurd in [-(10**30), 10**30, *([float("nan")] if isinstance(number, float) else [])]:
+                yield key, [absurd, *value[1:]] if isinstance(value, list) else absurd
+
+
+def check(kind: type, config: DictConfig, parent: str = "") -> None:
+    read_settings(kind, config, parent)
+    for key, value in beyond(config):
+        changed = OmegaConf.create(as_dict(config))
+        OmegaConf.update(changed, key, value)
+        with pytest.raises(InputError) as refusal:
+            read_settings(kind, changed, parent)
+        assert key.rpartition(".")[2] in str(refusal.value), key
+
+
+def test_every_script_is_tried():
+    assert {*KINDS, *ELSEWHERE} == {"train", *(path.stem for path in SCRIPTS.glob("*.py"))}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_number_of_a_scripts_configuration_has_a_range(name):
+    kind, given = KINDS[name]
+    config = composed(name, given)
+    if "section" in config:
+        config.section = {}  # has settings of its own
+    check(kind, config)
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_every_number_of_a_section_of_the_paper_has_a_range(section):
+    targets = ["section.targets=[a]"] if section == "gallery" else []
+    config = composed("reproduce_paper", [f"section={section}", "scene.meshes=[a.obj]", *targets])
+    check(SECTIONS[section][1], config.section, "section")
