@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from augment.progress import underway
 from renderer.arguments import require_fields
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, concatenate, load_mesh, normalise
@@ -122,7 +123,8 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
 
     InputError: as `load_mesh` and `solid`.
     """
-    mesh = normalise(subdivide(_load(item), vertices))
+    with underway(f"preparing {item.mesh}"):
+        mesh = normalise(subdivide(_load(item), vertices))
     return in_company(SceneObject(item.label, mesh, item.gain, item.mesh), [_companion(each) for each in item.beside])
 
 

@@ -1,10 +1,12 @@
+import sys
+
 import numpy as np
 import pytest
 import trimesh
 
 from augment.objects import CompanionSettings, ObjectSettings, another_individual, load_object, on_ground
 from renderer.errors import InputError
-from renderer.mesh import normalise
+from renderer.mesh import load_mesh, normalise
 from renderer.shapes import solid
 
 
@@ -22,6 +24,21 @@ def test_a_mesh_without_colours_is_given_one(plain):
     white = load_object(ObjectSettings(plain, "orange")).mesh
     np.testing.assert_array_equal(mesh.vertices, white.vertices)
     assert (white.corner_colors == 1).all()
+
+
+def test_a_terminal_shows_that_a_mesh_is_prepared_before_it_is_read(plain, capsys, monkeypatch):
+    shown = []
+
+    def read(path, up):
+        shown.append(capsys.readouterr().err)
+        return load_mesh(path, up)
+
+    monkeypatch.setattr("augment.objects.load_mesh", read)
+    for terminal in (True, False):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda terminal=terminal: terminal)
+        load_object(ObjectSettings(plain, "orange"))
+    assert shown[0].startswith(f"\rpreparing {plain}:   0%|") and shown[1].strip() == ""
+    assert capsys.readouterr().err == ""
 
 
 def test_a_mesh_that_brings_colours_keeps_them():
