@@ -69,6 +69,8 @@ class LampsSettings:
                 f"scene.lamps: give places [x, y, z] and, as start, a number or [r, g, b]s ({error})"
             ) from error
         basis = Lamps(places, self.power, self.radius)
+        if not ((start >= 0) & (start <= self.power)).all():  # NaN is neither
+            raise InputError(f"scene.lamps.start={self.start}: give powers from 0 to scene.lamps.power={self.power:g}")
         return basis, basis.nearest_physical(start)
 
 

@@ -147,6 +147,12 @@ def test_training_draws_and_attacks_patterns_beside_the_light(arm):
         (lambda: LampsSettings(radius=-0.1).build(), r"lamps\.radius=-0\.1"),
         (lambda: LampsSettings([[1, 0]]).build(), r"scene\.lamps: give places"),
         (lambda: LampsSettings(start=[[1], [2]]).build(), r"scene\.lamps: give places"),
+        (
+            lambda: LampsSettings(start=math.nan).build(),
+            r"scene\.lamps\.start=nan: give powers from 0 to scene\.lamps\.",
+        ),
+        (lambda: LampsSettings(start=-1.0).build(), r"scene\.lamps\.start=-1\.0: give powers"),
+        (lambda: LampsSettings(start=[[11, 0, 0]] * 4).build(), r"scene\.lamps\.start=.* to scene\.lamps\.power=10$"),
         (lambda: scene(ground=[0.5, 2.0, 0.5]), r"scene\.ground=.* must be red, green and blue"),
         (lambda: ProjectorPattern(scene(projector=None), StepSettings()), r"no projector: set scene\.projector"),
     ],
