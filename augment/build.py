@@ -15,7 +15,7 @@ from renderer.arguments import as_device, checked
 from renderer.basis import with_placed
 from renderer.cache import OperatorCache
 from renderer.camera import ring
-from renderer.errors import InputError
+from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh, normalise
@@ -63,6 +63,7 @@ def build_scene(
     as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
     settings, device = ImageSettings(size, samples, encoding, normals, transport), as_device(device)
+    require_range("exposure", exposure, 1 / FACTOR, FACTOR)
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
     basis, lights = with_placed(sky, [each.build() for each in (projector, lamps) if each is not None])
     angle = None if perspective is None else math.radians(perspective)

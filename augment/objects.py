@@ -194,4 +194,7 @@ def _read(item: MeshSettings) -> Mesh:
     name, _, seed = name.partition(":")
     if seed and not seed.isdecimal():
         raise InputError(f"scene.meshes: the seed in {item.mesh!r} must be a whole number, as in solid:orange:3")
-    return solid(name, int(seed or 0))
+    try:
+        return solid(name, int(seed or 0))
+    except InputError as error:
+        raise InputError(f"scene.meshes: {item.mesh}: {error}") from error

@@ -242,8 +242,9 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("solid:orangutan", "orange"),
+        ("solid:orangutan", r"scene\.meshes: solid:orangutan: No solid is called 'orangutan': use 'orange'"),
         ("solid", "No solid is called ''"),
+        ("solid:orange:" + 30 * "9", rf"scene\.meshes: solid:orange:{30 * '9'}: seed is"),
         ("solid:orange:red", r"scene\.meshes: the seed in 'solid:orange:red' must be a whole number"),
         ("solid:orange:-1", "must be a whole number"),
         ("solid:orange:1:2", "must be a whole number"),

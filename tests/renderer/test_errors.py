@@ -107,6 +107,12 @@ def test_what_is_no_tensor_of_real_numbers_is_refused_by_name(light):
         require_bounded(light=light)
 
 
+@pytest.mark.parametrize("light", [torch.ones(49, 3, device="meta"), torch.ones(49, 3).to_sparse()])
+def test_a_tensor_without_all_its_values_is_refused_by_name(light):
+    with pytest.raises(InputError, match=r"^light is sparse or has no values: give a dense tensor on a device"):
+        require_bounded(light=light)
+
+
 @pytest.mark.parametrize("require", [require_finite, require_bounded])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16, torch.bfloat16])
 def test_the_first_tensor_that_is_not_finite_is_named(dtype, require):

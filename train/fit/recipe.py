@@ -114,14 +114,12 @@ class TrainSettings:
         for name in ("momentum", "label_smoothing", "averaging"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")
-        for name in ("ranking", "distillation"):
+        for name in ("ranking", "distillation", "weight_decay"):
             require_range(f"train.{name}", getattr(self, name), 0, FACTOR)
         for name, use in {"distillation": "holds to", "soup": "comes back to"}.items():
             if getattr(self, name) and not self.init_from:
                 raise InputError(
                     f"train.{name}={getattr(self, name)} {use} the network begun with: name one in train.init_from"
                 )
-        if not 0 < self.learning_rate < math.inf:
-            raise InputError(f"train.learning_rate={self.learning_rate} must be positive")
-        if not 0 <= self.weight_decay < math.inf:
-            raise InputError(f"train.weight_decay={self.weight_decay} must not be negative")
+        if not 0 < self.learning_rate <= FACTOR:
+            raise InputError(f"train.learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")

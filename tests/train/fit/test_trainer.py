@@ -85,6 +85,8 @@ def test_a_ranking_without_look_alikes_is_refused(tmp_path):
         ({"momentum": -0.1}, "train.momentum=-0.1"),
         ({"weight_decay": -1.0}, "train.weight_decay=-1.0"),
         ({"weight_decay": math.nan}, "train.weight_decay=nan"),
+        ({"weight_decay": 1e300}, "train.weight_decay=1e\\+300 must be"),
+        ({"learning_rate": 1e300}, "train.learning_rate=1e\\+300 must be"),
         ({"schedule": "linear"}, "train.schedule=linear: choose one of step, cosine, one_cycle"),
         ({"flips": "vertical"}, "train.flips=vertical: choose one of random, alternating"),
         ({"compile": "maybe"}, "train.compile=maybe: choose one of auto, always, never"),
