@@ -63,7 +63,7 @@ def build_scene(
     as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
     """
     settings, device = ImageSettings(size, samples, encoding, normals, transport), as_device(device)
-    require_range("exposure", exposure, 1 / FACTOR, FACTOR)
+    require_range("exposure", exposure, 0, FACTOR)
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
     basis, lights = with_placed(sky, [each.build() for each in (projector, lamps) if each is not None])
     angle = None if perspective is None else math.radians(perspective)

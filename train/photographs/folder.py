@@ -153,7 +153,7 @@ def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str,
     except (ValueError, csv.Error, OSError) as error:  # no header, a column missing, not UTF-8, or not a table
         raise InputError(f"{table} cannot be used: {advice}") from error
     table_rows = [dict(zip(header, line, strict=False)) for line in lines if len(line) > max(path, tag)]
-    rows = {}
+    rows: dict[PurePosixPath, tuple[str | None, tuple[str, ...]]] = {}
     for row in table_rows:
         place = PurePosixPath(row["path"].replace("\\", "/"))
         told = row["source_tag"] or None, split_sources(row.get("look_alikes", ""))
