@@ -45,6 +45,7 @@ class Settings:
 def main(settings: Settings) -> None:
     device = choose_device(settings.device)
     network = _load(settings)
+    network.label(settings.label)  # refused here, where the network has a name
     model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
     with sole_writer("out", out):

@@ -39,6 +39,7 @@ class RunLog:
         self._renders = folder / "renders"
         self._board = folder / f"events.out.tfevents.{time.time():010.0f}.{socket.gethostname()}.{os.getpid()}"
         self._epochs = len(history)
+        self._metrics.unlink(missing_ok=True)  # a pipe of that name would be waited for
         self._metrics.write_text("".join(json.dumps(line) + "\n" for line in history))
         self._show(0, file_version="brain.Event:2")
         self._show(self._epochs + 1, session_log=SessionLog(status=SessionLog.START))

@@ -1,5 +1,6 @@
 import json
 import logging
+import os
 import struct
 from pathlib import Path
 
@@ -110,3 +111,11 @@ def test_a_console_line_that_finds_no_room_is_lost_and_nothing_else(capsys):
         with pytest.raises(OSError, match="No space left"):
             handler.stream.close()
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_pipe_in_the_place_of_the_metrics_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / METRICS)
+    reader = os.open(tmp_path / METRICS, os.O_RDWR)  # so that this test fails, and does not hang
+    RunLog(tmp_path, [{"epoch": 1}])
+    os.close(reader)
+    assert read_metrics(tmp_path) == [{"epoch": 1}]
