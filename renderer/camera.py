@@ -139,11 +139,7 @@ class PerspectiveCamera(Camera):
 
 @checked
 def ring(
-    views: int,
-    field_of_view: float,
-    polar: float = math.pi / 3,
-    azimuth: float = 0.0,
-    perspective: float | None = None,
+    views: int, field_of_view: float, polar: float = math.pi / 3, azimuth: float = 0.0, perspective: float | None = None
 ) -> list[Camera]:
     """Cameras at one polar angle and equally spaced azimuths from a first (the paper's appendix C: π/3 and 10).
 

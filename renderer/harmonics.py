@@ -101,10 +101,7 @@ def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
                     rows[index] = circular * legendre
         if m == 0:
             cosine = cosine * math.sqrt(2)
-        cosine, sine = (
-            torch.addcmul(x * cosine, y, sine, value=-1),
-            torch.addcmul(x * sine, y, cosine),
-        )
+        cosine, sine = (torch.addcmul(x * cosine, y, sine, value=-1), torch.addcmul(x * sine, y, cosine))
     return [rows[index] for index in wanted]
 
 

@@ -75,11 +75,7 @@ def radiance(directions: Tensor, zenith: Tensor | float, azimuth: Tensor | float
 
 
 def coefficients_by_quadrature(
-    zenith: Tensor | float,
-    azimuth: Tensor | float,
-    turbidity: Tensor | float,
-    degree: int = DEGREE,
-    nodes: int = 48,
+    zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor | float, degree: int = DEGREE, nodes: int = 48
 ) -> Tensor:
     """Coefficients ((degree + 1)², 3) float64 of the sky, by Gauss-Legendre quadrature over the upper hemisphere.
 

@@ -27,14 +27,7 @@ from renderer.transfer import COEFFICIENTS, DEGREE
 from train.classes import class_index
 from train.command_line.configuration import as_dict, read_settings
 from train.command_line.entry_points import NO_ROOM
-from train.data import (
-    DataSet,
-    channel_statistics,
-    load_cifar100,
-    load_folder,
-    load_npz,
-    stratified_split,
-)
+from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
 from train.device import MixedPrecision, choose_device, choose_precision, set_deterministic, set_threads
 from train.distributed import first_process_first
 from train.fit.evaluation import evaluate

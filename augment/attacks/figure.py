@@ -12,18 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
-from renderer.tiles import (
-    CAPTION_SIZE,
-    FAINT,
-    GAP,
-    INK,
-    LINE_HEIGHT,
-    MARGIN,
-    PAPER,
-    TITLE_HEIGHT,
-    TITLE_SIZE,
-    Tile,
-)
+from renderer.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
 
 SIDE = 192  # px: smaller images are enlarged by a whole factor to at least this width
 COLUMNS = "columns"  # the text in a .png that says where its tiles are

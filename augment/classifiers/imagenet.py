@@ -58,10 +58,7 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     fill(network, _current_keys(model, state), weights or published.url, name)
     transforms = published.transforms()
     return Classifier(
-        Normalised(network, transforms.mean, transforms.std),
-        _size(published),
-        published.meta["categories"],
-        name,
+        Normalised(network, transforms.mean, transforms.std), _size(published), published.meta["categories"], name
     )
 
 

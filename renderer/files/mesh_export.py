@@ -26,11 +26,7 @@ _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
 
 @checked
 def export_mesh(
-    mesh: Mesh,
-    path: str | Path,
-    normals: str = "smooth",
-    cameras: Sequence[Camera] = (),
-    first: int | None = None,
+    mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[Camera] = (), first: int | None = None
 ) -> None:
     """Write a mesh to a .glb or .ply file. A vertex whose corners differ in colour, uv or normal is written for each.
 

@@ -19,7 +19,7 @@ def format_attack(mesh: str, attacked: Attacked, checks: Checks | None, verdicts
     lines = [
         f"{mesh}: {kinds} against {attacked.classifier.name}: {_success(attacked)}"
         + (f"; median of {steps.median():.0f} steps" if len(steps) else "")
-        + f" ({attacked.seconds['attack']:.1f} s)",
+        + f" ({attacked.seconds['attack']:.1f} s)"
     ]
     if checks is not None:
         by_steps = ", ".join(f"{share:.0%} in {steps}" for steps, share in checks.success_by_steps.items())

@@ -42,13 +42,7 @@ class Learner:
         )
         compiled = compiles(settings.compile, self.device)
         self._training_pass = training_pass(
-            replica,
-            settings.label_smoothing,
-            compiled,
-            settings.ranking,
-            label,
-            settings.distillation,
-            teacher,
+            replica, settings.label_smoothing, compiled, settings.ranking, label, settings.distillation, teacher
         )
         self._distort = distortion(settings.distortion, model, seed)
         self.attacked, self.scored = (FixedSizes(each) if compiled else each for each in (model, self.selected))

@@ -17,15 +17,7 @@ from renderer.errors import InputError
 from train.data import Split
 from train.device import PRECISIONS, MixedPrecision
 from train.distributed import summed
-from train.fit.epoch import (
-    EpochUnderWay,
-    Round,
-    batch_count,
-    put_last,
-    rounds_of_epoch,
-    training_batches,
-    with_room,
-)
+from train.fit.epoch import EpochUnderWay, Round, batch_count, put_last, rounds_of_epoch, training_batches, with_room
 from train.fit.evaluation import evaluate
 from train.fit.learner import Learner
 from train.fit.recipe import TrainSettings

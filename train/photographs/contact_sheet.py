@@ -8,18 +8,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from renderer.tiles import (
-    CAPTION_SIZE,
-    FAINT,
-    GAP,
-    INK,
-    LINE_HEIGHT,
-    MARGIN,
-    PAPER,
-    TITLE_HEIGHT,
-    TITLE_SIZE,
-    Tile,
-)
+from renderer.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
 from train.photographs.answers import Answer
 
 TILES_PER_SECTION = 40

@@ -178,11 +178,7 @@ def _check_look_alikes(table: Path, photographs: Sequence[Photograph]) -> None:
 
 
 def load_photographs(
-    folder: Path,
-    photographs: Sequence[Photograph],
-    size: int = 32,
-    skip_unreadable: bool = False,
-    advice: str = SKIP,
+    folder: Path, photographs: Sequence[Photograph], size: int = 32, skip_unreadable: bool = False, advice: str = SKIP
 ) -> tuple[list[Photograph], torch.Tensor, list[str]]:
     """Read photographs as the classifier sees them.
 

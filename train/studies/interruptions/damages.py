@@ -32,11 +32,7 @@ LIMITS = {
         lambda run, rng: (run / METRICS).stat().st_size + int(rng.integers(1, 300)),
         lambda run, ending: not (run / METRICS).read_bytes().endswith(b"\n"),
     ),
-    "no room for anything": Limit(
-        "start-up",
-        lambda run, rng: int(rng.integers(1, 500)),
-        lambda run, ending: True,
-    ),
+    "no room for anything": Limit("start-up", lambda run, rng: int(rng.integers(1, 500)), lambda run, ending: True),
 }
 
 

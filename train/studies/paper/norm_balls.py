@@ -31,11 +31,7 @@ class NormBallSettings(SectionSettings):
     steps: int
 
 
-METHODS = {
-    "adversarial": "adversarial",
-    "random": "random, one draw",
-    "search": "random, any of {steps} draws",
-}
+METHODS = {"adversarial": "adversarial", "random": "random, one draw", "search": "random, any of {steps} draws"}
 STYLES: dict[str, dict[str, Any]] = {
     "adversarial": {"color": "#c2410c", "marker": "o", "linestyle": "-"},
     "random": {"color": "#888888", "marker": "s", "linestyle": ":"},

@@ -71,11 +71,7 @@ def page(findings: Findings, command: str, machine: str) -> str:
     """The whole page, in Markdown."""
     samples, size, uncertainty = findings.reference
     header = HEADER.format(
-        command=command,
-        machine=machine,
-        reference_samples=samples,
-        reference_size=size,
-        uncertainty=shown(uncertainty),
+        command=command, machine=machine, reference_samples=samples, reference_size=size, uncertainty=shown(uncertainty)
     )
     sections = [
         header,
