@@ -4,7 +4,6 @@ import os
 import resource
 import socket
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from multiprocessing.queues import SimpleQueue
@@ -119,10 +118,3 @@ def described(load: Load, usual: Load = Load(0, 0, 0, 0, 0)) -> str:
     """What differs from the usual."""
     changed = {name: value for name, value in asdict(load).items() if value != getattr(usual, name)}
     return ", ".join(f"{name} {value:,}" for name, value in changed.items()) or "as it is"
-
-
-def timed(function: Callable[[], object]) -> float:
-    """Seconds of one core."""
-    start = time.process_time()
-    function()
-    return time.process_time() - start

@@ -8,7 +8,8 @@ import torch.nn.functional as F
 from torchvision.models import resnet50
 
 from augment.build import build_scene
-from train.studies.growth.cost import GREYS, timed
+from train.studies.growth.cost import GREYS
+from train.studies.renderer_speed.measure import seconds
 
 IMAGES = 1_281_167  # of ImageNet's training set
 BATCH, SIZE = 4, 224
@@ -46,7 +47,7 @@ def measure_parts(rounds: int) -> Parts:
         rendered = scene.render(type(conditions)(light), everything)
         torch.autograd.grad(rendered.sum(), light)
 
-    rows = [[timed(part) / BATCH for part in (training, attack, render)] for _ in range(rounds + 1)]
+    rows = [[seconds(part) / BATCH for part in (training, attack, render)] for _ in range(rounds + 1)]
     return Parts(*np.median(rows[1:], axis=0).tolist())
 
 

@@ -30,6 +30,7 @@ from train.studies.figures import panels_beside, save
 from train.studies.paper.adversaries import ATTACKS
 from train.studies.paper.section import Study
 from train.studies.paper.subjects import GREYS, Subject, scene_of
+from train.studies.renderer_speed.measure import seconds
 from train.wideresnet import WideResNet
 
 TARGETS = {"lighting": 1.05, "geometry": 1.3}
@@ -85,12 +86,6 @@ class Stopwatch(Phases):
         start = time.process_time()
         yield
         self.seconds += (time.process_time() - start) * (name == "attack_classifier")
-
-
-def seconds(run: Callable[[], object]) -> float:
-    start = time.process_time()
-    run()
-    return time.process_time() - start
 
 
 def classifier_pass(model: nn.Module, images: Tensor, labels: Tensor, batch_size: int) -> None:

@@ -22,13 +22,13 @@ from train.studies.paper.iterations import (
     iteration_table,
     many,
     ratio_table,
-    seconds,
     stubborn,
     training_step,
 )
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import interval
 from train.studies.paper.subjects import Subject, finer, recognised_scene, scene_of
+from train.studies.renderer_speed.measure import seconds
 
 FIELDS = (2.0, 2.8, 4.0, 5.7, 8.0)  # each halves the pixels of the one before
 SOLID = ObjectSettings("solid:orange", "orange")

@@ -66,6 +66,13 @@ class Clock:
             torch.cuda.synchronize(self.device)
 
 
+def seconds(call: Callable[[], object]) -> float:
+    """That a call takes of the processor, over all threads."""
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
 def peak_bytes(call: Callable[[], object], device: torch.device) -> int:
     """The most that torch's allocator held at once during the call, beyond what it held before."""
     call()

@@ -1,6 +1,5 @@
 """Time and memory of operators with shadows and bounces, beside those of direct light."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,6 +17,7 @@ from renderer.transport import rays
 from renderer.visibility import choose
 from train.report.tables import markdown
 from train.studies.quadrature import quadrature
+from train.studies.renderer_speed import measure
 from train.studies.renderer_speed.measure import Clock
 
 TRANSPORTS = ("direct", "shadows", "bounces:3")
@@ -41,12 +41,7 @@ def operators(mesh: Mesh, transport: str, size: int, views: int = VIEWS) -> list
 
 def seconds(call: Callable[[], object]) -> float:
     """The process's own, the lesser of two calls."""
-    times = []
-    for _ in range(2):
-        start = time.process_time()
-        call()
-        times.append(time.process_time() - start)
-    return min(times)
+    return min(measure.seconds(call) for _ in range(2))
 
 
 def light_step(operator: Operator, light: Tensor) -> None:
