@@ -61,6 +61,7 @@ def build_scene(
     view, off +x. field_of_view: width of the image in world units. perspective: degrees between its sides, None of an
     orthographic camera. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility:
     as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
+    InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
     """
     settings, device = ImageSettings(size, samples, encoding, normals, transport), as_device(device)
     require_range("exposure", exposure, 0, FACTOR)

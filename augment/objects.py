@@ -61,8 +61,8 @@ class CompanionSettings(MeshSettings):
 
 @dataclass
 class ObjectSettings(MeshSettings):
-    """One mesh of a scene. label: the name of its class. gain: multiplies the albedo. beside: what is in the image,
-    too, shadows it and is shadowed, and is no part of what is attacked."""
+    """One mesh of a scene, named as in `MeshSettings`. label: the name of its class. gain: multiplies the albedo.
+    beside: what is in the image, too, shadows it and is shadowed, and is no part of what is attacked."""
 
     label: str
     gain: float = 1.0

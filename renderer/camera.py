@@ -88,7 +88,7 @@ class Camera(ABC):
 
 @dataclass(frozen=True)
 class OrthographicCamera(Camera):
-    """A parallel projection."""
+    """A parallel projection; its angles and lengths are `Camera`'s."""
 
     @property
     def distance(self) -> float:  # type: ignore[override]
