@@ -18,6 +18,11 @@ def joined(blocks: Iterable[str]) -> str:
     return "\n\n".join(block.strip() for block in blocks) + "\n"
 
 
+def filled(module: str, **values: object) -> str:
+    """The Markdown beside a module's file, with values in its braces."""
+    return Path(module).with_suffix(".md").read_text(encoding="utf-8").format(**values).strip()
+
+
 def wrapped(text: str) -> str:
     """Markdown whose paragraphs and lists have lines of at most 120 characters."""
     return "\n\n".join(

@@ -29,7 +29,7 @@ from renderer.visibility import choose
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
 from train.report.tables import markdown
-from train.studies.page import joined, machine, wrapped, write
+from train.studies.page import filled, joined, machine, wrapped, write
 from train.studies.renderer_speed.measure import MOST_ROUNDS, Clock, relative_error
 from train.studies.transport.cost import light_step, seconds
 
@@ -45,41 +45,6 @@ BASES: dict[str, Basis] = {
     "projector of 32²": Projector(32),
     "harmonics and projector of 16²": Sum((HARMONICS, Projector(16))),
 }
-TEXT = """
-# Lights in the scene: time and error
-
-`{command}` measures everything on this page in one run and writes it; do not edit.
-
-{machine}
-
-A cup of several colours, {faces:,} faces and {vertices:,} vertices, with flat normals and 2² samples per pixel unless
-said otherwise, from one side; time is the process's own, on one thread.
-
-## A light step
-
-Image, clamp and the gradient of a loss by the light; the median of rounds in which all take turns, and as a multiple of
-the harmonics'. An operator is built once: rasterised, and a ray cast from each sample to each place, or to {rays}
-points of each disc, of radius {radius:g}. *All entries* is the same operator with what is zero in it: of more than
-{small_operator:,} entries a channel, if less than 1/{fewer} are not zero, these alone are stored and multiplied.
-
-{steps}
-
-## Error
-
-Of one view at {small}² with so many samples per pixel, float32, against float64 with {reference}²: root mean square of
-the difference over that of the reference, of the radiance in random light from 0 to 1 and of the gradient of
-Σ radiance × normal random numbers. What is left are edges of pattern, shadow and outline within a pixel. Mitsuba's
-images of the same lights are compared in tests/renderer/test_placed.py.
-
-{errors}
-
-## Lamps that are moved
-
-A step by the places of the 3 lamps is not linear: each casts its rays anew, {samples}² per pixel. *Held* is the same
-without casting any, as if shadows stayed where they are, which would leave images that are not those of the lamps.
-
-{moved}
-"""
 
 
 @dataclass
@@ -100,7 +65,8 @@ def run(settings: PlacedLightSettings) -> None:
     out = writable_file(settings.out, "out")
     torch.set_num_threads(1)
     cup, clock = subdivide(normalise(solid("cup", 0)), settings.vertices), Clock(torch.device("cpu"), settings.rounds)
-    text = TEXT.format(
+    text = filled(
+        __file__,
         command=command_line(),
         machine=machine(clock.device),
         faces=len(cup.faces),
@@ -116,7 +82,7 @@ def run(settings: PlacedLightSettings) -> None:
         samples=SAMPLES[0],
         moved=_moved(cup, clock),
     )
-    write(out, joined([wrapped(text.strip())]))
+    write(out, joined([wrapped(text)]))
 
 
 def operator(mesh: Mesh, basis: Basis, size: int, samples: int = SAMPLES[0], **kind: Any) -> Operator:

@@ -13,37 +13,7 @@ from train.report.tables import markdown
 from train.studies.accuracy.conditions import Row
 from train.studies.accuracy.measure import Error
 from train.studies.accuracy.refusals import Refusal
-from train.studies.page import joined
-
-INTRODUCTION = """# Accuracy
-
-How far the renderer is off, condition by condition. The reference
-([train/studies/accuracy/](../train/studies/accuracy/)) evaluates the same formulas slowly, by explicit sums and without
-torch, in long doubles ({bits} bits of mantissa here) or, where those would not do (harmonics, thin faces, lights of
-high degree), in 256 bits. It takes each input as the renderer gets it, after its rounding to the number type, and which
-face a sample sees as the rasteriser says, which has tests of its own.
-
-- *Error*: the largest difference anywhere in an image or gradient, over the largest magnitude in it; in brackets, in
-  units of ε, the spacing at 1 of the number type computed in (float64 2.2e-16, float32 1.2e-07, float16 9.8e-04,
-  bfloat16 7.8e-03).
-- *image*, *light gradient*: through an operator (`renderer.transfer`) in float32, unless the row names a type.
-- *image by geometry*, *vertex gradient*: `renderer.shading` in float64, unless the row names a type. With vertex
-  normals, the gradient's product with one random direction.
-- Gradients are of Σ upstream × image with random upstream gradients of either sign in [-1, 1]; those of the
-  harmonics are each over its own largest component.
-
-Unless the row says otherwise: images of 16² pixels and 4 samples, a light of degree 6 with random coefficients in all
-49 places, a colour per face; under "Lights" the geometry is float32, and under "Shadows" and "Bounces"
-(`renderer.transport`) a pixel has one sample, whose 512 rays the reference casts, too, and bounces are between some 64
-patches, which look in 64 directions each, in images of 8². Made by
-
-```bash
-{command}
-```
-
-with torch {torch}, NumPy {numpy}, mpmath {mpmath} on {machine}, one thread. It needs the `test` extra, and fails where
-a number that the renderer returns is not finite or where bad input is not refused.
-"""
+from train.studies.page import filled, joined
 
 
 @dataclass(frozen=True)
@@ -54,7 +24,8 @@ class Table:
 
 def page(tables: Sequence[Table], refusals: Sequence[Refusal], command: str) -> str:
     """Markdown."""
-    introduction = INTRODUCTION.format(
+    introduction = filled(
+        __file__,
         bits=np.finfo(np.longdouble).nmant + 1,
         command=command,
         torch=torch.__version__,

@@ -14,20 +14,8 @@ from train.report.tables import markdown
 from train.settings import MOST_IMAGES
 from train.studies.growth.cost import GREYS, Cost, Load, described, measure
 from train.studies.growth.imagenet import IMAGES, SIZE, Parts, added_share, measure_parts
-from train.studies.page import joined, machine, wrapped, write
+from train.studies.page import filled, joined, machine, wrapped, write
 
-INTRODUCTION = """\
-# How the cost of renders grows
-
-Made by `{command}`. {machine}
-
-- One round of adversarial renders: oranges before five greys, 2 × 2 samples per pixel, {steps} steps of the light, one
-  thread, against a WideResNet-10-1 that is sure of the label, so that every attack takes all its steps. Unless a row
-  says otherwise: {default}. Each row is measured in a process of its own.
-- *Seconds* are those of one core, which other work on the machine lengthens little; *elapsed* is by the clock.
-- *Memory* is the peak beyond what Python and the libraries take, the operators of distinct views and the renders.
-  Images are rendered 16.8 million pixels at a time. What would not fit is refused before it is made.
-"""
 HEADER = ["load", "views", "operators, s", "attack, s", "ms per render and pass", "outside the network", "memory, MB"]
 FURTHER = "{n:,} renders would take {attack:,.0f} s and {memory:,.1f} GB"
 SHARED = """\
@@ -94,8 +82,8 @@ def run(settings: GrowthSettings) -> None:
     shared = [replace(few, renders=settings.shared, processes=count) for count in settings.processes]
     costs = {load: measure(load) for load in dict.fromkeys([*chain(*loads.values()), *shared])}
     torch.set_num_threads(1)
-    introduction = INTRODUCTION.format(
-        command=command_line(), machine=described_machine, steps=settings.steps, default=described(few)
+    introduction = filled(
+        __file__, command=command_line(), machine=described_machine, steps=settings.steps, default=described(few)
     )
     blocks = [wrapped(introduction)]
     for title, rows in loads.items():

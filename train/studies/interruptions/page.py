@@ -9,7 +9,7 @@ import torch
 from train.report.tables import markdown
 from train.studies.interruptions.bench import Bench, Outcome
 from train.studies.interruptions.process import ORDER
-from train.studies.page import joined
+from train.studies.page import filled, joined
 
 CONCERNS = {  # of faults, and the heads of their columns
     "checkpoints": "weights, optimiser",
@@ -18,18 +18,6 @@ CONCERNS = {  # of faults, and the heads of their columns
     "images": "images",
     "said": "exit status and words",
 }
-INTRODUCTION = """\
-# Interruptions
-
-Made by `{command}` with torch {torch} on {machine}. Undisturbed, a run has {epochs} epochs of {epoch:.0f} ms
-after {start:.0f} s of start-up. Half of the moments are uniform over all of it, half over what follows the start-up.
-Every run is resumed until it ends by itself.
-
-- *Equal* to the undisturbed run, bit for bit and seconds aside: every tensor and value of `last.pt` and `best.pt`; the
-  lines of `metrics.jsonl` and what TensorBoard shows, each epoch once; all images and the photographs' scores.
-- *As it should*: a signal ends the run with 128 + its number, a full disk or damage to both checkpoints with 2 and one
-  sentence; a run that falls back to the checkpoint before says so; nothing else is on stderr.
-"""
 
 
 def merged(outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -52,7 +40,8 @@ def failures(outcomes: Sequence[Outcome]) -> list[str]:
 def page(outcomes: Sequence[Outcome], bench: Bench, command: str) -> str:
     """Markdown."""
     seconds, epochs = bench.seconds, bench.small.epochs
-    introduction = INTRODUCTION.format(
+    introduction = filled(
+        __file__,
         command=command,
         torch=torch.__version__,
         machine=platform.machine(),

@@ -15,21 +15,9 @@ from train.interruption import heed_interrupts
 from train.report.tables import markdown
 from train.studies.load import loads
 from train.studies.load.observed import Observed, observe
-from train.studies.page import joined, machine, wrapped, write
+from train.studies.page import filled, joined, machine, wrapped, write
 from train.studies.reliability.study import prepare
 
-INTRODUCTION = """\
-# Load
-
-Made by `{command}`. {machine}
-
-- Each command is run on a terminal and gets Ctrl-C after {patience} s of a core. Where it ends before, it is run again,
-  with Ctrl-C after half of what it took. *Memory* is the peak of the process, of which some {idle:,.0f} MB are Python
-  and its libraries. *Bar*: whether it showed how far it was.
-- Renders have 32 pixels per side, views 16, and one step of attack. What does not fit into the memory that is free is
-  refused before it is made, with the sentence below the table.
-- The machine did other work at the same time, which lengthens the seconds by the clock, also those after Ctrl-C.
-"""
 HEADER = ["asked for", "ended", "s by the clock", "s of a core", "memory, MB", "bar"]
 HEADER += ["s from Ctrl-C to the end", "of a core"]
 SIGNALLED = 130  # as a shell says it of Ctrl-C
@@ -73,8 +61,8 @@ def run(settings: LoadSettings) -> list[str]:
             elif whole.status not in (0, SIGNALLED) or ended.status != SIGNALLED:
                 failures.append(f"{asked} ended with {whole.status} ({whole.said}), by Ctrl-C with {ended.status}")
             rows.append(_row(asked, whole, ended))
-    introduction = INTRODUCTION.format(
-        command=command_line(), machine=described, patience=settings.patience, idle=idle / 1e6
+    introduction = filled(
+        __file__, command=command_line(), machine=described, patience=settings.patience, idle=idle / 1e6
     )
     write(out, joined([wrapped(introduction), markdown(HEADER, rows), "\n".join(refusals)]))
     return failures

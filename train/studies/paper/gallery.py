@@ -21,6 +21,7 @@ from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackCommandSettings, AttackExperimentSettings, AttackSceneSettings
 from train.report.tables import markdown
 from train.settings import RendererSettings
+from train.studies.page import filled
 from train.studies.paper.adversaries import LIGHT, SHAPE
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.subjects import VERTICES
@@ -32,20 +33,6 @@ ALBEDO = StepSettings("linf", 0.1, "sign", 0.02)
 PIXELS = StepSettings("linf", 8 / 255, "sign", 2 / 255)
 COLUMNS = ["attack", "parameters", "views", "steps", "before", "after", "largest change", "seconds"]
 
-TEXT = """
-An attack of each kind on {classifier}. `{mesh}` is one of the solids that the project makes from formulas, which the
-classifier calls {label}; the orange is a file; the paper's figures show bought shapes. Where the shape is attacked it
-is subdivided past {vertices:,} vertices, as in the paper. At most {steps} steps. The white ball shows the light, where
-that is attacked; the largest change is that of any parameter.
-
-{table}
-
-{finding}
-
-{images}
-
-The images of the orange show "An Orange" by thisisepic (Sketchfab, CC BY-SA 4.0), `orange_sketchfab.glb`.
-"""
 FINDING = """
 - Light: {lighting}. One light for three views: {lighting_views}. Long descents depend on rounding: on two
   threads, the same attack on three views ended after 60 steps with two of them fooled.
@@ -205,7 +192,8 @@ def measure(study: Study, settings: GallerySettings) -> Section:
         rows.append(row(case, numbers[-1]))
         figures[f"gallery_{case.name}.png"] = partial(save_small, attacked)
         images.append(f"### {case.title.capitalize()}\n\n![{case.title}](paper/gallery_{case.name}.png)")
-    text = TEXT.format(
+    text = filled(
+        __file__,
         classifier=study.classifier.name,
         mesh=Path(lamp.mesh).name,
         label=lamp.label,

@@ -17,6 +17,7 @@ from augment.seeding import generator
 from train.photographs.shares import share
 from train.report.tables import markdown
 from train.studies.figures import panels_beside, pyplot, save
+from train.studies.page import filled
 from train.studies.paper.balls import LEVELS, PART, SPACES, Outcome, attack_ball, joined, parts
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import draw_shares, interval
@@ -37,47 +38,6 @@ STYLES: dict[str, dict[str, Any]] = {
     "random": {"color": "#888888", "marker": "s", "linestyle": ":"},
     "search": {"color": "#222222", "marker": "^", "linestyle": "--"},
 }
-
-TEXT = """
-The share of {count} images that {classifier} recognises as `{label}` to begin with and no longer does, after a
-descent in an L∞ ball and after uniform draws from the same ball, with 95 % Wilson intervals; {examples} random views
-each of {meshes} in the light `{probe}`, the same ones in every row. Descents take up to {steps} steps along the
-gradient's sign, a quarter of the radius each (pixels: the whole radius, the fast gradient sign method, repeated), and
-end as soon as the classifier is fooled. *L∞ on the image* is the largest change of any value in it, averaged over
-the images: where the descent ended, with the share of pixels that change by more than half of it, and of one draw.
-
-{table}
-
-![Success against radius](paper/norm_balls.png)
-
-Adversaries of one image at about the same L∞ on it (the paper's 0.12, 0.53 and 0.82), with the class that they are
-taken for, each beside its change (grey: none):
-
-![Light, shape and pixels at about the same L∞](paper/norm_balls.spaces.png)
-
-| at the paper's radius | paper | here: adversarial | here: random, one draw |
-| --- | --- | --- | --- |
-| light, 0.1 | adversarial above random, of 10,000 each | {light_adversarial} | {light_random} |
-| shape, 0.002 | adversarial above random, of 10,000 each | {shape_adversarial} | {shape_random} |
-
-The paper shows its shares in a figure and prints none, so that only their order can be compared. What differs:
-
-- {count} images instead of 10,000, since a step of a shape takes a CPU about a tenth of a second. All show one
-  class: the intervals are about views of these meshes, not about shapes at large.
-- {classifier} instead of ResNet-101; up to {steps} steps, where the paper's appendix has 30. The paper does not say
-  how its attacks step within the ball, nor how often a random one may try; one draw and as many as there are steps
-  bracket that.
-- Images need only be recognised: the median confidence in the label is {confidence:.2f} before the attacks. What
-  small random changes fool are views on the verge of another class, whatever is perturbed.
-- The same radius is not the same perturbation from mesh to mesh. An offset of a vertex tilts the faces around it by
-  about the offset over the length of an edge, so that finer meshes give way to smaller radii. The paper's shapes have
-  over 10,000 vertices, here {fineness}.
-- L∞ on the image does not compare the spaces well: a few pixels at the outline or at an edge of the texture that
-  change sides give a shape a large one where all else is nearly still, as the share of pixels beyond half of it tells.
-  Under light a large part of the object changes as much; in pixels almost the whole image does.
-
-Made in {minutes:.0f} minutes of processor time by
-"""
 
 
 def outcomes(subject: Subject, study: Study, settings: NormBallSettings) -> dict[tuple[str, float], Outcome]:
@@ -215,7 +175,8 @@ def measure(study: Study, settings: NormBallSettings) -> Section:
     records = [record(mesh, *ball, outcome) for mesh, balls in found.items() for ball, outcome in balls.items()]
     together = [record("all", *ball, outcome) for ball, outcome in pooled.items()]
     before = next(iter(pooled.values())).before
-    text = TEXT.format(
+    text = filled(
+        __file__,
         classifier=study.classifier.name,
         label=study.label,
         meshes=study.meshes,

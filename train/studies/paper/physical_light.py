@@ -17,6 +17,7 @@ from renderer.harmonics import basis, project, quadrature
 from renderer.transfer import DEGREE
 from train.photographs.shares import share
 from train.report.tables import markdown
+from train.studies.page import filled
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import interval
 from train.studies.paper.subjects import recognised_scene
@@ -24,19 +25,6 @@ from train.studies.paper.subjects import recognised_scene
 BATCH = 10  # examples in a pass through the classifier
 RADII = (0.02, 0.05, 0.1, 0.3, 1.0, None)
 HEADER = ["radius", "any light", "its negative radiance left out", "physical light"]
-TEXT = """
-The paper's light may be negative in places, which no lamp is. Here one attack finds any coefficients, and the other
-only such whose radiance is nowhere negative (`attack.light=physical`, what `scripts/attack.py` does unless told
-otherwise). The share of {count} images of {meshes} that {classifier} no longer calls `{label}`, with 95 % Wilson
-intervals; it does in the light `{probe}` and in the nearest to it without negative radiance, where the second attack
-begins. Balls are L∞ per coefficient around either start, steps a quarter of the radius along the gradient's sign, at
-most {steps}; without a radius, steps of 0.05 along the gradient. The third column has what the first attack found as an
-environment map holds it, without what is negative.
-
-{table}
-
-The first attack's lights fall to {dip:.0%} of their largest radiance at the median, over the channels and all rows.
-"""
 
 
 @dataclass
@@ -59,7 +47,8 @@ def measure(study: Study, settings: PhysicalLightSettings) -> Section:
             dips.append(dip)
     records = [_record(radius, torch.cat(rows, dim=1)) for radius, rows in fooled.items()]
     cells = ([record["radius"] or "none", *map(interval, list(record.values())[1:])] for record in records)
-    text = TEXT.format(
+    text = filled(
+        __file__,
         count=sum(rows.shape[1] for rows in fooled[None]),
         meshes=study.meshes,
         classifier=study.classifier.name,

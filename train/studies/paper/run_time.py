@@ -12,6 +12,7 @@ from augment.descent import DescentSettings, Goal, descend
 from augment.objects import ObjectSettings, load_object
 from train.photographs.shares import share
 from train.report.tables import markdown
+from train.studies.page import filled
 from train.studies.paper.adversaries import ATTACKS
 from train.studies.paper.iterations import (
     BATCH,
@@ -36,50 +37,6 @@ MANY_PASSES = 2  # of a timed descent on many examples at once, which takes its 
 FEWER = 10  # iterations, the paper's
 SHARES = {"quartile": 0.25, "median": 0.5, "third quartile": 0.75, "90 %": 0.9, "most": 1.0}
 ATTACK_COLUMNS = ["mesh", "attacks", "fooled", *(f"{unit}, {name}" for unit in ("steps", "s") for name in SHARES)]
-
-TEXT = """
-One CPU thread, process time, medians; what is compared is measured in turns within one run, and the intervals are the
-quartiles of the turns. An iteration is all that an attack does for one step: render, ask the classifier, differentiate
-both, step, project.
-
-### An iteration against the pixels that need derivatives
-
-One image of {size}², {classifier}, the mesh {mesh} with {vertices:,} vertices, its texture, smooth normals and 2×2
-samples a pixel; the field of view sets how many pixels it covers. Lighting keeps what it rasterised; geometry
-rasterises anew at every step.
-
-![Milliseconds per iteration](paper/run_time.png)
-
-{iterations}
-
-The paper's inset plots the time per iteration, which grows with the pixels that need derivatives, and prints no figure.
-Ours grows with them too. The classifier, whose cost does not depend on them, takes {classifier_share} of the time with
-light and {geometry_share} with shape at {most:,} pixels. The paper differentiates in Python on a Xeon of 3.5 GHz and
-rasterises by OpenGL on a GTX 1080, for ResNet-101, which is about twenty times as much work as {classifier}.
-
-### Against the classifier's own forward and input-gradient pass
-
-{ratios}
-
-On a machine that others share, the same pass through the classifier takes a tenth more or less from one second to the
-next, at times a quarter, and iteration / pass with it. 1 + renderer / pass leaves that out; the renderer is all of
-an iteration but the pass; the targets are judged by it.
-
-100 examples at 224² are 20 views on 5 backgrounds, {batch} per pass through {classifier}. At 32² a step is that of the
-training's attack: two meshes, 10 views and 5 backgrounds, WideResNet-16-4 as in `pretrained/none`, with its bias for
-the label raised so that no example leaves the batch. A single image's iteration finds in the processor's cache what
-the classifier left there: a good part of its cost by light is reading the operator twice, which images of one view
-share.
-
-### How many iterations, how many seconds
-
-An attack on the light of {examples} images that {classifier} recognises, one after the other: steps of 0.05 along the
-gradient at unit length, at most {max_steps}, no limit to the norm. Seconds include what is rendered once per image.
-
-{distribution}
-
-{finding}
-"""
 
 
 @dataclass
@@ -168,7 +125,8 @@ def measure(study: Study, settings: RunTimeSettings) -> Section:
     training = training_step(study, settings.passes, settings.turns // 2)
     done = [each for subject in study.subjects for each in attacks(subject, study, settings)]
     share_of = {kind: np.median(np.divide(each.inside, each.whole)) for kind, each in largest.items()}
-    text = TEXT.format(
+    text = filled(
+        __file__,
         size=study.classifier.size,
         classifier=study.classifier.name,
         mesh=first.name,

@@ -23,6 +23,7 @@ from renderer.lights import ambient
 from renderer.transfer import build_operators
 from renderer.visibility import choose
 from train.report.tables import markdown
+from train.studies.page import filled
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
 from train.studies.paper.subjects import Subject, recognised_scene
@@ -44,27 +45,12 @@ class ShapedLightSettings(SectionSettings):
     margin: float
 
 
-TEXT = """
-A light that fools {classifier} by a margin of {margin:g} in the logit is looked for in {steps} steps at most of
-{size_of_step} of unit length, nowhere negative, for each of {examples} random views of each mesh, with what
-`renderer.transport` has of shadows and bounces. The mesh is then rendered by Mitsuba's path tracer in the lights before
-and after. *Fools here*: of the images that the network recognises in the light before, here and there. *Path-traced*:
-of these adversaries, those that fool it there.
-
-{table}
-
-*Concave* are the meshes that keep more than {share:.0%} of a white sky's light from themselves: {meshes}. In brackets
-95 % Wilson intervals. *Difference* is the mean of the absolute difference between Mitsuba's adversary and ours, of all
-pixels that the mesh covers. Initial light `{light}`, its nearest that is nowhere negative; {size}², 4² samples, flat
-normals. Examples are few, for one network: the intervals say nothing about others.
-"""
-
-
 def measure(study: Study, settings: ShapedLightSettings) -> Section:
     """Adversaries of every mesh under every transport."""
     records = [record for subject in study.subjects for record in adversaries(subject, study, settings)]
     kept = {record["mesh"]: record["kept"] for record in records}
-    text = TEXT.format(
+    text = filled(
+        __file__,
         classifier=study.classifier.name,
         steps=settings.steps,
         margin=settings.margin,

@@ -19,6 +19,7 @@ from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings
 from train.command_line.configuration import composed, read_settings
 from train.report.tables import markdown
+from train.studies.page import filled
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
 
@@ -31,23 +32,6 @@ ATTACKS = {  # by their names in the tables, as `attack=` of scripts/attack.py
     "light, shape and albedo": "lighting,geometry,albedo",
     "projector and shape": "projector,geometry",
 }
-TEXT = """
-Adversaries of {classifier}, found by what `python scripts/attack.py attack=...` runs: views of {meshes}, {examples} of
-each mesh and attack, {around}° apart in azimuth and with a `seed` each, in a scene that is searched for where the
-classifier is not right in it (`scene.search`: {searched} of {total} were); *recognised* are those with a scene. They
-have to fool in {rounding} by a margin of {margin:g} in the logit, after at most {steps} steps, in {light} light, which
-meshes shape as `renderer.transport={transport}` has it; projectors and lamps are dark to begin with. Each is written as
-a folder; *reload* and *mitsuba* render it from these files alone, the latter with {samples} samples a pixel. The shares
-that still fool are of those that fooled:
-
-{table}
-
-{by_mesh}
-
-{differences}
-
-Adversaries that are reloaded to the same image within 1/255: {same} of {attacked}.
-"""
 
 
 @dataclass
@@ -67,7 +51,8 @@ def measure(study: Study, settings: SurvivalSettings) -> Section:
     meshes = dict.fromkeys(record["mesh"] for record in records)
     head = ["recognised", "fooled", *versions]
     command = _command(study.items[0], "lighting", 0, study, settings)
-    text = TEXT.format(
+    text = filled(
+        __file__,
         classifier=study.classifier.name,
         meshes=", ".join(f"{_name(item)} (`{item.label}`)" for item in study.items),
         examples=settings.examples,

@@ -15,6 +15,7 @@ from augment.seeding import generator
 from train.report.tables import markdown
 from train.run_folder.classifier import load_classifier
 from train.studies.figures import pyplot, save
+from train.studies.page import filled
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, recognised_parts, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
@@ -41,41 +42,6 @@ PAPER = {
     "lighting": {"AlexNet": 81.2, "VGG": 65.0, "SqueezeNet": 78.6, "DenseNet": 43.5},
     "geometry": {"AlexNet": 70.3, "VGG": 58.9, "SqueezeNet": 71.1, "DenseNet": 40.1},
 }
-
-TEXT = """
-{source} is attacked on `{label}`, and what fools it is rendered for the other networks, each at its own size: the same
-camera, background, and light or shape. The share of those fooled, among the images that the network recognised
-before:
-
-{tables}
-
-![Adversaries as each network sees them](paper/transfer.png)
-
-*The first example of each mesh after {further} further steps, as each network sees it, with its answer: green where
-that is right, red where it is wrong, grey where it was wrong before the attack.*
-
-The paper's Table 3, with ResNet-101 attacked and 5,000 adversaries:
-
-{paper}
-
-Intervals are 95 % Wilson intervals over {examples} recognised examples ({meshes}) and say nothing about other meshes. A
-random change moves each coefficient or coordinate as far as the adversary does, up or down at random: a network that it
-fools as often merely fails in any changed light. The source itself: {source_success}.
-
-Where this differs from the paper's result, and why:
-
-- The paper does not say when its attacks stop. As found, an adversary lies just beyond the source's border, and nothing
-  pushes it beyond another network's; {further} steps later it is stronger, and the columns show how much hangs on that
-  rule. {distances}
-- The paper's networks all learned ImageNet at 224 pixels. Here the `run:` networks learned CIFAR-100 at 32 pixels,
-  where a shape's details are smaller than a pixel. `run:pretrained/random` and `run:pretrained/adversarial` have also
-  learned from renders of these two meshes, the latter under lights that fooled it.
-- Two oranges instead of 75 shapes of many classes, and fewer examples: `section.examples` sets how many per mesh.
-
-Lighting: steps of 0.05 of unit length, no bound. Geometry: signed steps of 0.0005 within 0.002 per axis, the paper's
-radius, over 10,000 vertices. Either: {steps} steps at most until the source is fooled. Views at 60° from the zenith at
-any azimuth, field of view 2 or 3, five greys, initial light `{light}`.
-"""
 
 
 @dataclass(frozen=True)
@@ -225,7 +191,8 @@ def measure(study: Study, settings: TransferSettings) -> Section:
             seen.setdefault((views[0].kind, subject.name), views)
     names, source = [network.name for network in seen_by], study.classifier.name
     of_paper = list(PAPER["lighting"])
-    text = TEXT.format(
+    text = filled(
+        __file__,
         source=source,
         label=study.label,
         tables=results(records, names, study.label),

@@ -19,6 +19,7 @@ from augment.seeding import generator, stream_seed
 from train.photographs.shares import share
 from train.report.tables import markdown
 from train.studies.figures import panels_beside, save
+from train.studies.page import filled
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, recognised_parts, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import draw_shares, percent
@@ -47,42 +48,6 @@ PAPER = {"lighting": {1: 29.4, 5: 64.2}, "geometry": {1: 0.6, 5: 3.6}}
 BINS = (0, 15, 30, 60, 90, 180)  # degrees
 FAR = 90  # degrees
 COLOURS = {1: "#4269d0", 5: "#ef7a34"}
-
-TEXT = """
-One light or one shape is found that fools {classifier} in 1 or 5 views of `{label}` at once, their costs summed, and
-is then seen from views that the attack did not have, correctly classified before: the share of those fooled.
-
-{table}
-
-With 0 views attacked nothing has changed, and the share is 0 by choice of the views, here as in the paper. In brackets
-95 % Wilson intervals over views. Views under one light are alike, so behind them stands how far the {sets} sets of
-attacked views differ: the lowest and the highest share among them. A random change moves each coefficient or coordinate
-as far as the adversary {further} steps on does, up or down at random, once per set.
-
-Sets in which that adversary fools all views that were attacked, and its median L2 distance from the start: {attacked}.
-
-![Success by distance from the attacked views](paper/unseen_views.png)
-
-*The share of unseen views fooled by adversaries {further} steps on, by the angle to the nearest attacked view about the
-vertical, with 95 % Wilson intervals.*
-
-Where this differs from the paper's result, and why:
-
-- The paper tests on 500 views of a shape; here each cell has {views}, {per_set} for each of {sets} sets of attacked
-  views, on {meshes}. `section.views` and `section.sets`, the latter per mesh, change it.
-- What a shape fools depends on how much of the attacked surface a view still sees: {far}.
-  Where the paper's views lie is not said: if they spread over all directions, fewer are near an attacked one than on a
-  ring of azimuths. A light reaches all views.
-- The paper does not say when its attacks stop: as found is the first step at which all attacked views are fooled, and
-  {further} steps later is a stronger adversary of the same kind.
-- Views differ by azimuth, field of view (2 or 3) and background (five greys), all at 60° from the zenith; the paper
-  does not say how far its views vary.
-- {classifier} instead of ResNet-101, and oranges, which look alike from all sides.
-
-Lighting: steps of 0.05 of unit length, no bound. Geometry: signed steps of 0.0005 within 0.002 per axis, the paper's
-radius, over 10,000 vertices. Either: {steps} steps at most until all attacked views are fooled. Initial light:
-`{light}`.
-"""
 
 
 @dataclass(frozen=True)
@@ -251,7 +216,8 @@ def measure(study: Study, settings: UnseenViewSettings) -> Section:
         for index in range(settings.sets)
         for record in unseen(subject, study.classifier, index, settings.views, study.light, study.seed)
     ]
-    text = TEXT.format(
+    text = filled(
+        __file__,
         classifier=study.classifier.name,
         label=study.label,
         table=results(records, study.label),

@@ -5,20 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from train.report.tables import markdown
-from train.studies.page import joined, versions, wrapped
+from train.studies.page import filled, joined, versions, wrapped
 
-INTRODUCTION = """\
-# Reliability
-
-Made by `{command}`. {versions} Of {all:,} hostile inputs {tried:,} were tried, drawn at random, each at a
-command in a process and a folder of its own, with good files that the project makes for everything else. {started}
-processes were started as a user starts them, the others forked from one that had imported the libraries.
-
-- *Used*: exit status 0, where what is meant can be clear. *Refused*: exit status 2 and one sentence that names the file
-  or the key.
-- *Mishandled*: a traceback, another status, a hang of {patience} s, code from an input that ran, damage that was taken
-  without a word, or a sentence that names neither file nor key. Each of the last column is listed below.
-"""
 NO_FAULTS = "Nothing was mishandled."
 
 
@@ -41,8 +29,14 @@ def failures(outcomes: Iterable[Outcome]) -> list[str]:
 def page(outcomes: Sequence[Outcome], command: str, number: int, patience: float) -> str:
     """Markdown. number: of the inputs there are."""
     started = sum(each.started for each in outcomes)
-    introduction = INTRODUCTION.format(
-        command=command, versions=versions(), tried=len(outcomes), all=number, started=started, patience=patience
+    introduction = filled(
+        __file__,
+        command=command,
+        versions=versions(),
+        tried=len(outcomes),
+        all=number,
+        started=started,
+        patience=patience,
     )
     pairs = list(dict.fromkeys((each.door, each.kind) for each in outcomes))
     rows = [_row(*pair, [each for each in outcomes if (each.door, each.kind) == pair]) for pair in pairs]

@@ -4,33 +4,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from train.report.tables import markdown, shown
-from train.studies.page import joined
+from train.studies.page import filled, joined
 from train.studies.renderer_speed.results import Row, compared, pareto_front, verdict
 from train.studies.renderer_speed.scaling import Point
 from train.studies.renderer_speed.skipping import Saving
 from train.studies.renderer_speed.vertices import Vertices, section
 from train.studies.targets import Target, table_of
-
-HEADER = """# Time against error
-
-`{command}` measures everything on this page in one run, but what names a command
-of its own, and writes it; do not edit.
-
-{machine}.
-
-- The scene is an ellipsoid of one colour, flat-shaded, under the Grace Cathedral probe and a sun: parallel light, whose
-  bands never end, so that cutting the light off after a degree is an error too.
-- **Time** is the median over rounds in which all candidates take turns. On a CPU it is the process's own time, on one
-  thread. **Error** is the root mean square of the difference to a converged reference, over the reference's root mean
-  square: of the radiance before clamping, and of the gradient of Σ radiance × normal random numbers.
-- **The reference** is float64, differentiated by plain autograd, with the sun uncut and 64² samples per pixel at 32²
-  ({reference_samples}² at {reference_size}², where its own image is still off by {uncertainty}). Visibility is fixed
-  in every gradient, and a cut light's gradient is compared on the coefficients that the light has.
-- Operators with **shadows and bounces** are of a cup, and their reference has 16² samples, 16,384 directions and
-  8,192 patches; [transport.md](transport.md) has what a light step with them costs, and Mitsuba beside them.
-- A **light step** is image, clamp and gradient of a scalar loss by the light; a **vertex step** is the same by the
-  vertices, with visibility kept or the mesh projected and rasterised anew. There is no classifier in either.
-"""
 
 
 @dataclass(frozen=True)
@@ -70,8 +49,13 @@ visibility; it is the fastest other way that runs here.
 def page(findings: Findings, command: str, machine: str) -> str:
     """The whole page, in Markdown."""
     samples, size, uncertainty = findings.reference
-    header = HEADER.format(
-        command=command, machine=machine, reference_samples=samples, reference_size=size, uncertainty=shown(uncertainty)
+    header = filled(
+        __file__,
+        command=command,
+        machine=machine,
+        reference_samples=samples,
+        reference_size=size,
+        uncertainty=shown(uncertainty),
     )
     sections = [
         header,

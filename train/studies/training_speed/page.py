@@ -7,31 +7,10 @@ import torch
 from train.report.tables import markdown, shown
 from train.run_folder.logs import PHASES
 from train.studies.figures import pyplot, save
-from train.studies.page import joined
+from train.studies.page import filled, joined
 from train.studies.targets import table_of
 from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, REST, RUN, Findings, Spread, targets
 from train.studies.training_speed.peak import PRECISIONS
-
-HEADER = """# Training speed
-
-`{command}` measures everything on this page in one run and writes it; do not edit.
-
-{machine}.
-
-- **The network** is {network}: {multiply_adds:.1f} M multiply-adds in an image's forward pass, counted as they
-  are called. A training step is taken as three forward passes. The data are {data}.
-- **Ours** is `train.fit`, as `python -m train` runs it, in {precision}, {compiled}, in batches of {batch_size}.
-- **The baseline** is the loop that one writes with torchvision: PIL images, `RandomCrop`, `RandomHorizontalFlip`,
-  `ToTensor` and `Normalize` in a `DataLoader` with {workers} workers, the same network with `nn.Dropout`, channels
-  first, eager, in float32{on_gpu}, and `torch.optim.SGD`.
-- **Images per second** count from stored images to updated weights. **The peak** is the device's best in square
-  matrix products of several sizes.
-- {turns}
-- Numbers are medians of {rounds} rounds ({attacked} of the adversarial arm), with the least and the most in brackets,
-  after a round that warms up.
-- **Every attack takes all its steps** ({attack_steps} on average, of {renders} renders), because the network is made
-  sure of the class before each epoch: the most that the attack can cost, whatever the network has learnt.
-"""
 
 SHORTENED = """A turn is an epoch shortened to {trained} images, and {validated} to validate on; the plain arm,
   the baseline and the matrix products take turns in every round, so that a busy machine disturbs all alike. The seconds
@@ -80,7 +59,8 @@ def draw(path: Path, findings: Findings) -> None:
 def _header(findings: Findings, facts: dict[str, str]) -> str:
     work = findings.workload
     counts = {name: f"{getattr(work, name):,}" for name in ("trained", "validated", "images", "validation")}
-    return HEADER.format(
+    return filled(
+        __file__,
         **facts,
         multiply_adds=findings.multiply_adds / 1e6,
         precision=findings.precision,
