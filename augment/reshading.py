@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial, reduce
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from renderer.basis import Basis, Placed, parts_of
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
+from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.transport.rays import Rays
 from renderer.visibility import Backend
@@ -82,22 +83,25 @@ class Reshading:
         else:
             positions = vertices.detach().cpu().double().numpy()
             fragments, albedo = self._seen(number, camera, positions)
-            rays = Rays(replace(mesh, vertices=positions))
-            placed = partial(PlacedView, rays, mesh, fragments, self._settings, vertices)
+            # once, where lights stand in the scene: a mesh is checked as it is made, and a step's is used by them alone
+            placed = cache(partial(self._moved_view, mesh, positions, fragments, vertices))
         if added is not None:
             albedo = painted_albedo(mesh, fragments, self._settings.encoding, gain, added)
         smooth_faces = self._faces[number] if self._settings.normals == "smooth" else None
-        seen = vertices.new_zeros(3, len(fragments.pixels))
+        seen = []
         for where, part in parts_of(self._basis):
             own = light[where]
             if isinstance(part, Placed):
-                seen = seen + placed().radiance(part, albedo, own, places)
+                seen.append(placed().radiance(part, albedo, own, places))
                 continue
-            seen = seen + radiance(fragments, vertices, own, albedo, smooth_faces)
+            seen.append(radiance(fragments, vertices, own, albedo, smooth_faces))
             if self._settings.transport != "direct":
                 held = self._held(example, number, camera, positions)
-                seen = seen + held.radiance(camera, fragments, albedo, own)
-        return fragments, seen
+                seen.append(held.radiance(camera, fragments, albedo, own))
+        return fragments, reduce(torch.add, seen)
+
+    def _moved_view(self, mesh: Mesh, positions: np.ndarray, fragments: Fragments, vertices: Tensor) -> PlacedView:
+        return PlacedView(Rays(replace(mesh, vertices=positions)), mesh, fragments, self._settings, vertices)
 
     def _held(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> HeldTransport:
         """Of a shape near the vertices of an example, and with the camera's view of it."""

@@ -363,6 +363,14 @@ def test_each_row_has_the_gradient_that_it_has_by_itself(mixed):
         torch.testing.assert_close(gradient([example])[0], together[example], rtol=0, atol=1e-12)
 
 
+def test_a_step_of_vertices_makes_and_checks_no_mesh_where_no_light_stands_in_the_scene(mixed, monkeypatch):
+    examples = torch.arange(len(mixed))
+    conditions = replace(mixed.conditions(examples), vertices=mixed.vertices[mixed.object_of])
+    expected = mixed.render(conditions, examples)
+    monkeypatch.setattr(Mesh, "__post_init__", None)  # which raises if it is called
+    assert torch.equal(mixed.render(conditions, examples), expected)
+
+
 @pytest.mark.parametrize("kind", [Geometry, Albedo])
 def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_its_own_values_only(mixed, kind):
     """What is left over has no gradient and is never drawn; the L2 ball is that of the values in use."""
