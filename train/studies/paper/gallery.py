@@ -33,19 +33,6 @@ ALBEDO = StepSettings("linf", 0.1, "sign", 0.02)
 PIXELS = StepSettings("linf", 8 / 255, "sign", 2 / 255)
 COLUMNS = ["attack", "parameters", "views", "steps", "before", "after", "largest change", "seconds"]
 
-FINDING = """
-- Light: {lighting}. One light for three views: {lighting_views}. Long descents depend on rounding: on two
-  threads, the same attack on three views ended after 60 steps with two of them fooled.
-- Skylight, three parameters: the lamp is {skylight_lamp}, the orange is {skylight}. The paper finds an adversary and
-  calls it more difficult than with all coefficients, which the lamp bears out. Under the sky the classifier takes the
-  orange for a lemon or an apple from most views; of three skies, four views and two greys it is surest of this one.
-- Shape: {geometry}. One shape for three views: {geometry_views}. The paper shows one of either, without a number.
-- Optical illusion: {illusion}, the targets at a confidence of {reached}. The paper turns a jaguar into a cat and a dog.
-  The solid and the targets are choices: of the solids, the classifier knows the lamp best; of three pairs of targets
-  tried, candle and joystick, and soap dispenser and joystick, succeeded within 7 steps, thimble and bell cote did not
-  within 60 (1.00 and 0.02).
-"""
-
 
 @dataclass
 class GallerySettings(SectionSettings):
@@ -170,14 +157,12 @@ def row(case: Case, numbers: dict[str, Any]) -> list[str]:
     ]
 
 
-def finding(numbers: Sequence[dict[str, Any]]) -> str:
-    """What the paper claims of these figures, and what came of it here."""
-    outcomes = {
+def findings(numbers: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """What came of each case, by its name, and what the illusion `reached`."""
+    reached = next(each["target_confidence"] for each in numbers if each["case"] == "illusion")
+    return {"reached": " and ".join(f"{value:.2f}" for value in reached)} | {
         each["case"]: f"{'fooled' if each['fooled'] else 'not fooled'} after {each['steps']} steps" for each in numbers
     }
-    (illusion,) = (each for each in numbers if each["case"] == "illusion")
-    reached = " and ".join(f"{value:.2f}" for value in illusion["target_confidence"])
-    return FINDING.strip().format(**outcomes, reached=reached)
 
 
 def measure(study: Study, settings: GallerySettings) -> Section:
@@ -200,7 +185,7 @@ def measure(study: Study, settings: GallerySettings) -> Section:
         vertices=VERTICES,
         steps=settings.steps,
         table=markdown(COLUMNS, rows),
-        finding=finding(numbers),
+        **findings(numbers),
         images="\n\n".join(images),
     )
     return Section(text, numbers, figures)
