@@ -18,8 +18,7 @@ from renderer.errors import InputError
 from renderer.lights import load_light, probe, save_light
 from train.data import load_npz
 from train.photographs import Photograph, find_photographs, load_photographs
-from train.photographs.answers import Answer
-from train.photographs.answers_table import ANSWERS, read_answers, write_answers
+from train.photographs.answers import ANSWERS, Answer, read_answers, write_answers
 from train.run_folder.checkpoint import BEST, PUBLISHED, describe, load_network, publish, save
 from train.run_folder.files import read_config, read_json, read_numbers
 from train.wideresnet import WideResNet

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from train.photographs.cells import as_cell
+from train.photographs.answers import as_cell
 from train.photographs.figures import OVERALL, Pool
 from train.photographs.ranking import RATES, Ranking
 

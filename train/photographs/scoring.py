@@ -8,8 +8,7 @@ from typing import Any
 
 import torch
 
-from train.photographs.answers import Answer, ask, rank_classes
-from train.photographs.answers_table import ANSWERS, write_answers
+from train.photographs.answers import ANSWERS, Answer, ask, rank_classes, write_answers
 from train.photographs.contact_sheet import choose_sections, draw_contact_sheet
 from train.photographs.figures import OVERALL, Pool, figures, pool_answers, share_true
 from train.photographs.folder import find_photographs, left_out, load_photographs, require_outside

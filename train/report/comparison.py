@@ -9,8 +9,7 @@ import numpy as np
 
 from renderer.errors import InputError
 from train.photographs import FIGURES, figure_title, format_interval
-from train.photographs.answers import Answer
-from train.photographs.answers_table import ANSWERS, read_answers
+from train.photographs.answers import ANSWERS, Answer, read_answers
 from train.photographs.bootstrap import interval, replicate_difference
 from train.photographs.figures import OVERALL, Pool, figures, find_figure, pool_all, pool_answers, replicate_figures
 from train.report.summary import RunSummary, complete, group_by_settings, name_among

@@ -7,7 +7,7 @@ from typing import Any
 from renderer.errors import InputError
 from train.command_line.configuration import as_dict
 from train.photographs import figure_title, find_figure, format_interval
-from train.photographs.answers_table import ANSWERS, read_answers
+from train.photographs.answers import ANSWERS, read_answers
 from train.photographs.figures import pool_all
 from train.photographs.ranking import Ranking
 from train.report import images, plots

@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 
 from renderer.errors import InputError
 from train.photographs import evaluate_photographs, format_summary
-from train.photographs.answers_table import read_answers
+from train.photographs.answers import read_answers
 
 
 def share(hits: int, n: int) -> dict:

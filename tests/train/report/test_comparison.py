@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from renderer.errors import InputError
-from train.photographs.answers import Answer
-from train.photographs.answers_table import write_answers
+from train.photographs.answers import Answer, write_answers
 from train.photographs.folder import Photograph
 from train.report.comparison import format_comparison
 from train.report.summary import summarise
