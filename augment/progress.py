@@ -1,7 +1,7 @@
 """Progress bars of what may take long."""
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -11,9 +11,13 @@ PATIENCE = 5  # seconds without one
 Item = TypeVar("Item")
 
 
-def progress(items: Sequence[Item], description: str) -> Iterable[Item]:
-    """The items, with a bar on a terminal once they have taken some seconds; nothing elsewhere."""
-    return tqdm(items, description, delay=PATIENCE, leave=False, disable=not sys.stderr.isatty())
+def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterable[Item]:
+    """The items, with a bar on a terminal once they have taken some seconds; nothing elsewhere.
+
+    total: how many there are, where they have no length. done: before these.
+    """
+    hidden = not sys.stderr.isatty()
+    return tqdm(items, description, total, delay=PATIENCE, leave=False, disable=hidden, initial=done)
 
 
 @contextmanager

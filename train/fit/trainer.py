@@ -1,16 +1,15 @@
 """The training loop: each round regenerates the renders and trains on data and renders; an epoch of rounds ends with
 validation and a checkpoint."""
 
-import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from augment import processes
 from augment.phases import Phases
+from augment.progress import progress
 from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError
@@ -191,9 +190,9 @@ class Trainer:
         batches = training_batches(
             mixed.images, mixed.labels, settings.batch_size, self.seed, now, settings.flips, first=first
         )
-        for images, labels, rendered in _progress(batches, so_far.step, total, f"epoch {self.epoch + 1}"):
-            progress = (self.epoch % cycle + so_far.step / total) / cycle
-            so_far.sums += self.learner.step(images, labels, rendered, progress, self.epoch * total + so_far.step)
+        for images, labels, rendered in progress(batches, f"epoch {self.epoch + 1}", total, so_far.step):
+            over = (self.epoch % cycle + so_far.step / total) / cycle
+            so_far.sums += self.learner.step(images, labels, rendered, over, self.epoch * total + so_far.step)
             so_far.step += 1
             if interruption.requested():
                 break
@@ -280,9 +279,3 @@ def _require_whole(state: Mapping[str, Any]) -> None:
         raise ValueError(f"precision {state['precision']!r}")
     if not isinstance(state["random_state"], Mapping):
         raise ValueError("no random state")
-
-
-def _progress(batches: Iterable[Any], first: int, total: int, description: str) -> Iterable[Any]:
-    """A progress bar on a terminal, nothing elsewhere."""
-    hidden = not sys.stderr.isatty()
-    return tqdm(batches, initial=first, total=total, desc=description, leave=False, disable=hidden)

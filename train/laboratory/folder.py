@@ -3,7 +3,6 @@
 import csv
 import json
 import platform
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -13,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from tqdm import tqdm
 
 from augment.objects import load_object
+from augment.progress import progress
 from augment.seeding import stream_seed
 from renderer.environment import read_panorama
 from renderer.errors import InputError
@@ -71,8 +70,8 @@ def _read_environment(path: Path) -> np.ndarray:
 
 def _write(sittings: Iterator[tuple[int, Shot, Subject]], settings: LabSettings, out: Path) -> int:
     """Photograph and write; the number of photographs."""
-    hidden, rows = not sys.stderr.isatty(), []
-    for light, shot, subject in tqdm(sittings, "photographs", 2 * settings.lights, leave=False, disable=hidden):
+    rows = []
+    for light, shot, subject in progress(sittings, "photographs", 2 * settings.lights):
         path = Path(subject.label) / f"{light:04d}_{shot.family}.png"
         (out / path).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(_image(subject, shot, light, settings)).save(out / path)
