@@ -79,7 +79,7 @@ class Reshading:
         if vertices is None:
             vertices, positions = self.vertices[number], mesh.vertices
             fragments, albedo = self.own(number, camera)
-            placed = partial(self.placed_view, number, camera)
+            placed = cache(partial(self.placed_view, number, camera))
         else:
             positions = vertices.detach().cpu().double().numpy()
             fragments, albedo = self._seen(number, camera, positions)

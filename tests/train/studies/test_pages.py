@@ -25,7 +25,7 @@ def test_every_study_with_markdown_has_a_page():
     assert {path.relative_to(STUDIES).with_suffix("").as_posix() for path in STUDIES.rglob("*.md")} == PAGES.keys()
 
 
-@pytest.mark.parametrize(("template", "page"), [pair for pair in PAGES.items() if pair[0] != "paper/survival"])
+@pytest.mark.parametrize(("template", "page"), PAGES.items())
 def test_the_committed_page_has_the_words_of_its_study_in_their_order(template, page):
     words, at = " ".join((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8").split()), 0
     told = " ".join((STUDIES / f"{template}.md").read_text(encoding="utf-8").split())
