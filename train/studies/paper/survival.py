@@ -32,6 +32,7 @@ ATTACKS = {  # by their names in the tables, as `attack=` of scripts/attack.py
     "light, shape and albedo": "lighting,geometry,albedo",
     "projector and shape": "projector,geometry",
 }
+LIT = ["light", "projector", "lamps"]  # what changes the light alone, counted together, too
 
 
 @dataclass
@@ -50,6 +51,7 @@ def measure(study: Study, settings: SurvivalSettings) -> Section:
     fooled = [record for record in recognised if record["fooled"]]
     meshes = dict.fromkeys(record["mesh"] for record in records)
     head = ["recognised", "fooled", *versions]
+    rows = {**{name: [name] for name in ATTACKS}, ", ".join(LIT): LIT}
     command = _command(study.items[0], "lighting", 0, study, settings)
     text = filled(
         __file__,
@@ -64,8 +66,11 @@ def measure(study: Study, settings: SurvivalSettings) -> Section:
         light=command.attack.light,
         transport=command.renderer.transport,
         samples=SAMPLES,
-        table=markdown(["attack", *head], (_row("attack", name, records, versions) for name in ATTACKS)),
-        by_mesh=markdown(["mesh", *head], (_row("mesh", name, records, versions) for name in meshes)),
+        table=markdown(
+            ["attack", *head],
+            (_row(name, _of("attack", names, records), versions) for name, names in rows.items()),
+        ),
+        by_mesh=markdown(["mesh", *head], (_row(name, _of("mesh", [name], records), versions) for name in meshes)),
         differences=markdown(
             ["values differ from ours, in 255ths", *ATTACKS], (_differences(version, fooled) for version in versions)
         ),
@@ -118,8 +123,11 @@ def _name(item: ObjectSettings) -> str:
     return Path(item.mesh).stem
 
 
-def _row(column: str, name: str, records: Sequence[dict[str, Any]], versions: Sequence[str]) -> list[str]:
-    here = [record for record in records if record[column] == name]
+def _of(column: str, names: Sequence[str], records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [record for record in records if record[column] in names]
+
+
+def _row(name: str, here: Sequence[dict[str, Any]], versions: Sequence[str]) -> list[str]:
     recognised = [record for record in here if record["recognised"]]
     fooled = [record for record in recognised if record["fooled"]]
     kept = [percent([record["versions"][version]["fooled"] for record in fooled]) for version in versions]
