@@ -80,6 +80,15 @@ def summarise(folder: Path) -> RunSummary:
         photographs={path.parent.name: read_json(path) for path in sorted(folder.glob(f"*/{SUMMARY}"))},
     )
     with complete(folder):
+        for key, value, kind in (
+            ("augment.arm", run.arm, str),
+            ("label", run.config.label, str),
+            ("seed", run.config.seed, int),
+        ):
+            if not isinstance(value, kind):
+                raise TypeError(f"{key} is {value}")
+        if not 0 <= run.scores["test/accuracy"] <= 1:  # NaN is not
+            raise ValueError(f"test/accuracy is {run.scores['test/accuracy']}")
         format_table([run])
     return run
 

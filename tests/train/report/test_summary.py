@@ -165,3 +165,22 @@ def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
 def test_a_run_without_its_selected_network_is_not_published(tmp_path, made_up_run):
     with pytest.raises(InputError, match=r"best.pt does not exist"):
         publish_run(made_up_run(tmp_path / "run"), tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "reason"),
+    [
+        ("config.yaml", "arm: none", "arm: [none]", r"augment\.arm is \['none'\]"),
+        ("config.yaml", "\nseed: 0", "\nseed: abc", "seed is abc"),
+        ("config.yaml", "\nlabel: orange", "\nlabel: 5", "label is 5"),
+        ("metrics.jsonl", '"test/accuracy": ', '"test/accuracy": NaN, "x": ', "test/accuracy is nan"),
+        ("metrics.jsonl", '"test/accuracy": ', '"test/accuracy": 7e300, "x": ', r"test/accuracy is 7e\+300"),
+    ],
+)
+def test_what_no_run_wrote_is_refused_before_any_table(made_up_run, tmp_path, file, old, new, reason):
+    folder = made_up_run(tmp_path / "run")
+    text = (folder / file).read_text()
+    assert old in text
+    (folder / file).write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=rf"{folder}: .* is not as `python -m train` wrote it \(.*{reason}"):
+        summarise(folder)
