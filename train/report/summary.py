@@ -1,5 +1,6 @@
 """Tables and model cards of finished runs, from the files in their folders."""
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -227,15 +228,22 @@ def _spread(values: Sequence[float | None]) -> str:
         return f"{np.mean(known):.3f} ± {np.std(known, ddof=1):.3f}"
 
 
+def _counted(meshes: Sequence[Any]) -> str:
+    """Names of scene.meshes or scene.look_alikes, each with how often it is there."""
+    counts = Counter(Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in meshes)
+    return ", ".join(f"{count} × {name}" if count > 1 else name for name, count in counts.items())
+
+
 def _card(run: RunSummary, name: str) -> str:
     config, scores = run.config, run.scores
     architecture = model_title(**config.model)
     data = Path(config.data.path).name if config.data.name in ("npz", "folder") else config.data.name
-    meshes = Counter(Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in config.scene.meshes)
-    shown = ", ".join(f"{count} × {name}" if count > 1 else name for name, count in meshes.items())
+    meshes, look_alikes = config.scene.meshes, config.scene.get("look_alikes") or []
+    beside = f" beside {_counted(look_alikes)}" if look_alikes else ""
     often = f"every {config.augment.every} training images" if config.augment.get("every") else "each epoch"
-    count = config.augment.examples or f"{config.scene.views} × {len(config.scene.backgrounds)}"
-    renders = f"{count} renders of {shown}" if run.arm != "none" else "none"
+    each = len(meshes) + len(look_alikes), config.scene.views, len(config.scene.backgrounds)
+    count = config.augment.examples or math.prod(each)
+    renders = f"{count} renders of {_counted(meshes)}{beside}" if run.arm != "none" else "none"
     start = config.train.get("init_from")
     selection = "of which the mean is kept" if config.train.get("soup") else "selected on validation"
     rows = [

@@ -3,6 +3,7 @@ import math
 from shutil import copytree
 
 import pytest
+from omegaconf import OmegaConf
 from scipy.stats import binomtest
 
 from renderer.errors import InputError
@@ -142,6 +143,18 @@ def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_ma
     assert [name for name in rows if name.startswith("photographs: ")] == [f"photographs: {name}" for name in FIGURES]
     assert "run=pretrained/tiny-adversarial photos=" in card
     assert str(finished.parent) not in card and str(tmp_path) not in card
+
+
+def test_a_card_counts_the_renders_that_the_scene_makes_and_names_the_look_alikes(finished, tmp_path, read_markdown):
+    run = copytree(finished, tmp_path / "run")
+    config = OmegaConf.load(run / "config.yaml")
+    config.scene.look_alikes = ["solid:fruit", {"mesh": "solid:apple", "label": "apple"}, "solid:fruit"]
+    config.scene.views, config.scene.backgrounds, config.augment.examples = 3, [0.2, 0.4], None
+    OmegaConf.save(config, run / "config.yaml")
+    publish_run(run, tmp_path / "published")
+    (table,) = read_markdown((tmp_path / "published" / "README.md").read_text()).values()
+    shown = "30 renders of solid:orange:0, solid:orange:1 beside 2 × solid:fruit, solid:apple"
+    assert dict(table[1:])["augmentation"] == f"adversarial; renders each epoch: {shown}"
 
 
 def test_the_card_of_a_soup_says_so(finished, tmp_path):
