@@ -4,7 +4,8 @@ Writes docs/performance_lights.md. Takes a minute or two on one CPU thread, and 
 """
 
 from train.command_line.entry_points import script
-from train.studies.placed_lights import PlacedLightSettings, run
+from train.studies.placed_lights import run
+from train.studies.transport.cost import CupSettings
 
 if __name__ == "__main__":
-    script(run, PlacedLightSettings)
+    script(run, CupSettings)

@@ -5,7 +5,8 @@ Mitsuba's gradients LLVM (`apt install libllvm19`).
 """
 
 from train.command_line.entry_points import script
-from train.studies.transport.study import TransportSettings, run
+from train.studies.transport.cost import CupSettings
+from train.studies.transport.study import run
 
 if __name__ == "__main__":
-    script(run, TransportSettings)
+    script(run, CupSettings)

@@ -16,17 +16,16 @@ from train.studies.growth.study import GrowthSettings
 from train.studies.interruptions.study import InterruptionSettings
 from train.studies.load.study import LoadSettings
 from train.studies.paper.study import SECTIONS, PaperSettings
-from train.studies.placed_lights import PlacedLightSettings
 from train.studies.reliability.study import ReliabilitySettings
 from train.studies.renderer_speed.study import RendererSpeedSettings
-from train.studies.transport.study import TransportSettings
+from train.studies.transport.cost import CupSettings
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 SETTINGS = {
     "benchmark_growth": GrowthSettings,
-    "benchmark_lights": PlacedLightSettings,
+    "benchmark_lights": CupSettings,
     "benchmark_renderer": RendererSpeedSettings,
-    "benchmark_transport": TransportSettings,
+    "benchmark_transport": CupSettings,
     "check_accuracy": AccuracySettings,
     "check_interruptions": InterruptionSettings,
     "check_load": LoadSettings,

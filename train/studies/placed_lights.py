@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,14 +13,13 @@ from renderer import sparse
 from renderer.albedo import surface_albedo
 from renderer.basis import HARMONICS, Basis, Sum
 from renderer.camera import OrthographicCamera
-from renderer.errors import require_range
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.lamps import RAYS, Lamps
 from renderer.mesh import Mesh, normalise
 from renderer.projector import Projector
 from renderer.shapes import solid
-from renderer.subdivision import MOST_VERTICES, subdivide
+from renderer.subdivision import subdivide
 from renderer.transfer import Operator, build_operators
 from renderer.transport.placed import lit, placed_radiance
 from renderer.transport.rays import Rays
@@ -30,8 +29,8 @@ from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
 from train.report.tables import markdown
 from train.studies.page import filled, joined, machine, wrapped, write
-from train.studies.renderer_speed.measure import MOST_ROUNDS, Clock, relative_error
-from train.studies.transport.cost import light_step, seconds
+from train.studies.renderer_speed.measure import Clock, relative_error
+from train.studies.transport.cost import CupSettings, light_step, seconds
 
 CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
 SIZES, SAMPLES, REFERENCE = (32, 224), (2, 8), 64  # pixels per side, and samples
@@ -47,20 +46,7 @@ BASES: dict[str, Basis] = {
 }
 
 
-@dataclass
-class PlacedLightSettings:
-    """conf/benchmark_lights.yaml. out: the page. vertices: the cup has more. rounds: of the clock."""
-
-    out: str
-    vertices: int
-    rounds: int
-
-    def __post_init__(self) -> None:
-        require_range("vertices", self.vertices, 0, MOST_VERTICES)
-        require_range("rounds", self.rounds, 1, MOST_ROUNDS)
-
-
-def run(settings: PlacedLightSettings) -> None:
+def run(settings: CupSettings) -> None:
     """Measure on one thread, and write the page."""
     out = writable_file(settings.out, "out")
     torch.set_num_threads(1)

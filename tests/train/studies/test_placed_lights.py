@@ -5,7 +5,8 @@ import pytest
 
 from renderer import sparse
 from train.studies import placed_lights
-from train.studies.placed_lights import BASES, PlacedLightSettings, run
+from train.studies.placed_lights import BASES, run
+from train.studies.transport.cost import CupSettings
 
 
 def test_the_page_has_every_light_with_what_is_zero_in_it_and_its_error(monkeypatch, tmp_path):
@@ -13,7 +14,7 @@ def test_the_page_has_every_light_with_what_is_zero_in_it_and_its_error(monkeypa
     monkeypatch.setattr(placed_lights, "REFERENCE", 16)
     monkeypatch.setattr(sparse, "SMALL", 0)
     page = tmp_path / "lights.md"
-    run(PlacedLightSettings(str(page), vertices=0, rounds=1))
+    run(CupSettings(str(page), vertices=0, rounds=1))
     _, steps, errors, moved = page.read_text(encoding="utf-8").split("\n## ")
     for name in BASES:
         assert f"| {name} | " in steps and errors.count(f"\n| {name} | ") == 2

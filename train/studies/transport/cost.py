@@ -1,7 +1,7 @@
 """Time and memory of operators with shadows and bounces, beside those of direct light."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -9,16 +9,18 @@ import torch
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera, ring
+from renderer.errors import require_range
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.mesh import Mesh
+from renderer.subdivision import MOST_VERTICES
 from renderer.transfer import Operator, build_operators
 from renderer.transport import rays
 from renderer.visibility import choose
 from train.report.tables import markdown
 from train.studies.quadrature import quadrature
 from train.studies.renderer_speed import measure
-from train.studies.renderer_speed.measure import Clock
+from train.studies.renderer_speed.measure import MOST_ROUNDS, Clock
 
 TRANSPORTS = ("direct", "shadows", "bounces:3")
 VIEWS, FIELD_OF_VIEW = 20, 2.2
@@ -26,6 +28,20 @@ CONVERGED = 2**13  # directions
 RESOLUTION = 256  # of a depth map
 EACH = 8  # of them is timed
 DIRECTIONS = (128, 256, 512, 1024)
+
+
+@dataclass
+class CupSettings:
+    """conf/benchmark_transport.yaml and conf/benchmark_lights.yaml. out: the page. vertices: the cup has more. rounds:
+    of the clock."""
+
+    out: str
+    vertices: int
+    rounds: int
+
+    def __post_init__(self) -> None:
+        require_range("vertices", self.vertices, 0, MOST_VERTICES)
+        require_range("rounds", self.rounds, 1, MOST_ROUNDS)
 
 
 def painted(mesh: Mesh, color: Sequence[float]) -> Mesh:

@@ -1,42 +1,27 @@
 """docs/transport.md: what shadows and bounces cost and how right they are."""
 
-from dataclasses import dataclass
-
 import torch
 
 from augment.held_transport import NEAR
-from renderer.errors import require_range
 from renderer.files.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.mesh import normalise
 from renderer.shapes import solid
-from renderer.subdivision import MOST_VERTICES, subdivide
+from renderer.subdivision import subdivide
 from renderer.transport.radiosity import PATCHES
 from renderer.transport.rays import DIRECTIONS
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
 from train.run_folder.classifier import load_classifier
 from train.studies.page import filled, joined, machine, wrapped, write
-from train.studies.renderer_speed.measure import MOST_ROUNDS, Clock
+from train.studies.renderer_speed.measure import Clock
 from train.studies.transport import beside_mitsuba, cost, held
+from train.studies.transport.cost import CupSettings
 
 SIZES = (32, 224)
 COLORS = {"several colours": None, "one grey": (0.5, 0.5, 0.5), "one colour": (0.9, 0.5, 0.2)}
 
 
-@dataclass
-class TransportSettings:
-    """conf/benchmark_transport.yaml. out: the page. vertices: the cup has more. rounds: of the clock."""
-
-    out: str
-    vertices: int
-    rounds: int
-
-    def __post_init__(self) -> None:
-        require_range("vertices", self.vertices, 0, MOST_VERTICES)
-        require_range("rounds", self.rounds, 1, MOST_ROUNDS)
-
-
-def run(settings: TransportSettings) -> None:
+def run(settings: CupSettings) -> None:
     """Measure on one thread, and write the page."""
     out = writable_file(settings.out, "out")
     with mitsuba(DIFFERENTIABLE):
