@@ -88,8 +88,9 @@ def file_trials(door: Door) -> Iterator[Trial]:
                 def prepare(folder: Path, edit: Callable[[Path], object] = damage.edit, file: str = file) -> None:
                     edit(folder / file)
 
+                words = (*named, "label") if "classes" in damage.name else named  # that lack it are told by the key
                 refused = damage.refused and file != door.renewed and damage.name not in door.meant
-                yield Trial(door, damage.kind, f"{file}: {damage.name}", command, named, refused, prepare)
+                yield Trial(door, damage.kind, f"{file}: {damage.name}", command, words, refused, prepare)
 
 
 def name_trials(door: Door) -> Iterator[Trial]:
