@@ -6,6 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+import train.command_line.entry_points as command
 from augment.attacks.adversary_folder import read_adversary
 from augment.attacks.run import logits_of
 from augment.attacks.sweep import Sweep
@@ -19,7 +20,6 @@ from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack, format_reloaded
 from train.attacks.transfers import format_transfers, load_others, write_transfers
 from train.command_line.configuration import read_settings
-from train.command_line.entry_points import one_sentence_errors, script
 from train.command_line.outputs import writable_folder
 from train.device import choose_device
 from train.run_folder.classifier import load_classifier
@@ -65,7 +65,7 @@ def main(config: DictConfig) -> None:
         OmegaConf.save(config, out / "config.yaml")
 
 
-@one_sentence_errors
+@command.one_sentence_errors
 def _several_kinds(argument: str) -> str:
     """Hydra's form, attack=[lighting,geometry], of attack=lighting+geometry."""
     key, _, kinds = argument.partition("=")
@@ -85,4 +85,4 @@ def _arguments(given: list[str]) -> list[str]:
 
 if __name__ == "__main__":
     sys.argv[1:] = _arguments(sys.argv[1:])
-    script(main)
+    command.script(main)

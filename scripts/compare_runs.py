@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import train.command_line.entry_points as command
 from augment.progress import progress
 from renderer.errors import InputError
-from train.command_line.entry_points import script
 from train.report.comparison import format_comparison
 from train.report.summary import summarise
 
@@ -32,4 +32,4 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    script(main, Settings)
+    command.script(main, Settings)

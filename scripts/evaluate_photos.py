@@ -6,9 +6,9 @@ classifier= takes any other network, by a name that scripts/attack.py knows.
 from dataclasses import dataclass
 from pathlib import Path
 
+import train.command_line.entry_points as command
 from augment.classifiers import Classifier
 from renderer.errors import InputError, require_range
-from train.command_line.entry_points import script
 from train.command_line.outputs import writable_folder
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.photographs import evaluate_photographs, format_summary
@@ -70,4 +70,4 @@ def _load(settings: Settings) -> Classifier:
 
 
 if __name__ == "__main__":
-    script(main, Settings)
+    command.script(main, Settings)

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import train.command_line.entry_points as command
 from renderer.environment import check_map_name, negative_share, to_map, write_map
 from renderer.errors import InputError, require_range
 from renderer.lights import load_light
-from train.command_line.entry_points import script
 from train.command_line.outputs import writable_file
 
 LARGEST_HEIGHT = 8192  # of a map that fits in memory: 3 GB
@@ -43,4 +43,4 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    script(main, Settings)
+    command.script(main, Settings)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import torch
 from safetensors.torch import save
 
+import train.command_line.entry_points as command
 from renderer.errors import require_range
 from renderer.skylight import fit_error, fit_polynomials
-from train.command_line.entry_points import script
 from train.command_line.outputs import writable_file
 
 
@@ -35,4 +35,4 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    script(main, Settings)
+    command.script(main, Settings)

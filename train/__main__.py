@@ -13,8 +13,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+import train.command_line.entry_points as command
 from augment import processes
-from train.command_line.entry_points import one_sentence_errors, quoted, run_command
 from train.data import DataSet
 from train.distributed import announce, announced, first_process_first, process_group
 from train.experiment import load_data, prepare, write_images
@@ -29,7 +29,7 @@ NAMED_MODEL = re.compile(r"^model=(?!\{)")  # by its name alone
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="train")
-@one_sentence_errors
+@command.one_sentence_errors
 def main(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
@@ -85,13 +85,13 @@ def resume_command(folder: Path) -> str:
 
 def start() -> None:
     """`main` in this process, or in each that torchrun starts; all take the first one's folder, and it alone writes."""
-    one_sentence_errors(check_launcher)(sys.argv[1:])
+    command.one_sentence_errors(check_launcher)(sys.argv[1:])
     with process_group():
         if processes.rank() > 0:
             console.setLevel("WARNING")
-            sys.argv.append(f"run={quoted(announced())}")
+            sys.argv.append(f"run={command.quoted(announced())}")
         sys.argv[1:] = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
-        run_command(main, "train")
+        command.run_command(main, "train")
 
 
 if __name__ == "__main__":

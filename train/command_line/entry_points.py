@@ -11,8 +11,9 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import hydra
@@ -24,6 +25,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import InterpolationResolutionError, MissingMandatoryValue
 
 from renderer.errors import InputError, is_out_of_memory
+from train.command_line import INTERRUPTED
 from train.command_line.configuration import read_settings
 from train.distributed import is_process_lost
 
@@ -97,11 +99,32 @@ def run_command(main: Callable[[], None], config_name: str) -> None:
             stream.reconfigure(errors="backslashreplace")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors then; else it prints them, in several lines
     Hydra.get_mode = _no_mode  # type: ignore[method-assign]
-    try:
+    with _one_line_of_interrupts():
         _run(main, config_name)
-    except KeyboardInterrupt:
-        print("ended by SIGINT", file=sys.stderr)
+
+
+@contextmanager
+def _one_line_of_interrupts() -> Iterator[None]:
+    """Also where a library that is being imported makes an error of its own of Ctrl-C."""
+    came = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        signal.default_int_handler(number, frame)
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    except (KeyboardInterrupt, Exception) as error:
+        if not came and not isinstance(error, KeyboardInterrupt):
+            raise
+        print(INTERRUPTED, file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
+    finally:
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, before)
 
 
 def _no_mode(*_: object, **__: object) -> None:

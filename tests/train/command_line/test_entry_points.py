@@ -1,4 +1,5 @@
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -201,6 +202,43 @@ def test_ctrl_c_outside_the_epochs_is_one_line_and_as_a_shell_says_it(monkeypatc
     with pytest.raises(SystemExit) as stop:
         run_command(one_sentence_errors(interrupted), "train")
     assert stop.value.code == 130 and capsys.readouterr() == ("", "ended by SIGINT\n")
+
+
+def test_an_interrupt_that_a_library_makes_an_error_of_ends_in_one_line(monkeypatch, capsys):
+    """As trimesh does, which keeps whatever is raised while its optional parts are imported."""
+
+    def imported():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise TypeError("unsupported operand type(s) for |") from None
+
+    monkeypatch.setattr(sys, "argv", ["train"])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job has it ignored
+    try:
+        with pytest.raises(SystemExit) as stop:
+            run_command(one_sentence_errors(imported), "train")
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert stop.value.code == 130 and capsys.readouterr() == ("", "ended by SIGINT\n")
+
+
+@pytest.mark.parametrize("script", ["attack.py", "evaluate_photos.py", "export_light.py", "lab.py", "publish.py"])
+def test_an_interrupt_while_torch_is_imported_is_one_line(script):
+    interrupted = """
+import runpy, signal, sys
+class Finder:
+    def find_spec(name, *_):
+        if name == "torch":
+            signal.raise_signal(signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Finder)
+runpy.run_path(sys.argv[1], run_name="__main__")
+"""
+    command = [sys.executable, "-c", interrupted, str(ROOT / "scripts" / script)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert ended.returncode == -signal.SIGINT and (ended.stdout, ended.stderr) == ("", "ended by SIGINT\n")
 
 
 @given(st.text())
