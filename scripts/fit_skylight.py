@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import save
 
 import train.command_line.entry_points as command
-from renderer.errors import require_range
+from renderer.errors import InputError, require_range
 from renderer.skylight import fit_error, fit_polynomials
 from train.command_line.outputs import writable_file
 
@@ -27,6 +27,8 @@ class Settings:
 
 def main(settings: Settings) -> None:
     out = writable_file(settings.out, "out")
+    if out.suffix != ".safetensors":  # or a mistaken name would cost another file
+        raise InputError(f"out={out}: name a .safetensors file")
     fit = fit_polynomials(settings.zenith_degree, settings.turbidity_degree).float()
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_bytes(save({"fit": fit}))

@@ -75,6 +75,7 @@ WRONG = [
     ([*EXPORT, "height=1000000000", "out=a.hdr"], "height=1000000000 must be at least 1 and at most 8192"),
     (["publish", "run=[a]", "out=out"], "run: "),
     (["fit_skylight", "zenith_degree=many", "out=a.safetensors"], "zenith_degree: "),
+    (["fit_skylight", "out=photo.png"], "out=photo.png: name a .safetensors file"),
     (["check_accuracy", "degree=-1", "out=a.md"], "degree=-1 must be at least"),
     (["attack", f"scene.field_of_view={10**400}"], "scene.field_of_view: int too large to convert to float"),
     (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),

@@ -214,7 +214,7 @@ def test_a_failed_cell_is_told_with_its_reason_and_tried_again_and_stops_no_othe
         cell(tmp_path, "train.epochs=1", f"train.learning_rate={r}") for r in ("-1", "0.05", "0.5")
     )
     reasons = {
-        wrong: "train.learning_rate=-1.0 must be positive",
+        wrong: "train.learning_rate=-1.0 must be positive and at most 100000",
         unlucky: "ZeroDivisionError: no fault of the user's",
     }
     with monkeypatch.context() as patch:
