@@ -9,6 +9,7 @@ shade with albedo / π where this project leaves out the π: a strength of π gi
 """
 
 import math
+import os
 from pathlib import Path
 from types import ModuleType
 
@@ -170,6 +171,8 @@ def _openimageio(path: Path) -> ModuleType:
         import OpenImageIO
     except ImportError as error:
         raise InputError(f"environment map {path} needs OpenImageIO: pip install openimageio") from error
+    if os.fsencode(path) != str(path).encode(errors="replace"):
+        raise InputError(f"environment map {path} has a name that is not UTF-8, as OpenImageIO needs it: rename it")
     OpenImageIO.attribute("threads", 1)  # no pool of threads beside torch's own
     OpenImageIO.attribute("exr_threads", -1)
     OpenImageIO.attribute("limits:imagesize_MB", LARGEST_MAP)

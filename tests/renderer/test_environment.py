@@ -1,5 +1,6 @@
 import io
 import math
+import os
 import re
 import struct
 import sys
@@ -335,6 +336,15 @@ def test_an_array_that_is_no_map_is_refused(tmp_path, content, message):
     (tmp_path / "map.npy").write_bytes(content)
     with pytest.raises(InputError, match=re.escape(message)):
         read_map(tmp_path / "map.npy")
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".exr"])
+def test_a_name_that_is_not_utf_8_is_refused(tmp_path, suffix):
+    path = tmp_path / os.fsdecode(b"a\xffb" + suffix.encode())
+    path.touch()
+    for use in (read_map, lambda path: write_map(path, random_map())):
+        with pytest.raises(InputError, match="has a name that is not UTF-8, as OpenImageIO needs it: rename it"):
+            use(path)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
