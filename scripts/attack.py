@@ -8,6 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import train.command_line.entry_points as command
 from augment.attacks.adversary_folder import read_adversary
+from augment.attacks.files import LINES
 from augment.attacks.run import logits_of
 from augment.attacks.sweep import Sweep
 from augment.parameters import KINDS
@@ -42,6 +43,8 @@ def main(config: DictConfig) -> None:
             return
     others = load_others(settings, device)
     out = writable_folder(settings.out, "out")
+    if any(out.glob(f"*/{LINES}")):  # whose examples would lie among the new ones
+        raise InputError(f"out={out} holds the adversaries of an earlier call: choose another folder, or remove it")
     sweeps: dict[str, Sweep] = {}
     with sole_writer("out", out):
         for index, (name, scene, attacked) in enumerate(attacks(settings, classifier, device, adversary)):

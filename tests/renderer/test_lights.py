@@ -161,7 +161,7 @@ def test_the_middle_column_faces_x_and_azimuth_grows_to_the_left(column, directi
     torch.testing.assert_close(found / found.norm(), torch.tensor(direction).double(), rtol=0, atol=64 * EPS)
 
 
-def smooth_map(height: int = 128, width: int = 64) -> np.ndarray:
+def smooth_map(height: int = 128, width: int = 256) -> np.ndarray:
     """1 + 0.5 z + 0.3 y, tinted; azimuth π at the left edge, falling."""
     polar = np.pi * (np.arange(height) + 0.5)[:, None] / height
     azimuth = np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width
@@ -202,7 +202,7 @@ def test_a_map_gives_the_same_light_in_every_format(tmp_path, suffix):
 
 
 def with_value(value: float) -> np.ndarray:
-    radiance = smooth_map(4, 8)
+    radiance = smooth_map(8, 16)
     radiance[2, 3, 1] = value
     return radiance
 
@@ -212,8 +212,8 @@ def with_value(value: float) -> np.ndarray:
     [
         pytest.param(with_value(np.nan), "holds NaN or infinity", id="NaN"),
         pytest.param(with_value(np.inf), "holds NaN or infinity", id="infinite"),
-        pytest.param(-smooth_map(4, 8), "has a mean luminance of -", id="negative"),
-        pytest.param(np.zeros((4, 8, 3)), "has a mean luminance of 0", id="black"),
+        pytest.param(-smooth_map(8, 16), "has a mean luminance of -", id="negative"),
+        pytest.param(np.zeros((8, 16, 3)), "has a mean luminance of 0", id="black"),
     ],
 )
 @pytest.mark.parametrize("suffix", [".npy", ".exr"])

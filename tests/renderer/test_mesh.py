@@ -417,7 +417,7 @@ def text(content: str):
         ("garbage.glb", text("garbage " * 50), "cannot be read"),
         ("garbage.ply", text("garbage " * 50), "cannot be read"),
         ("truncated.glb", truncated_glb, "cannot be read"),
-        ("damaged_texture.glb", damaged_texture_glb, "cannot be read"),
+        ("damaged_texture.glb", damaged_texture_glb, "no image that can be read"),
         ("two_coordinates.obj", text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n"), "cannot be read"),
         ("beyond.obj", text(TRIANGLE_OBJ + "f 1 2 9\n"), "cannot be read"),
         ("beyond.ply", ply_with_face("3 0 1 7"), "faces name vertices that are not there"),

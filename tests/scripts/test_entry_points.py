@@ -78,6 +78,7 @@ WRONG = [
     (["fit_skylight", "out=photo.png"], "out=photo.png: name a .safetensors file"),
     (["check_accuracy", "degree=-1", "out=a.md"], "degree=-1 must be at least"),
     (["attack", f"scene.field_of_view={10**400}"], "scene.field_of_view: int too large to convert to float"),
+    (["attack", "target={a: 1}"], "target: give a class, least_likely, or a list of classes, one per view"),
     (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
     (["check_interruptions", "jobs=0", "out=a.md"], "jobs=0 must be at least 1"),
     (["lab", "size=0", "out=a"], "size=0 must be at least 1"),

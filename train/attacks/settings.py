@@ -96,6 +96,9 @@ class AttackExperimentSettings:
 
     def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)
+        names = self.target if isinstance(self.target, list) else [self.target]
+        if any(isinstance(name, dict | list) for name in names):
+            raise InputError("target: give a class, least_likely, or a list of classes, one per view")
         require_transferable(self.attack.kinds, self.transfer.azimuths, self.transfer.meshes)
         if self.attack.projector is not None and self.scene.projector is None:
             self.scene.projector = ProjectorSettings()

@@ -21,7 +21,7 @@ def fingerprints(config: DictConfig) -> dict[str, str]:
     """By path, of every file and folder that KEYS name: SHA-256 of a file, or of a folder's names and sizes."""
     settings = dict(dotted(as_dict(config, resolve=True)))
     paths = {path for key in KEYS for path in _paths(settings.get(key)) if os.path.exists(path)}
-    return {path: _of_folder(path) if os.path.isdir(path) else _of_file(path, os.stat(path)) for path in sorted(paths)}
+    return {path: _of_folder(path) if os.path.isdir(path) else _of_file(path, _version(path)) for path in sorted(paths)}
 
 
 def require_same_inputs(folder: Path, config: DictConfig) -> None:
@@ -54,7 +54,13 @@ def _of_folder(path: str) -> str:
     return hashlib.sha256(repr(files).encode(errors="surrogateescape")).hexdigest()
 
 
+def _version(path: str) -> tuple[int, ...]:
+    """Another one where a file has been written to."""
+    found = os.stat(path)
+    return found.st_ino, found.st_size, found.st_mtime_ns
+
+
 @cache
-def _of_file(path: str, _: os.stat_result) -> str:
+def _of_file(path: str, _: tuple[int, ...]) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
