@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from renderer.errors import InputError
+from renderer.files.array_files import read_numbers
 from renderer.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")
@@ -101,12 +102,7 @@ def write_map(path: Path, radiance: Tensor) -> None:
 
 def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     try:
-        with np.errstate(over="ignore"):  # beyond float32 is infinite, and refused as such
-            # By a map, so that no header makes room for more than the file holds.
-            array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
-            if array.dtype.kind not in "fiu" or not array.size:
-                raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
-            array = array.astype(np.float32)
+        array = read_numbers(path)
     except Exception as error:  # Python's parser raises many kinds for a damaged header
         raise InputError(f"environment map {path} is not a readable .npy file: {_first_line(str(error))}") from error
     names = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(array.shape[-1] if array.ndim == 3 else 0)

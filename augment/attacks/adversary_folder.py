@@ -23,6 +23,7 @@ from renderer.basis import parts_of, with_placed
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.environment import negative_share, to_map, write_map
 from renderer.errors import FACTOR, InputError, require_bounded, require_file, require_range
+from renderer.files.array_files import read_numbers
 from renderer.files.mesh_export import export_mesh
 from renderer.files.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.files.placed_lights import load_placed, save_placed
@@ -155,11 +156,7 @@ def _write_background(background: Tensor, folder: Path) -> float | str:
 def _read_images(path: Path, shape: tuple[int, ...]) -> Tensor:
     require_file(path, "write the adversary again")
     try:
-        array = np.lib.format.open_memmap(path, mode="r")  # which makes no room for what a header only announces
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"it holds {array.dtype}")
-        with np.errstate(over="ignore"):  # beyond float32 is infinite, and refused as such
-            images = torch.from_numpy(array.astype(np.float32))
+        images = torch.from_numpy(read_numbers(path))
         require_bounded(images=images)
     except Exception as error:  # Python's parser raises many kinds for a damaged header
         raise InputError(f"{path} cannot be read ({error}): write the adversary again") from error
