@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from renderer.convex import Ball, nearest_in_box
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import FACTOR, InputError, require_choice, require_range
 
 NORMS = ("linf", "l2")
 
@@ -37,8 +37,7 @@ class NormBall:
     radius: float | None = None
 
     def __post_init__(self) -> None:
-        if self.norm not in NORMS:
-            raise InputError(f"attack: norm={self.norm}: choose one of {', '.join(NORMS)}")
+        require_choice("attack: norm", self.norm, NORMS)
         require_range("attack: radius", self.radius, 0, FACTOR)  # no limit: null
 
     def project(self, values: Tensor, centre: Tensor, domain: Domain = anywhere) -> Tensor:

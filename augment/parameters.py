@@ -21,7 +21,7 @@ from augment.scene import Conditions, Scene
 from renderer.arguments import require_fields
 from renderer.basis import Distant, Placed, parts_of
 from renderer.convex import Ball, nearest_in_box
-from renderer.errors import FACTOR, LARGEST, InputError, require_range
+from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
 from renderer.lamps import Lamps
 from renderer.lights import mean_luminance
 from renderer.projector import Projector
@@ -46,14 +46,8 @@ class StepSettings:
     def __post_init__(self) -> None:
         require_fields(self)
         NormBall(self.norm, self.radius)
-        check_step(self.step, self.step_size, "attack: ")
-
-
-def check_step(step: str, step_size: float, prefix: str) -> None:
-    """InputError unless the rule is known and the size positive. prefix: of the settings' names."""
-    if step not in STEPS:
-        raise InputError(f"{prefix}step={step}: choose one of {', '.join(STEPS)}")
-    require_range(f"{prefix}step_size", step_size, 1 / LARGEST, FACTOR)
+        require_choice("attack: step", self.step, STEPS)
+        require_range("attack: step_size", self.step_size, 1 / LARGEST, FACTOR)
 
 
 def direction(gradient: Tensor, step: str) -> Tensor:

@@ -19,7 +19,7 @@ from augment.descent import NO_CLASS, AttackResult, Goal, Part, descend_in_parts
 from augment.labels import is_right, label_loss
 from augment.memory import BatchSize
 from augment.model_state import as_found
-from augment.parameters import Albedo, Geometry, Lighting, StepSettings, check_step
+from augment.parameters import Albedo, Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
@@ -27,7 +27,7 @@ from augment.seeding import generator, stream_seed
 from augment.specimens import Specimens, choose_specimens
 from augment.variation import VariationSettings, vary
 from renderer.arguments import checked, require_fields
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.lights import perturb
 
 if TYPE_CHECKING:
@@ -74,8 +74,6 @@ class TrainingAttackSettings(AttackSettings):
     batch_size: int = 128
 
     def __post_init__(self) -> None:
-        require_fields(self)
-        check_step(self.step, self.step_size, "augment.attack.")
         self._light = StepSettings(step=self.step, step_size=self.step_size)
         super().__post_init__()
 
@@ -105,13 +103,8 @@ class AugmentationSettings:
 
     def __post_init__(self) -> None:
         require_fields(self)
-        for name, value, choices in [
-            ("arm", self.arm, ARMS),
-            ("start", self.start, STARTS),
-            ("lights", self.lights, SCHEDULES),
-        ]:
-            if value not in choices:
-                raise InputError(f"augment.{name}={value}: choose one of {', '.join(choices)}")
+        for name, choices in {"arm": ARMS, "start": STARTS, "lights": SCHEDULES}.items():
+            require_choice(f"augment.{name}", getattr(self, name), choices)
         require_range("augment.examples", self.examples, 0, MOST_EXAMPLES)
         require_range("augment.every", self.every, 1, MOST_EVERY)
         if self.arm == "random" or self.start == "random":

@@ -1,6 +1,6 @@
 """The one exception for what a user can mend, and the checks that keep NaN and the absurd out."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import torch
@@ -32,6 +32,12 @@ def require_range(name: str, value: float | None, least: float, most: float) -> 
     """InputError naming a setting that lies outside of what can be meant, NaN included; None is not set."""
     if value is not None and not least <= value <= most:
         raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}")
+
+
+def require_choice(name: str, value: object, choices: Collection[str]) -> None:
+    """InputError naming a setting that is none of its choices."""
+    if value not in choices:
+        raise InputError(f"{name}={value}: choose one of {', '.join(choices)}")
 
 
 def require_limits(name: str, limits: Sequence[float], least: float, most: float) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.arguments import require_fields
-from renderer.errors import InputError, require_bounded, require_range
+from renderer.errors import InputError, require_bounded, require_choice, require_range
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
@@ -50,8 +50,7 @@ class ImageSettings:
                 f"{MOST_SAMPLES}: choose fewer"
             )
         check_encoding(self.encoding)
-        if self.normals not in NORMALS:
-            raise InputError(f"renderer.normals={self.normals}: choose one of {', '.join(NORMALS)}")
+        require_choice("renderer.normals", self.normals, NORMALS)
         bounces(self.transport)
 
 
@@ -179,8 +178,7 @@ def decode(image: Tensor, encoding: str) -> Tensor:
 
 def check_encoding(encoding: str) -> None:
     """InputError unless the encoding is known."""
-    if encoding not in ENCODINGS:
-        raise InputError(f"renderer.encoding={encoding}: choose one of {', '.join(ENCODINGS)}")
+    require_choice("renderer.encoding", encoding, ENCODINGS)
 
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:

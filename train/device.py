@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from augment import processes
 from augment.labels import divergence, is_right, label_loss, ranking_loss
 from renderer.arguments import as_device
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice
 from renderer.image import to_unit
 from train.run_folder.logs import console
 
@@ -83,8 +83,7 @@ class MixedPrecision(nn.Module):
 
 def choose_precision(precision: str, device: torch.device) -> str:
     """ "bfloat16" or "float32"; "auto" takes the faster on this device by a short measurement."""
-    if precision not in PRECISIONS:
-        raise InputError(f"train.precision={precision}: choose one of {', '.join(PRECISIONS)}")
+    require_choice("train.precision", precision, PRECISIONS)
     return _faster_precision(device) if precision == "auto" else precision
 
 

@@ -20,7 +20,7 @@ from augment.scene import Scene
 from augment.seeding import stream_seed
 from augment.service import AugmentationService
 from renderer.cache import OperatorCache, TensorCache, cache_folder
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice
 from renderer.harmonics import live_coefficients
 from renderer.image import LARGEST_SIZE
 from renderer.transfer import COEFFICIENTS, DEGREE
@@ -59,8 +59,7 @@ def load_data(config: DictConfig) -> DataSet:
         "folder": lambda: load_folder(data.path, data.size, data.test_share),
         "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed, cache),
     }
-    if data.name not in loaders:
-        raise InputError(f"data.name={data.name}: choose one of {', '.join(loaders)}")
+    require_choice("data.name", data.name, loaders)
     console.info("data: %s", data.name)
     with first_process_first():
         loaded = loaders[data.name]()

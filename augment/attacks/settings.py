@@ -12,7 +12,7 @@ from augment.perturbation import Perturbation
 from augment.scene import Scene
 from augment.seeding import generator
 from renderer.arguments import require_fields
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError, require_choice, require_range
 
 PHYSICAL, SIGNED = "physical", "signed"
 LIGHTS = (PHYSICAL, SIGNED)
@@ -58,8 +58,7 @@ class AttackSettings:
         require_fields(self)
         if self.lighting and self.skylight:
             raise InputError("attack: lighting and skylight both set the light: choose one of them")
-        if self.light not in LIGHTS:
-            raise InputError(f"attack.light={self.light}: choose one of {', '.join(LIGHTS)}")
+        require_choice("attack.light", self.light, LIGHTS)
         require_range("attack.restarts", self.restarts, 0, 10**6)
         if self.restarts and any(settings.radius is None for settings in self.kinds.values()):
             raise InputError("attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0")

@@ -12,7 +12,7 @@ from torch.nn.functional import grid_sample
 
 from renderer.arguments import checked
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice
 from renderer.image import NORMALS, decode, encode
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh
 from renderer.normals import vertex_normals
@@ -53,8 +53,7 @@ def export_mesh(
 def corner_normals(mesh: Mesh, normals: str) -> np.ndarray:
     """(F, 3, 3) float64 unit normals that the corners of faces are shaded with, "smooth" or "flat"; up where there is
     none. InputError: another choice."""
-    if normals not in NORMALS:
-        raise InputError(f"normals={normals}: choose one of {', '.join(NORMALS)}")
+    require_choice("normals", normals, NORMALS)
     flat = np.broadcast_to(mesh.face_normals()[:, None], (len(mesh.faces), 3, 3))
     if normals == "smooth":
         smooth = vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)).numpy()[mesh.faces]

@@ -21,7 +21,7 @@ from importlib import import_module
 
 import numpy as np
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice
 from renderer.visibility import opengl
 
 NAMES = ("auto", "opengl", "compiled", "software")
@@ -52,8 +52,7 @@ def choose(backend: str = "auto") -> Backend:
     "auto" takes OpenGL where a GPU drives it, else compiled where numba is installed, else software. InputError:
     unknown name, "opengl" on a machine that cannot, or "compiled" without numba.
     """
-    if backend not in NAMES:
-        raise InputError(f"renderer.visibility={backend}: choose one of {', '.join(NAMES)}")
+    require_choice("renderer.visibility", backend, NAMES)
     if backend == "software":
         return Backend("software", "software (NumPy)")
     if backend == "compiled":

@@ -653,7 +653,7 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["train.threads=100000"], "train.threads=100000 must be at least 1 and at most 1024"),
         (["augment.examples=1000000000000"], "augment.examples=1000000000000 must be at least 0"),
         (["augment.random.amplitude=1e30"], r"augment.random.amplitude=1e\+30 must be"),
-        (["augment.attack.step_size=nan"], "augment.attack.step_size=nan must be"),
+        (["augment.attack.step_size=nan"], "attack: step_size=nan must be"),
         (["renderer.samples=65"], "renderer.samples=65 must be at least 1 and at most 64"),
         (["renderer=x"], "renderer: Merge error: str is not a subclass of RendererSettings"),
         (["scene.meshes=['']"], "scene.meshes: a mesh is '': give a file or solid:NAME"),

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import FACTOR, InputError, require_choice, require_range
 from train.device import COMPILE
 from train.fit.distortions import DISTORTIONS
 from train.fit.epoch import FLIPS
@@ -107,8 +107,7 @@ class TrainSettings:
     def __post_init__(self) -> None:
         choices_of = {"schedule": SCHEDULES, "flips": FLIPS, "distortion": DISTORTIONS, "compile": COMPILE}
         for name, choices in choices_of.items():
-            if getattr(self, name) not in choices:
-                raise InputError(f"train.{name}={getattr(self, name)}: choose one of {', '.join(choices)}")
+            require_choice(f"train.{name}", getattr(self, name), choices)
         for name, most in MOST.items():
             require_range(f"train.{name}", getattr(self, name), 1, most)
         for name in ("momentum", "label_smoothing", "averaging"):
