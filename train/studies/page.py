@@ -38,6 +38,14 @@ def _filled(paragraph: str) -> str:
     )
 
 
+def with_section(page: str, section: str) -> str:
+    """The page with a section in place of the one of the same heading or, where there is none, at its end."""
+    heading, new = section.partition("\n")[0], f"{section.strip()}\n\n"
+    pattern = re.compile(rf"^{re.escape(heading)}\n.*?(?=^## |\Z)", re.M | re.S)
+    text, found = pattern.subn(lambda _: new, page, count=1)
+    return joined([text] if found else [page, new])
+
+
 def write(path: Path | None, text: str) -> None:
     """Print a page, which is not lost then where it cannot be written, and write it where a path says."""
     print(text)

@@ -13,11 +13,10 @@ from scipy.special import eval_legendre, sph_harm_y
 from train.studies.accuracy import reference
 from train.studies.accuracy.conditions import Row
 from train.studies.accuracy.measure import Error, Setup, light
-from train.studies.accuracy.page import Table, failures, page, with_table
 from train.studies.accuracy.reference import exact, extended
 from train.studies.accuracy.refusals import Refusal, refusals
 from train.studies.accuracy.shapes import sphere
-from train.studies.accuracy.study import AccuracySettings, measure
+from train.studies.accuracy.study import AccuracySettings, failures, measure, page
 
 ROOT = Path(__file__).parents[3]
 REDUCED = {"degree": 6, "subdivisions": 2, "size": 64, "slivers": 1}
@@ -39,7 +38,7 @@ def rows_by_title(text: str) -> dict[str, int]:
 
 
 def test_a_reduced_run_has_a_row_for_each_row_of_the_committed_page(tables):
-    text = page(tables, list(refusals()), "command")
+    text = page(tables, list(refusals()))
     committed = rows_by_title((ROOT / "docs" / "accuracy.md").read_text())
     assert rows_by_title(text) == committed
     assert sum(committed.values()) > 60
@@ -48,37 +47,29 @@ def test_a_reduced_run_has_a_row_for_each_row_of_the_committed_page(tables):
 def test_nothing_is_nan_and_all_bad_input_is_refused(tables):
     refused = list(refusals())
     assert failures(tables, refused) == []
-    assert not re.search(r"\bnan\b|\binf\b|\*\*not finite", page(tables, [], "command"), re.I)
+    assert not re.search(r"\bnan\b|\binf\b|\*\*not finite", page(tables, []), re.I)
 
 
 def test_every_error_is_rounding(tables):
     """A few ε each, more where many terms cancel: thousands of pixels, 49 harmonics."""
     errors = {
         (row.condition, name): error.units
-        for table in tables
-        for row in table.rows
+        for rows in tables.values()
+        for row in rows
         for name, error in row.errors.items()
     }
     assert {key: units for key, units in errors.items() if not units < 64} == {}
 
 
 def test_what_is_not_finite_or_not_refused_fails_the_script():
-    row = Row("dark", {"image": Error(math.inf, 1e-7), "gradient": Error(0.5, 1e-7)}, "")
-    assert failures([Table("Lights", [row])], [Refusal("NaN", None), Refusal("∞", "no")]) == [
+    tables = {"Lights": [Row("dark", {"image": Error(math.inf, 1e-7), "gradient": Error(0.5, 1e-7)}, "")]}
+    refused = [Refusal("basis", "directions", "NaN", False), Refusal("basis", "directions", "∞", True)]
+    assert failures(tables, refused) == [
         "dark: image is not finite",
-        "NaN: no error",
+        "basis, directions of NaN: no error that names it",
     ]
-    text = page([Table("Lights", [row])], [Refusal("NaN", None)], "command")
-    assert "| dark | **not finite** | 5.0e-01 (5e+06 ε) |  |" in text and "| NaN | **nothing** |" in text
-
-
-@pytest.mark.parametrize("title", ["Lights", "Meshes", "Shadows"])
-def test_a_table_alone_takes_its_place_on_the_page(title):
-    new = Table(title, [Row("new", {"image": Error(0.0, 1e-7)}, "")])
-    old = [Table(each, [Row("old", {"image": Error(0.0, 1e-7)}, "")]) for each in ("Meshes", "Lights")]
-    text = with_table(page(old, [Refusal("NaN", "no")], "command"), new)
-    kept = [new if each.title == title else each for each in old]
-    assert text == page(kept if new in kept else [*kept, new], [Refusal("NaN", "no")], "command")
+    text = page(tables, refused)
+    assert "| dark | **not finite** | 5,000,000 |  |" in text and "| directions | **nothing** |" in text
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).parents[3]
 STUDIES = ROOT / "train" / "studies"
 PAGES = {
-    "accuracy/page": "accuracy",
+    "accuracy/study": "accuracy",
     "growth/study": "performance_growth",
     "interruptions/page": "interruptions",
     "load/study": "load",

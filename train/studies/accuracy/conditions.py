@@ -48,9 +48,13 @@ def rounded(mesh: Mesh, dtype: torch.dtype) -> Mesh:
 
 def harmonics(degree: int) -> Iterator[Row]:
     directions = torch.from_numpy(np.random.default_rng(0).normal(size=(6, 3)))
-    for name, dtype in DTYPES.items():
-        does = "Legendre recurrences in float64" if dtype == torch.float64 else "computed in float64, rounded once"
-        yield Row(f"degree 0 to {degree}, {name}", of_harmonics(directions.to(dtype), range(degree + 1)), does)
+
+    def in_types(*dtypes: torch.dtype) -> Errors:
+        return worst(of_harmonics(directions.to(dtype), range(degree + 1)) for dtype in dtypes)
+
+    yield Row(f"degree 0 to {degree}, float64", in_types(torch.float64), "Legendre recurrences in float64")
+    narrow = in_types(torch.float32, torch.bfloat16, torch.float16)
+    yield Row(f"degree 0 to {degree}, float32, bfloat16, float16", narrow, "computed in float64, rounded once")
     tilts = [(0, 1), (0, -1), (1e-1, 1), (1e-4, -1), (1e-8, 1), (1e-300, -1)]
     poles = torch.tensor([[0.6 * tilt, 0.8 * tilt, pole] for tilt, pole in tilts], dtype=torch.float64)
     yield Row(
@@ -66,14 +70,15 @@ def harmonics(degree: int) -> Iterator[Row]:
         of_harmonics(lengths, [6]),
         "only the direction counts; the gradient falls with 1 / length",
     )
-    for name in ("float64", "float32"):
-        info = torch.finfo(DTYPES[name])
-        denormal = (directions / directions.norm(dim=1, keepdim=True)).to(DTYPES[name]) * (info.smallest_normal / 2)
-        yield Row(
-            f"denormal: length {info.smallest_normal / 2:.1e}, {name}, degree 1",
-            of_harmonics(denormal, [1]),
-            "scaled up before they are squared",
-        )
+    units = directions / directions.norm(dim=1, keepdim=True)
+    yield Row(
+        "denormal: half the smallest normal length, float64 and float32, degree 1",
+        worst(
+            of_harmonics(units.to(dtype) * (torch.finfo(dtype).smallest_normal / 2), [1])
+            for dtype in (torch.float64, torch.float32)
+        ),
+        "scaled up before they are squared",
+    )
     shortest = torch.finfo(torch.float32).smallest_normal * torch.finfo(torch.float32).eps
     yield Row(
         f"denormal: length {shortest:.1e}, float32, degree 6",
@@ -86,14 +91,14 @@ def harmonics(degree: int) -> Iterator[Row]:
 
 def meshes(subdivisions: int) -> Iterator[Row]:
     ball = shapes.sphere()
-    yield Row("a dented sphere of 320 faces, radius 1", by_both(Setup(ball, light())), "for comparison")
+    yield Row("a dented sphere of 320 faces, radius 1", by_both(Setup(ball)), "for comparison")
     scales = [10.0**power for power in (-6, -3, 3, 6)]
     yield Row(
         "scaled by 10⁻⁶, 10⁻³, 10³ and 10⁶, normalised to be seen, shaded as scaled",
         worst(by_both(placed(ball.vertices * scale)) for scale in scales),
         "divided by a power of two before edges are multiplied",
     )
-    small = Setup(replace(ball, vertices=1e-6 * ball.vertices), light(), camera=framing(1e-6 * CAMERA.field_of_view))
+    small = Setup(replace(ball, vertices=1e-6 * ball.vertices), camera=framing(1e-6 * CAMERA.field_of_view))
     yield Row("scaled by 10⁻⁶, not normalised, in as small a frame", by_both(small), "the frame's width is the unit")
     offsets = [1e6 * np.array(axis) for axis in ([1, 0, 0], [0, -1, 0], [1, -1, 1])]
     yield Row(
@@ -111,33 +116,22 @@ def meshes(subdivisions: int) -> Iterator[Row]:
         worst(of_nothing(replace(ball, vertices=v)) for v in (ball.vertices * 1e6, ball.vertices + 1e6)),
         "beyond the frame's depth: an empty image",
     )
-    yield Row(
-        "three faces without area beside each",
-        by_both(Setup(shapes.with_faces_without_area(ball), light())),
-        "never drawn, gradient 0",
-    )
-    yield Row(
-        "faces that lose their area once rasterised: vertices moved together",
-        by_geometry(Setup(ball, light(), vertices=merged(ball))),
-        "a normal of zero, gradient 0",
-    )
+    without_area, does = shapes.with_faces_without_area(ball), "never drawn, gradient 0"
+    yield Row("three faces without area beside each", by_both(Setup(without_area)), does)
+    condition = "faces that lose their area once rasterised: vertices moved together"
+    yield Row(condition, by_geometry(Setup(ball, vertices=merged(ball))), "a normal of zero, gradient 0")
     twice = shapes.painted(ball.vertices, np.concatenate([ball.faces, ball.faces[:, ::-1]]))
-    yield Row("every face twice", by_both(Setup(twice, light())), "depths tie: the lower index is seen")
+    yield Row("every face twice", by_both(Setup(twice)), "depths tie: the lower index is seen")
     inside_out = shapes.painted(ball.vertices, ball.faces[:, ::-1])
-    yield Row("inverted winding", by_both(Setup(inside_out, light())), "shaded on the side that is seen")
-    yield Row("open, its inside seen", by_both(Setup(shapes.opened(ball), light())), "shaded on the side that is seen")
-    yield Row(
-        "not manifold: three faces on an edge, two solids in a point",
-        by_both(Setup(shapes.non_manifold(), light())),
-        "each face by itself",
-    )
-    yield Row("a single triangle", by_both(Setup(shapes.TRIANGLE, light())), "each face by itself")
+    yield Row("inverted winding", by_both(Setup(inside_out)), "shaded on the side that is seen")
+    yield Row("open, its inside seen", by_both(Setup(shapes.opened(ball))), "shaded on the side that is seen")
+    condition = "not manifold: three faces on an edge, two solids in a point"
+    yield Row(condition, by_both(Setup(shapes.non_manifold())), "each face by itself")
+    yield Row("a single triangle", by_both(Setup(shapes.TRIANGLE)), "each face by itself")
     many, settings = shapes.sphere(subdivisions), ImageSettings(size=256, samples=1)
-    yield Row(
-        f"{len(many.faces):,} faces, thin ones, at 256²", by_both(Setup(many, light(), settings=settings)), SUMMED
-    )
-    yield Row("vertex normals", with_vertex_normals(Setup(ball, light())), "weighted with areas")
-    single = Setup(rounded(ball, torch.float32), light(), dtype=torch.float32)
+    yield Row(f"{len(many.faces):,} faces, thin ones, at 256²", by_both(Setup(many, settings=settings)), SUMMED)
+    yield Row("vertex normals", with_vertex_normals(Setup(ball)), "weighted with areas")
+    single = Setup(rounded(ball, torch.float32), dtype=torch.float32)
     yield Row("vertex normals, float32", with_vertex_normals(single), "normals in float64")
 
 
@@ -147,7 +141,7 @@ def framing(width: float) -> OrthographicCamera:
 
 def of_nothing(mesh: Mesh) -> Errors:
     """Of what no sample sees."""
-    setup = Setup(mesh, light())
+    setup = Setup(mesh)
     assert not len(setup.view().pixels)
     return by_both(setup)
 
@@ -155,7 +149,7 @@ def of_nothing(mesh: Mesh) -> Errors:
 def placed(vertices: np.ndarray, dtype: torch.dtype = torch.float64) -> Setup:
     """The sphere with other vertices, rounded to a dtype: normalised where it is seen, as it is where it is shaded."""
     mesh = rounded(replace(shapes.sphere(), vertices=vertices), dtype)
-    return Setup(normalise(mesh), light(), vertices=mesh.vertices, dtype=dtype)
+    return Setup(normalise(mesh), vertices=mesh.vertices, dtype=dtype)
 
 
 def merged(mesh: Mesh) -> np.ndarray:
@@ -166,8 +160,8 @@ def merged(mesh: Mesh) -> np.ndarray:
     return vertices
 
 
-def shadows() -> Iterator[Row]:
-    lumpy, cast = shapes.lumpy(), "rays by Embree in float32, their sum in float64"
+def transports() -> Iterator[Row]:
+    lumpy, cast = shapes.lumpy(), "rays in float32, sums in float64"
     for condition, mesh in {
         "closed and lumpy": lumpy,
         "open, self-touching, of several parts": shapes.heap(),
@@ -175,45 +169,40 @@ def shadows() -> Iterator[Row]:
         "open, its inside seen": shapes.opened(shapes.sphere(1)),
         "not manifold": shapes.non_manifold(),
     }.items():
-        yield Row(condition, by_transport(Setup(mesh, light())), cast)
-    yield Row("convex", by_transport(Setup(shapes.box(), light())), "no ray is cast; the operator of direct light")
-    small = replace(lumpy, vertices=1e-3 * lumpy.vertices)
-    framed = Setup(small, light(), camera=framing(1e-3 * CAMERA.field_of_view))
-    yield Row("scaled by 10⁻³, not normalised", by_transport(framed), "rays start 1e-5 of the mesh's extent above it")
-    yield Row("float64", by_transport(Setup(lumpy, light()), dtype=torch.float64), cast)
+        yield Row(condition, by_transports(Setup(mesh)), cast)
+    yield Row("convex", by_transport(Setup(shapes.box())), "no ray is cast; the operator of direct light")
+    small = Setup(replace(lumpy, vertices=1e-3 * lumpy.vertices), camera=framing(1e-3 * CAMERA.field_of_view))
+    does = "rays start 1e-5 of the mesh's extent above it"
+    yield Row("scaled by 10⁻³, not normalised", by_transports(small), does)
+    yield Row("closed and lumpy, float64", by_transports(Setup(lumpy), torch.float64), cast)
 
 
-def bounces() -> Iterator[Row]:
-    lumpy, gathered = shapes.lumpy(), "what patches send in float64"
-    conditions: list[tuple[str, Mesh, int, torch.dtype]] = [
-        ("closed and lumpy, one bounce", lumpy, 1, torch.float32),
-        ("closed and lumpy, three bounces", lumpy, 3, torch.float32),
-        ("open, self-touching, of several parts, three bounces", shapes.heap(), 3, torch.float32),
-        ("thin boards, 0.03 apart, three bounces", shapes.boards(), 3, torch.float32),
-        ("open, its inside seen, three bounces", shapes.opened(shapes.sphere(1)), 3, torch.float32),
-        ("not manifold, three bounces", shapes.non_manifold(), 3, torch.float32),
-        ("float64, three bounces", lumpy, 3, torch.float64),
-    ]
-    for condition, mesh, count, dtype in conditions:
-        setup = Setup(mesh, light(), settings=replace(SETTINGS, size=8))
-        with quadrature(patches=2**6, of_patch=2**6):  # so few that the reference takes seconds
-            errors = by_transport(setup, count, dtype)
-        yield Row(condition, errors, gathered)
+def by_transports(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
+    """Of shadows, and of three bounces between so few patches that the reference takes seconds."""
+    smaller = replace(setup, settings=replace(SETTINGS, size=8))
+    with quadrature(patches=2**6, of_patch=2**6):
+        bounces = by_transport(smaller, 3, dtype)
+    return by_transport(setup, 0, dtype) | bounces
 
 
 def thin_faces(count: int) -> Iterator[Row]:
     def measured(mesh: Mesh, dtype: torch.dtype) -> Errors:
         settings = ImageSettings(size=ceil(sqrt(len(mesh.faces))), samples=1)
-        return by_both(Setup(mesh, light(), settings=settings, backend=shapes.Chart(), lift=exact, dtype=dtype))
+        return by_both(Setup(mesh, settings=settings, backend=shapes.Chart(), lift=exact, dtype=dtype))
 
-    for power in (2, 4, 6, 8, 10, 12):
-        thin = shapes.slivers(10.0**-power, count, TOWARDS)
-        does = "rounding errors of differences and products are added back"
-        yield Row(f"height / edge = {ten_to(-power)}", measured(thin, torch.float64), does)
-    for power in (4, 6, 12):
-        thin = rounded(shapes.slivers(10.0**-power, count, TOWARDS), torch.float32)
-        does = f"the same; in float32 normals would be off by {in_float32_arithmetic(thin):.1g}"
-        yield Row(f"height / edge = {ten_to(-power)}, rounded to float32", measured(thin, torch.float32), does)
+    thin = {power: shapes.slivers(10.0**-power, count, TOWARDS) for power in (2, 4, 6, 8, 10, 12)}
+    yield Row(
+        "height / edge = 10⁻² to 10⁻¹²",
+        worst(measured(mesh, torch.float64) for mesh in thin.values()),
+        "rounding errors of differences and products are added back",
+    )
+    single = [rounded(thin[power], torch.float32) for power in (4, 6, 12)]
+    least, *_, most = map(in_float32_arithmetic, single)
+    yield Row(
+        "height / edge = 10⁻⁴ to 10⁻¹², rounded to float32",
+        worst(measured(mesh, torch.float32) for mesh in single),
+        f"the same; in float32 normals would be off by {least:.1g} to {most:.1g}",
+    )
 
 
 def in_float32_arithmetic(mesh: Mesh) -> float:
@@ -225,26 +214,26 @@ def in_float32_arithmetic(mesh: Mesh) -> float:
 
 def lights(degree: int) -> Iterator[Row]:
     ball = rounded(shapes.sphere(), torch.float32)
-    negative = "radiance is negative; `develop` clamps"
-    kinds = [(f"coefficients of {ten_to(n)}", light() * 10.0**n, "linear in the light") for n in (-8, -4, 4, 8, 11)] + [
-        ("all coefficients negative", -light().abs(), negative),
-        ("radiance of −1 from everywhere", ambient(-torch.ones(3)), negative),
-        ("all coefficients zero", 0 * light(), "image and vertex gradient exactly 0"),
-    ]
-    for condition, coefficients, does in kinds:
-        yield Row(condition, by_both(Setup(ball, coefficients, dtype=torch.float32)), does)
-    for name in ("float64", "float32"):
-        mesh = rounded(shapes.box(), DTYPES[name])
-        yield Row(
-            f"lights of degree 0 to {degree} on a box, geometry in {name}",
-            worst(by_both(Setup(mesh, light(l), dtype=DTYPES[name], lift=exact)) for l in range(degree + 1)),
-            "operators and shading of any degree; odd bands from 3 on have a gradient of 0",
-        )
+
+    def lit(*lights: torch.Tensor) -> Errors:
+        return worst(by_both(Setup(ball, each, dtype=torch.float32)) for each in lights)
+
+    scaled = [light() * 10.0**power for power in (-8, -4, 4, 8, 11)]
+    yield Row("coefficients of 10⁻⁸ to 10¹¹", lit(*scaled), "linear in the light")
+    negative = -light().abs(), ambient(-torch.ones(3))
+    yield Row("coefficients, or all radiance, negative", lit(*negative), "radiance is negative; `develop` clamps")
+    yield Row("all coefficients zero", lit(0 * light()), "image and vertex gradient exactly 0")
+    boxes = [Setup(rounded(shapes.box(), each), dtype=each, lift=exact) for each in (torch.float64, torch.float32)]
+    yield Row(
+        f"lights of degree 0 to {degree} on a box, geometry in float64 and float32",
+        worst(by_both(replace(box, light=light(l))) for box in boxes for l in range(degree + 1)),
+        "operators and shading of any degree; odd bands from 3 on have a gradient of 0",
+    )
 
 
 def number_types() -> Iterator[Row]:
     for name, dtype in DTYPES.items():
-        setup = Setup(rounded(shapes.sphere(), dtype), light(), dtype=dtype)
+        setup = Setup(rounded(shapes.sphere(), dtype), dtype=dtype)
         half = torch.finfo(dtype).bits == 16
         does = "operators in this type; normals in float64, harmonics in " + ("float32" if half else "this type")
         yield Row(name, by_operator(setup, dtype) | by_geometry(setup), does)
@@ -252,29 +241,26 @@ def number_types() -> Iterator[Row]:
 
 def images(size: int) -> Iterator[Row]:
     ball = shapes.sphere()
-    for samples in (1, 16):
-        settings = ImageSettings(size=1, samples=samples)
-        yield Row(
-            f"1 × 1, {samples**2} sample{'s' * (samples > 1)}",
-            by_both(Setup(ball, light(), settings=settings)),
-            "one pixel",
-        )
+    tiny = [ImageSettings(size=1, samples=samples) for samples in (1, 16)]
+    errors = worst(by_both(Setup(ball, settings=settings)) for settings in tiny)
+    yield Row("1 × 1, 1 and 256 samples", errors, "one pixel")
     settings = ImageSettings(size=size, samples=1)
-    yield Row(f"{size} × {size}", by_both(Setup(ball, light(), settings=settings, camera=framing(6.0))), SUMMED)
+    yield Row(f"{size} × {size}", by_both(Setup(ball, settings=settings, camera=framing(6.0))), SUMMED)
     around = replace(ball, vertices=1.5 * ball.vertices + 1.2 * TOWARDS)
     yield Row(
         "the camera inside the mesh",
-        by_both(Setup(around, light())),
+        by_both(Setup(around)),
         "what is nearer than the frame is cut away; the far wall is seen from inside",
     )
-    close = Setup(ball, light(), camera=framing(1e-3))
+    close = Setup(ball, camera=framing(1e-3))
     yield Row("a mesh far larger than the frame", by_both(close), "cut at the frame")
-    aside = replace(ball, vertices=ball.vertices + 10 * CAMERA.axes()[0])
-    yield Row("a mesh outside the frame", of_nothing(aside), "an empty image: P = 0, gradients of 0")
-    behind = replace(ball, vertices=ball.vertices + 10 * TOWARDS)
-    yield Row("a mesh behind the camera", of_nothing(behind), "an empty image")
+    aside, behind = (replace(ball, vertices=ball.vertices + 10 * axis) for axis in (CAMERA.axes()[0], TOWARDS))
     edge_on = shapes.painted([-0.5 * TOWARDS, 0.5 * TOWARDS, 0.5 * CAMERA.axes()[1]], [[0, 1, 2]])
-    yield Row("a triangle seen edge on", of_nothing(edge_on), "an empty image")
+    yield Row(
+        "a mesh outside the frame, one behind the camera, a triangle seen edge on",
+        worst(map(of_nothing, (aside, behind, edge_on))),
+        "an empty image: P = 0, gradients of 0",
+    )
 
 
 def development() -> Iterator[Row]:
@@ -282,14 +268,13 @@ def development() -> Iterator[Row]:
     outside = [-1e8, -1.0, -1e-8, -1e-45, 1.001, 2.0, 1e8, 60.0, 0.5, 0.9]
     coverage = torch.tensor([[1.0] * 8 + [0.5] * 2], dtype=torch.float64)
     background = torch.tensor([[0.25]], dtype=torch.float64)
-    for encoding in ("linear", "srgb"):
-        for name, dtype in DTYPES.items():
-            largest = min(1e8, torch.finfo(dtype).max)
-            radiance = torch.tensor([inside, outside], dtype=torch.float64).clamp(-largest, largest)
-            seen, covered, behind = (part.to(dtype) for part in (radiance, coverage, background))
-            does = "clamped to [0, 1]" + ("; the sRGB curve's slope stays finite at 0" if encoding == "srgb" else "")
-            yield Row(f"`{encoding}`, {name}", of_development(seen, covered, behind, encoding), does)
 
+    def developed(encoding: str, dtype: torch.dtype) -> Errors:
+        largest = min(1e8, torch.finfo(dtype).max)
+        radiance = torch.tensor([inside, outside], dtype=torch.float64).clamp(-largest, largest)
+        return of_development(radiance.to(dtype), coverage.to(dtype), background.to(dtype), encoding)
 
-def ten_to(power: int) -> str:
-    return "10" + str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    does = {"linear": "clamped to [0, 1]", "srgb": "clamped to [0, 1]; the curve's slope stays finite at 0"}
+    for encoding, behaviour in does.items():
+        errors = worst(developed(encoding, dtype) for dtype in DTYPES.values())
+        yield Row(f"`{encoding}`, {', '.join(DTYPES)}", errors, behaviour)

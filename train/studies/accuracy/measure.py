@@ -1,7 +1,7 @@
 """The renderer's largest errors against the wide reference, quantity by quantity."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Any
 
@@ -77,7 +77,7 @@ class Setup:
     renderer in its dtype, and to the reference with that rounding."""
 
     mesh: Mesh
-    light: Tensor
+    light: Tensor = field(default_factory=light)
     vertices: np.ndarray | None = None
     camera: OrthographicCamera = CAMERA
     settings: ImageSettings = SETTINGS
@@ -139,9 +139,10 @@ def by_transport(setup: Setup, bounces: int = 0, dtype: torch.dtype = torch.floa
     lit, above = extended(light.double().numpy()), extended(upstream.double().numpy())
     image = reference.image(view, lit) - (lost * lit).sum(axis=1)
     gradient = reference.light_gradient(view, above, setup.degree) - (lost * above[:, None]).sum(axis=0)
+    kind = "bounces" if bounces else "shadows"
     return {
-        IMAGE: error(operator.radiance(light).T, image),
-        LIGHT_GRADIENT: error(operator.light_gradient(upstream.to(dtype).T), gradient),
+        f"{IMAGE}, {kind}": error(operator.radiance(light).T, image),
+        f"{LIGHT_GRADIENT}, {kind}": error(operator.light_gradient(upstream.to(dtype).T), gradient),
     }
 
 

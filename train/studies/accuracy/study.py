@@ -1,16 +1,25 @@
-"""Every condition measured and every refusal tried, once."""
+"""docs/accuracy.md: every condition measured and every refusal tried, once."""
 
+import platform
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 
+import mpmath
+import numpy as np
 import torch
 
 from renderer.errors import InputError, require_range
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
+from train.report.tables import markdown, shown
 from train.studies.accuracy import conditions
-from train.studies.accuracy.page import Table, failures, page, with_table
-from train.studies.accuracy.refusals import refusals
-from train.studies.page import write
+from train.studies.accuracy.conditions import Row
+from train.studies.accuracy.measure import Error
+from train.studies.accuracy.refusals import Refusal, refusals
+from train.studies.page import filled, joined, with_section, write
+
+Tables = dict[str, Sequence[Row]]  # by title
 
 
 @dataclass
@@ -36,15 +45,15 @@ def run(settings: AccuracySettings) -> list[str]:
     torch.set_num_threads(1)
     tables = measure(settings)
     if settings.only:
-        write(out, with_table(out.read_text("utf-8"), tables[0]))
+        write(out, with_section(out.read_text("utf-8"), _section(*tables.popitem())))
         return failures(tables, [])
     refused = list(refusals())
-    write(out, page(tables, refused, command_line()))
-    print(f"{sum(len(table.rows) for table in tables)} conditions and {len(refused)} refusals")
+    write(out, page(tables, refused))
+    print(f"{sum(map(len, tables.values()))} conditions and {len(refused)} refusals")
     return failures(tables, refused)
 
 
-def measure(settings: AccuracySettings) -> list[Table]:
+def measure(settings: AccuracySettings) -> Tables:
     """Every table, or the one that the settings name. InputError where there is none of that title."""
     rows = {
         "Spherical harmonics": conditions.harmonics(settings.degree),
@@ -54,9 +63,48 @@ def measure(settings: AccuracySettings) -> list[Table]:
         "Number types": conditions.number_types(),
         "Images and cameras": conditions.images(settings.size),
         "Radiance to image": conditions.development(),
-        "Shadows": conditions.shadows(),
-        "Bounces": conditions.bounces(),
+        "Shadows and bounces": conditions.transports(),
     }
     if settings.only not in (None, *rows):
         raise InputError(f"only={settings.only}: choose one of {', '.join(rows)}")
-    return [Table(title, list(found)) for title, found in rows.items() if settings.only in (None, title)]
+    return {title: list(found) for title, found in rows.items() if settings.only in (None, title)}
+
+
+def page(tables: Tables, refused: Sequence[Refusal]) -> str:
+    """Markdown."""
+    lines = [(f"`{each.call}`", each.argument, each.value if each.named else "**nothing**") for each in refused]
+    text = filled(
+        __file__,
+        bits=np.finfo(np.longdouble).nmant + 1,
+        command=command_line(),
+        torch=torch.__version__,
+        numpy=np.__version__,
+        mpmath=mpmath.__version__,
+        machine=platform.machine(),
+        tables="\n\n".join(_section(*table) for table in tables.items()),
+        refusals=markdown(["call", "argument", "refused"], lines),
+    )
+    return joined([text])
+
+
+def failures(tables: Tables, refused: Sequence[Refusal]) -> list[str]:
+    """What was not finite or not refused, in words."""
+    return [
+        f"{row.condition}: {quantity} is not finite"
+        for rows in tables.values()
+        for row in rows
+        for quantity, error in row.errors.items()
+        if not isfinite(error.relative)
+    ] + [f"{each.call}, {each.argument} of {each.value}: no error that names it" for each in refused if not each.named]
+
+
+def _section(title: str, rows: Sequence[Row]) -> str:
+    quantities = list(dict.fromkeys(quantity for row in rows for quantity in row.errors))
+    cells = [[row.condition, *(_cell(row.errors.get(name)) for name in quantities), row.behaviour] for row in rows]
+    return f"## {title}\n\n{markdown(['condition', *quantities, 'what the code does'], cells)}"
+
+
+def _cell(error: Error | None) -> str:
+    if error is None:
+        return "-"
+    return shown(error.units) if isfinite(error.relative) else "**not finite**"
