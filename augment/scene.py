@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from augment.objects import SceneObject
 from augment.operator_stack import OperatorStack
 from augment.relighting import Relighting
 from augment.reshading import Reshading
-from renderer.arguments import checked
+from renderer.arguments import checked, require_fields
 from renderer.basis import HARMONICS, Basis, parts_of
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
@@ -63,66 +63,70 @@ class Conditions:
     places: Float[Tensor, "A L 3"] | None = None
 
 
+@dataclass(eq=False)
 class Scene:
     """E examples of V views each, over backgrounds (B, 3 or 1, size, size) of values in [0, 1].
 
     Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
     (`Relighting`). Where vertices move, their view is rasterised anew each time (`Reshading`).
-    light: (size, 3), or (E, size, 3), where attacks begin; its dtype and device are those of the images. basis: what
-    lights are coefficients of; 49 harmonics, unless another is given. taken: what a camera makes of rendered images
-    (A, V, 3, size, size) of examples (A,), differentiable; see `Snapshot`.
+    lights: (E, size, 3), or (size, 3) for all, where attacks begin; their dtype and device are those of the images.
+    operators: where rendered views are kept. basis: what lights are coefficients of; 49 harmonics, unless another is
+    given. taken: what a camera makes of rendered images (A, V, 3, size, size) of examples (A,), differentiable; see
+    `Snapshot`.
     """
 
-    @checked
-    def __init__(
-        self,
-        objects: Sequence[SceneObject],
-        examples: Sequence[Example],
-        backgrounds: Tensor,
-        light: Tensor,
-        settings: ImageSettings,
-        backend: Backend,
-        operators: OperatorCache | None = None,
-        basis: Basis = HARMONICS,
-        taken: Callable[[Tensor, Tensor], Tensor] | None = None,
-    ):
-        if not examples:
-            raise InputError("nothing is to be rendered: name one mesh, one view and one background or more")
-        if light.shape[-2:] != (basis.size, 3):
-            raise InputError(f"light of shape {tuple(light.shape)} is not of {basis}: give {basis.size} rows")
-        size = settings.size
-        if not (backgrounds.is_floating_point() and backgrounds.shape[1:] in ((1, size, size), (3, size, size))):
-            raise InputError(
-                f"backgrounds of {backgrounds.dtype} {tuple(backgrounds.shape)}: give images (B, 3, {size}, {size})"
-            )
-        if not (backgrounds.min() >= 0 and backgrounds.max() <= 1):
-            raise InputError("scene.backgrounds: give values in [0, 1]")
-        self.objects = list(objects)
-        self.examples = [_seen_whole(example, self.objects[example.object].radius) for example in examples]
-        self.settings, self.backend, self.basis, self._taken = settings, backend, basis, taken
-        self.backgrounds = backgrounds.flatten(2).to(light)
-        self.lights = light.expand(len(examples), *light.shape[-2:])
+    objects: Sequence[SceneObject]
+    examples: Sequence[Example]
+    backgrounds: Tensor
+    lights: Tensor
+    settings: ImageSettings
+    backend: Backend
+    operators: OperatorCache = field(default_factory=OperatorCache)
+    basis: Basis = HARMONICS
+    taken: Callable[[Tensor, Tensor], Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        require_fields(self)
+        self._require_consistent()
+        self.examples = [_seen_whole(example, self.objects[example.object].radius) for example in self.examples]
+        self.backgrounds = self.backgrounds.to(self.lights)
+        self.lights = self.lights.expand(len(self.examples), *self.lights.shape[-2:])
         self.views = len(self.examples[0].cameras)  # per example
-        self._cache = operators or OperatorCache()
-        self.object_of = self._column(example.object for example in examples)  # (E,)
-        self._background = self._column(example.background for example in examples)
-        self._exposure = torch.tensor([example.exposure for example in examples]).to(light)[:, None, None]
-        pixels = settings.size**2
-        self.at_once = max(1, AT_ONCE // (self.views * pixels))  # examples
-        images = len(self.examples) * self.views
-        asked = (
-            f"{images} renders of {settings.size} pixels per side (augment.examples, scene.views, scene.backgrounds)"
-        )
-        require_memory(asked, 24 * images * pixels, self.lights.device)
-        seen = [(example.object, camera) for example in self.examples for camera in example.cameras]
-        cache, dtype = self._cache, self.lights.dtype  # without the scene, which each epoch replaces, tied to itself
+        self.object_of = self._column(example.object for example in self.examples)  # (E,)
+        self._background = self._column(example.background for example in self.examples)
+        exposures = torch.tensor([example.exposure for example in self.examples])
+        self._exposure = exposures.to(self.lights)[:, None, None]
+        size, images = self.settings.size, len(self.examples) * self.views
+        self.at_once = max(1, AT_ONCE // (self.views * size**2))  # examples
+        asked = f"{images} renders of {size} pixels per side (augment.examples, scene.views, scene.backgrounds)"
+        require_memory(asked, 24 * images * size**2, self.lights.device)
+        self._relighting = self._relit_views()
+        self._reshading = Reshading(self.objects, self.settings, self.backend, self.basis, self.lights)
+
+    def _require_consistent(self) -> None:
+        if not self.examples:
+            raise InputError("nothing is to be rendered: name one mesh, one view and one background or more")
+        if self.lights.shape[-2:] != (self.basis.size, 3):
+            raise InputError(
+                f"light of shape {tuple(self.lights.shape)} is not of {self.basis}: give {self.basis.size} rows"
+            )
+        behind, size = self.backgrounds, self.settings.size
+        if not (behind.is_floating_point() and behind.shape[1:] in ((1, size, size), (3, size, size))):
+            raise InputError(f"backgrounds of {behind.dtype} {tuple(behind.shape)}: give images (B, 3, {size}, {size})")
+        if not (behind.min() >= 0 and behind.max() <= 1):
+            raise InputError("scene.backgrounds: give values in [0, 1]")
+
+    def _relit_views(self) -> Relighting:
+        # without the scene, which each epoch replaces, tied to itself
+        cache, settings, backend = self.operators, self.settings, self.backend
+        basis, dtype = self.basis, self.lights.dtype
 
         def build(item: SceneObject, cameras: Sequence[Camera]) -> Sequence[Operator]:
             return cache.operators(item.mesh, cameras, settings, backend, item.gain, basis, dtype)
 
+        seen = [(example.object, camera) for example in self.examples for camera in example.cameras]
         behind_images = self._background.repeat_interleave(self.views)
-        self._relighting = Relighting(self.objects, seen, behind_images, self.backgrounds, settings, build)
-        self._reshading = Reshading(self.objects, settings, backend, basis, self.lights)
+        return Relighting(self.objects, seen, behind_images, self.backgrounds.flatten(2), settings, build)
 
     @classmethod
     @checked
@@ -143,50 +147,10 @@ class Scene:
         attacked, every object over every background from all cameras."""
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = [Example(*row) for row in product(range(len(objects)), views, range(len(backgrounds)))]
-        return cls(objects, examples, backgrounds, light, settings, backend, operators, basis)
-
-    @classmethod
-    @checked
-    def of_mesh(
-        cls,
-        mesh: Mesh,
-        cameras: Sequence[Sequence[Camera]],
-        backgrounds: Tensor,
-        light: Tensor,
-        settings: ImageSettings,
-        backend: Backend,
-        gain: float = 1.0,
-        operators: OperatorCache | None = None,
-    ) -> Scene:
-        """One mesh from cameras (E × V), each example before a background of its own (E, 3, size, size)."""
-        examples = [Example(0, tuple(views), index) for index, views in enumerate(cameras)]
-        return cls([SceneObject("", mesh, gain)], examples, backgrounds, light, settings, backend, operators)
-
-    def with_rows(self, examples: Sequence[Example], **changed: Any) -> Scene:
-        """Other rows, as many as before, of the same scene but for what is given: keywords are the constructor's."""
-        same: dict[str, Any] = {
-            "objects": self.objects,
-            "backgrounds": self.images_behind,
-            "light": self.lights,
-            "settings": self.settings,
-            "backend": self.backend,
-            "operators": self._cache,
-            "basis": self.basis,
-            "taken": self._taken,
-        }
-        return Scene(examples=examples, **same | changed)
-
-    def in_physical_light(self) -> Scene:
-        """The same, in the nearest lights that something can emit."""
-        return self.with_rows(self.examples, light=self.basis.nearest_physical(self.lights))
+        return cls(objects, examples, backgrounds, light, settings, backend, operators or OperatorCache(), basis)
 
     def __len__(self) -> int:
         return len(self.examples)
-
-    @property
-    def images_behind(self) -> Tensor:
-        """The backgrounds as they were given, (B, 3 or 1, size, size)."""
-        return self.backgrounds.unflatten(2, (self.settings.size, -1))
 
     @cached_property
     def cameras(self) -> list[tuple[Camera, ...]]:
@@ -226,12 +190,12 @@ class Scene:
         InputError: NaN.
         """
         layers = list(self._layers(conditions, examples))
-        canvas = self.backgrounds.index_select(0, self._background[examples].repeat_interleave(self.views))
+        canvas = self.backgrounds.flatten(2).index_select(0, self._background[examples].repeat_interleave(self.views))
         canvas = canvas.expand(-1, 3, -1).contiguous()
         covered = [develop_composite(layer.composite, self.settings.encoding) for layer in layers]
         images = in_place(canvas, layers, covered)
         images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
-        images = images if self._taken is None else self._taken(images, examples)
+        images = images if self.taken is None else self.taken(images, examples)
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
 
     @torch.no_grad()
@@ -287,7 +251,7 @@ class Scene:
             places = None if conditions.places is None else conditions.places[row]
             fragments, seen = self._reshading.radiance(*shown, light[row], vertices, added, places)
             coverage = fragments.coverage.to(seen)[None]
-            there = self.backgrounds[example.background].index_select(1, fragments.pixels)
+            there = self.backgrounds[example.background].flatten(1).index_select(1, fragments.pixels)
             composite = seen + behind(coverage, there, self.settings.encoding)
             yield Layer([image], fragments.pixels, composite[None], coverage[None], [0])
 

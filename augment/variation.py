@@ -82,10 +82,9 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, ligh
     the light and the camera's part. InputError where the folder of backgrounds has no readable image.
     """
     moved = _moved_rows(scene, settings, draws) if settings.moves or settings.backgrounds is not None else scene
-    repeated = (
-        moved.with_rows(moved.examples * lights, light=moved.lights.repeat(lights, 1, 1)) if lights > 1 else moved
-    )
-    return _taken_anew(repeated, settings, draws) if settings.varies else repeated
+    if lights > 1:
+        moved = replace(moved, examples=[*moved.examples] * lights, lights=moved.lights.repeat(lights, 1, 1))
+    return _taken_anew(moved, settings, draws) if settings.varies else moved
 
 
 def _moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
@@ -111,7 +110,7 @@ def _moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generato
         rows = [replace(row, object=index) for row, index in zip(rows, which, strict=True)]
     if settings.moves:  # views that never come again are not worth a place on the disk
         changed["operators"] = OperatorCache()
-    return scene.with_rows(rows, **changed)
+    return replace(scene, examples=rows, **changed)
 
 
 def _taken_anew(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
@@ -121,13 +120,13 @@ def _taken_anew(scene: Scene, settings: VariationSettings, draws: torch.Generato
     changed: dict[str, Any] = {}
     if settings.lights:
         which = torch.randint(len(settings.lights), (len(rows),), generator=draws)
-        changed["light"] = torch.stack([load_light(light) for light in settings.lights])[which].to(scene.lights)
+        changed["lights"] = torch.stack([load_light(light) for light in settings.lights])[which].to(scene.lights)
     if settings.lamps > 0:
         shown = [scene.objects[row.object] for row in rows]
-        changed["light"] = _in_lamplight(changed.get("light", scene.lights), rows, shown, settings, draws)
+        changed["lights"] = _in_lamplight(changed.get("lights", scene.lights), rows, shown, settings, draws)
     if settings.snapshot.changes:
         changed["taken"] = draw_snapshot(settings.snapshot, len(rows), scene.settings, draws).to(scene.lights.device)
-    varied = scene.with_rows(rows, **changed)
+    varied = replace(scene, examples=rows, **changed)
     return _with_lit_walls(varied) if settings.lit else varied
 
 
@@ -196,9 +195,8 @@ def _with_lit_walls(scene: Scene) -> Scene:
     exposures = torch.tensor([row.exposure for row in scene.examples])[:, None]
     live = scene.lights.cpu().double()[:, live_coefficients(DEGREE)]
     irradiance = torch.einsum("ek,ekc->ec", irradiance_basis(towards, DEGREE), live) * exposures
-    images = scene.images_behind[[row.background for row in scene.examples]]
+    images = scene.backgrounds[[row.background for row in scene.examples]]
     encoding = scene.settings.encoding
     lit = encode(clamp(decode(images, encoding) * irradiance.to(images)[:, :, None, None]), encoding)
-    return scene.with_rows(
-        [replace(row, background=index) for index, row in enumerate(scene.examples)], backgrounds=lit
-    )
+    rows = [replace(row, background=index) for index, row in enumerate(scene.examples)]
+    return replace(scene, examples=rows, backgrounds=lit)

@@ -51,7 +51,7 @@ class Adversary:
             cameras=row.cameras,
             light=after.light[example].detach().cpu() * row.exposure,
             basis=scene.basis_under(after, example),
-            background=scene.images_behind[row.background].cpu(),
+            background=scene.backgrounds[row.background].cpu(),
             settings=scene.settings,
             images_before=before.cpu(),
             images=images.cpu(),

@@ -1,7 +1,7 @@
 """What an attack may change, by which steps, and for how long: the same for a training and for a single attack."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torch import nn
 
@@ -89,7 +89,8 @@ class AttackSettings:
 
     def problem(self, scene: Scene) -> Perturbation:
         """What is changed of a scene, in light that is possible."""
-        scene = scene.in_physical_light() if self.light == PHYSICAL else scene
+        if self.light == PHYSICAL:
+            scene = replace(scene, lights=scene.basis.nearest_physical(scene.lights))
         return Perturbation(scene, [self._kind(name, scene, settings) for name, settings in self.kinds.items()])
 
     def _kind(self, name: str, scene: Scene, settings: StepSettings) -> Kind:

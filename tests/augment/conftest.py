@@ -9,7 +9,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from augment.scene import Scene
+from augment.objects import SceneObject
+from augment.scene import Example, Scene
 from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings
 from renderer.lights import ambient
@@ -48,7 +49,9 @@ def make_scene(stone) -> Callable[..., Scene]:
         if backgrounds is None:
             backgrounds = 0.2 + 0.6 * torch.rand(len(cameras), 3, size, size, generator=draws)
         settings = ImageSettings(size, samples=2, encoding=encoding)
-        return Scene.of_mesh(mesh, cameras, backgrounds, light.to(dtype), settings, choose("software"), gain)
+        rows = [Example(0, tuple(views), index) for index, views in enumerate(cameras)]
+        objects = [SceneObject("", mesh, gain)]
+        return Scene(objects, rows, backgrounds, light.to(dtype), settings, choose("software"))
 
     return build
 

@@ -205,7 +205,7 @@ def test_a_new_kind_is_one_class_and_goes_with_the_others(make_scene, make_linea
 def ringing(scene: Scene) -> Scene:
     """The same in the light of a sun, which dips below zero where harmonics of degree 6 cut it short."""
     sun = directional(torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64), 0.3 * torch.ones(3, dtype=torch.float64))
-    return scene.with_rows(scene.examples, light=sun)
+    return replace(scene, lights=sun)
 
 
 @pytest.mark.parametrize("norm", ["linf", "l2"])

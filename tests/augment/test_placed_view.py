@@ -47,9 +47,7 @@ def test_a_moved_mesh_is_seen_as_one_that_was_made_so(normals, transport):
     places = torch.tensor(LAMPS.places) + 0.3 * torch.randn(2, 3, generator=draws)
     given = Conditions(shown.lights, vertices.expand(2, -1, -1), places=places.expand(2, -1, -1))
     mesh = replace(shown.mesh(0), vertices=vertices.double().numpy())
-    other = shown.with_rows(
-        shown.examples, objects=[replace(shown.objects[0], mesh=mesh)], basis=shown.basis_under(given, 0)
-    )
+    other = replace(shown, objects=[replace(shown.objects[0], mesh=mesh)], basis=shown.basis_under(given, 0))
     expected = other.render(other.conditions(EVERY), EVERY)
     seen = shown.render(given, EVERY)
     torch.testing.assert_close(seen, expected, rtol=0, atol=2e-6 if transport == "direct" else 2e-3)

@@ -432,7 +432,8 @@ def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its
 
 def test_a_light_of_another_basis_is_refused():
     with pytest.raises(InputError, match=r"light of shape \(9, 3\) is not of harmonics of degree 6: give 49 rows"):
-        Scene.of_mesh(solid("plate"), [ring(1, 2.0)], load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, BACKEND)
+        plate = SceneObject("plate", solid("plate"))
+        Scene.grid([plate], ring(1, 2.0), load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, BACKEND)
 
 
 def test_a_scene_of_shadowed_and_open_meshes_shows_each_as_its_operator_does():

@@ -28,7 +28,7 @@ def composed(scene: Scene, lights: Tensor) -> Tensor:
     """Every example and view by itself, from operators made for this: (E, V, 3, size, size)."""
     images = []
     (item,) = scene.objects
-    for light, cameras, behind in zip(lights, scene.cameras, scene.backgrounds, strict=True):
+    for light, cameras, behind in zip(lights, scene.cameras, scene.backgrounds.flatten(2), strict=True):
         operators = build_operators(item.mesh, cameras, scene.settings, BACKEND, item.gain, dtype=lights.dtype)
         for operator in operators:
             canvas, seen = behind.clone(), operator.radiance(light)
@@ -175,7 +175,7 @@ def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(
     ):
         values = value.expand(3, -1, -1).clone().requires_grad_(True)
         images = scene.render(replace(scene.conditions(EVERY), **{part: values}), EVERY)
-        behind = scene.backgrounds.view(3, 1, 3, 6, 6).expand_as(images)
+        behind = scene.backgrounds[:, None].expand_as(images)
         torch.testing.assert_close(images.detach(), behind, rtol=0, atol=0)
         assert not torch.autograd.grad(images.sum(), values)[0].any()
 

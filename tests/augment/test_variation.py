@@ -178,7 +178,7 @@ def test_what_stands_on_a_table_has_no_lamp_below_it(scene):
     height = {}
     for ground in (None, [0.5, 0.5, 0.5]):
         objects = [item if ground is None else on_ground(item, ground) for item in scene.objects]
-        lights = drawn(scene.with_rows(scene.examples, objects=objects), lamps=1.0).lights
+        lights = drawn(replace(scene, objects=objects), lamps=1.0).lights
         height[ground is None] = lights[:, 2, 0]
     assert (height[True] < 0).any()
     assert torch.equal(height[False], height[True].abs())

@@ -66,7 +66,7 @@ def _brightest(
     coefficients = [load_light(name) * exposure for (name, _), exposure in zip(lights, exposures, strict=True)]
     sky = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(device)
     lit = torch.cat([sky, scene.lights.repeat(len(lights), 1, 1)[:, sky.shape[1] :]], dim=1)  # projector and lamps stay
-    rows = scene.with_rows([*scene.examples] * len(lights), light=lit)
+    rows = replace(scene, examples=[*scene.examples] * len(lights), lights=lit)
     confidence, index = _confidence(rows, settings, classifier, len(lights)).max(0)
     return float(confidence), replace(settings.scene, light=lights[index][0], exposure=exposures[index])
 

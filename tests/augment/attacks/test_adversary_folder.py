@@ -76,7 +76,7 @@ def test_company_and_table_are_never_attacked_not_after_they_are_read_back_eithe
     beside = replace(textured(), vertices=0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3]))
     item = on_ground(in_company(SceneObject("orange", normalise(textured())), [beside]), (0.4, 0.3, 0.2))
     scene = augment.build_scene([("solid:apple", "orange")], 24, visibility="software", field_of_view=3.0)
-    scene = scene.with_rows(scene.examples, objects=[item])
+    scene = replace(scene, objects=[item])
     painted = attacked({"albedo"}, scene).conditions.albedo[0]
     assert painted[item.own_faces].any() and not painted[~item.own_faces].any()
     for folder in (tmp_path / "first", tmp_path / "second"):
@@ -106,7 +106,7 @@ def test_exposure_gain_background_and_place_are_kept(tmp_path, perspective):
     ((camera,),) = scene.cameras
     row = Example(0, (replace(camera, right=0.3, up=-0.2, field_of_view=3.0),), 1, exposure=1.7)
     objects = [replace(each, gain=0.6) for each in scene.objects]
-    done = attacked({"albedo", "lighting"}, scene.with_rows([row], objects=objects, backgrounds=backgrounds))
+    done = attacked({"albedo", "lighting"}, replace(scene, examples=[row], objects=objects, backgrounds=backgrounds))
     write_adversary(adversary_of(done), tmp_path)
     found = read_adversary(tmp_path)
     assert torch.equal(found.background, backgrounds[1]) and found.cameras == row.cameras

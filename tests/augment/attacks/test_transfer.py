@@ -66,7 +66,7 @@ def test_other_sides_and_other_meshes_are_those_of_a_scene_with_them():
     scene = done.problem.scene
     cameras = [replace(row.cameras[0], azimuth=row.cameras[0].azimuth - math.pi / 6) for row in scene.examples]
     rows = [replace(row, cameras=(camera,)) for row, camera in zip(scene.examples, cameras, strict=True)]
-    for found, shown in ((turned, scene.with_rows(rows)), (other, apple)):
+    for found, shown in ((turned, replace(scene, examples=rows)), (other, apple)):
         logits = network()(shown.render(done.conditions, torch.arange(2))[:, 0])[:, None]
         torch.testing.assert_close(found.after, logits, rtol=0, atol=1e-4)
     assert not other.recognised.any()  # a lime by its label, and none by its colour

@@ -104,7 +104,7 @@ def parts(subject: Subject, scene: Scene, classifier: Classifier, light: str) ->
     """A scene's examples a few at a time: the gradient of a shape keeps all its images' samples."""
     for examples in torch.arange(len(scene)).split(PART):
         cameras = [scene.cameras[index] for index in examples]
-        yield scene_of(subject, classifier, light, cameras, scene.backgrounds[examples, 0, 0])
+        yield scene_of(subject, classifier, light, cameras, scene.backgrounds[examples, 0, 0, 0])
 
 
 def joined(found: Sequence[Outcome]) -> Outcome:

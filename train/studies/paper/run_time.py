@@ -66,7 +66,7 @@ def attacks(subject: Subject, study: Study, settings: RunTimeSettings) -> Iterat
     scene = recognised_scene(subject, classifier, study.light, settings.examples, study.seed)
     goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
     for example in range(len(scene)):
-        one = scene_of(subject, classifier, study.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0])
+        one = scene_of(subject, classifier, study.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0, 0])
         prepared = seconds(partial(getattr, one, "stacks"))
         problem = ATTACKS["lighting"].problem(one)
         start = time.process_time()

@@ -72,7 +72,7 @@ def adversaries(subject: Subject, study: Study, settings: ShapedLightSettings) -
     image, shown = ImageSettings(network.size, samples=4), [SceneObject(subject.label, subject.mesh, subject.gain)]
     kept, before = kept_from_itself(subject, drawn.cameras[0], image), None
     for transport in TRANSPORTS:
-        scene = drawn.with_rows(drawn.examples, objects=shown, settings=replace(image, transport=transport))
+        scene = replace(drawn, objects=shown, settings=replace(image, transport=transport))
         stepping = AttackSettings(lighting=LIGHT, max_steps=settings.steps, margin=settings.margin)
         attacked = attack(network, scene, settings=stepping, force=True)
         if before is None:  # the light is the same under every transport
@@ -116,7 +116,7 @@ def path_traced(scene: Scene, lights: Tensor) -> tuple[Tensor, Tensor]:
             write_map(Path(folder, "light.exr"), mitsuba_map(light, MAP_ROWS).clamp(min=0))
             seen = render_mitsuba_scene(Path(folder, SCENE), len(row.cameras))
         radiance, coverage = seen[:, :3], seen[:, 3:]
-        added = behind(coverage, scene.images_behind[row.background], settings.encoding)
+        added = behind(coverage, scene.backgrounds[row.background], settings.encoding)
         images.append(develop_composite(radiance + added, settings.encoding))
         coverages.append(coverage)
     return torch.stack(images), torch.stack(coverages)

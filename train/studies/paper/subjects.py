@@ -10,8 +10,8 @@ from torch import Tensor
 
 from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
-from augment.objects import ObjectSettings, load_object
-from augment.scene import Scene
+from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.scene import Example, Scene
 from augment.seeding import generator
 from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import InputError
@@ -69,14 +69,13 @@ def scene_of(
 ) -> Scene:
     """A subject before cameras (E × V), each example on a grey (E,)."""
     size = classifier.size
-    return Scene.of_mesh(
-        subject.mesh,
-        cameras,
+    return Scene(
+        [SceneObject("", subject.mesh, subject.gain)],
+        [Example(0, tuple(views), index) for index, views in enumerate(cameras)],
         greys.view(-1, 1, 1, 1).expand(-1, 3, size, size),
         load_light(light),
         ImageSettings(size, samples, normals=normals),
         choose(),
-        subject.gain,
     )
 
 
@@ -95,7 +94,7 @@ def recognised_scene(subject: Subject, classifier: Classifier, light: str, count
         scene = random_scene(subject, classifier, light, count, draws)
         kept = recognised(scene, classifier, subject.label).nonzero().squeeze(1).tolist()
         cameras += [scene.cameras[index] for index in kept]
-        greys += [float(scene.backgrounds[index, 0, 0]) for index in kept]
+        greys += [float(scene.backgrounds[index, 0, 0, 0]) for index in kept]
         if len(cameras) >= count:
             return scene_of(subject, classifier, light, cameras[:count], torch.tensor(greys[:count]))
     raise InputError(f"{classifier.name} recognises too few images of {subject.name}: {len(cameras)} of {20 * count}")

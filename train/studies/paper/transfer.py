@@ -69,7 +69,7 @@ def transfer(
 ) -> Iterator[tuple[list[dict[str, Any]], list[Seen]]]:
     """For some examples at a time and each kind of attack: a record per example, and images of the first."""
     for scene, kept in recognised_parts(subject, seen_by[0], light, count, draws):
-        greys = scene.backgrounds[:, 0, 0]
+        greys = scene.backgrounds[:, 0, 0, 0]
         scenes = [scene, *(scene_of(subject, target, light, scene.cameras, greys) for target in seen_by[1:])]
         for kind, attack in ATTACKS.items():
             problems = [attack.problem(each) for each in scenes]

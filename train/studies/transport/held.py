@@ -32,8 +32,8 @@ def table(mesh: Mesh, classifier: Classifier) -> str:
     try:
         for every in EVERY:
             held_transport.NEAR = (every - 0.5) * STEP.step_size
-            shown = {"objects": [SceneObject("cup", mesh)], "settings": replace(drawn.settings, transport="shadows")}
-            scene = drawn.with_rows(drawn.examples, **shown)
+            image = replace(drawn.settings, transport="shadows")
+            scene = replace(drawn, objects=[SceneObject("cup", mesh)], settings=image)
             start = time.process_time()
             attacked = attack(classifier, scene, settings=settings, force=True)
             taken = (time.process_time() - start) / int(attacked.steps.sum() + EXAMPLES)
