@@ -19,7 +19,8 @@ from renderer.lights import load_light, probe, save_light
 from train.data import load_npz
 from train.photographs import Photograph, find_photographs, load_photographs
 from train.photographs.answers import ANSWERS, Answer, read_answers, write_answers
-from train.run_folder.checkpoint import BEST, PUBLISHED, describe, load_network, publish, save
+from train.run_folder.checkpoint import BEST, save
+from train.run_folder.classifier import PUBLISHED, describe, load_run, publish
 from train.run_folder.files import read_config, read_json, read_numbers
 from train.wideresnet import WideResNet
 
@@ -74,8 +75,8 @@ DOORS = [
     Door("light.npy", lambda path: write_map(path, torch.ones(8, 16, 3)), lambda path: load_light(str(path))),
     Door("light.json", lambda path: save_light(path, probe("grace")), lambda path: load_light(str(path))),
     Door("data.npz", write_npz, lambda path: load_npz(str(path))),
-    Door(BEST, lambda path: save(path, network_state()), load_network),
-    Door(PUBLISHED, lambda path: publish(path, network_state()), load_network),
+    Door(BEST, lambda path: save(path, network_state()), load_run),
+    Door(PUBLISHED, lambda path: publish(path, network_state()), load_run),
     Door("config.yaml", lambda path: path.write_text("seed: 1\ndata: {path: '${a}', size: [1, 2]}\n"), read_config),
     Door("metrics.jsonl", lambda path: path.write_text('{"epoch": 1}\n{"test/accuracy": 0.5}\n'), read_numbers),
     Door("summary.json", lambda path: path.write_text(json.dumps({"recall": {"value": None, "n": 0}})), read_json),

@@ -1,6 +1,5 @@
 """One run from its configuration: data, scene, network, training, scores on the test set and on photographs."""
 
-import os
 import platform
 import time
 from collections.abc import Callable, Iterator
@@ -31,6 +30,7 @@ from train.data import DataSet, channel_statistics, load_cifar100, load_folder, 
 from train.device import MixedPrecision, choose_device, choose_precision, set_deterministic, set_threads
 from train.distributed import first_process_first
 from train.fit.evaluation import evaluate
+from train.fit.resumption import resume
 from train.fit.trainer import Trainer
 from train.networks import build_network
 from train.photographs import (
@@ -43,7 +43,8 @@ from train.photographs import (
 )
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import checkpoint
-from train.run_folder.files import CONFIG
+from train.run_folder.classifier import describe, start_from
+from train.run_folder.files import CONFIG, write_whole
 from train.run_folder.inputs import INPUTS, fingerprints, require_same_inputs
 from train.run_folder.logs import NoLog, RunLog, console
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, require_same_settings
@@ -140,10 +141,10 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
     network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
     facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
     if settings.train.init_from:
-        checkpoint.start_from(network, facts, Path(settings.train.init_from))
+        start_from(network, facts, Path(settings.train.init_from))
     service = _build_service(settings, data, device, phases)
     model = MixedPrecision(network.to(device), precision)
-    described = checkpoint.describe(network, **facts)
+    described = describe(network, **facts)
     return Trainer(settings.train, model, described, service, phases, folder, settings.seed)
 
 
@@ -157,7 +158,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
             )
         require_same_settings(folder, config)
         require_same_inputs(folder, config)
-        trainer.resume()
+        resume(trainer)
         console.info("resumed %s after epoch %d%s", folder, trainer.epoch, trainer.part_of_epoch)
     elif trainer.settings.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
@@ -175,11 +176,7 @@ def _write_config(config: DictConfig, folder: Path) -> None:
         "torchvision": version("torchvision"),
         "numpy": np.__version__,
     }
-    temporary = folder / "config.tmp"  # so that the old file is whole where the new one finds no room
-    OmegaConf.save(OmegaConf.create(resolved), temporary)
-    with open(temporary, "rb+") as file:
-        os.fsync(file.fileno())  # a run goes on with these settings alone, also after a loss of power
-    os.replace(temporary, folder / CONFIG)
+    write_whole(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
 
 
 def _build_service(

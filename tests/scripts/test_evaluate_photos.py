@@ -11,7 +11,8 @@ import torch
 from PIL import Image
 
 from train.command_line.entry_points import USER_ERROR
-from train.run_folder.checkpoint import BEST, describe, load_network, save
+from train.run_folder.checkpoint import BEST, save
+from train.run_folder.classifier import describe, load_run
 from train.wideresnet import WideResNet
 
 CLASSES = ["lime", "orange"]
@@ -51,7 +52,7 @@ def test_a_network_is_scored_at_the_size_that_it_was_trained_at(evaluate, run, p
     header, first = (row.split(",") for row in rows[:2])
     image = np.asarray(Image.open(photos / first[0])).transpose(2, 0, 1).copy()
     with torch.no_grad():
-        logits = load_network(run).module(torch.from_numpy(image)[None] / 255)[0]
+        logits = load_run(run)(torch.from_numpy(image)[None] / 255)[0]
     assert float(first[header.index("orange_log_odds")]) == pytest.approx(float(logits[1] - logits[0]), abs=1e-4)
 
 

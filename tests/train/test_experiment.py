@@ -26,6 +26,7 @@ from train.experiment import load_data, prepare, run
 from train.fit import trainer
 from train.interruption import Interrupted
 from train.run_folder import checkpoint
+from train.run_folder.classifier import load_run
 from train.run_folder.logs import read_metrics
 from train.settings import ExperimentSettings, require_same_settings
 
@@ -219,7 +220,7 @@ def fail_with(number: int):
         pytest.param("train.run_folder.logs.RunLog._show", 0, id="TensorBoard"),
         pytest.param("train.run_folder.logs.RunLog.renders", 0, id="renders"),
         pytest.param("train.run_folder.logs.RunLog.scalars", 0, id="metrics"),
-        pytest.param("train.run_folder.checkpoint.os.fsync", 0, id="checkpoint"),
+        pytest.param("train.run_folder.files.os.fsync", 0, id="checkpoint"),
         pytest.param("train.experiment.evaluate_photographs", 1, id="photographs"),
     ],
 )
@@ -275,11 +276,7 @@ def test_a_configuration_that_does_not_fit_leaves_the_old_one_whole(tiny, finish
     shutil.copytree(finished, tmp_path / "run")
     before = (tmp_path / "run" / "config.yaml").read_bytes()
 
-    def cut_short(config, path):
-        Path(path).write_text("seed")
-        fail_with(errno.ENOSPC)()
-
-    monkeypatch.setattr(OmegaConf, "save", cut_short)
+    monkeypatch.setattr("train.run_folder.files.os.fsync", fail_with(errno.ENOSPC))
     with pytest.raises(InputError, match=r"make room and go on with train\.resume=true"):
         prepare(tiny("train.resume=true"), load_data(tiny()), tmp_path / "run")
     assert (tmp_path / "run" / "config.yaml").read_bytes() == before
@@ -523,9 +520,9 @@ def test_the_selected_network_is_the_best_on_validation_and_the_one_that_is_scor
     accuracies = [line["validation/accuracy"] for line in epochs]
     best = checkpoint.load(finished / checkpoint.BEST)
     assert best["epoch"] == scores["test/epoch"] == accuracies.index(max(accuracies)) + 1
-    network = checkpoint.load_network(finished)
+    network = load_run(finished)
     test = load_data(tiny()).test
-    logits = network.module(test.images / 255)
+    logits = network(test.images / 255)
     assert scores["test/accuracy"] == pytest.approx((logits.argmax(1) == test.labels).double().mean().item())
     assert network.classes == ("apple", "orange", "pear") and network.size == 16
 

@@ -9,7 +9,7 @@ from torchvision.models import resnet18
 from renderer.errors import InputError
 from train.networks import build_network, model_title
 from train.run_folder import checkpoint
-from train.run_folder.classifier import load_run
+from train.run_folder.classifier import describe, load_run, start_from
 from train.wideresnet import WideResNet
 
 CLASSES = ("apple", "orange", "pear")
@@ -43,7 +43,7 @@ def here(tmp_path, monkeypatch) -> Path:
 
 def saved(path: Path, network: torch.nn.Module, **shape) -> Path:
     """A checkpoint of a network for images of 16 pixels."""
-    described = checkpoint.describe(network, CLASSES, size=16, encoding="linear", **shape)
+    described = describe(network, CLASSES, size=16, encoding="linear", **shape)
     checkpoint.save(path / checkpoint.BEST, {"model": network.state_dict(), "architecture": described})
     return path
 
@@ -105,18 +105,17 @@ def test_what_is_no_network_for_the_data_is_refused_by_name(name, size, message)
 
 def test_a_network_of_torchvision_comes_back_from_its_file(tmp_path):
     network = build_network(CLASSES, 16, "torchvision:shufflenet_v2_x0_5", MEAN, STD).eval()
-    loaded = checkpoint.load_network(saved(tmp_path, network, name="torchvision:shufflenet_v2_x0_5"))
+    loaded = load_run(saved(tmp_path, network, name="torchvision:shufflenet_v2_x0_5"))
     images = torch.rand(2, 3, 16, 16)
-    assert torch.equal(loaded.module(images), network(images))
+    assert torch.equal(loaded(images), network(images))
     assert (loaded.classes, loaded.size) == (CLASSES, 16)
 
 
 def test_no_file_runs_code_that_the_user_did_not_name(tmp_path):
     run = saved(tmp_path, build_network(CLASSES, 16, "python:own_models:build"), name="python:own_models:build")
     (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
-    for load in (checkpoint.load_network, lambda path: load_run(str(path))):
-        with pytest.raises(InputError, match="give model=python:own_models:build to run that code"):
-            load(run)
+    with pytest.raises(InputError, match="give model=python:own_models:build to run that code"):
+        load_run(run)
 
 
 def test_a_network_of_ones_own_comes_back_where_its_function_is_named(tmp_path):
@@ -130,7 +129,7 @@ def test_one_goes_on_from_a_network_of_ones_own_without_its_code(tmp_path):
     name = "python:own_models:build"
     trained, fresh = (build_network(CLASSES, 16, name) for _ in range(2))
     own = {"classes": list(CLASSES), "size": 16, "name": name}
-    checkpoint.start_from(fresh, own, saved(tmp_path, trained, name=name))
+    start_from(fresh, own, saved(tmp_path, trained, name=name))
     assert torch.equal(fresh.layer.weight, trained.layer.weight)
 
 
@@ -139,7 +138,7 @@ def test_weights_of_another_kind_of_network_are_refused(tmp_path):
     network = WideResNet(3, 10, 1)
     own = {"classes": list(CLASSES), "size": 16, "depth": 10, "width": 1}
     with pytest.raises(InputError, match="was trained with name python:own_models:build, not wideresnet"):
-        checkpoint.start_from(network, own, run)
+        start_from(network, own, run)
 
 
 def test_titles_name_the_network():

@@ -14,7 +14,7 @@ from augment.seeding import stream_seed
 from augment.service import AugmentationService, Renders
 from renderer.errors import InputError
 from train.data import Split
-from train.device import PRECISIONS, MixedPrecision
+from train.device import MixedPrecision
 from train.distributed import summed
 from train.fit.epoch import EpochUnderWay, Round, batch_count, put_last, rounds_of_epoch, training_batches, with_room
 from train.fit.evaluation import evaluate
@@ -92,39 +92,6 @@ class Trainer:
                         self._save()
                 if ending:
                     interruption.stop()
-
-    def resume(self) -> None:
-        """Go on from the folder's newest whole checkpoint; InputError where it is from another architecture."""
-        state, problem = checkpoint.load_newest(self.folder)
-        if missing := self.state_dict().keys() - state.keys():
-            raise InputError(
-                f"the checkpoint in {self.folder} has a network and no run to go on with ({min(missing)} is missing): "
-                f"restore {checkpoint.LAST}, or start in another folder with run="
-            )
-        if checkpoint.contradiction(state["architecture"], self.architecture):
-            raise InputError(
-                f"the checkpoint in {self.folder} is from another architecture or other classes: resume with the "
-                f"settings of {self.folder / 'config.yaml'}, or start in another folder with run="
-            )
-        for key, kept, without in [("averaging", "average", "0"), ("soup", "soup", "false")]:
-            if (value := getattr(self.settings, key)) and not state[kept]:
-                raise InputError(
-                    f"train.{key}={value}, and the checkpoint in {self.folder} has no {kept}: resume with "
-                    f"train.{key}={without}"
-                )
-        if problem:
-            console.warning("%s: going on from the one before", problem)
-            (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or the next one would take the place of the whole
-        try:
-            _require_whole(state)
-            self.load_state_dict(state)
-        except InputError:
-            raise
-        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            raise InputError(
-                f"the checkpoint in {self.folder} holds what no run wrote ({' '.join(str(error).split())}): restore "
-                f"{checkpoint.LAST}, or start in another folder with run="
-            ) from error
 
     def state_dict(self) -> dict[str, Any]:
         """All that a run needs to go on as if it had never ended."""
@@ -268,14 +235,3 @@ class Trainer:
             sum(seconds.get(name, 0.0) for name in PHASES),
             seconds.get("attack", 0.0),
         )
-
-
-def _require_whole(state: Mapping[str, Any]) -> None:
-    """ValueError for a state, with a right hash, in which a run cannot have been."""
-    epoch, history = state["epoch"], state["history"]
-    if not isinstance(epoch, int) or not isinstance(history, list) or len(history) != epoch:
-        raise ValueError(f"after epoch {epoch!r} it has other than as many lines of history")
-    if state["precision"] not in PRECISIONS:
-        raise ValueError(f"precision {state['precision']!r}")
-    if not isinstance(state["random_state"], Mapping):
-        raise ValueError("no random state")

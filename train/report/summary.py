@@ -19,6 +19,7 @@ from train.networks import PYTHON, model_title
 from train.photographs import FIGURES, SUMMARY, figure_title, find_figure, format_interval
 from train.report.tables import Table, aligned
 from train.run_folder import checkpoint
+from train.run_folder.classifier import PUBLISHED, load_run, publish
 from train.run_folder.files import CONFIG, read_config, read_json
 from train.run_folder.logs import METRICS, PHASES, read_metrics
 from train.settings import decisive_settings
@@ -177,9 +178,9 @@ def publish_run(folder: Path, out: Path) -> None:
         card = _card(run, out.name)
     state = checkpoint.load(folder / checkpoint.BEST)
     if not str(state["architecture"].get("name")).startswith(PYTHON):  # whose code only its user runs
-        checkpoint.load_network(folder / checkpoint.BEST)  # or raises: nobody could use it
+        load_run(folder / checkpoint.BEST)  # or raises: nobody could use it
     out.mkdir(parents=True, exist_ok=True)
-    checkpoint.publish(out / checkpoint.PUBLISHED, state)
+    publish(out / PUBLISHED, state)
     (out / "README.md").write_text(card, encoding="utf-8")
 
 

@@ -1,6 +1,7 @@
 """A run's folder: who may write in it, and what its files hold, read as data that anyone may have written."""
 
 import json
+import os
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -69,6 +70,36 @@ def state(folder: Path) -> str:
         if failure.exists()
         else "interrupted"
     )
+
+
+def write_whole(path: Path, content: bytes | memoryview, previous: Path | None = None) -> None:
+    """Write a file so that it is, at any moment, also after a loss of power, either the old one or the new one.
+
+    previous: where the old one is kept. OSError that names the path where the disk does not take it; the old one stays.
+    """
+    temporary = path.with_suffix(".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        if previous and path.exists():
+            os.replace(path, previous)
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the renaming last, where folders can be synchronised."""
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def read_config(path: Path) -> DictConfig:

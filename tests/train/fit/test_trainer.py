@@ -16,6 +16,7 @@ from train.device import MixedPrecision
 from train.fit.epoch import put_last, rounds_of_epoch, with_room
 from train.fit.evaluation import evaluate
 from train.fit.recipe import TrainSettings, cosine
+from train.fit.resumption import resume
 from train.fit.trainer import Trainer
 from train.run_folder import checkpoint
 from train.run_folder.logs import RunLog, read_metrics
@@ -236,7 +237,7 @@ def test_a_resumed_run_remembers_the_best_epoch(tmp_path, monkeypatch):
         )
         trainer = make_trainer(tmp_path, epochs=epochs)
         if epochs > 1:
-            trainer.resume()
+            resume(trainer)
         fit_noise(trainer)
     assert checkpoint.load(tmp_path / checkpoint.BEST)["epoch"] == 1
     last = checkpoint.load(tmp_path / checkpoint.LAST)
@@ -248,7 +249,7 @@ def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tm
     fit_noise(make_trainer(tmp_path, epochs=2))
     (tmp_path / checkpoint.LAST).write_bytes(b"")
     trainer = make_trainer(tmp_path, epochs=2)
-    trainer.resume()
+    resume(trainer)
     assert trainer.epoch == 1
     fit_noise(trainer)
     assert [checkpoint.load(tmp_path / name)["epoch"] for name in (checkpoint.PREVIOUS, checkpoint.LAST)] == [1, 2]
@@ -294,7 +295,7 @@ def test_a_forged_checkpoint_with_a_right_hash_is_refused_in_one_sentence(tmp_pa
     fit_noise(make_trainer(tmp_path, epochs=1))
     checkpoint.save(tmp_path / checkpoint.LAST, checkpoint.load(tmp_path / checkpoint.LAST) | changes)
     with pytest.raises(InputError, match=message) as caught:
-        make_trainer(tmp_path).resume()
+        resume(make_trainer(tmp_path))
     assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -304,7 +305,7 @@ def test_weights_of_nan_are_not_gone_on_with(tmp_path):
     state["model"]["stem.weight"].fill_(math.nan)
     checkpoint.save(tmp_path / checkpoint.LAST, state)
     with pytest.raises(InputError, match=r"last.pt has NaN or infinity in stem.weight: use another one"):
-        make_trainer(tmp_path).resume()
+        resume(make_trainer(tmp_path))
 
 
 @pytest.mark.parametrize("ended", ["by itself", "by a signal"])
@@ -354,7 +355,7 @@ def test_resuming_with_another_architecture_is_an_error(tmp_path):
     with pytest.raises(
         InputError, match=r"checkpoint in .* is from another architecture or other classes: resume with"
     ):
-        other.resume()
+        resume(other)
 
 
 def test_every_epoch_has_its_line_before_its_checkpoint(tmp_path, monkeypatch):
@@ -394,7 +395,7 @@ def test_a_resumed_average_goes_on_bit_for_bit(tmp_path, soup):
     whole = checkpoint.load(tmp_path / checkpoint.LAST)
     (tmp_path / checkpoint.LAST).unlink()  # the epoch before the last is left
     resumed = make_trainer(tmp_path, **settings)
-    resumed.resume()
+    resume(resumed)
     assert resumed.epoch == 2
     fit_noise(resumed)
     again = checkpoint.load(tmp_path / checkpoint.LAST)
@@ -404,14 +405,11 @@ def test_a_resumed_average_goes_on_bit_for_bit(tmp_path, soup):
     assert all(torch.equal(value, expected[name]) for name, value in found.items())
 
 
-@pytest.mark.parametrize(
-    "key, value, message",
-    [("averaging", 0.8, r"averaging=0\.8, .* no average: .*averaging=0$"), ("soup", True, r"no soup: .*soup=false$")],
-)
-def test_resuming_with_an_average_that_the_run_has_not_is_an_error(tmp_path, key, value, message):
+@pytest.mark.parametrize("key, value", [("averaging", 0.8), ("soup", True)])
+def test_resuming_with_an_average_that_the_run_has_not_is_an_error(tmp_path, key, value):
     fit_noise(make_trainer(tmp_path, epochs=1))
-    with pytest.raises(InputError, match=message):
-        make_trainer(tmp_path, init_from="base", **{key: value}).resume()
+    with pytest.raises(InputError, match=f"the checkpoint in {tmp_path} holds what no run wrote"):
+        resume(make_trainer(tmp_path, init_from="base", **{key: value}))
 
 
 @pytest.mark.parametrize("averaging", [0.0, 0.8])

@@ -10,7 +10,8 @@ from renderer.errors import InputError
 from train.photographs import share
 from train.report.summary import format_spread, format_table, publish_run, summarise
 from train.run_folder import checkpoint
-from train.run_folder.checkpoint import BEST, PUBLISHED, load_network
+from train.run_folder.checkpoint import BEST
+from train.run_folder.classifier import PUBLISHED, load_run
 
 FIGURES = [
     "orange recognised", "others called orange", "AUC",
@@ -126,8 +127,8 @@ def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_ma
     out = tmp_path / "pretrained" / "tiny-adversarial"
     publish_run(finished, out)
     assert sorted(path.name for path in out.iterdir()) == ["README.md", PUBLISHED]
-    network = load_network(out)
-    assert network.classes == ("apple", "orange", "pear") and network.module.head.in_features == 64
+    network = load_run(out)
+    assert network.classes == ("apple", "orange", "pear") and network.function.head.in_features == 64
     card = (out / "README.md").read_text()
     (table,) = read_markdown(card).values()
     rows = dict(table[1:])

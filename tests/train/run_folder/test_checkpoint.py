@@ -10,20 +10,15 @@ import safetensors.torch
 import torch
 
 from renderer.errors import InputError
-from train.run_folder import checkpoint
-from train.run_folder.checkpoint import (
-    BEST,
-    LAST,
-    PREVIOUS,
+from train.run_folder import files
+from train.run_folder.checkpoint import BEST, LAST, PREVIOUS, content_hash, load, load_newest, save
+from train.run_folder.classifier import (
     PUBLISHED,
-    content_hash,
     describe,
-    load,
-    load_network,
-    load_newest,
+    load_run,
+    load_selected,
     load_weights,
     publish,
-    save,
     start_from,
 )
 from train.wideresnet import WideResNet
@@ -84,7 +79,7 @@ def test_a_disk_that_is_full_leaves_the_old_checkpoint_whole_and_the_error_names
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     module, function = fault.split(".")
-    monkeypatch.setattr(getattr(checkpoint, module), function, fail)
+    monkeypatch.setattr(getattr(files, module), function, fail)
     with pytest.raises(OSError, match="No space left on device") as full:
         save(tmp_path / LAST, state_of(network) | {"epoch": 2}, tmp_path / PREVIOUS)
     assert full.value.errno == errno.ENOSPC and full.value.filename == str(tmp_path / LAST)
@@ -189,11 +184,11 @@ def test_weights_of_another_architecture_are_named(network):
 
 def test_a_network_loads_from_its_file_or_its_run_folder(network, tmp_path):
     save(tmp_path / BEST, state_of(network))
-    images = torch.rand(3, 3, 16, 16)
+    images = torch.rand(3, 3, 32, 32)
     for path in (tmp_path, tmp_path / BEST):
-        loaded = load_network(path)
-        assert loaded.classes == ("fig", "lime") and not loaded.module.training
-        assert torch.equal(loaded.module(images), network(images))
+        loaded = load_run(path)
+        assert loaded.classes == ("fig", "lime")
+        assert torch.equal(loaded(images), network(images))
 
 
 def test_a_network_is_stored_with_all_that_it_takes_to_use_it(network, tmp_path):
@@ -202,18 +197,19 @@ def test_a_network_is_stored_with_all_that_it_takes_to_use_it(network, tmp_path)
     save(tmp_path / BEST, state)
     publish(tmp_path / PUBLISHED, state)
     for name in (BEST, PUBLISHED):
-        loaded = load_network(tmp_path / name)
-        assert (loaded.size, loaded.encoding, loaded.classes) == (64, "srgb", ("fig", "lime"))
-        assert loaded.architecture["mean"] == pytest.approx([0.1, 0.2, 0.3])
-        assert loaded.architecture["std"] == pytest.approx([0.3, 0.2, 0.1])
+        loaded = load_run(tmp_path / name)
+        assert (loaded.size, loaded.classes) == (64, ("fig", "lime"))
+        kept = load_selected(tmp_path / name)[1]["architecture"]
+        assert kept["encoding"] == "srgb"
+        assert kept["mean"] == pytest.approx([0.1, 0.2, 0.3]) and kept["std"] == pytest.approx([0.3, 0.2, 0.1])
         with pytest.raises(InputError, match=r"size=32: .* was trained on images of 64 pixels per side"):
-            load_network(tmp_path / name, 32)
+            load_run(tmp_path / name, size=32)
 
 
 def test_an_old_network_that_does_not_say_its_size_has_32_or_the_one_asked_for(network, tmp_path):
     save(tmp_path / BEST, state_of(network))
-    assert load_network(tmp_path).size == 32
-    assert load_network(tmp_path, 64).size == 64
+    assert load_run(tmp_path).size == 32
+    assert load_run(tmp_path, size=64).size == 64
 
 
 @pytest.mark.parametrize(
@@ -227,7 +223,7 @@ def test_a_network_that_says_what_cannot_be_meant_is_refused_in_one_sentence(net
     publish(tmp_path / PUBLISHED, state)
     for name in (BEST, PUBLISHED):
         with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} [^\n]+$"):
-            load_network(tmp_path / name)
+            load_run(tmp_path / name)
 
 
 @pytest.mark.parametrize("architecture", [None, [], "orange", 3])
@@ -237,13 +233,13 @@ def test_a_network_without_a_description_is_refused_by_name(network, tmp_path, a
     publish(tmp_path / PUBLISHED, state)
     for name in (BEST, PUBLISHED):
         with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} .*lacks its .*architecture"):
-            load_network(tmp_path / name)
+            load_run(tmp_path / name)
 
 
 def test_a_network_of_a_later_version_is_refused(network, tmp_path):
     save(tmp_path / BEST, state_of(network, version=99))
     with pytest.raises(InputError, match=r"best.pt was written by a later version"):
-        load_network(tmp_path)
+        load_run(tmp_path)
 
 
 # ---------------------------------------------------------------------------------------- starting from another run's
@@ -294,14 +290,14 @@ def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, cha
 def test_a_checkpoint_of_another_network_is_one_error(network, tmp_path, architecture):
     save(tmp_path / BEST, state_of(network) | {"architecture": architecture})
     with pytest.raises(InputError, match=r"best.pt is from another architecture"):
-        load_network(tmp_path)
+        load_run(tmp_path)
 
 
 @pytest.mark.parametrize("model", [None, 3, ["stem"], {"stem.weight": 1}, {}])
 def test_a_checkpoint_of_other_things_than_weights_is_one_error(network, tmp_path, model):
     save(tmp_path / BEST, state_of(network) | {"model": model})
     with pytest.raises(InputError, match=r"checkpoint .*best\.pt (holds other things|is from another architecture)"):
-        load_network(tmp_path)
+        load_run(tmp_path)
 
 
 def test_a_checkpoint_nested_beyond_reason_is_one_error(network, tmp_path):
@@ -320,7 +316,7 @@ def test_a_checkpoint_nested_beyond_reason_is_one_error(network, tmp_path):
 
 def test_a_folder_without_a_network_is_one_error(tmp_path):
     with pytest.raises(InputError, match=f"run={re.escape(str(tmp_path))} holds neither best.pt nor model.safetensors"):
-        load_network(tmp_path)
+        load_run(tmp_path)
 
 
 # ---------------------------------------------------------------------------------------- publishing
@@ -329,9 +325,9 @@ def test_a_folder_without_a_network_is_one_error(tmp_path):
 def test_a_published_network_is_the_same_to_half_precision(network, tmp_path):
     publish(tmp_path / PUBLISHED, state_of(network))
     for path in (tmp_path, tmp_path / PUBLISHED):
-        loaded = load_network(path)
+        loaded = load_run(path)
         assert loaded.classes == ("fig", "lime")
-        found_state = loaded.module.state_dict()
+        found_state = loaded.function.state_dict()
         for (name, value), found in zip(network.state_dict().items(), found_state.values(), strict=True):
             assert found.dtype == value.dtype
             # rounding to 11 bits; below 2^-14 half precision is spaced evenly
@@ -370,4 +366,4 @@ def test_a_damaged_published_file_is_one_error(network, tmp_path, spoil):
     publish(path, state_of(network))
     spoil(path)
     with pytest.raises(InputError, match=r"model.safetensors is damaged or lacks its architecture"):
-        load_network(tmp_path)
+        load_run(tmp_path)
