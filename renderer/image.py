@@ -41,15 +41,14 @@ class ImageSettings:
 
     def __post_init__(self) -> None:
         require_fields(self)
-        if self.size < 1:
-            raise InputError(f"the size {self.size} must be at least 1 pixel per side")
+        require_range("size", self.size, 1, MOST_SAMPLES)
         require_range("renderer.samples", self.samples, 1, FINEST)
         if self.size * self.samples > MOST_SAMPLES:
             raise InputError(
                 f"renderer.samples={self.samples} for each of {self.size} pixels in a row are more than "
                 f"{MOST_SAMPLES}: choose fewer"
             )
-        check_encoding(self.encoding)
+        require_choice("renderer.encoding", self.encoding, ENCODINGS)
         require_choice("renderer.normals", self.normals, NORMALS)
         bounces(self.transport)
 
@@ -159,7 +158,7 @@ class _Clamp(torch.autograd.Function):
 
 def encode(linear: Tensor, encoding: str) -> Tensor:
     """Linear values in [0, 1] to image values: unchanged, or the sRGB transfer function (IEC 61966-2-1)."""
-    check_encoding(encoding)
+    require_choice("renderer.encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear
     # The power's derivative is infinite at 0, in the branch that is not taken; the floor keeps it finite.
@@ -169,16 +168,11 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
 
 def decode(image: Tensor, encoding: str) -> Tensor:
     """Inverse of `encode`. Under "linear" a texture's values are taken as the albedo as they stand."""
-    check_encoding(encoding)
+    require_choice("renderer.encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return image
     curve = ((image.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(image <= 0.04045, image / 12.92, curve)
-
-
-def check_encoding(encoding: str) -> None:
-    """InputError unless the encoding is known."""
-    require_choice("renderer.encoding", encoding, ENCODINGS)
 
 
 def to_bytes(image: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:

@@ -92,8 +92,7 @@ def _write_radiance(adversary: Adversary, folder: Path) -> dict[str, float]:
 def read_adversary(folder: Path) -> Adversary:
     """What `write_adversary` wrote. InputError: something is missing, damaged or not to be rendered."""
     path = folder / DESCRIPTION
-    if not path.is_file():
-        raise InputError(f"{path} does not exist: give a folder that an attack wrote, such as .../example_000")
+    require_file(path, "give a folder that an attack wrote, such as .../example_000")
     try:
         description = json.loads(path.read_text(encoding="utf-8"))
         settings = ImageSettings(**description["image"])

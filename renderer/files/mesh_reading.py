@@ -10,7 +10,7 @@ from PIL import Image
 from trimesh.visual.base import Visuals
 from trimesh.visual.material import Material, PBRMaterial, empty_material
 
-from renderer.errors import LARGEST, InputError
+from renderer.errors import LARGEST, InputError, require_file
 from renderer.files.image_files import eight_bits
 from renderer.files.mesh_files import open_mesh
 from renderer.image import encode
@@ -24,8 +24,7 @@ def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
 
     linear: the file's colours, textures aside, are linear. InputError: as `renderer.mesh.load_mesh`.
     """
-    if not path.is_file():
-        raise InputError(f"{path} does not exist: give the path of a mesh file")
+    require_file(path, "give the path of a mesh file")
     formats = set(trimesh.available_formats()) - ARCHIVES
     suffix = path.suffix.lower().lstrip(".")
     if suffix not in formats:

@@ -177,8 +177,8 @@ def test_an_unknown_encoding_is_refused(function):
     ("settings", "message"),
     [
         (dict(samples=0), r"renderer\.samples=0"),
-        (dict(size=0), r"size 0 must be at least 1"),
-        (dict(size=-3), r"size -3 must be at least 1"),
+        (dict(size=0), r"size=0 must be at least 1"),
+        (dict(size=-3), r"size=-3 must be at least 1"),
         (dict(size=math.nan), "size is nan: give int"),
         (dict(size="32"), "size is '32': give int"),
         (dict(samples=1.5), r"samples is 1\.5: give int"),

@@ -113,7 +113,7 @@ def test_what_is_no_background_is_refused(background):
         ({"light": torch.full((49, 3), math.nan)}, "light holds NaN"),
         ({"light": torch.zeros(48, 3)}, r"light has shape \(48, 3\)"),
         ({"cameras": []}, "cameras is empty"),
-        ({"size": 0}, "size 0 must be at least 1"),
+        ({"size": 0}, "size=0 must be at least 1"),
         ({"encoding": "jpeg"}, "encoding=jpeg"),
         ({"visibility": "eyes"}, "visibility=eyes"),
     ],
