@@ -17,12 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_file
 from renderer.files.array_files import read_numbers
 from renderer.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")
 FEWEST_ROWS = 8  # fewer give even radiance from everywhere a direction, by 16 % at 4: see `to_map`
+BLOCK = 2**14  # directions at a time: bounds the memory
 LARGEST_MAP = 4096  # MB, which a damaged header may exceed
 
 
@@ -32,9 +33,15 @@ def to_map(coefficients: Tensor, height: int) -> Tensor:
     Negative where the series rings. `renderer.harmonics.project` takes it back, off by its midpoint rule along z:
     at degree 6 by up to 22.2 / height² of the coefficients' L2 norm (3.4e-4 at a height of 256).
     """
+    return light_radiance(coefficients, equirectangular(height, 2 * height)[0])
+
+
+def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """Radiance (..., 3) of a light's coefficients ((degree + 1)², 3) from directions (..., 3), in their dtype."""
     degree = math.isqrt(len(coefficients)) - 1
-    directions, _ = equirectangular(height, 2 * height)
-    return torch.stack([basis(row, degree) @ coefficients.to(row) for row in directions])  # by rows: see `project`
+    blocks = directions.flatten(0, -2).split(BLOCK)
+    radiance = torch.cat([basis(block, degree) @ coefficients.to(block) for block in blocks])
+    return radiance.unflatten(0, directions.shape[:-1])
 
 
 def negative_share(radiance: Tensor) -> float:
@@ -51,8 +58,7 @@ def read_map(path: Path) -> Tensor:
     layers, the unnamed one counts, or else the first that has red, green and blue.
     InputError where the file is missing, unreadable, no such map, or holds NaN or infinity.
     """
-    if not path.is_file():
-        raise InputError(f"environment map {path} does not exist: give the path of an .npy, .hdr or .exr file")
+    require_file(path, "give the path of an .npy, .hdr or .exr file")
     texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
     radiance = texels[..., _color_channels(path, names)]
     if not np.isfinite(radiance).all():
