@@ -15,7 +15,7 @@ from renderer.mesh import Mesh
 
 
 @dataclass(frozen=True)
-class _Texture:
+class Texture:
     """texels: row-major indices (S,) → linear albedo (3, S)."""
 
     height: int
@@ -25,11 +25,11 @@ class _Texture:
 
 def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
     """(S, 3) float64 linear albedo at the samples: corner colour × texture, each decoded before it is interpolated."""
-    textures = _packed_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
+    textures = mesh_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
     return _albedo(mesh, fragments, textures, encoding)
 
 
-def _packed_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[_Texture]:
+def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
     """The mesh's own textures, eight bits a channel, decoded to the dtype and device of `like`."""
     decoded = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(like)
     bits = torch.tensor([[0], [8], [16]], dtype=torch.int32, device=like.device)
@@ -39,7 +39,7 @@ def _packed_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[_Texture]:
         return decoded.index_select(0, channels.long().flatten()).view(3, -1)
 
     packed = [torch.from_numpy(each).to(like.device) for each in mesh.packed_textures]
-    return [_Texture(each.shape[0], each.shape[1], partial(texels, each.flatten())) for each in packed]
+    return [Texture(each.shape[0], each.shape[1], partial(texels, each.flatten())) for each in packed]
 
 
 def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], encoding: str) -> Tensor:
@@ -50,8 +50,7 @@ def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor]
     for texture in textures:
         require_bounded(texture=texture)
     rows = [
-        _Texture(each.shape[0], each.shape[1], partial(torch.index_select, each.flatten(0, 1).T, 1))
-        for each in textures
+        Texture(each.shape[0], each.shape[1], partial(torch.index_select, each.flatten(0, 1).T, 1)) for each in textures
     ]
     return _albedo(mesh, fragments, rows, encoding)
 
@@ -77,7 +76,7 @@ def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, gain: float,
     colors = (_colors(mesh, faces, fragments, encoding) * gain).to(added)
     uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(fragments.coverage)).T
     texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)[fragments.face]
-    for index, texture in enumerate(_packed_textures(mesh, encoding, added)):
+    for index, texture in enumerate(mesh_textures(mesh, encoding, added)):
         here = torch.nonzero(texture_ids == index).squeeze(1)
         texels = [
             (weight.to(added), colors[here] * texture.texels(at).T) for weight, at in _taps(texture, uvs[:, here])
@@ -91,7 +90,7 @@ def _within(changed: Tensor, albedo: Tensor) -> Tensor:
     return clamp(changed, albedo.clamp(min=1))
 
 
-def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[_Texture], encoding: str) -> Tensor:
+def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Texture], encoding: str) -> Tensor:
     """Corner colour × texture at the samples."""
     faces = fragments.faces.cpu().numpy()
     albedo = _colors(mesh, faces, fragments, encoding)
@@ -100,11 +99,11 @@ def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[_Texture], enco
     uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(albedo)).T
     texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)
     if len(textures) == 1 and not texture_ids.any():
-        return albedo * _bilinear(textures[0], uvs).T
+        return albedo * bilinear(textures[0], uvs).T
     albedo, texture_ids = albedo.T, texture_ids.index_select(0, fragments.face)
     for index, texture in enumerate(textures):
         here = torch.nonzero(texture_ids == index).squeeze(1)
-        value = _bilinear(texture, uvs.index_select(1, here))
+        value = bilinear(texture, uvs.index_select(1, here))
         albedo = albedo.index_copy(1, here, albedo.index_select(1, here) * value)
     return albedo.T
 
@@ -127,7 +126,7 @@ def _of_faces(values: Tensor, fragments: Fragments) -> Tensor:
     return values.T.contiguous().index_select(1, fragments.face).T  # by rows: it takes half as long
 
 
-def _bilinear(texture: _Texture, uvs: Tensor) -> Tensor:
+def bilinear(texture: Texture, uvs: Tensor) -> Tensor:
     """(3, S) linear albedo of a texture that repeats, at uvs (2, S).
 
     Texel centres are at half-integers, v = 0 is the bottom row's lower edge.
@@ -138,7 +137,7 @@ def _bilinear(texture: _Texture, uvs: Tensor) -> Tensor:
     return torch.cat(blocks, dim=1)
 
 
-def _taps(texture: _Texture, uvs: Tensor) -> list[tuple[Tensor, Tensor]]:
+def _taps(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Tensor]]:
     """(weight, row-major index) of the four texels around places (2, S)."""
     columns, rows = _neighbours(uvs[0], texture.width), _neighbours(1 - uvs[1], texture.height)
     return [(down * across, (row * texture.width + column).long()) for row, down in rows for column, across in columns]

@@ -13,7 +13,7 @@ from torch import Tensor
 from renderer.arguments import checked
 from renderer.basis import HARMONICS, Basis
 from renderer.environment import SUFFIXES, read_panorama
-from renderer.errors import FACTOR, InputError, require_bounded
+from renderer.errors import FACTOR, InputError, require_bounded, require_file
 from renderer.harmonics import basis, live_coefficients, project, rotate
 from renderer.transfer import COEFFICIENTS, DEGREE
 
@@ -85,14 +85,6 @@ def probe(name: str) -> Tensor:
     return coefficients
 
 
-def project_environment(radiance: Tensor) -> Tensor:
-    """Coefficients (49, 3) float64 of an environment map (H, W, 3) of linear radiance.
-
-    Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
-    """
-    return project(radiance, DEGREE)
-
-
 def ambient(color: Tensor) -> Tensor:
     """Coefficients (49, 3) of the same radiance (3,) from everywhere: irradiance π × color."""
     require_bounded(color=color)
@@ -129,7 +121,7 @@ def mean_luminance(coefficients: Tensor) -> float:
 
 def _read_light_map(path: Path) -> Tensor:
     """Coefficients (49, 3) float64 of a map, at the grace probe's mean luminance."""
-    coefficients = project_environment(read_panorama(path))
+    coefficients = project(read_panorama(path), DEGREE)
     luminance = mean_luminance(coefficients)
     if not luminance > 0:
         raise InputError(f"environment map {path} has a mean luminance of {luminance:g}: give a map with light in it")
@@ -140,8 +132,7 @@ def _read_light_map(path: Path) -> Tensor:
 
 
 def _read_coefficients(path: Path) -> Tensor:
-    if not path.is_file():
-        raise InputError(f"light {path} does not exist: give the path of a .json file of coefficients")
+    require_file(path, "give the path of a .json file of coefficients")
     try:
         light = json.loads(path.read_text(encoding="utf-8-sig"))
         if not isinstance(light, dict):  # the rows alone, of harmonics

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from renderer.arguments import checked, require_fields
-from renderer.errors import LARGEST, InputError
+from renderer.errors import LARGEST, InputError, require_choice
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
@@ -72,13 +72,13 @@ class Mesh:
 
     def face_normals(self) -> np.ndarray:
         """(F, 3) unit normals, outward for counter-clockwise faces; the zero vector for zero-area faces."""
-        doubled = self._doubled_area_vectors()
+        doubled = doubled_area_vectors(self.vertices, self.faces)
         length = np.linalg.norm(doubled, axis=1, keepdims=True)
         return np.divide(doubled, length, out=np.zeros_like(doubled), where=length > 0)
 
     def face_areas(self) -> np.ndarray:
         """(F,) areas in squared world units."""
-        return np.linalg.norm(self._doubled_area_vectors(), axis=1) / 2
+        return np.linalg.norm(doubled_area_vectors(self.vertices, self.faces), axis=1) / 2
 
     @cached_property
     def one_color(self) -> bool:
@@ -119,9 +119,11 @@ class Mesh:
         a, b, c = (self.vertices[self.faces[:, corner]] - self.vertices.mean(axis=0) for corner in range(3))
         return bool((np.bincount(part, np.einsum("fi,fi->f", a, np.cross(b, c))) > 0).all())
 
-    def _doubled_area_vectors(self) -> np.ndarray:
-        a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
-        return np.cross(b - a, c - a)
+
+def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F, 3): normal to each face, outward for counter-clockwise ones, twice as long as the face has area."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
 
 
 def _require_shape(name: str, values: np.ndarray, shape: tuple[int, ...], kinds: str = "fiu") -> None:
@@ -171,8 +173,7 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     from renderer.files.mesh_reading import read_parts
 
     path = Path(path)
-    if up not in ("auto", "y", "z"):
-        raise InputError(f"up={up} for {path}: choose auto, y or z")
+    require_choice(f"{path}: up", up, ("auto", "y", "z"))
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
     placed = [transformed(*part) for part in read_parts(path, linear=is_gltf)]
     if not placed:

@@ -61,7 +61,10 @@ def render(
     """
     settings = ImageSettings(size, samples, encoding, normals, transport)
     require_range("gain", gain, 0, FACTOR)
-    vertices = _matching(vertices, mesh.vertices.shape, "vertices", torch.from_numpy(mesh.vertices)).to(light)
+    if vertices is not None and vertices.shape != mesh.vertices.shape:
+        given = tuple(vertices.shape)
+        raise InputError(f"vertices of shape {given} does not fit the mesh: give {mesh.vertices.shape}")
+    vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(light)
     positions = vertices.detach().cpu().double().numpy()
     views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(visibility), closed=mesh.closed)
     backgrounds = as_background(background, size, light).expand(len(views), -1, -1, -1)
@@ -107,14 +110,6 @@ def _listed(cameras: Camera | Sequence[Camera]) -> Sequence[Camera]:
     if not listed:
         raise InputError("cameras is empty: give one camera or several")
     return listed
-
-
-def _matching(values: Tensor | None, shape: tuple[int, ...], name: str, default: Tensor) -> Tensor:
-    if values is None:
-        return default
-    if values.shape != shape:
-        raise InputError(f"{name} of shape {tuple(values.shape)} does not fit the mesh: give {tuple(shape)}")
-    return values
 
 
 def _albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -> Tensor:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.polynomial.chebyshev import chebpts1, chebvander2d
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -111,16 +112,12 @@ def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) 
     Chebyshev points. The model has a pole at a turbidity of 1.65: polynomials in turbidity itself, of the paper's
     degrees 13 and 7, are off by up to 4 %, those in its inverse by 0.15 %. Monomials would lose float32's digits.
     """
-    x, to_zenith = _chebyshev_projection(zenith_degree)
-    y, to_turbidity = _chebyshev_projection(turbidity_degree)
-    zeniths, turbidities = math.pi / 4 * (x + 1), 5 / (y + 1.5)  # undone by `_FittedSky`
-    skies = [
-        coefficients_by_quadrature(zenith, 0.0, turbidity, nodes=nodes)[_UPRIGHT]
-        for zenith in zeniths
-        for turbidity in turbidities
-    ]
-    grid = torch.stack(skies).unflatten(0, (len(x), len(y)))
-    return torch.einsum("iz,jt,ztkc->ijkc", to_zenith, to_turbidity, grid)
+    degrees = zenith_degree, turbidity_degree
+    x, y = (each.ravel() for each in np.meshgrid(*(chebpts1(2 * (degree + 1)) for degree in degrees)))
+    places = zip(math.pi / 4 * (x + 1), 5 / (y + 1.5), strict=True)  # undone by `_FittedSky`
+    skies = [coefficients_by_quadrature(zenith, 0.0, turbidity, nodes=nodes)[_UPRIGHT] for zenith, turbidity in places]
+    fit = np.linalg.lstsq(chebvander2d(x, y, degrees), torch.stack(skies).flatten(1).numpy())[0]
+    return torch.from_numpy(fit).view(zenith_degree + 1, turbidity_degree + 1, *skies[0].shape)
 
 
 def fit_error(fit: Tensor, skies: int, generator: torch.Generator) -> float:
@@ -256,12 +253,3 @@ def _chebyshev(x: Tensor, slope: Tensor | float, count: int) -> tuple[Tensor, Te
         derivatives.append(2 * (slope * values[-1] + x * derivatives[-1]) - derivatives[-2])
         values.append(2 * x * values[-1] - values[-2])
     return torch.stack(values[:count], dim=-1), torch.stack(derivatives[:count], dim=-1)
-
-
-def _chebyshev_projection(degree: int) -> tuple[Tensor, Tensor]:
-    """Points (N,) in [-1, 1], N = 2 (degree + 1), and what takes values there to coefficients (degree + 1, N)."""
-    count = 2 * (degree + 1)
-    angles = math.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count
-    projection = 2 / count * torch.cos(torch.arange(degree + 1)[:, None] * angles)
-    projection[0] /= 2
-    return angles.cos(), projection

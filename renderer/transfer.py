@@ -7,7 +7,7 @@ and bounces (`renderer.transport`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -242,7 +242,7 @@ class OperatorBuilder:
 
     def _distant_transfer(self, surface: Surface, albedo: Tensor, basis: Distant) -> tuple[Tensor, Tensor]:
         """((C, K, P), the K coefficients that reach a pixel (K,)); albedo: (S, C), at the samples."""
-        transfer = _box_filter(_shades(surface, albedo, basis), len(surface.fragments.pixels), self._dtype)
+        transfer = _box_filter(surface, albedo, basis, self._dtype)
         change = self._transport.change(surface, albedo) if self._transport else None
         if change is None:
             return transfer, basis.live
@@ -256,35 +256,23 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     return by_pixel if (spread <= torch.finfo(dtype).eps * albedo).all() else None
 
 
-@dataclass(frozen=True)
-class _Shades:
-    """R contributions to pixels (R,), weights (R, C) each; basis: some of them → their A_l Y_lm(n) (..., K)."""
-
-    pixel: Tensor
-    weights: Tensor
-    basis: Callable[[slice], Tensor]
-
-
-def _shades(surface: Surface, albedo: Tensor, basis: Distant) -> _Shades:
-    fragments = surface.fragments
-    if surface.smooth_faces is not None:
-        weights = albedo / fragments.samples**2
-        return _Shades(fragments.pixel, weights, lambda some: basis.irradiance(surface.normals[some]))
-    shading = basis.irradiance(surface.face_planes)
-    pixel, face, weights = fragments.merge(albedo)
-    return _Shades(pixel, weights, lambda some: shading.index_select(0, face[some]))
-
-
-def _box_filter(shades: _Shades, pixels: int, dtype: torch.dtype) -> Tensor:
-    """Sum over each pixel's contributions of basis × weights: (C, K, P), by blocks of pixels in float64."""
+def _box_filter(surface: Surface, albedo: Tensor, basis: Distant, dtype: torch.dtype) -> Tensor:
+    """(C, K, P): albedo (S, C) × A_l Y_lm(n), summed over each pixel's samples, by blocks of pixels in float64."""
+    fragments, smooth = surface.fragments, surface.smooth_faces is not None
+    pixels = len(fragments.pixels)
+    if smooth:
+        pixel, weights = fragments.pixel, albedo / fragments.samples**2
+    else:
+        pixel, face, weights = fragments.merge(albedo)
+        shading = basis.irradiance(surface.face_planes)
     starts = torch.arange(0, pixels, BLOCK)
-    ends = torch.searchsorted(shades.pixel, starts + BLOCK).tolist()
-    functions = shades.basis(slice(0)).shape[1]
-    filtered = torch.empty(shades.weights.shape[1], functions, pixels, dtype=dtype)
+    ends = torch.searchsorted(pixel, starts + BLOCK).tolist()
+    filtered = torch.empty(albedo.shape[1], len(basis.live), pixels, dtype=dtype)
     for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
-        rows, pixel = shades.basis(slice(begin, end)), shades.pixel[begin:end] - first
+        some = slice(begin, end)
+        rows = basis.irradiance(surface.normals[some]) if smooth else shading.index_select(0, face[some])
         block = filtered[..., first : first + BLOCK]
-        for channel, weight in zip(block, shades.weights[begin:end].T, strict=True):
+        for channel, weight in zip(block, weights[some].T, strict=True):
             summed = rows.new_zeros(channel.shape[::-1])
-            channel.copy_(summed.index_add_(0, pixel, rows * weight[:, None]).T)
+            channel.copy_(summed.index_add_(0, pixel[some] - first, rows * weight[:, None]).T)
     return filtered

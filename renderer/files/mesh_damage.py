@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from renderer.mesh import doubled_area_vectors
+
 # Storing both ends of a face's height as float32 moves each by up to √3 · 2⁻²⁴ of the coordinate, which is 2^-22.2
 # together: a height below 2⁻²² of it cannot be told from none.
 _SMALLEST_HEIGHT = 2.0**-22
@@ -24,7 +26,8 @@ def mesh_damage(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> Mes
     A face has no area where its smallest height is at most 2⁻²² of its largest coordinate, which is float32's rounding.
     Faces that had none before are not counted; those that lost it, which have no normal, are not flipped.
     """
-    old, new = _doubled_area_vectors(before, faces), _doubled_area_vectors(after, faces)
+    before, after = before.astype(np.float64), after.astype(np.float64)
+    old, new = doubled_area_vectors(before, faces), doubled_area_vectors(after, faces)
     had_area, has_area = _has_area(before, faces, old), _has_area(after, faces, new)
     turned = np.einsum("fi,fi->f", old, new) < 0
     return MeshDamage(
@@ -32,11 +35,6 @@ def mesh_damage(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> Mes
         degenerate=int((had_area & ~has_area).sum()),
         displacement=tuple(np.abs(after - before).max(axis=0).tolist()),
     )
-
-
-def _doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
-    return np.cross(b - a, c - a)
 
 
 def _has_area(vertices: np.ndarray, faces: np.ndarray, doubled_areas: np.ndarray) -> np.ndarray:

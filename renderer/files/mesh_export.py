@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from PIL import Image
-from torch.nn.functional import grid_sample
 
+from renderer.albedo import bilinear, mesh_textures
 from renderer.arguments import checked
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, require_choice
@@ -141,20 +141,11 @@ def _ply(mesh: Mesh, normals: np.ndarray) -> bytes:
 def _baked_colors(mesh: Mesh) -> np.ndarray:
     """(F, 3, 3) uint8: corner colour × texture at the corners, sRGB-encoded."""
     linear = decode(torch.from_numpy(mesh.corner_colors), "srgb")
-    for index, texture in enumerate(mesh.textures):
+    for index, texture in enumerate(mesh_textures(mesh, "srgb", linear)):
         here = torch.from_numpy(mesh.texture_ids == index)
         uvs = torch.from_numpy(mesh.corner_uvs)[here]
-        linear[here] *= _sample(texture, uvs.flatten(0, 1)).unflatten(0, (-1, 3))
+        linear[here] *= bilinear(texture, uvs.flatten(0, 1).T).T.unflatten(0, (-1, 3))
     return (encode(linear, "srgb") * 255).round().to(torch.uint8).numpy()
-
-
-def _sample(texture: np.ndarray, uvs: torch.Tensor) -> torch.Tensor:
-    """Linear colours (N, 3) of a texture (H, W, 3) that repeats, at uvs (N, 2), interpolated between texels."""
-    size = torch.tensor(texture.shape[1::-1])
-    framed = torch.from_numpy(np.pad(texture, ((1, 1), (1, 1), (0, 0)), mode="wrap"))
-    places = (torch.stack([uvs[:, 0], 1 - uvs[:, 1]], dim=1) % 1 * size + 1) / (size + 2) * 2 - 1
-    texels = decode(framed.permute(2, 0, 1).float() / 255, "srgb")
-    return grid_sample(texels[None], places[None, None], align_corners=False)[0, :, 0].T
 
 
 def _split(faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

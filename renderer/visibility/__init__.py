@@ -79,10 +79,3 @@ def _compiled() -> Backend:
     from renderer.visibility import compiled  # numba takes half a second to import
 
     return Backend("compiled", f"compiled (numba {compiled.VERSION})")
-
-
-def rasterise(
-    points: np.ndarray, faces: np.ndarray, resolution: int, backend: str = "auto", closed: bool = False
-) -> np.ndarray:
-    """Ids (N, R, R) int32 by the module's contract. To draw more than once, `choose` a back end and keep it."""
-    return choose(backend).rasterise(points, faces, resolution, closed)

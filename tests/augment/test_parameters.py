@@ -17,9 +17,11 @@ from augment.phases import Phases
 from augment.scene import Conditions, Scene
 from renderer.environment import read_map, to_map, write_map
 from renderer.errors import InputError
-from renderer.lights import directional, mean_luminance, project_environment
+from renderer.harmonics import project
+from renderer.lights import directional, mean_luminance
 from renderer.nonnegative import TOLERANCE
 from renderer.skylight import TURBIDITY, ZENITH, coefficients_by_quadrature
+from renderer.transfer import DEGREE
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 FREE = StepSettings()
@@ -236,7 +238,7 @@ def test_a_descent_in_physical_light_ends_in_light_that_an_environment_map_holds
     written = []
     for light in values:
         write_map(tmp_path / "light.hdr", to_map(light.unflatten(0, (49, 3)), 128))
-        written.append(project_environment(read_map(tmp_path / "light.hdr")))
+        written.append(project(read_map(tmp_path / "light.hdr"), DEGREE))
     read = scene.render(Conditions(torch.stack(written)), EVERY)
     torch.testing.assert_close(read, images, rtol=0, atol=0.5 / 255)
 

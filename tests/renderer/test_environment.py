@@ -16,7 +16,8 @@ from PIL import Image
 from renderer.environment import SUFFIXES, negative_share, read_map, to_map, write_map
 from renderer.errors import InputError
 from renderer.harmonics import basis, equirectangular, project
-from renderer.lights import load_light, mean_luminance, probe, project_environment, save_light
+from renderer.lights import load_light, mean_luminance, probe, save_light
+from renderer.transfer import DEGREE
 
 ROOT = Path(__file__).parents[2]
 HDRI = ROOT.parent / "shared" / "data" / "hdri"
@@ -209,7 +210,7 @@ def test_a_files_rows_and_columns_face_as_the_conventions_say(tmp_path, suffix, 
         radiance[row - 1 : row + 1, column - 1 : column + 1] = 1.0
     path = tmp_path / f"map{suffix}"
     write_map(path, radiance)
-    y, z, x = project_environment(read_map(path))[1:4, 0]
+    y, z, x = project(read_map(path), DEGREE)[1:4, 0]
     found = torch.stack([x, y, z])
     torch.testing.assert_close(found / found.norm(), torch.tensor(direction).double(), rtol=0, atol=64 * EPS)
 
@@ -483,7 +484,7 @@ def test_the_shared_maps_keep_their_light_as_hdr_and_exr(tmp_path, name):
     for suffix in (".hdr", ".exr"):
         write_map(tmp_path / f"map{suffix}", radiance)
     torch.testing.assert_close(read_map(tmp_path / "map.exr"), radiance, rtol=0, atol=0)
-    light, returned = project_environment(radiance), project_environment(read_map(tmp_path / "map.hdr"))
+    light, returned = project(radiance, DEGREE), project(read_map(tmp_path / "map.hdr"), DEGREE)
     flux = (radiance.amax(dim=-1) * equirectangular(*radiance.shape[:2])[1]).sum()
     bands = torch.arange(49).sqrt().floor()
     bound = RGBE * flux * ((2 * bands + 1) / (4 * math.pi)).sqrt()

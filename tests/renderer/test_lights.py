@@ -12,7 +12,7 @@ from scipy.special import eval_legendre
 from renderer.camera import OrthographicCamera
 from renderer.environment import SUFFIXES, to_map, write_map
 from renderer.errors import InputError
-from renderer.harmonics import basis, irradiance_basis, live_coefficients
+from renderer.harmonics import basis, irradiance_basis, live_coefficients, project
 from renderer.lights import (
     PROBES,
     ambient,
@@ -20,11 +20,11 @@ from renderer.lights import (
     load_light,
     perturb,
     probe,
-    project_environment,
     save_light,
 )
 from renderer.mesh import Mesh
 from renderer.rendering import render
+from renderer.transfer import DEGREE
 
 HDRI = Path(__file__).parents[3] / "shared" / "data" / "hdri"
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -120,7 +120,7 @@ def test_grace_is_lit_from_one_side():
 def test_a_constant_map_has_only_its_mean():
     """The sum over a row is exact in azimuth; along z it is the midpoint rule, off by Σ Δz³/24 · max |Y''| · 2π."""
     height, color = 64, torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)
-    light = project_environment(color.expand(height, 32, 3))
+    light = project(color.expand(height, 32, 3), DEGREE)
     torch.testing.assert_close(light[0], math.sqrt(4 * math.pi) * color, rtol=200 * EPS, atol=0)  # 2,048 terms
     zonal = torch.tensor([l * l + l for l in range(7)])
     rest = torch.ones(49, dtype=torch.bool).index_fill(0, zonal, False)
@@ -135,7 +135,7 @@ def test_a_constant_map_has_only_its_mean():
 def test_a_map_bright_in_its_top_row_lights_from_straight_above():
     radiance = torch.zeros(32, 48, 3)
     radiance[0] = torch.tensor([3.0, 2.0, 1.0])
-    light = project_environment(radiance)
+    light = project(radiance, DEGREE)
     solid_angle = 2 * math.pi * (1 - math.cos(math.pi / 32))
     z = (1 + math.cos(math.pi / 32)) / 2
     expected = torch.zeros(49, 3, dtype=torch.float64)
@@ -156,7 +156,7 @@ def test_the_middle_column_faces_x_and_azimuth_grows_to_the_left(column, directi
     """Texels on both sides of a column's left edge and of the horizon."""
     radiance = torch.zeros(24, 48, 3)
     radiance[11:13, [column - 1, column]] = 1.0
-    y, z, x = project_environment(radiance)[1:4, 0]
+    y, z, x = project(radiance, DEGREE)[1:4, 0]
     found = torch.stack([x, y, z])
     torch.testing.assert_close(found / found.norm(), torch.tensor(direction).double(), rtol=0, atol=64 * EPS)
 

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from renderer import visibility
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.visibility import SPAN, Backend, choose, opengl, rasterise, software
+from renderer.visibility import SPAN, Backend, choose, opengl, software
 
 needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
 needs_numba = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
@@ -355,7 +355,7 @@ def test_the_cpu_equals_the_reference_on_any_triangles(name, scene, closed):
 @pytest.mark.parametrize("resolution", [1, 2, 7, 33])
 def test_the_cpu_equals_the_reference_on_spheres(name, resolution, closed):
     points, faces = rotated_spheres(views=1, subdivisions=1)
-    ids = rasterise(points, faces, resolution, name, closed)
+    ids = choose(name).rasterise(points, faces, resolution, closed)
     np.testing.assert_array_equal(ids[0], reference(points[0], faces, resolution, closed))
 
 
@@ -364,17 +364,17 @@ def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides(name
     """Huge faces, whose edge functions have more than 53 bits, at a depth halfway between two keys."""
     points, faces = random_triangles(seed=5, count=40, reach=1e5, depth=0)
     faces = np.concatenate([faces, np.roll(faces, 1, axis=1)[::-1]])
-    ids = rasterise(points, faces, 16, name)
+    ids = choose(name).rasterise(points, faces, 16)
     np.testing.assert_array_equal(ids[0], reference(points[0], faces, 16, closed=False))
 
 
 @pytest.mark.parametrize(("parts", "faces_at_a_time"), [(1, 100), (7, 3), (100, 1)])
 def test_software_draws_the_same_however_little_at_a_time(monkeypatch, parts, faces_at_a_time):
     points, faces = random_triangles(seed=4, count=40, reach=1.3)
-    at_once = rasterise(points, faces, 16, "software")
+    at_once = choose("software").rasterise(points, faces, 16)
     monkeypatch.setattr(software, "PARTS", parts)
     monkeypatch.setattr(software, "FACES", faces_at_a_time)
-    np.testing.assert_array_equal(rasterise(points, faces, 16, "software"), at_once)
+    np.testing.assert_array_equal(choose("software").rasterise(points, faces, 16), at_once)
 
 
 @needs_numba
@@ -396,7 +396,9 @@ def test_compiled_equals_software_to_the_bit(seed, shape, resolution, lattice, s
     if lattice:
         points = np.round(points * lattice) / lattice
     points, triangles = points * scales, np.asarray(rng.integers(0, vertices, (faces, 3)), order=order)
-    compiled, plain = (rasterise(points, triangles, resolution, name, closed) for name in ("compiled", "software"))
+    compiled, plain = (
+        choose(name).rasterise(points, triangles, resolution, closed) for name in ("compiled", "software")
+    )
     assert compiled.dtype == plain.dtype
     np.testing.assert_array_equal(compiled, plain)
 
@@ -407,7 +409,9 @@ def test_compiled_equals_software_to_the_bit(seed, shape, resolution, lattice, s
 def test_compiled_equals_software_to_the_bit_on_solids(resolution, closed):
     for mesh in (trimesh.creation.icosphere(5), trimesh.creation.torus(0.6, 0.3), trimesh.creation.box([1.9, 0.01, 1])):
         points, faces = turned(mesh, views=2)
-        compiled, plain = (rasterise(points, faces, resolution, name, closed) for name in ("compiled", "software"))
+        compiled, plain = (
+            choose(name).rasterise(points, faces, resolution, closed) for name in ("compiled", "software")
+        )
         np.testing.assert_array_equal(compiled, plain)
 
 
@@ -417,14 +421,14 @@ def test_compiled_draws_in_many_threads_at_once():
     backend = choose("compiled")
     with ThreadPoolExecutor(8) as pool:
         drawn = list(pool.map(lambda view: backend.rasterise(view[None], faces, 100)[0], points))
-    np.testing.assert_array_equal(drawn, rasterise(points, faces, 100, "software"))
+    np.testing.assert_array_equal(drawn, choose("software").rasterise(points, faces, 100))
 
 
 @needs_numba
 @pytest.mark.parametrize("corner", [-1, 3])
 def test_compiled_reads_no_memory_that_is_not_the_points(corner):
     with pytest.raises(IndexError, match="not among the 3"):
-        rasterise(np.zeros((1, 3, 3)), np.array([[0, 1, corner]]), 4, "compiled")
+        choose("compiled").rasterise(np.zeros((1, 3, 3)), np.array([[0, 1, corner]]), 4)
 
 
 @needs_numba
@@ -490,7 +494,7 @@ def test_culling_a_closed_mesh_changes_ids_where_front_and_back_meet_on_a_sample
 def test_the_back_ends_agree_on_spheres(resolution, closed):
     """Coverage exactly; ids but for the rounding of depths, in 1 of 100,000 samples or fewer."""
     points, faces = rotated_spheres(views=4)
-    gpu, cpu = (rasterise(points, faces, resolution, name, closed) for name in ("opengl", "software"))
+    gpu, cpu = (choose(name).rasterise(points, faces, resolution, closed) for name in ("opengl", "software"))
     np.testing.assert_array_equal(gpu >= 0, cpu >= 0)
     assert (gpu != cpu).mean() < 2e-5
 
@@ -512,7 +516,7 @@ def test_the_back_ends_agree_on_any_triangles(seed, count, resolution, lattice, 
     points, faces = random_triangles(seed, count)
     if lattice:
         points[..., :2] = np.round(points[..., :2] * lattice) / lattice
-    gpu, cpu = (rasterise(points, faces, resolution, name, closed)[0] for name in ("opengl", "software"))
+    gpu, cpu = (choose(name).rasterise(points, faces, resolution, closed)[0] for name in ("opengl", "software"))
     np.testing.assert_array_equal(gpu >= 0, cpu >= 0)
     row, column = np.nonzero(gpu != cpu)
     rivals = np.stack([gpu[row, column], cpu[row, column]], axis=1)
@@ -546,7 +550,7 @@ def test_a_face_of_a_million_samples_takes_bounded_memory():
     """Less than a candidate (face, sample) list of it would take: 5 int64 numbers each."""
     points, faces = triangle(*rectangle(-1, 1, -1, 1, 0))
     tracemalloc.start()
-    ids = rasterise(points, faces, 1024, "software")
+    ids = choose("software").rasterise(points, faces, 1024)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert (ids >= 0).all()
@@ -558,7 +562,7 @@ def test_a_million_faces_take_bounded_memory():
     points, _ = triangle([-1, -1, 0], [3, -1, 0], [-1, 3, 0])
     faces = np.tile([0, 1, 2], (2**20, 1))
     tracemalloc.start()
-    ids = rasterise(points, faces, 1, "software")
+    ids = choose("software").rasterise(points, faces, 1)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert ids.item() == 0
