@@ -32,9 +32,9 @@ class MeshSettings:
     def __post_init__(self) -> None:
         require_fields(self)
         if not self.mesh:
-            raise InputError("scene.meshes: a mesh is '': give a file or solid:NAME")
-        if self.color is not None and (len(self.color) != 3 or not all(0 <= each <= 1 for each in self.color)):
-            raise InputError(f"scene.meshes: {self.mesh}: color={self.color} must be red, green and blue from 0 to 1")
+            raise InputError("mesh is '': give a file or solid:NAME")
+        if self.color is not None:
+            _require_color(f"{self.mesh}: color", self.color)
 
 
 @dataclass
@@ -52,11 +52,11 @@ class CompanionSettings(MeshSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.at) != 2:
-            raise InputError(f"scene.meshes: beside: {self.mesh}: at={self.at} must be x and y")
+            raise InputError(f"beside: {self.mesh}: at={self.at} must be x and y")
         for place in self.at:
-            require_range(f"scene.meshes: beside: {self.mesh}: at", place, -FARTHEST, FARTHEST)
-        require_range(f"scene.meshes: beside: {self.mesh}: scale", self.scale, 1 / FARTHEST, FARTHEST)
-        require_range(f"scene.meshes: beside: {self.mesh}: azimuth", self.azimuth, -360, 360)
+            require_range(f"beside: {self.mesh}: at", place, -FARTHEST, FARTHEST)
+        require_range(f"beside: {self.mesh}: scale", self.scale, 1 / FARTHEST, FARTHEST)
+        require_range(f"beside: {self.mesh}: azimuth", self.azimuth, -360, 360)
 
 
 @dataclass
@@ -70,7 +70,7 @@ class ObjectSettings(MeshSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range(f"scene.meshes: {self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
+        require_range(f"{self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,10 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
 def in_company(item: SceneObject, company: Sequence[Mesh]) -> SceneObject:
     """The object among meshes that stand on z = 0, which are raised or lowered to where it stands."""
     height = np.array([0, 0, item.lowest])
-    placed = [replace(each, vertices=_rounded(each.vertices + height)) for each in company]
+    placed = []
+    for each in company:
+        raised = (each.vertices + height).astype(np.float32)  # as `normalise` rounds
+        placed.append(replace(each, vertices=raised.astype(np.float64)))
     return replace(item.among(placed), company=company)
 
 
@@ -143,8 +146,7 @@ def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
     """
     if color is None:
         return item
-    if len(color) != 3 or not all(0 <= each <= 1 for each in color):
-        raise InputError(f"scene.ground={color} must be red, green and blue from 0 to 1")
+    _require_color("ground", color)
     corners = [[x * GROUND, y * GROUND, item.lowest] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     table = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.array(color))
     return replace(item.among([table]), ground=color)
@@ -169,21 +171,12 @@ def _companion(item: CompanionSettings) -> Mesh:
     return replace(mesh, vertices=turned + np.array([*item.at, -lowest]))
 
 
-def _rounded(vertices: np.ndarray) -> np.ndarray:
-    """To float32, as `normalise` does."""
-    return vertices.astype(np.float32).astype(np.float64)
-
-
 def _load(item: MeshSettings) -> Mesh:
     mesh = _read(item)
-    return mesh if item.color is None else _colored(mesh, item)
-
-
-def _colored(mesh: Mesh, item: MeshSettings) -> Mesh:
+    if item.color is None:
+        return mesh
     if not mesh.uncolored:
-        raise InputError(
-            f"scene.meshes: {item.mesh} brings colours of its own: leave color out; gain brightens or dims them"
-        )
+        raise InputError(f"{item.mesh} brings colours of its own: leave color out; gain brightens or dims them")
     return Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
 
 
@@ -193,8 +186,10 @@ def _read(item: MeshSettings) -> Mesh:
         return load_mesh(item.mesh, up=item.up)
     name, _, seed = name.partition(":")
     if seed and not seed.isdecimal():
-        raise InputError(f"scene.meshes: the seed in {item.mesh!r} must be a whole number, as in solid:orange:3")
-    try:
-        return solid(name, int(seed or 0))
-    except InputError as error:
-        raise InputError(f"scene.meshes: {item.mesh}: {error}") from error
+        raise InputError(f"mesh={item.mesh}: its seed must be a whole number, as in solid:orange:3")
+    return solid(name, int(seed or 0))
+
+
+def _require_color(name: str, color: Sequence[float]) -> None:
+    if len(color) != 3 or not all(0 <= each <= 1 for each in color):
+        raise InputError(f"{name}={color} must be red, green and blue from 0 to 1")

@@ -653,7 +653,7 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["augment.attack.step_size=nan"], "attack: step_size=nan must be"),
         (["renderer.samples=65"], "renderer.samples=65 must be at least 1 and at most 64"),
         (["renderer=x"], "renderer: Merge error: str is not a subclass of RendererSettings"),
-        (["scene.meshes=['']"], "scene.meshes: a mesh is '': give a file or solid:NAME"),
+        (["scene.meshes=['']"], "mesh is '': give a file or solid:NAME"),
         (["train.compile=always"], "train.compile=always is for a GPU"),
         (["train.device=meta"], "device=meta is not available here"),
         (["model.width=100000"], "model.depth=10, model.width=100000 make"),
