@@ -4,10 +4,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from renderer.errors import require_range
+
 
 def anything_but(label: int) -> int:
     """The label of what is of no class that the classifier knows, and in particular not of this one."""
     return -1 - label
+
+
+def require_known(labels: Tensor, logits: Tensor) -> None:
+    """InputError for a label of a class beyond those of logits (N, classes)."""
+    require_range("label", int(_subject(labels).amax()), 0, logits.shape[1] - 1)
 
 
 def label_loss(logits: Tensor, labels: Tensor, label_smoothing: float = 0.0) -> Tensor:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,116 +13,26 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment import processes
-from augment.attacks.settings import SIGNED, AttackSettings
 from augment.build import Shown, build_scene
-from augment.descent import NO_CLASS, AttackResult, Goal, Part, descend_in_parts
-from augment.labels import is_right, label_loss
+from augment.descent import AttackResult, Part, descend_in_parts
+from augment.goal import NO_CLASS, Goal
+from augment.labels import is_right, label_loss, require_known
 from augment.memory import BatchSize
 from augment.model_state import as_found
-from augment.parameters import Albedo, Geometry, Lighting, StepSettings
+from augment.parameters import Lighting
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
 from augment.seeding import generator, stream_seed
+from augment.service_settings import AugmentationSettings
 from augment.specimens import Specimens, choose_specimens
-from augment.variation import VariationSettings, vary
-from renderer.arguments import checked, require_fields
-from renderer.errors import FACTOR, InputError, require_choice, require_range
+from augment.variation import vary
+from renderer.arguments import checked
+from renderer.errors import InputError, require_range
 from renderer.lights import perturb
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
-
-ARMS = ("none", "random", "adversarial")
-STARTS = ("light", "random")
-SCHEDULES = ("restart", "continue")
-MOST_EXAMPLES = 10**6  # at 32 × 32 pixels they take 12 GB
-MOST_EVERY = 10**9
-MOST_CANDIDATES = 100
-
-
-@dataclass
-class RandomLights:
-    """Perturbations of the initial light: uniform ±amplitude, or scaled to an L2 radius (see `lights.perturb`).
-
-    candidates: how many lights are tried of each example of the random arm, all that `vary` draws of the light and the
-    camera's part included, to keep the one of the highest loss.
-    """
-
-    amplitude: float = 0.5
-    radius: float | None = None
-    candidates: int = 1
-
-    def __post_init__(self) -> None:
-        require_fields(self)
-        require_range("augment.random.candidates", self.candidates, 1, MOST_CANDIDATES)
-        for name in ("amplitude", "radius"):  # no radius: null
-            require_range(f"augment.random.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
-
-
-@dataclass
-class TrainingAttackSettings(AttackSettings):
-    """Unless kinds are named, the paper's appendix C: 0.05 along the gradient's direction of the light, 30 steps, any
-    coefficients.
-
-    step, step_size: those of that light; see `StepSettings` for what "along the direction" means.
-    """
-
-    step: str = "unit"
-    step_size: float = 0.05
-    light: str = SIGNED
-    batch_size: int = 128
-
-    def __post_init__(self) -> None:
-        self._light = StepSettings(step=self.step, step_size=self.step_size)
-        super().__post_init__()
-
-    @property
-    def kinds(self) -> dict[str, StepSettings]:
-        return super().kinds or {Lighting.name: self._light}
-
-
-@dataclass
-class AugmentationSettings:
-    """What is regenerated, and when.
-
-    start: where an attack begins, the scene as it is ("light") or a random perturbation of it: of the light by
-    `random`, of all else uniform in its norm-ball. lights: "restart" begins there each time, "continue" begins where
-    the last attack ended. vary: what of the scene is drawn afresh each time.
-    every: after how many training images the renders are made anew, counted within an epoch; None: each epoch.
-    """
-
-    arm: str = "adversarial"
-    examples: int | None = 100
-    start: str = "light"
-    lights: str = "restart"
-    every: int | None = None
-    vary: VariationSettings = field(default_factory=VariationSettings)
-    random: RandomLights = field(default_factory=RandomLights)
-    attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
-
-    def __post_init__(self) -> None:
-        require_fields(self)
-        for name, choices in {"arm": ARMS, "start": STARTS, "lights": SCHEDULES}.items():
-            require_choice(f"augment.{name}", getattr(self, name), choices)
-        require_range("augment.examples", self.examples, 0, MOST_EXAMPLES)
-        require_range("augment.every", self.every, 1, MOST_EVERY)
-        if self.arm == "random" or self.start == "random":
-            for name, settings in self.attack.kinds.items():
-                if name != Lighting.name and settings.radius is None:
-                    raise InputError(f"augment.attack.{name}.radius=null has no random draw: set a radius")
-        if self.lights == "continue" and self.vary.individuals:
-            raise InputError("augment.lights=continue goes on with the last shapes: set augment.vary.individuals=false")
-
-    @property
-    def renders(self) -> bool:
-        """Whether any example is rendered at all."""
-        return self.arm != "none" and self.examples != 0
-
-    @property
-    def relights(self) -> bool:
-        """Whether nothing but the light changes, so that the scene's operators last from epoch to epoch."""
-        return not (self.vary.moves or {Geometry.name, Albedo.name} & self.attack.kinds.keys())
 
 
 @dataclass(frozen=True)
@@ -246,6 +156,7 @@ class AugmentationService:
             batches = BatchSize(self.settings.attack.batch_size).map(lambda part: model(images[part]), len(images))
             logits = torch.cat(list(batches))
         labels = self._labels.repeat(self.settings.random.candidates)
+        require_known(labels, logits)
         fooled, losses = ~is_right(logits.argmax(1), labels), label_loss(logits, labels)
         worst = losses.unflatten(0, (-1, len(self))).argmax(0) * len(self) + torch.arange(len(self)).to(labels)
         diagnostics = {"fooled": _mean(fooled[worst]), "loss": _mean(losses[worst])}
@@ -285,18 +196,16 @@ class AugmentationService:
 
     def _perturbed(self, problem: Perturbation, number: int) -> Tensor:
         """Random values (E, D), within the norm-balls."""
-        values = torch.cat(list(self._perturbed_parts(problem, number)), dim=1)
-        return problem.project(values, problem.everything)
-
-    def _perturbed_parts(self, problem: Perturbation, number: int) -> Iterator[Tensor]:
-        random, draws = self.settings.random, generator(self._seed, number, "lights")
+        random, drawn = self.settings.random, []
         for kind, start in zip(problem.kinds, problem.split(problem.start), strict=True):
             if isinstance(kind, Lighting):
                 none = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
+                draws = generator(self._seed, number, "lights")
                 offsets = perturb(none, len(start), random.amplitude, random.radius, draws)
-                yield start + offsets.flatten(1).to(start)
+                drawn.append(start + offsets.flatten(1).to(start))
             else:
-                yield kind.sample(generator(self._seed, number, kind.name), problem.everything).to(start)
+                drawn.append(kind.sample(generator(self._seed, number, kind.name), problem.everything).to(start))
+        return problem.project(torch.cat(drawn, dim=1), problem.everything)
 
     def _attack_diagnostics(self, result: AttackResult) -> dict[str, float]:
         attack = self.settings.attack

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 import renderer
 from augment.classifiers import Classifier
-from augment.descent import AttackResult, DescentSettings, Goal, adversarial_cost, descend
+from augment.descent import AttackResult, DescentSettings, descend
+from augment.goal import Goal, adversarial_cost
 from augment.parameters import Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases

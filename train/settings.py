@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from augment.build import count_views
 from augment.objects import CompanionSettings, ObjectSettings
 from augment.placed_lights import LampsSettings, ProjectorSettings
-from augment.service import AugmentationSettings
+from augment.service_settings import AugmentationSettings
 from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range

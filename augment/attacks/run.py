@@ -14,7 +14,8 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.criteria import Criterion, Misclassification, Targeted
 from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier
-from augment.descent import AttackResult, Goal, descend_in_parts
+from augment.descent import AttackResult, descend_in_parts
+from augment.goal import Goal
 from augment.memory import BatchSize
 from augment.objects import SceneObject
 from augment.parameters import StepSettings

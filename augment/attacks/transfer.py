@@ -14,7 +14,7 @@ from torch import Tensor
 from augment.attacks.adversary import Adversary
 from augment.attacks.run import Attacked, logits_of
 from augment.classifiers import Classifier
-from augment.descent import Goal
+from augment.goal import Goal
 from augment.objects import SceneObject
 from renderer.errors import InputError
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.descent import AttackResult, DescentSettings, Goal, descend, descend_repeatedly
+from augment.descent import AttackResult, DescentSettings, descend, descend_repeatedly
+from augment.goal import Goal
 from augment.norm_ball import NormBall
 from augment.parameters import STEPS, direction
 from augment.phases import Phases

@@ -7,7 +7,8 @@ from torch import nn
 
 from augment import memory
 from augment.build import build_scene
-from augment.descent import AttackResult, DescentSettings, Goal, descend, descend_in_parts
+from augment.descent import AttackResult, DescentSettings, descend, descend_in_parts
+from augment.goal import Goal
 from augment.memory import BatchSize, require_memory
 from augment.phases import Phases
 from renderer.errors import InputError

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from augment import reshading
-from augment.descent import DescentSettings, Goal, descend
+from augment.descent import DescentSettings, descend
+from augment.goal import Goal
 from augment.parameters import KINDS, STEPS, Albedo, Geometry, Kind, Lighting, Pixels, Skylight, StepSettings, direction
 from augment.perturbation import Perturbation
 from augment.phases import Phases

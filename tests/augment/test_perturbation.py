@@ -5,7 +5,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.descent import AttackResult, DescentSettings, Goal, descend
+from augment.descent import AttackResult, DescentSettings, descend
+from augment.goal import Goal
 from augment.parameters import Albedo, Geometry, Lighting, Pixels, Skylight, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases

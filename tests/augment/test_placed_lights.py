@@ -12,7 +12,7 @@ from augment.parameters import LampPlaces, LampPowers, Lighting, ProjectorPatter
 from augment.perturbation import Perturbation
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
-from augment.service import TrainingAttackSettings
+from augment.service_settings import TrainingAttackSettings
 from renderer import sparse
 from renderer.basis import parts_of
 from renderer.cache import OperatorCache
@@ -154,7 +154,7 @@ def test_training_draws_and_attacks_patterns_beside_the_light(arm):
         (lambda: LampsSettings(start=-1.0).build(), r"scene\.lamps\.start=-1\.0: give powers"),
         (lambda: LampsSettings(start=[[11, 0, 0]] * 4).build(), r"scene\.lamps\.start=.* to scene\.lamps\.power=10$"),
         *((lambda each=each: scene(exposure=each), r"exposure=.* must be at least") for each in (math.nan, -1.0, 1e30)),
-        (lambda: scene(ground=[0.5, 2.0, 0.5]), r"scene\.ground=.* must be red, green and blue"),
+        (lambda: scene(ground=[0.5, 2.0, 0.5]), r"ground=.* must be red, green and blue"),
         (lambda: ProjectorPattern(scene(projector=None), StepSettings()), r"no projector: set scene\.projector"),
     ],
 )

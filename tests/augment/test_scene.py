@@ -10,14 +10,16 @@ import renderer
 from augment import relighting
 from augment.backgrounds import load_backgrounds
 from augment.build import build_scene, count_views
-from augment.descent import DescentSettings, Goal, descend
+from augment.descent import DescentSettings, descend
+from augment.goal import Goal
 from augment.held_transport import NEAR
 from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object
 from augment.parameters import Albedo, Geometry, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Example, Scene
-from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
+from augment.service import AugmentationService
+from augment.service_settings import AugmentationSettings, TrainingAttackSettings
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera, ring
 from renderer.convex import nearest_in_box
@@ -242,10 +244,10 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("solid:orangutan", r"scene\.meshes: solid:orangutan: No solid is called 'orangutan': use 'orange'"),
+        ("solid:orangutan", "No solid is called 'orangutan': use 'orange'"),
         ("solid", "No solid is called ''"),
         ("solid:orange:" + 30 * "9", rf"scene\.meshes: solid:orange:{30 * '9'}: seed is"),
-        ("solid:orange:red", r"scene\.meshes: the seed in 'solid:orange:red' must be a whole number"),
+        ("solid:orange:red", "mesh=solid:orange:red: its seed must be a whole number"),
         ("solid:orange:-1", "must be a whole number"),
         ("solid:orange:1:2", "must be a whole number"),
         ("no/such.glb", "no/such.glb does not exist"),

@@ -12,7 +12,8 @@ from augment.objects import ObjectSettings, load_object
 from augment.parameters import StepSettings
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
-from augment.service import AugmentationService, AugmentationSettings, RandomLights, TrainingAttackSettings
+from augment.service import AugmentationService
+from augment.service_settings import AugmentationSettings, RandomLights, TrainingAttackSettings
 from augment.variation import VariationSettings
 from renderer.camera import ring
 from renderer.errors import InputError
@@ -241,6 +242,14 @@ def test_continued_lights_of_another_number_of_examples_are_refused(serve):
 def test_lights_that_an_older_version_continued_are_refused(serve):
     with pytest.raises(InputError, match="as an older version kept them"):
         serve(lights="continue").load_state_dict({"lights": torch.zeros(4, 49, 3)})
+
+
+@pytest.mark.parametrize("arm", ["random", "adversarial"])
+def test_a_label_beyond_the_classes_of_the_network_is_refused(model, arm):
+    settings = AugmentationSettings(arm)
+    service = AugmentationService.from_meshes([("solid:plate", 53)], 8, settings, views=1, backgrounds=[0.5])
+    with pytest.raises(InputError, match=r"label=53 must be at least 0 and at most \d"):
+        service.regenerate(model, 0)
 
 
 @pytest.mark.parametrize(

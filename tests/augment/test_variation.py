@@ -15,7 +15,8 @@ from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.phases import Phases
 from augment.scene import Scene
 from augment.seeding import generator
-from augment.service import AugmentationService, AugmentationSettings
+from augment.service import AugmentationService
+from augment.service_settings import AugmentationSettings
 from augment.snapshot import SnapshotSettings
 from augment.variation import VariationSettings, vary
 from renderer.camera import ring

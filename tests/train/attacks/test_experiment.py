@@ -11,7 +11,8 @@ from augment.attacks import run
 from augment.attacks.checks import Checks, check
 from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings, adversarial_cost, descend_in_parts
+from augment.descent import DescentSettings, descend_in_parts
+from augment.goal import adversarial_cost
 from augment.parameters import KINDS
 from renderer.camera import ring
 from renderer.errors import InputError

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings, Goal, Part, Problem, descend
+from augment.descent import DescentSettings, Part, Problem, descend
+from augment.goal import Goal
 from augment.parameters import Geometry, Kind, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases

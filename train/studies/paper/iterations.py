@@ -15,11 +15,13 @@ from torch import Tensor, nn
 
 from augment.backgrounds import load_backgrounds
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings, Goal, adversarial_cost, descend
+from augment.descent import DescentSettings, descend
+from augment.goal import Goal, adversarial_cost
 from augment.objects import SceneObject
 from augment.phases import Phases
 from augment.scene import Scene
-from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
+from augment.service import AugmentationService
+from augment.service_settings import AugmentationSettings, TrainingAttackSettings
 from renderer.camera import ring
 from renderer.image import ImageSettings
 from renderer.lights import load_light

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from augment.attacks.run import logits_of
-from augment.descent import DescentSettings, Goal, descend
+from augment.descent import DescentSettings, descend
+from augment.goal import Goal
 from augment.parameters import Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases

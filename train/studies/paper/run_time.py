@@ -8,7 +8,8 @@ from functools import partial
 import numpy as np
 import torch
 
-from augment.descent import DescentSettings, Goal, descend
+from augment.descent import DescentSettings, descend
+from augment.goal import Goal
 from augment.objects import ObjectSettings, load_object
 from train.photographs.shares import share
 from train.report.tables import markdown

@@ -11,7 +11,7 @@ from augment import held_transport
 from augment.attacks.run import attack
 from augment.attacks.settings import AttackSettings
 from augment.classifiers import Classifier
-from augment.descent import Goal, adversarial_cost
+from augment.goal import Goal, adversarial_cost
 from augment.objects import SceneObject
 from augment.parameters import StepSettings
 from augment.perturbation import Perturbation
