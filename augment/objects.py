@@ -186,8 +186,11 @@ def _read(item: MeshSettings) -> Mesh:
         return load_mesh(item.mesh, up=item.up)
     name, _, seed = name.partition(":")
     if seed and not seed.isdecimal():
-        raise InputError(f"mesh={item.mesh}: its seed must be a whole number, as in solid:orange:3")
-    return solid(name, int(seed or 0))
+        raise InputError(f"{item.mesh}: the seed must be a whole number, as in solid:orange:3")
+    try:
+        return solid(name, int(seed or 0))
+    except InputError as error:
+        raise InputError(f"{item.mesh}: {error}") from error
 
 
 def _require_color(name: str, color: Sequence[float]) -> None:
