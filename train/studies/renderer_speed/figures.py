@@ -1,6 +1,6 @@
 """The figures: fronts of time and error, and how time and memory grow."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,37 +17,31 @@ FEW = 12  # settings that can all be named in the figure
 
 def draw_fronts(path: Path, panels: Sequence[Sequence[Row]]) -> None:
     """One set of axes per panel: all settings, by name or coloured by degree, their front and the default."""
-    plt = pyplot()
     lines = -(-len(panels) // 3)
-    figure, axes = plt.subplots(lines, 3, figsize=(16, 5 * lines), squeeze=False, layout="tight")
+    figure, axes = pyplot().subplots(lines, 3, figsize=(16, 6 * lines), squeeze=False, layout="constrained")
     for ax, rows in zip(axes.flat, panels, strict=False):
-        _draw_front(ax, rows)
-        if len(rows) > FEW:
-            _draw_by_degree(ax, rows, plt.get_cmap("viridis"))
-        else:
-            for row in rows:
-                ax.plot(row.time_ms, row.error, "o", ms=6, label=row.setting)
+        front = pareto_front(rows)
+        ax.plot([row.time_ms for row in front], [row.error for row in front], "k-", lw=1, zorder=1, label="front")
+        for name, group in _groups(rows).items():
+            ax.plot([row.time_ms for row in group], [row.error for row in group], "o", ms=5, label=name)
+        for row in rows:
+            if row.default:
+                ax.plot(row.time_ms, row.error, "*", ms=15, color=RED, label="default")
         ax.set(title=rows[0].panel, xlabel="milliseconds", ylabel="relative error")
         _logarithmic(ax, "x", *("y" if min(row.error for row in rows) > 0 else ""))
-        ax.legend(fontsize=8)
+        columns = 1 if len(rows) <= FEW else 4
+        ax.legend(fontsize=8, ncols=columns, loc="upper center", bbox_to_anchor=(0.5, -0.12))  # it hides no setting
     for ax in axes.flat[len(panels) :]:
         ax.axis("off")
     save(figure, path, dpi=100)
 
 
-def _draw_front(ax: "Axes", rows: Sequence[Row]) -> None:
-    front = pareto_front(rows)
-    ax.plot([row.time_ms for row in front], [row.error for row in front], "k-", lw=1, zorder=1, label="front")
-    for row in rows:
-        if row.default:
-            ax.plot(row.time_ms, row.error, "*", ms=15, color=RED, label="default")
-
-
-def _draw_by_degree(ax: "Axes", rows: Sequence[Row], colors: Callable[[float], Any]) -> None:
-    degrees = sorted({row.degree for row in rows if row.degree is not None})
-    for place, degree in enumerate(degrees):
-        times, errors = zip(*((row.time_ms, row.error) for row in rows if row.degree == degree), strict=True)
-        ax.scatter(times, errors, s=22, color=colors(place / len(degrees)), label=f"degree {degree}")
+def _groups(rows: Sequence[Row]) -> Mapping[str, Sequence[Row]]:
+    """What has a colour and a name: each setting if they are few, or else each degree."""
+    if len(rows) <= FEW:
+        return {row.setting: [row] for row in rows}
+    degrees = dict.fromkeys(row.degree for row in rows)
+    return {f"degree {degree}": [row for row in rows if row.degree == degree] for degree in degrees}
 
 
 def draw_scaling(path: Path, points: Sequence[Point], workloads: Sequence[Sequence[Row]]) -> None:

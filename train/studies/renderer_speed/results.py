@@ -14,11 +14,11 @@ NOISE = 0.05  # of a median: times closer than that may change places from run t
 
 @dataclass(frozen=True)
 class Row:
-    """Time and error of one setting, and the setting itself; None where an axis has no meaning.
+    """Time and error of one setting; None where there is none.
 
     panel: what is compared with what. time_ms: median. image_error, gradient_error: relative root mean square against
     the converged reference. default: what the renderer does when it is not told otherwise. samples: of a whole pixel.
-    cost: what a descent left of the cost it began with.
+    batch: of lights. cost: what a descent left of the cost it began with.
     """
 
     panel: str
@@ -29,13 +29,9 @@ class Row:
     default: bool = False
     degree: int | None = None
     samples: int | None = None
-    dtype: str | None = None
-    rasteriser: str | None = None
-    layout: str | None = None
     batch: int | None = None
     size: int | None = None
     vertices: int | None = None
-    refresh: int | None = None
     cost: float | None = None
 
     @property
@@ -61,31 +57,45 @@ def pareto_front(rows: Sequence[Row]) -> list[Row]:
     return sorted((row for row in rows if not dominators(row, rows)), key=lambda row: row.time_ms)
 
 
-def verdict(rows: Sequence[Row]) -> str:
-    """Whether the default among the rows lies on their front, in a sentence."""
-    default = next(row for row in rows if row.default)
+def verdict(default: Row, rows: Sequence[Row]) -> str:
+    """Whether the default among the rows lies on their front, and what is better where it does not."""
     better = dominators(default, rows)
     if not better:
-        return f"The default, {default.setting}, lies on the front."
+        return "yes"
     best = better[0]
-    where = "lies within the noise of" if best.time_ms > (1 - NOISE) * default.time_ms else "does not lie on"
+    where = "within the noise" if best.time_ms > (1 - NOISE) * default.time_ms else "**no**"
     return (
-        f"The default, {default.setting}, {where} the front: {best.setting} takes {best.time_ms / default.time_ms:.2f} "
-        f"of its time at {best.error / default.error:.2f} of its error."
+        f"{where}: {best.setting} takes {best.time_ms / default.time_ms:.2f} of its time at "
+        f"{best.error / default.error:.2f} of its error"
     )
+
+
+def defaults(panels: Iterable[Sequence[Row]]) -> str:
+    """A Markdown table of the default in each panel."""
+    header = ["work", "settings", "default", "ms", "image's error", "gradient's error", "on the front"]
+    lines = [
+        (row.panel, len(rows), row.setting, row.time_ms, row.image_error, row.gradient_error, verdict(row, rows))
+        for rows in panels
+        for row in rows
+        if row.default
+    ]
+    return markdown(header, lines)
 
 
 def compared(rows: Sequence[Row]) -> str:
     """A Markdown table of who took how long, and how much longer than the fastest."""
     fastest = min(row.time_ms for row in rows)
     header = ["who", "samples per pixel", "ms", "image's error", "gradient's error", "of the fastest"]
-    return markdown(
-        header,
-        [
-            (r.setting, r.samples, r.time_ms, r.image_error, r.gradient_error, f"{shown(r.time_ms / fastest)}×")
-            for r in rows
-        ],
-    )
+    lines = [
+        (row.setting, row.samples, row.time_ms, row.image_error, row.gradient_error, times(row.time_ms / fastest))
+        for row in rows
+    ]
+    return markdown(header, lines)
+
+
+def times(ratio: float) -> str:
+    """As a person reads it."""
+    return f"{shown(ratio)}×"
 
 
 def write_csv(path: Path, records: Sequence[dict[str, Any]]) -> None:

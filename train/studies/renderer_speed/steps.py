@@ -1,4 +1,4 @@
-"""The steps that are timed: of an attack on the light and on the vertices, without the classifier."""
+"""What is timed: steps of attacks on the light and on the vertices, and descents, without a classifier."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +12,9 @@ from renderer.fragments import Fragments
 from renderer.image import develop
 from renderer.transfer import Operator
 from train.studies.renderer_speed.scenes import BACKGROUND, View
+
+LAYOUTS = ("one channel", "three channels", "pixel-major")  # the default first
+STEP = 0.05  # of a descent: L2 norm, over all coordinates
 
 Shading = Callable[[Fragments, Tensor, Tensor, Tensor], Tensor]
 Seen = tuple[Fragments, Tensor, Tensor]  # with albedo (S, 3) and coverage (1, P)
@@ -66,9 +69,6 @@ def shade_by_face(fragments: Fragments, vertices: Tensor, light: Tensor, albedo:
     return shade.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel, shade).T
 
 
-LAYOUTS = ("one channel", "three channels", "pixel-major")  # the default first
-
-
 def laid_out(wide: Operator, layout: str, dtype: torch.dtype) -> Operator:
     """A one-channel operator in another dtype and layout; pixel-major: a pixel's coefficients are neighbours."""
     transfer, albedo = wide.transfer, wide.albedo
@@ -77,3 +77,34 @@ def laid_out(wide: Operator, layout: str, dtype: torch.dtype) -> Operator:
     if layout == "pixel-major":
         transfer = transfer.mT.contiguous().mT
     return replace(wide, transfer=transfer.to(dtype), albedo=albedo.to(dtype), coverage=wide.coverage.to(dtype))
+
+
+def bend(view: View, samples: int, light: Tensor, target: Tensor, steps: int, every: int) -> tuple[float, Tensor]:
+    """(cost, image) after so many steps towards a target (3, size, size), visibility refreshed `every` so many.
+
+    The cost is the mean squared difference; image and cost are of the mesh as it is then seen.
+    """
+    vertices = view.vertices()
+    for step in range(steps):
+        if step % every == 0:
+            sight = seen(view, samples, vertices)
+        variable = vertices.clone().requires_grad_()
+        cost = (_image(view, sight, variable, light) - target).square().mean()
+        (gradient,) = torch.autograd.grad(cost, variable)
+        vertices = vertices - STEP * gradient / gradient.norm()
+    last = _image(view, seen(view, samples, vertices), vertices, light)
+    return float((last - target).square().mean()), last
+
+
+def lit_from_opposite(view: View, samples: int, light: Tensor) -> Tensor:
+    """The target: the mesh as it is, under a light whose band 1 has turned around."""
+    opposite = light.clone()
+    opposite[1:4] *= -1
+    return _image(view, seen(view, samples, view.vertices()), view.vertices(), opposite)
+
+
+def _image(view: View, sight: Seen, vertices: Tensor, light: Tensor) -> Tensor:
+    """(3, size, size) in [0, 1]."""
+    fragments, albedo, coverage = sight
+    radiance = shading.radiance(fragments, vertices, light, albedo)
+    return view.canvas(develop(radiance, coverage, light.new_full((1, 1), BACKGROUND)), fragments.pixels, BACKGROUND)

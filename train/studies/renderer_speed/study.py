@@ -1,21 +1,23 @@
 """The renderer's time against its error, in one run."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 
 from augment.objects import load_object
-from renderer.errors import InputError
+from renderer.errors import InputError, require_choice
 from renderer.mesh import Mesh
 from renderer.shapes import solid
 from renderer.visibility import NAMES, Backend, choose
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_folder
 from train.device import choose_device
+from train.report.tables import markdown, shown
 from train.settings import SceneSettings, read_object
-from train.studies.page import machine, write
+from train.studies.page import filled, joined, machine, with_section, wrapped, write
 from train.studies.renderer_speed import (
     comparison,
     figures,
@@ -23,16 +25,15 @@ from train.studies.renderer_speed import (
     panels,
     results,
     scaling,
-    shaped,
     skipping,
     targets,
     vertices,
 )
+from train.studies.renderer_speed.bench import QUICK, Bench, Plan
 from train.studies.renderer_speed.measure import Clock
-from train.studies.renderer_speed.page import Findings, page
-from train.studies.renderer_speed.panels import QUICK, Bench, Plan
 from train.studies.renderer_speed.reference import Converged
 from train.studies.renderer_speed.scenes import irradiance
+from train.studies.targets import table_of
 
 PAGE = "performance_renderer.md"
 
@@ -56,23 +57,22 @@ class RendererSpeedSettings:
 def run(settings: RendererSpeedSettings) -> None:
     """Measure, and write the page, its figures and its numbers."""
     out = writable_folder(settings.out, "out")
-    if settings.only not in (None, "vertices"):
-        raise InputError(f"only={settings.only}: choose vertices, or null for the whole page")
-    if settings.only and not (out / PAGE).is_file():
-        raise InputError(f"only={settings.only}: there is no {out / PAGE} to put the section into")
+    if settings.only is not None:
+        require_choice("only", settings.only, ["vertices"])
+        if not (out / PAGE).is_file():
+            raise InputError(f"only={settings.only}: there is no {out / PAGE} to put the section into")
     torch.set_num_threads(1)
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software OpenGL, too, on the one thread
     device, plan = choose_device(settings.device), QUICK if settings.quick else Plan()
     description = machine(device)
     bench = Bench(plan, Clock(device, plan.rounds), _backends(), device)
+    without = _without_mitsuba(settings.peers)
     if settings.only:
-        found = vertices.measure(bench, _mitsuba_starts(settings.peers)[0])
-        section = vertices.section(found, command_line(), description)
-        return write(out / PAGE, vertices.put(section, (out / PAGE).read_text("utf-8")))
+        _, section = vertices.measure(bench, not without, description)
+        return write(out / PAGE, with_section((out / PAGE).read_text("utf-8"), section))
     named = [read_object(item, "", index) for index, item in enumerate(settings.scene.meshes)]
     meshes = [load_object(item).mesh for item in named] or [solid("orange", seed) for seed in (0, 1)]
-    findings = _measure(bench, meshes, settings.peers)
-    _write(out, findings, description)
+    _measure(bench, meshes, out, description, without)
 
 
 def _backends() -> tuple[Backend, ...]:
@@ -87,58 +87,54 @@ def _backends() -> tuple[Backend, ...]:
     return tuple(backends)
 
 
-def _mitsuba_starts(asked: bool) -> tuple[bool, list[str]]:
-    """(whether Mitsuba is timed, and why not)."""
+def _without_mitsuba(asked: bool) -> str:
+    """Why Mitsuba is not timed; nothing where it is."""
     if not asked:
-        return False, ["Run with peers=true to time Mitsuba 3, too."]
+        return "Run with peers=true to time Mitsuba 3, too."
     try:
         mitsuba_peer.on_one_thread()
     except InputError as error:
-        return False, [f"{mitsuba_peer.NAME} was not timed: {error}."]
-    return True, []
+        return f"{mitsuba_peer.NAME} was not timed: {error}."
+    return ""
 
 
-def _measure(bench: Bench, meshes: list[Mesh], peers: bool) -> Findings:
+def _measure(bench: Bench, meshes: Sequence[Mesh], out: Path, description: str, without: str) -> None:
+    """Everything. meshes: whose operators are built. description: of the machine. without: why Mitsuba is not timed."""
     plan = bench.plan
-    with_mitsuba, notes = _mitsuba_starts(peers)
     print(f"rasterisers: {', '.join(backend.description for backend in bench.backends)}", flush=True)
-    choices = [
-        panels.light_steps(bench, plan.small),
-        panels.light_steps(bench, plan.large),
-        panels.builds(bench),
-        panels.vertex_steps(bench),
-        *shaped.builds(bench),
-    ]
+    choices, descent = panels.measure(bench), panels.refreshes(bench)
     print("measured: choices", flush=True)
-    compared = [
-        comparison.by_light(bench, plan.small, with_mitsuba),
-        comparison.by_light(bench, plan.large, with_mitsuba),
-    ]
+    by_light = [bench.timed(comparison.by_light(bench, size, not without)) for size in (plan.small, plan.large)]
+    of_vertices, section = vertices.measure(bench, not without, description)
     print("measured: comparisons", flush=True)
-    of_vertices = vertices.measure(bench, with_mitsuba)
-    print("measured: vertices", flush=True)
-    workloads = [*(panels.workloads(bench, axis) for axis in ("size", "vertices")), panels.batches(bench)]
+    workloads = [*(scaling.workloads(bench, axis) for axis in ("size", "vertices")), scaling.batches(bench)]
+    points, reference = scaling.measure(bench), Converged(bench.view(plan.mesh, plan.large))
     print("measured: workloads", flush=True)
-    reference = Converged(bench.view(plan.mesh, plan.large))
-    return Findings(
-        targets=[*targets.by_light(*compared), *targets.measured(bench, meshes)],
-        choices=choices,
-        descent=panels.refreshes(bench),
-        comparisons=compared,
-        vertices=of_vertices,
-        workloads=workloads,
-        savings=skipping.measure(bench, meshes),
-        scaling=scaling.measure(bench),
-        notes=notes,
-        reference=(reference.samples, plan.large, reference.uncertainty(irradiance)),
+    text = filled(
+        __file__,
+        command=command_line(),
+        machine=description,
+        without=without,
+        reference_samples=reference.samples,
+        reference_size=plan.large,
+        small=plan.small,
+        uncertainty=shown(reference.uncertainty(irradiance)),
+        targets=table_of([*targets.by_light(*by_light), *targets.measured(bench, meshes)]),
+        choices=results.defaults(choices),
+        descent=markdown(
+            ["visibility", "ms per step", "final image's error", "share of the cost that is left"],
+            [(row.setting, row.time_ms, row.image_error, row.cost) for row in descent],
+        ),
+        by_light="\n\n".join(map(results.compared, by_light)),
+        vertices=section,
+        savings=skipping.table(bench, meshes),
+        by_lights=", ".join(f"{row.setting} {shown(row.time_ms)} ms" for row in workloads[-1]),
+        by_variables=scaling.table(points),
     )
-
-
-def _write(folder: Path, findings: Findings, description: str) -> None:
-    text = page(findings, command_line(), description)
-    write(folder / PAGE, text)
-    rows = [*results.records(findings.panels), *(asdict(row) for rows in findings.workloads for row in rows)]
-    results.write_csv(folder / "renderer_pareto.csv", rows)
-    results.write_csv(folder / "renderer_scaling.csv", [asdict(point) for point in findings.scaling])
-    figures.draw_fronts(folder / "renderer_pareto.png", findings.panels)
-    figures.draw_scaling(folder / "renderer_scaling.png", findings.scaling, findings.workloads)
+    write(out / PAGE, joined([wrapped(text)]))
+    fronts = [*choices, descent, *by_light, of_vertices]
+    growth = (asdict(row) for rows in workloads for row in rows)
+    results.write_csv(out / "renderer_pareto.csv", [*results.records(fronts), *growth])
+    results.write_csv(out / "renderer_scaling.csv", [asdict(point) for point in points])
+    figures.draw_fronts(out / "renderer_pareto.png", fronts)
+    figures.draw_scaling(out / "renderer_scaling.png", points, workloads)

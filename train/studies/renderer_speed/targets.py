@@ -6,8 +6,8 @@ from renderer.cache import OperatorCache
 from renderer.mesh import Mesh
 from train.report.tables import shown
 from train.studies.renderer_speed import comparison, mitsuba_peer
-from train.studies.renderer_speed.panels import SAMPLES, Bench
-from train.studies.renderer_speed.results import Row
+from train.studies.renderer_speed.bench import SAMPLES, Bench
+from train.studies.renderer_speed.results import Row, times
 from train.studies.renderer_speed.skipping import build_operators
 from train.studies.renderer_speed.steps import light_step, vertex_step
 from train.studies.targets import Target
@@ -18,7 +18,7 @@ def by_light(small: Sequence[Row], large: Sequence[Row]) -> list[Target]:
     asked = {comparison.BY_FACE_KEPT: (10, 30), mitsuba_peer.NAME: (300, 400)}
     panels = [{row.setting: row for row in rows} for rows in (large, small)]
     return [
-        _faster(rows, comparison.DIRECT, peer, least)
+        _faster(rows, comparison.OPERATOR, peer, least)
         for peer, each in asked.items()
         for rows, least in zip(panels, each, strict=True)
     ]
@@ -43,20 +43,14 @@ def _faster(rows: dict[str, Row], ours: str, theirs: str, least: float) -> Targe
     what, asked = f"{own.panel}: {ours}, against {theirs}", f"at least {least}× faster"
     if other is None:
         return Target(what, asked, "not measured", None)
-    ratio, found = other.time_ms / own.time_ms, f"{shown(other.time_ms / own.time_ms)}×"
+    ratio = other.time_ms / own.time_ms
     if theirs != mitsuba_peer.NAME:
-        return Target(what, asked, found, ratio >= least)
-    accurate = _at_most(own.image_error, other.image_error) and _at_most(own.gradient_error, other.gradient_error)
-    errors = f"errors of image and gradient {_errors(own)} against {_errors(other)}"
-    return Target(what, f"{asked}, error no larger", f"{found}, {errors}", ratio >= least and accurate)
-
-
-def _at_most(error: float | None, other: float | None) -> bool:
-    return error is not None and other is not None and error <= other
-
-
-def _errors(row: Row) -> str:
-    return f"{shown(row.image_error)} and {shown(row.gradient_error)}"
+        return Target(what, asked, times(ratio), ratio >= least)
+    errors = [(row.image_error or 0.0, row.gradient_error or 0.0) for row in (own, other)]
+    accurate = all(our <= their for our, their in zip(*errors, strict=True))
+    mine, its = (" and ".join(map(shown, pair)) for pair in errors)
+    found = f"{times(ratio)}, errors of image and gradient {mine} against {its}"
+    return Target(what, f"{asked}, error no larger", found, ratio >= least and accurate)
 
 
 def measured(bench: Bench, meshes: Sequence[Mesh]) -> list[Target]:
@@ -71,8 +65,8 @@ def _any_mesh(bench: Bench) -> Target:
         count: light_step(view, view.operator(bench.plan.workload_samples), bench.light())
         for count, view in views.items()
     }
-    times = bench.clock.medians(steps, 3 * bench.clock.rounds)
-    ratio = times[counts[1]] / times[counts[0]]
+    ms = bench.clock.medians(steps, 3 * bench.clock.rounds)
+    ratio = ms[counts[1]] / ms[counts[0]]
     what = f"light step, {bench.plan.large}²: {counts[1]:,} vertices against {counts[0]:,}"
     return Target(what, "within 10 %", f"{100 * (ratio - 1):+.1f} %", abs(ratio - 1) <= 0.1)
 
@@ -84,11 +78,11 @@ def _geometry(bench: Bench) -> list[Target]:
         comparison.KEPT: vertex_step(view, 1, light, kept=True),
         comparison.REFRESHED: vertex_step(view, 1, light),
     }
-    times = bench.clock.medians(steps, 3 * bench.clock.rounds)
+    ms = bench.clock.medians(steps, 3 * bench.clock.rounds)
     targets = []
     for visibility, most in ((comparison.KEPT, 8), (comparison.REFRESHED, 14)):
-        ratio = times[visibility] / times["light"]
-        found = f"{shown(ratio)}×, {shown(times[visibility])} ms against {shown(times['light'])} ms"
+        ratio = ms[visibility] / ms["light"]
+        found = f"{times(ratio)}, {shown(ms[visibility])} ms against {shown(ms['light'])} ms"
         what = f"vertex step against light step, {view.size}², {visibility}"
         targets.append(Target(what, f"at most {most}×", found, ratio <= most))
     return targets
@@ -96,8 +90,8 @@ def _geometry(bench: Bench) -> list[Target]:
 
 def _building(bench: Bench, meshes: Sequence[Mesh]) -> Target:
     rounds = max(1, bench.clock.rounds // 3)
-    times = bench.clock.medians({"build": lambda: build_operators(bench, meshes, OperatorCache())}, rounds)
-    faces, seconds = " and ".join(f"{len(mesh.faces):,}" for mesh in meshes), times["build"] / 1e3
+    ms = bench.clock.medians({"build": lambda: build_operators(bench, meshes, OperatorCache())}, rounds)
+    faces, seconds = " and ".join(f"{len(mesh.faces):,}" for mesh in meshes), ms["build"] / 1e3
     views, size = len(meshes) * bench.plan.views, bench.plan.small
     what = f"operators of {views} views, {size}², {SAMPLES}² samples, meshes of {faces} faces"
     return Target(what, "under 1.5 s", f"{shown(seconds)} s", seconds < 1.5)

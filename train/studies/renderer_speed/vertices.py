@@ -1,57 +1,61 @@
 """The page's section on attacks that move vertices, which can be measured by itself."""
 
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from functools import partial
+from itertools import product
 
+import numpy as np
+
+from train.command_line.entry_points import command_line
 from train.report.tables import shown
-from train.studies.page import joined
-from train.studies.renderer_speed import comparison, rasterising, targets
-from train.studies.renderer_speed.panels import Bench
-from train.studies.renderer_speed.rasterising import Drawn
-from train.studies.renderer_speed.results import Row, compared
-from train.studies.targets import table_of
+from train.studies.page import filled
+from train.studies.renderer_speed import comparison, targets
+from train.studies.renderer_speed.bench import Bench
+from train.studies.renderer_speed.results import Row, compared, times
+from train.studies.renderer_speed.scenes import CAMERA, ellipsoid
+from train.studies.targets import Target, table_of
 
-WHY_NOT = """\
-Plain autograd sample by sample is `renderer.reference`; face by face it shades each face once, as the analytic
-derivative does, which is the fastest other way that runs here. Rasterising anew is the same work for all: with
-visibility kept, the ratio to that way is {kept}×, and no rasteriser brings it beyond. The light is cut after degree 6
-in the reference too, since that is what all are given.
-"""
+COMPILED, PLAIN = "compiled", "software"
+MOST = 100_000  # vertices, of meshes that are rasterised alone
 
 
-@dataclass(frozen=True)
-class Vertices:
-    """rows: a gradient by the vertices, side by side. drawn: rasterising alone. start: what numba takes at first."""
-
-    rows: Sequence[Row]
-    drawn: Sequence[Drawn]
-    start: str
-
-
-def measure(bench: Bench, with_mitsuba: bool) -> Vertices:
-    rows = comparison.by_vertices(bench, bench.plan.large, with_mitsuba)
-    return Vertices(rows, rasterising.measure(bench), rasterising.starting(bench))
-
-
-def section(found: Vertices, command: str, machine: str) -> str:
-    """In Markdown, headed by the command that measures it."""
-    times = {row.setting: row.time_ms for row in found.rows}
-    kept = times[comparison.BY_FACE_KEPT] / times[f"{comparison.ANALYTIC}, {comparison.KEPT}"]
-    return joined(
-        [
-            "## Vertices",
-            f"`{command}`: {machine}.",
-            table_of([*targets.by_vertices(found.rows), rasterising.target(found.drawn)]),
-            WHY_NOT.format(kept=shown(kept)),
-            compared(found.rows),
-            "One view rasterised, without back faces; `auto` takes `compiled` where numba is and no GPU draws:",
-            rasterising.table(found.drawn),
-            found.start,
-        ]
+def measure(bench: Bench, with_mitsuba: bool, machine: str) -> tuple[list[Row], str]:
+    """(Who takes how long for a gradient by the vertices, the section in Markdown)."""
+    rows = bench.timed(comparison.by_vertices(bench, bench.plan.large, with_mitsuba))
+    taken = {row.setting: row.time_ms for row in rows}
+    section = filled(
+        __file__,
+        command=command_line(),
+        machine=machine,
+        targets=table_of([*targets.by_vertices(rows), _rasterising(bench)]),
+        kept=shown(taken[comparison.BY_FACE_KEPT] / taken[f"{comparison.ANALYTIC}, {comparison.KEPT}"]),
+        rows=compared(rows),
     )
+    return rows, section
 
 
-def put(section: str, page: str) -> str:
-    """The page with this section in place of the one before."""
-    return re.sub(r"^## Vertices$.*?(?=^## )", lambda _: section + "\n", page, count=1, flags=re.M | re.S)
+def _rasterising(bench: Bench) -> Target:
+    """One view of each mesh of the plan, but for the largest, at each size up to the large one."""
+    backends = [each for each in bench.backends if each.name in (COMPILED, PLAIN)]
+    counts = [count for count in bench.plan.vertices if count <= MOST]
+    sizes = [size for size in bench.plan.sizes if size <= bench.plan.large]
+    ratios, unlike = {}, 0
+    for count, size in product(counts, sizes) if len(backends) == 2 else ():
+        mesh = ellipsoid(count)
+        points = CAMERA.project(mesh.vertices)[None]
+        calls = {each.name: partial(each.rasterise, points, mesh.faces, size, closed=True) for each in backends}
+        unlike += int(np.sum(calls[COMPILED]() != calls[PLAIN]()))
+        ms = bench.clock.medians(calls)
+        ratios[f"{len(mesh.faces):,} faces, {size}²"] = ms[PLAIN] / ms[COMPILED]
+    return compiled(ratios, unlike)
+
+
+def compiled(ratios: Mapping[str, float], unlike: int) -> Target:
+    """How many times as fast as the plain one the compiled rasteriser is, by what is drawn, if it is there; and in how
+    many samples they differ."""
+    what, asked = "rasterising alone: compiled against software", "at least 3× faster, the same samples"
+    if not ratios:
+        return Target(what, asked, "not measured", None)
+    (slow, least), *_, (fast, most) = sorted(ratios.items(), key=lambda each: each[1])
+    found = f"{times(least)} ({slow}) to {times(most)} ({fast}), {unlike or 'no'} samples differ"
+    return Target(what, asked, found, least >= 3 and not unlike)
