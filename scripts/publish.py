@@ -5,7 +5,7 @@ from pathlib import Path
 
 from train.command_line.entry_points import script
 from train.command_line.outputs import writable_folder
-from train.report.summary import publish_run
+from train.report.card import publish_run
 
 
 @dataclass

@@ -17,8 +17,8 @@ from renderer.environment import read_map, write_map
 from renderer.errors import InputError
 from renderer.lights import load_light, probe, save_light
 from train.data import load_npz
-from train.photographs import Photograph, find_photographs, load_photographs
 from train.photographs.answers import ANSWERS, Answer, read_answers, write_answers
+from train.photographs.folder import Photograph, find_photographs, load_photographs
 from train.run_folder.checkpoint import BEST, save
 from train.run_folder.classifier import PUBLISHED, describe, load_run, publish
 from train.run_folder.files import read_config, read_json, read_numbers

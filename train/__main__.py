@@ -19,7 +19,8 @@ from train.data import DataSet
 from train.distributed import announce, announced, first_process_first, process_group
 from train.experiment import load_data, prepare, write_images
 from train.interruption import Interrupted
-from train.report.summary import format_table, summarise
+from train.report.overview import format_table
+from train.report.summary import summarise
 from train.report.write import report_of
 from train.run_folder.files import sole_writer
 from train.run_folder.logs import console

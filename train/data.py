@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.seeding import generator
 from renderer.errors import InputError
 from train.classes import class_index
-from train.photographs import find_photographs, is_hidden, left_out, load_photographs
+from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
 from train.run_folder.logs import console
 
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # no names of classes

@@ -33,14 +33,10 @@ from train.fit.evaluation import evaluate
 from train.fit.resumption import resume
 from train.fit.trainer import Trainer
 from train.networks import build_network
-from train.photographs import (
-    FIGURES,
-    evaluate_photographs,
-    find_figure,
-    find_photographs,
-    format_summary,
-    require_outside,
-)
+from train.photographs.figures import FIGURES, find_figure
+from train.photographs.folder import find_photographs, require_outside
+from train.photographs.scoring import evaluate_photographs
+from train.photographs.text import format_summary
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import checkpoint
 from train.run_folder.classifier import describe, start_from

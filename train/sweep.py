@@ -29,7 +29,8 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from train.command_line.entry_points import one_sentence, one_sentence_errors
 from train.experiment import load_data, run, write_images
-from train.report.summary import format_spread, format_table, is_finished, summarise
+from train.report.overview import format_spread, format_table
+from train.report.summary import is_finished, summarise
 from train.report.write import report_of
 from train.run_folder import checkpoint
 from train.run_folder.files import FAILURE, locked, state

@@ -113,7 +113,7 @@ def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, ca
     def work(*arguments, **more):
         raise AssertionError("the work was begun")
 
-    for name in ("train.photographs.evaluate_photographs", "train.report.summary.publish_run",
+    for name in ("train.photographs.scoring.evaluate_photographs", "train.report.card.publish_run",
                  "renderer.environment.to_map", "renderer.skylight.fit_polynomials"):  # fmt: skip
         monkeypatch.setattr(name, work)
     suffix = ".hdr" if command is EXPORT else ""

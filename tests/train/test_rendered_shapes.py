@@ -9,7 +9,7 @@ from renderer.cache import TensorCache
 from renderer.errors import InputError
 from renderer.harmonics import irradiance_basis, live_coefficients
 from train import rendered_shapes
-from train.photographs import find_photographs, load_photographs
+from train.photographs.folder import find_photographs, load_photographs
 from train.rendered_shapes import CLASSES, SOURCE, even_light, hard_light, load_shapes, write_held_out
 
 SIZE = 8

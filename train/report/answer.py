@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from statistics import fmean
 
 from renderer.errors import InputError
-from train.photographs import figure_title
-from train.photographs.figures import OVERALL
+from train.photographs.figures import OVERALL, figure_title
 from train.report.arms import Arms, Score
 from train.report.attacks import Attack
 from train.report.comparison import difference, read_evaluations
-from train.report.photographs import Scored, scored, scored_on, scores_of
+from train.report.photographs import scored, scored_on, scores_of
 
 RATE = "recall_at/0.10"  # what tells discernment: recall at equal false alarms
 
@@ -18,8 +17,7 @@ def of_runs(arms: Arms, name: str) -> str:
     """About all arms, and the last beside the first, on the images `name`, or on the test set where there are none."""
     runs = scored(arms, name)
     if not runs:
-        accuracies = {arm: [run.summary.scores["test/accuracy"] for run in group] for arm, group in arms.items()}
-        told = ", ".join(f"{arm} {fmean(values):.3f}" for arm, values in accuracies.items())
+        told = ", ".join(f"{arm} {fmean(run.accuracy for run in group):.3f}" for arm, group in arms.items())
         return f"Asked: what do {len(arms)} ways of training reach on the test set? Answered: accuracy {told}."
     first = next(iter(runs.values()))[0]
     scores = [scores_of(runs, name, figure) for figure in ("recall", "false_alarms", "auc")]
@@ -41,7 +39,7 @@ def _told(recall: Score | None, alarms: Score | None, auc: Score | None) -> str:
     return ", ".join(filter(None, parts)) or "has no score"
 
 
-def _difference(runs: Scored, name: str) -> str:
+def _difference(runs: Arms, name: str) -> str:
     if len(runs) < 2:
         return ""
     (reference, base), *_, (arm, group) = runs.items()

@@ -5,22 +5,19 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from train.photographs import format_interval
-from train.report.folders import FinishedRun, Run
+from train.photographs.text import format_interval
 from train.report.summary import RunSummary, group_by_settings, name_among, varied_settings
 from train.report.tables import Table
 
 MOST_ARMS, MOST_SEEDS = 6, 5  # that are drawn and compared
 MOST_NAMED, LONGEST_NAME = 30, 36  # arms by their settings, and characters of such a name
-Arms = Mapping[str, Sequence[FinishedRun]]
+Arms = Mapping[str, Sequence[RunSummary]]
 
 
-def arms_of(runs: Sequence[Run]) -> dict[str, list[FinishedRun]]:
-    """The finished runs by arm and the settings that tell it apart; by number where those are many or long."""
-    by_folder = {run.folder: run for run in runs if isinstance(run, FinishedRun)}
-    groups = group_by_settings([run.summary for run in by_folder.values()])
-    names = _names([group[0] for group in groups])
-    return {name: [by_folder[run.folder] for run in group] for name, group in zip(names, groups, strict=True)}
+def arms_of(runs: Sequence[RunSummary]) -> Arms:
+    """The runs by arm and the settings that tell it apart; by number where those are many or long."""
+    groups = group_by_settings(runs)
+    return dict(zip(_names([group[0] for group in groups]), groups, strict=True))
 
 
 def _names(heads: Sequence[RunSummary]) -> list[str]:
@@ -31,14 +28,14 @@ def _names(heads: Sequence[RunSummary]) -> list[str]:
     return [f"{number}: {head.arm}" for number, head in enumerate(heads, 1)]
 
 
-def drawn(arms: Arms) -> dict[str, Sequence[FinishedRun]]:
+def drawn(arms: Arms) -> Arms:
     """The first MOST_ARMS, MOST_SEEDS of each."""
     return {name: runs[:MOST_SEEDS] for name, runs in [*arms.items()][:MOST_ARMS]}
 
 
 def settings_table(arms: Arms) -> Table:
     """What the arms differ in, a row each; without rows where it is the seed alone."""
-    heads = {name: runs[0].summary for name, runs in arms.items()}
+    heads = {name: runs[0] for name, runs in arms.items()}
     varied = varied_settings([*heads.values()])
     rows = [[name, *(str(head.settings.get(key)) for key in varied)] for name, head in heads.items()]
     return Table("What the arms differ in", ["arm", *varied], rows if varied else [])

@@ -8,10 +8,20 @@ from typing import Any
 import numpy as np
 
 from renderer.errors import InputError
-from train.photographs import FIGURES, figure_title, format_interval
 from train.photographs.answers import ANSWERS, Answer, read_answers
 from train.photographs.bootstrap import interval, replicate_difference
-from train.photographs.figures import OVERALL, Pool, figures, find_figure, pool_all, pool_answers, replicate_figures
+from train.photographs.figures import (
+    FIGURES,
+    OVERALL,
+    Pool,
+    figure_title,
+    figures,
+    find_figure,
+    pool_all,
+    pool_answers,
+    replicate_figures,
+)
+from train.photographs.text import format_interval
 from train.report.summary import RunSummary, complete, group_by_settings, name_among
 from train.report.tables import Table
 from train.run_folder.logs import PHASES
@@ -92,13 +102,7 @@ def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], sou
 
 
 def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str = PHOTOGRAPHS) -> str:
-    """`comparison_tables` as Markdown."""
-    tables = comparison_tables(runs, exclude, photographs)
-    return "\n\n".join(f"### {table.title}\n\n{table}" for table in tables)
-
-
-def comparison_tables(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str) -> list[Table]:
-    """Tables of runs: accuracy, figures on photographs by source, and seconds per epoch and phase.
+    """Tables of runs as Markdown: accuracy, figures on photographs by source, and seconds per epoch and phase.
 
     Runs that differ only in the seed are a group; a table for each group shows how far it is from the first one.
     exclude: sources that the pooled figures leave out; photographs: the sub-folder of each run with its scores.
@@ -115,7 +119,7 @@ def comparison_tables(runs: Sequence[RunSummary], exclude: Sequence[str], photog
             *(_figure_table(evaluations, name, pooled) for name in FIGURES),
             *difference_tables(evaluations, pooled),
         ]
-    return tables
+    return "\n\n".join(f"### {table.title}\n\n{table}" for table in tables)
 
 
 def _accuracy_table(runs: Sequence[RunSummary]) -> Table:
@@ -124,7 +128,7 @@ def _accuracy_table(runs: Sequence[RunSummary]) -> Table:
         [
             run.arm,
             str(run.config.seed),
-            f"{run.scores['test/accuracy']:.4f}",
+            f"{run.accuracy:.4f}",
             str(run.scores["test/epoch"]),
             f"{run.scores['test/accuracy_last']:.4f}",
         ]
@@ -178,10 +182,11 @@ def _format_difference(figure: dict[str, Any]) -> str:
 def _seconds_table(runs: Sequence[RunSummary]) -> Table:
     """Means per epoch; the operators are built once a run. The own share is the attack outside the classifier."""
     header = ["augment", *PHASES, "attack's own share", "attack's share of the epoch", "operators, once"]
-    return Table("Seconds per epoch", header, [[run.arm, *_seconds_row(run.seconds)] for run in runs])
+    return Table("Seconds per epoch", header, [[run.arm, *_seconds_row(run)] for run in runs])
 
 
-def _seconds_row(seconds: dict[str, float]) -> list[str]:
+def _seconds_row(run: RunSummary) -> list[str]:
+    seconds = run.seconds
     phases = [f"{seconds[phase]:.2f}" for phase in PHASES]
     if "attack_classifier" not in seconds:
         return [*phases, "-", "-", "-"]
@@ -189,6 +194,6 @@ def _seconds_row(seconds: dict[str, float]) -> list[str]:
     return [
         *phases,
         f"{own:.1%}",
-        f"{seconds['attack'] / sum(seconds[phase] for phase in PHASES):.1%}",
+        f"{seconds['attack'] / run.epoch_seconds:.1%}",
         f"{seconds['operators']:.2f}",
     ]

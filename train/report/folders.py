@@ -18,47 +18,63 @@ DEPTH = 4  # folders below the one that is named
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run's folder. summary: of a `FinishedRun`; else state says what became of it. epochs: its lines of metrics."""
+class UnfinishedRun:
+    """The folder of a run without final scores. state: what became of it. epochs: its lines of metrics."""
 
     folder: Path
     state: str
-    summary: RunSummary | None = None
     epochs: list[dict[str, float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
-class FinishedRun(Run):
-    """One that has its final scores."""
+class Found:
+    """What lies in folders. runs: by arm, so that others are compared with none. problems: of damaged attacks."""
 
-    summary: RunSummary
+    runs: list[RunSummary] = field(default_factory=list)
+    unfinished: list[UnfinishedRun] = field(default_factory=list)
+    attacks: list[Attack] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
 
 
-def find(folders: Sequence[Path]) -> tuple[list[Run], list[Attack], list[str]]:
-    """The runs and attacks in folders and below them, and a sentence on each that cannot be read.
+def find(folders: Sequence[Path]) -> Found:
+    """The runs and attacks in folders and below them, with a sentence on each that cannot be read.
 
-    InputError for a folder that is missing, and where there is nothing.
+    InputError for a folder that is missing, and where there is nothing, or nothing that can be read.
     """
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"runs: {folder} is no folder: give those of runs, of a sweep or of attacks")
-    found = list(dict.fromkeys(path for folder in folders for path in _walk(folder)))
-    runs = sorted((_read_run(path) for path in found if not (path / LINES).is_file()), key=_arm)
-    attacks, problems = [], []
-    for path in found:
-        if (path / LINES).is_file():
-            try:
-                attacks.append(read_attack(path))
-            except InputError as error:
-                problems.append(str(error))
-    if not (runs or attacks or problems):
+    paths = list(dict.fromkeys(path for folder in folders for path in _walk(folder)))
+    found, damaged = Found(), []
+    for path in paths:
+        try:
+            _read(path, found)
+        except InputError as error:
+            damaged.append(error)
+            if (path / LINES).is_file():
+                found.problems.append(str(error))
+            else:
+                found.unfinished.append(UnfinishedRun(path, f"cannot be read: {error}"))
+    if not paths:
         raise InputError(f"runs: {', '.join(map(str, folders))} holds no run and no attack: give other folders")
-    return runs, attacks, problems
+    if len(damaged) == len(paths):
+        raise InputError(f"runs: none of {len(paths)} can be read, the first since {damaged[0]}")
+    found.runs.sort(key=lambda run: ARMS.index(run.arm) if run.arm in ARMS else len(ARMS))
+    return found
 
 
-def _arm(run: Run) -> int:
-    """The place of its arm, so that others are compared with none."""
-    return ARMS.index(run.summary.arm) if run.summary and run.summary.arm in ARMS else len(ARMS)
+def _read(path: Path, found: Found) -> None:
+    if (path / LINES).is_file():
+        found.attacks.append(read_attack(path))
+    elif is_finished(path):
+        found.runs.append(summarise(path))
+    else:
+        try:
+            become = state(path)
+        except OSError as error:  # the lock, in a folder that others own
+            become = f"not finished ({error.strerror})"
+        epochs = [line for line in read_metrics(path) if "epoch" in line]
+        found.unfinished.append(UnfinishedRun(path, become, epochs))
 
 
 def _walk(folder: Path) -> Iterator[Path]:
@@ -71,15 +87,3 @@ def _walk(folder: Path) -> Iterator[Path]:
         is_begun = CONFIG in files and "train.log" in files
         if LINES in files or is_run or is_begun:
             yield path
-
-
-def _read_run(folder: Path) -> Run:
-    try:
-        epochs = [line for line in read_metrics(folder) if "epoch" in line]
-        if is_finished(folder):
-            return FinishedRun(folder, "finished", summarise(folder), epochs)
-        return Run(folder, state(folder), None, epochs)
-    except InputError as error:
-        return Run(folder, f"cannot be read: {error}")
-    except OSError as error:  # the lock, in a folder that others own
-        return Run(folder, f"not finished ({error.strerror})")

@@ -35,7 +35,7 @@ def headline(arms: Arms, name: str) -> Illustration | None:
     pairs = next((found for group in reversed([*arms.values()]) if (found := turned(group[0].folder, EXAMPLES))), [])
     if not pairs:
         return None
-    first = next(iter(arms.values()))[0].summary
+    first = next(iter(arms.values()))[0]
     label, where = first.config.label, f"on {scored_on(first, name)}"
     scores = {title: scores_of(scored(arms, name), name, figure) for figure, title in FIGURES.items()}
     scores = {title: found for title, found in scores.items() if found}

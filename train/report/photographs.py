@@ -6,10 +6,10 @@ from typing import Any
 
 from renderer.errors import InputError
 from train.command_line.configuration import as_dict
-from train.photographs import figure_title, find_figure, format_interval
 from train.photographs.answers import ANSWERS, read_answers
-from train.photographs.figures import pool_all
+from train.photographs.figures import figure_title, find_figure, pool_all
 from train.photographs.ranking import Ranking
+from train.photographs.text import format_interval
 from train.report import images, plots
 from train.report.arms import Arms, Score, score
 from train.report.blocks import Block, Gallery, Illustration, Section
@@ -20,23 +20,22 @@ from train.settings import PHOTOGRAPHS
 
 FIGURES = ("recall", "false_alarms", "auc", "recall_at/0.10")
 MOST_SOURCES = 30
-Scored = Mapping[str, Sequence[RunSummary]]  # by arm
 ByArm = dict[str, Score | None]
 
 
 def scored(arms: Arms, name: str) -> dict[str, list[RunSummary]]:
     """The arms with the runs of each that were scored on the images `name`."""
-    found = {arm: [run.summary for run in runs if name in run.summary.photographs] for arm, runs in arms.items()}
+    found = {arm: [run for run in runs if name in run.photographs] for arm, runs in arms.items()}
     return {arm: runs for arm, runs in found.items() if runs}
 
 
 def most_scored(arms: Arms) -> str:
     """The name of the images that most arms were scored on, first PHOTOGRAPHS."""
-    names = sorted({name for runs in arms.values() for run in runs for name in run.summary.photographs})
+    names = sorted({name for runs in arms.values() for run in runs for name in run.photographs})
     return max(names, key=lambda name: (len(scored(arms, name)), name == PHOTOGRAPHS), default=PHOTOGRAPHS)
 
 
-def scores_of(runs: Scored, name: str, figure: str) -> dict[str, Score]:
+def scores_of(runs: Arms, name: str, figure: str) -> dict[str, Score]:
     """A figure on the images `name`, of the arms that have it."""
     found = {
         arm: score(find_figure(run.photographs.get(name, {}), figure) for run in group) for arm, group in runs.items()
@@ -52,7 +51,7 @@ def sections(arms: Arms, name: str) -> Iterator[Section]:
     yield Section(f"{name}: hits and misses", shown)
 
 
-def _by_source(runs: Scored, name: str) -> Iterator[Block]:
+def _by_source(runs: Arms, name: str) -> Iterator[Block]:
     every = [run for group in runs.values() for run in group]
     label = every[0].config.label
     try:
@@ -67,7 +66,7 @@ def _by_source(runs: Scored, name: str) -> Iterator[Block]:
         yield str(error)
 
 
-def _scores(runs: Scored, name: str) -> dict[str, dict[str, ByArm]]:
+def _scores(runs: Arms, name: str) -> dict[str, dict[str, ByArm]]:
     """By figure, source and arm, without the sources that have none of a figure."""
     parts = {arm: [_parts(run, name) for run in group] for arm, group in runs.items()}
     sources = [*dict.fromkeys(source for group in parts.values() for part in group for source in part)][:MOST_SOURCES]
@@ -93,7 +92,7 @@ def _parts(run: RunSummary, name: str) -> dict[str, dict[str, Any]]:
 
 
 def _plots(
-    runs: Scored, scores: Mapping[str, Mapping[str, ByArm]], name: str, label: str
+    runs: Arms, scores: Mapping[str, Mapping[str, ByArm]], name: str, label: str
 ) -> Iterator[Illustration | None]:
     rankings = {arm: [*_rankings(group, name, label)] for arm, group in runs.items()}
     yield plots.roc(rankings, label, "ROC")

@@ -9,24 +9,25 @@ from train.report import images, photographs, plots
 from train.report.arms import Arms, drawn, settings_table
 from train.report.blocks import Block, Code, Gallery, Section
 from train.report.command import training_command
-from train.report.folders import Run
-from train.report.summary import RunSummary, headline_tables, spread_tables, varied_settings
+from train.report.folders import UnfinishedRun
+from train.report.overview import run_tables, spread_tables
+from train.report.summary import RunSummary
 from train.report.tables import Table
 from train.run_folder.logs import PHASES
 
 MOST_ROWS, MOST_UNFINISHED = 30, 3  # rows of a table, and lines in plots
 LONGEST_NAME = 24  # characters of an unfinished run's folder in a legend
+Run = RunSummary | UnfinishedRun
 Lines = Mapping[str, Sequence[Run]]  # by arm, and those that are under way
 
 
-def of_runs(runs: Sequence[Run], arms: Arms) -> Iterator[Section]:
-    """Tables of all `arms`, as `arms_of` makes them of the runs; plots and images of those that are drawn."""
-    if arms:
-        yield Section("Arms", [*_tables(arms)])
-    yield _states(runs)
+def of_runs(arms: Arms, unfinished: Sequence[UnfinishedRun]) -> Iterator[Section]:
+    """Tables of all `arms`, as `arms_of` makes them of runs; plots and images of those that are drawn."""
+    yield Section("Arms", [*_tables(arms)])
+    yield _states(unfinished)
     few = drawn(arms)
-    yield _training(runs, few)
-    for name in sorted({name for group in few.values() for run in group for name in run.summary.photographs}):
+    yield _training(few, unfinished)
+    for name in sorted({name for group in few.values() for run in group for name in run.photographs}):
         yield from photographs.sections(few, name)
     yield Section("Renders", [images.renders(group[0].folder, arm) for arm, group in few.items()])
     yield _fooled(few)
@@ -35,39 +36,31 @@ def of_runs(runs: Sequence[Run], arms: Arms) -> Iterator[Section]:
 
 def _tables(arms: Arms) -> Iterator[Block]:
     """Means over seeds, a row for each run, and what the arms differ in."""
-    every = [(arm, run.summary) for arm, group in arms.items() for run in group]
-    names, runs = zip(*every, strict=True)
-    several = [arm for arm, group in arms.items() if len(group) > 1]
-    yield from _with_names(spread_tables(runs), several, runs)
-    yield from _with_names(headline_tables(runs[:MOST_ROWS]), names[:MOST_ROWS], runs[:MOST_ROWS])
+    several = {arm: group for arm, group in arms.items() if len(group) > 1}
+    seeds = [[arm, str(len(group))] for arm, group in several.items()]
+    every = [(arm, run) for arm, group in arms.items() for run in group]
+    names = [[arm, str(run.config.seed)] for arm, run in every[:MOST_ROWS]]
+    yield from map(_cut, spread_tables(["arm", "seeds"], seeds, [*several.values()]))
+    yield from run_tables(["arm", "seed"], names, [run for _, run in every[:MOST_ROWS]])
     yield _cut(settings_table(arms))
-    told = [f"{run.folder}: {arm}, seed {run.config.seed}, {run.scores['test/accuracy']:.3f}" for arm, run in every]
+    told = [f"{run.folder}: {arm}, seed {run.config.seed}, {run.accuracy:.3f}" for arm, run in every]
     yield Code(f"folders and test accuracy of all {len(every)} finished runs", "\n".join(told))
-
-
-def _with_names(tables: Sequence[Table], names: Sequence[str], runs: Sequence[RunSummary]) -> Iterator[Table]:
-    """The tables of `runs` with the names of the arms in the place of their settings."""
-    columns = 1 + len(varied_settings(runs))
-    for table in tables:
-        rows = [[name, *row[columns:]] for name, row in zip(names, table.rows, strict=True)]
-        yield _cut(Table(table.title, ["arm", *table.header[columns:]], rows))
 
 
 def _cut(table: Table) -> Table:
     return Table(table.title, table.header, table.rows[:MOST_ROWS])
 
 
-def _states(runs: Sequence[Run]) -> Section:
-    others = [run for run in runs if not run.summary]
-    rows = [[str(run.folder), run.state, len(run.epochs)] for run in others[:MOST_ROWS]]
-    more = [f"{run.folder}: {run.state}" for run in others[MOST_ROWS:]]
+def _states(runs: Sequence[UnfinishedRun]) -> Section:
+    rows = [[str(run.folder), run.state, len(run.epochs)] for run in runs[:MOST_ROWS]]
+    more = [f"{run.folder}: {run.state}" for run in runs[MOST_ROWS:]]
     table = Table("", ["run", "state", "epochs"], rows)
     return Section("Runs that are not finished", [table, Code(f"{len(more)} more", "\n".join(more))])
 
 
-def _training(runs: Sequence[Run], arms: Arms) -> Section:
-    unfinished = islice((run for run in runs if not run.summary and run.epochs), MOST_UNFINISHED)
-    under_way = {f"unfinished: {run.folder.name[-LONGEST_NAME:]}": [run] for run in unfinished}
+def _training(arms: Arms, unfinished: Sequence[UnfinishedRun]) -> Section:
+    begun = islice((run for run in unfinished if run.epochs), MOST_UNFINISHED)
+    under_way = {f"unfinished: {run.folder.name[-LONGEST_NAME:]}": [run] for run in begun}
     lines: Lines = {**arms, **under_way}
     drawn = [
         plots.curves(_series(lines, "train/accuracy"), "accuracy, training", "epoch"),
@@ -77,12 +70,12 @@ def _training(runs: Sequence[Run], arms: Arms) -> Section:
         plots.curves(_series(lines, "augment/steps"), "steps of the attack", "epoch", None),
     ]
     seconds = [
-        [arm, *(_rounded(group[0].summary.seconds.get(phase)) for phase in (*PHASES, "operators"))]
+        [arm, *(_rounded(group[0].seconds.get(phase)) for phase in (*PHASES, "operators"))]
         for arm, group in arms.items()
     ]
     table = Table("Seconds per epoch, and once for the operators", ["arm", *PHASES, "operators"], seconds)
     gallery = Gallery("", [image for image in drawn if image])
-    return Section("Over the epochs", [gallery, *([table] if seconds else [])])
+    return Section("Over the epochs", [gallery, table])
 
 
 def _rounded(seconds: float | None) -> str:
@@ -110,7 +103,7 @@ def _fooled(arms: Arms) -> Section:
 
 
 def _reproduction(arms: Arms) -> Section:
-    heads = {arm: group[0].summary for arm, group in arms.items()}
+    heads = {arm: group[0] for arm, group in arms.items()}
     commands = "\n\n".join(f"# {arm}\n{training_command(run.config)}" for arm, run in heads.items())
     configs = [Code(f"configuration: {arm}", OmegaConf.to_yaml(run.config)) for arm, run in heads.items()]
-    return Section("To reproduce", [Code("commands", commands), *configs] if heads else [])
+    return Section("To reproduce", [Code("commands", commands), *configs])

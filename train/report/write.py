@@ -27,19 +27,19 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
 
     Returns the page. What cannot be read is named in it. InputError as of `find`.
     """
-    runs, attacks, problems = find(folders)
-    arms = arms_of(runs)
+    found = find(folders)
+    arms = arms_of(found.runs)
     few, top = drawn(arms), None
-    told = [answer.of_attacks(attacks)] if attacks else []
+    told = [answer.of_attacks(found.attacks)] if found.attacks else []
     if few:
         name = photographs.most_scored(few)
         top = headline(few, name)
         told.insert(0, answer.of_runs(few, name))
-    first = Section("In short", [*told, *([Gallery("", [top])] if top else []), *problems])
-    parts = [first, *(sections.of_runs(runs, arms) if runs else ()), *attack_sections(attacks)]
+    first = Section("In short", [*told, Gallery("", [top] if top else []), *found.problems])
+    parts = [first, *sections.of_runs(arms, found.unfinished), *attack_sections(found.attacks)]
     parts = [part for part in map(_without_empty, parts) if part.blocks]
-    done = sum(run.summary is not None for run in runs)
-    about = f"{done} of {len(runs)} runs finished, {len(attacks)} attacks"
+    done, every = len(found.runs), len(found.runs) + len(found.unfinished)
+    about = f"{done} of {every} runs finished, {len(found.attacks)} attacks"
 
     out.mkdir(parents=True, exist_ok=True)
     if top:

@@ -11,7 +11,7 @@ from renderer.errors import InputError
 from renderer.shapes import LOOK_ALIKES, SOLIDS
 from train.laboratory.folder import read_subject, write_laboratory
 from train.laboratory.settings import LabSettings
-from train.photographs import find_photographs, load_photographs
+from train.photographs.folder import find_photographs, load_photographs
 
 pytest.importorskip("mitsuba")
 

@@ -1,8 +1,8 @@
 import numpy as np
 from PIL import Image
 
-from train.photographs import evaluate_photographs
 from train.photographs.contact_sheet import CELL, FRAME, IMAGE, Section, Tile, draw_contact_sheet
+from train.photographs.scoring import evaluate_photographs
 
 FRAMES = {"hits": (46, 158, 91), "misses": (208, 59, 59), "false alarms": (232, 163, 23)}
 

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from renderer.errors import InputError
-from train.photographs import Photograph, find_photographs, left_out, load_photographs
+from train.photographs.folder import Photograph, find_photographs, left_out, load_photographs
 
 CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
 DATA = Path(__file__).parents[4] / "shared" / "data"

@@ -6,9 +6,9 @@ import pytest
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from train.photographs import evaluate_photographs
 from train.photographs.ranking import Ranking
 from train.photographs.roc import draw_roc
+from train.photographs.scoring import evaluate_photographs
 
 
 def read_curves(path) -> dict[str, list[tuple[float, float, float]]]:

@@ -11,8 +11,9 @@ from scipy.special import logsumexp, softmax
 from scipy.stats import binomtest
 
 from renderer.errors import InputError
-from train.photographs import evaluate_photographs, format_summary
 from train.photographs.answers import read_answers
+from train.photographs.scoring import evaluate_photographs
+from train.photographs.text import format_summary
 
 
 def share(hits: int, n: int) -> dict:

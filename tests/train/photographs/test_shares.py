@@ -1,7 +1,7 @@
 import pytest
 from scipy.stats import binomtest
 
-from train.photographs import share
+from train.photographs.shares import share
 
 
 @pytest.mark.parametrize(

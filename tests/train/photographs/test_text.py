@@ -1,4 +1,5 @@
-from train.photographs import evaluate_photographs, format_summary
+from train.photographs.scoring import evaluate_photographs
+from train.photographs.text import format_summary
 
 
 def test_the_terminal_table_is_aligned_and_complete(story, tmp_path):

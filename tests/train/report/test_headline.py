@@ -8,9 +8,8 @@ from PIL import Image
 
 from augment.specimens import Specimens
 from train.photographs.shares import share
-from train.report.folders import FinishedRun
 from train.report.headline import headline
-from train.report.summary import summarise
+from train.report.summary import RunSummary, summarise
 from train.run_folder.specimens import write_specimens
 
 AUC = {"value": 0.9, "low": 0.8, "high": 1.0}
@@ -29,13 +28,13 @@ def keep_specimens(folder: Path, epoch: int, before: list[float], after: list[fl
 def arm(made_up_run, tmp_path):
     """The runs of an arm, a seed for each pair of hits and false alarms among ten."""
 
-    def make(name: str, *counts: tuple[int, int], overrides: Sequence[str] = ()) -> list[FinishedRun]:
+    def make(name: str, *counts: tuple[int, int], overrides: Sequence[str] = ()) -> list[RunSummary]:
         runs = []
         for seed, (hits, alarms) in enumerate(counts):
             scores = {"recall": share(hits, 10), "false_alarms": share(alarms, 10), "auc": AUC}
             folder, settings = tmp_path / f"{name}{seed}", [f"seed={seed}", "evaluate.photos=/data/a", *overrides]
             made_up_run(folder, name, {"photographs": scores}, *settings)
-            runs.append(FinishedRun(folder, "finished", summarise(folder)))
+            runs.append(summarise(folder))
         return runs
 
     return make

@@ -129,6 +129,17 @@ def test_where_there_is_nothing_one_sentence_says_so(tmp_path):
     assert report_of([tmp_path / "no"], tmp_path).startswith("no report: runs: ")
 
 
+def test_where_nothing_can_be_read_one_sentence_says_why(tmp_path):
+    """A run that cannot be read beside one that can is named in the page."""
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.jsonl").write_bytes(b"\xff{\n")
+    with pytest.raises(InputError, match=rf"^runs: none of 2 can be read, the first since {tmp_path}/a/metrics.jsonl"):
+        write_report([tmp_path], tmp_path)
+    (tmp_path / "b" / "metrics.jsonl").write_text("")
+    assert "/a</td><td" in write_report([tmp_path], tmp_path).read_text()
+
+
 def test_a_fault_of_the_report_is_told_with_its_place_and_raises_nothing(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(plots, "curves", lambda *_: 1 / 0)
     first, *frames, last = report_of([finished], tmp_path).strip().splitlines()

@@ -11,8 +11,10 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
+from train.report.card import publish_run
 from train.report.comparison import format_comparison
-from train.report.summary import format_table, publish_run, summarise
+from train.report.overview import format_table
+from train.report.summary import summarise
 from train.run_folder.files import LOCK, read_config, read_numbers, sole_writer
 
 SCORES = {"test/accuracy": 0.5, "test/accuracy_last": 0.4, "test/epoch": 1}
