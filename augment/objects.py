@@ -175,7 +175,7 @@ def _load(item: MeshSettings) -> Mesh:
     mesh = _read(item)
     if item.color is None:
         return mesh
-    if not mesh.uncolored:
+    if mesh.textures or (mesh.corner_colors != 1).any():
         raise InputError(f"{item.mesh} brings colours of its own: leave color out; gain brightens or dims them")
     return Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
 

@@ -73,12 +73,9 @@ def as_device(device: torch.device | str) -> torch.device:
 
 
 def _require(name: str, value: object, annotation: Any, module: str) -> None:
-    if annotation is not Parameter.empty and not _fits(value, _hint(annotation, module)):
+    hint = _evaluated(annotation, module) if isinstance(annotation, str) else annotation
+    if hint is not Parameter.empty and not _fits(value, hint):
         raise InputError(f"{name} is {_described(value)}: give {_words(annotation)}")
-
-
-def _hint(annotation: Any, module: str) -> object:
-    return _evaluated(annotation, module) if isinstance(annotation, str) else annotation
 
 
 @cache

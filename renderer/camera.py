@@ -42,10 +42,8 @@ class Camera(ABC):
         require_fields(self)
         require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
         require_range("a camera's reach", self.reach, 1 / LARGEST, LARGEST)
-        if not (math.isfinite(self.polar) and math.isfinite(self.azimuth)):
-            raise InputError(f"camera angles polar={self.polar}, azimuth={self.azimuth}: give finite ones, in radians")
-        if not (abs(self.right) <= LARGEST and abs(self.up) <= LARGEST):  # NaN is not
-            raise InputError(f"camera place right={self.right}, up={self.up}: give lengths of at most {LARGEST:g}")
+        for name in ("polar", "azimuth", "right", "up"):
+            require_range(f"a camera's {name}", getattr(self, name), -LARGEST, LARGEST)
 
     @property
     def near(self) -> float:

@@ -1,5 +1,6 @@
 """The one exception for what a user can mend, and the checks that keep NaN and the absurd out."""
 
+import os
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -24,8 +25,8 @@ def is_out_of_memory(error: Exception) -> bool:
 
 def require_file(path: Path, advice: str) -> None:
     """InputError naming what is no regular file: a pipe would be waited for."""
-    if not path.is_file():
-        raise InputError(f"{path} {'is no file' if path.exists() else 'does not exist'}: {advice}")
+    if not os.path.isfile(path):  # False, too, where the name is none or its folder closed
+        raise InputError(f"{path} {'is no file' if os.path.exists(path) else 'does not exist'}: {advice}")
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:

@@ -106,9 +106,8 @@ class Fragments:
         starts = torch.ones_like(self.pixel, dtype=torch.bool)
         starts[1:] = (self.pixel[1:] != self.pixel[:-1]) | (self.face[1:] != self.face[:-1])
         run = starts.cumsum(0) - 1
-        count = (
-            int(run[-1]) + 1
-        )  # which the samples of a run agree on is written once for each: a fifth of nonzero's time
+        count = int(run[-1]) + 1
+        # What the samples of a run agree on is written once for each: a fifth of nonzero's time.
         pixel, face = (each.new_empty(count).scatter_(0, run, each) for each in (self.pixel, self.face))
         return pixel, face, run
 

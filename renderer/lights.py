@@ -15,6 +15,7 @@ from renderer.basis import HARMONICS, Basis
 from renderer.environment import SUFFIXES, read_panorama
 from renderer.errors import FACTOR, InputError, require_bounded, require_file
 from renderer.harmonics import basis, live_coefficients, project, rotate
+from renderer.mesh import Y_UP_TO_Z_UP
 from renderer.transfer import COEFFICIENTS, DEGREE
 
 # Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps", figure 2: RGB rows
@@ -34,7 +35,6 @@ _PUBLISHED_PROBES = {
     ],
 }  # fmt: skip
 PROBES, UNIFORM = tuple(_PUBLISHED_PROBES), "uniform"
-_Y_UP_TO_Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 
 
 @checked
@@ -81,7 +81,7 @@ def probe(name: str) -> Tensor:
     """Coefficients (49, 3) float32 of a published probe, turned upright; bands 3 to 6 are zero."""
     published = torch.tensor(_PUBLISHED_PROBES[name], dtype=torch.float64)
     coefficients = torch.zeros(COEFFICIENTS, 3)
-    coefficients[:9] = rotate(published, _Y_UP_TO_Z_UP).float()
+    coefficients[:9] = rotate(published, torch.from_numpy(Y_UP_TO_Z_UP[:3, :3])).float()
     return coefficients
 
 

@@ -85,11 +85,6 @@ class Mesh:
         """Whether all corners have the same colour."""
         return len(self.faces) > 0 and bool((self.corner_colors == self.corner_colors[:1, :1]).all())
 
-    @property
-    def uncolored(self) -> bool:
-        """Whether it is white all over, as a file's mesh is that brings neither colours nor textures."""
-        return not self.textures and bool((self.corner_colors == 1).all())
-
     @cached_property
     def one_color_per_face(self) -> bool:
         """Whether the corners of each face have the same colour."""

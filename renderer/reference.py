@@ -67,22 +67,6 @@ def clamped_cosine(l: int) -> float:
     return sign * 2 * math.pi * math.comb(l, l // 2) / ((l + 2) * (l - 1) * 2**l)
 
 
-def blocked(points: Tensor, directions: Tensor, corners: Tensor) -> Tensor:
-    """(S, D), whether rays from points (S, 3) in directions (D, 3) meet a face, of corners (F, 3 corners, 3).
-
-    By Cramer's rule for point + t direction = a + u (b - a) + v (c - a) (Möller and Trumbore 1997).
-    """
-    a, b, c = corners.unbind(1)
-    met = torch.zeros(len(points), len(directions), dtype=torch.bool)
-    for origin, meets in zip(points, met, strict=True):
-        ahead = torch.linalg.cross(directions[:, None], (c - a)[None])
-        area = (ahead * (b - a)).sum(-1)  # zero where ray and face are parallel: nothing then is within bounds
-        across = torch.linalg.cross(origin - a, b - a)
-        u, v, t = (ahead * (origin - a)).sum(-1) / area, directions @ across.T / area, (across * (c - a)).sum(1) / area
-        meets |= ((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)).any(1)
-    return met
-
-
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """(V, 3) unit normals: the mean of those of the faces around a vertex, weighted with their areas."""
     weighted = doubled_area_vectors(vertices[faces]).repeat_interleave(3, dim=0)

@@ -7,18 +7,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 FLOAT = 5126  # a component's type (section 3.6.2.2)
-INDICES = (
-    "source",
-    "index",
-    "material",
-    "mesh",
-    "bufferView",
-    "buffer",
-    "indices",
-    "POSITION",
-    "TEXCOORD_0",
-    "COLOR_0",
-)
+INDICES = {"source", "index", "material", "mesh", "bufferView", "buffer", "indices"}
+INDICES |= {"POSITION", "TEXCOORD_0", "COLOR_0"}  # of a part's attributes
 SURFACES = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")  # begin what may be required: none moves a vertex
 
 

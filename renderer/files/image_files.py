@@ -7,7 +7,7 @@ import torch
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_file
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the final size
@@ -15,9 +15,8 @@ DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the fin
 
 def read_image(path: Path, size: int) -> Tensor:
     """`read_square` as (3, size, size) float32 in [0, 1]. InputError where the file cannot be read."""
+    require_file(path, "give an image file")
     try:
-        if not path.is_file():  # a pipe would be waited for
-            raise ValueError("there is no such file")
         square = read_square(path, size)
     except Exception as error:  # Pillow's decoders raise almost anything at a broken file
         raise InputError(f"{path} cannot be read ({error}): give an image file") from error

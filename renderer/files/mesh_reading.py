@@ -56,14 +56,13 @@ def _unreadable(path: Path, error: Exception) -> InputError:
 def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:
     """One geometry of a file, in its own coordinates. Raises whatever its contents make numpy or Pillow raise."""
     vertices, faces, uvs = geometry.vertices, np.asarray(geometry.faces), getattr(geometry.visual, "uv", None)
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise IndexError("faces name vertices that are not there")
+    mesh = Mesh.plain(vertices, faces)
     colors, image = _corner_colors(geometry.visual, faces)
     for name, values in {"coordinates": vertices, "texture coordinates": uvs, "colours": colors}.items():
         if values is not None and not (np.abs(values) <= LARGEST).all():  # NaN is not
             raise ValueError(f"{name} are not finite or beyond {LARGEST:g}")
     colors = encode(torch.from_numpy(colors), "srgb").numpy() if linear else colors
-    mesh = replace(Mesh.plain(vertices, faces), corner_colors=colors.astype(np.float32))
+    mesh = replace(mesh, corner_colors=colors.astype(np.float32))
     if image is None:
         return mesh
     if uvs is None:

@@ -42,6 +42,7 @@ def test_greys_outside_0_to_1_and_what_is_no_background_are_refused(choice):
 def test_an_unreadable_background_is_named(tmp_path):
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no image")
-    for path in (broken, tmp_path / "absent.png", tmp_path):
-        with pytest.raises(InputError, match=f"scene.backgrounds: {path} cannot be read .*: give an image file or a"):
+    faults = {broken: "cannot be read .*", tmp_path / "absent.png": "does not exist", tmp_path: "is no file"}
+    for path, fault in faults.items():
+        with pytest.raises(InputError, match=f"scene.backgrounds: {path} {fault}: give an image file or a grey value"):
             load_background(str(path), 4)
