@@ -85,4 +85,4 @@ def test_every_number_of_a_scripts_configuration_has_a_range(name):
 def test_every_number_of_a_section_of_the_paper_has_a_range(section):
     targets = ["section.targets=[a]"] if section == "gallery" else []
     config = composed("reproduce_paper", [f"section={section}", "scene.meshes=[a.obj]", *targets])
-    check(SECTIONS[section][1], config.section, "section")
+    check(SECTIONS[section].Settings, config.section, "section")

@@ -1,6 +1,6 @@
 """What Tables 3 and 4 share: attacks by light and by shape, random changes as large, and what a classifier answers."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,13 +14,10 @@ from augment.parameters import Geometry, Kind, Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene
-from renderer.errors import InputError
-from train.studies.paper.subjects import Subject, random_scene, recognised
+from train.studies.paper.subjects import PART
 
 STEPS = 30  # the paper's appendix C
 FURTHER = 10  # steps that an adversary goes on for
-PART = 10  # random examples held at once
-LEAST_SHARE = 0.02  # recognised; below it the search for examples is given up
 
 
 class Unreachable(Goal):
@@ -57,11 +54,9 @@ class Attack:
         return first.values, last.values
 
 
-LIGHT = StepSettings("linf", None, "unit", 0.05)
-SHAPE = StepSettings("linf", 0.002, "sign", 0.0005)
 ATTACKS = {
-    "lighting": Attack(Lighting, LIGHT, DescentSettings(STEPS)),
-    "geometry": Attack(Geometry, SHAPE, DescentSettings(STEPS, shorten=True)),
+    "lighting": Attack(Lighting, StepSettings("linf", None, "unit", 0.05), DescentSettings(STEPS)),
+    "geometry": Attack(Geometry, StepSettings("linf", 0.002, "sign", 0.0005), DescentSettings(STEPS, shorten=True)),
 }
 
 
@@ -81,18 +76,3 @@ def answers(problem: Problem, values: Tensor, examples: Tensor, classifier: Clas
     for part, rows in zip(values.split(PART), examples.split(PART), strict=True):
         found += logits_of(classifier, problem.render(part, rows), PART)[:, 0].argmax(1).tolist()
     return [classifier.classes[index] for index in found]
-
-
-def recognised_parts(
-    subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator
-) -> Iterator[tuple[Scene, Tensor]]:
-    """Random scenes, each with those of its examples (A,) that the classifier recognises: `count` in all."""
-    found = drawn = 0
-    while found < count:
-        scene = random_scene(subject, classifier, light, PART, draws)
-        kept = recognised(scene, classifier, subject.label).nonzero().squeeze(1)[: count - found]
-        if len(kept):
-            yield scene, kept
-        found, drawn = found + len(kept), drawn + len(scene)
-        if found < LEAST_SHARE * drawn - PART:
-            raise InputError(f"{classifier.name} recognises only {found} of {drawn} images of {subject.name}")

@@ -1,7 +1,7 @@
 """Attacks and uniform draws in norm-balls of light, shape and pixels."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -14,9 +14,7 @@ from augment.parameters import KINDS, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene
-from train.studies.paper.subjects import Subject, scene_of
-
-PART = 10  # examples attacked at once
+from train.studies.paper.subjects import PART
 
 
 @dataclass(frozen=True)
@@ -46,18 +44,20 @@ class Outcome:
     """What a ball holds for E examples.
 
     adversarial, random, search: (E,) bool, fooled by the descent, by one uniform draw, by any of as many draws as the
-    descent may take steps. reach, random_reach: (E,) L∞ between the starting image and those of the first two.
-    before, images: (E, 3, H, W) at the start and where the descent ended; predicted: (E,) its class.
+    descent may take steps. before, images: (E, 3, H, W) at the start and where the descent ended; predicted: (E,) its
+    class; reach: (E,) L∞ between the images.
     """
 
     adversarial: Tensor
     random: Tensor
     search: Tensor
-    reach: Tensor
-    random_reach: Tensor
     before: Tensor
     images: Tensor
     predicted: Tensor
+
+    @property
+    def reach(self) -> Tensor:
+        return (self.images - self.before).abs().flatten(1).amax(1)
 
 
 @torch.no_grad()
@@ -70,42 +70,27 @@ def attack_ball(
     goal = Goal(torch.full((len(scene), 1), classifier.label(label)))
     everything = torch.arange(len(scene))
 
-    def fooled(images: Tensor, examples: Tensor) -> Tensor:
+    def fooled(values: Tensor, examples: Tensor) -> Tensor:
+        images = problem.render(values, examples)
         return goal.of(examples).reached(logits_of(classifier, images, PART).argmax(2))
 
     before = problem.render(problem.start, everything)
     # The gradient of geometry holds visibility fixed, so that whole steps may raise the cost.
     descent = DescentSettings(steps, shorten=name == "geometry", batch_size=PART)
     result = descend(classifier, problem, goal, descent, Phases(problem.start.device))
-    drawn = problem.render(problem.sample(draws), everything)
-    random = fooled(drawn, everything)
+    random = fooled(problem.sample(draws), everything)
     search = random.clone()
     for _ in range(steps - 1):
         left = torch.nonzero(~search).squeeze(1)
         if len(left):
-            search[left] = fooled(problem.render(problem.sample(draws)[left], left), left)
-    return Outcome(
-        result.fooled,
-        random,
-        search,
-        distance(result.images, before),
-        distance(drawn, before),
-        before[:, 0],
-        result.images[:, 0],
-        result.predicted[:, 0],
-    )
+            search[left] = fooled(problem.sample(draws)[left], left)
+    return Outcome(result.fooled, random, search, before[:, 0], result.images[:, 0], result.predicted[:, 0])
 
 
-def distance(images: Tensor, before: Tensor) -> Tensor:
-    """(E,) L∞ between images (E, 1, 3, H, W)."""
-    return (images - before).abs().flatten(1).amax(1)
-
-
-def parts(subject: Subject, scene: Scene, classifier: Classifier, light: str) -> Iterator[Scene]:
+def parts(scene: Scene) -> Iterator[Scene]:
     """A scene's examples a few at a time: the gradient of a shape keeps all its images' samples."""
-    for examples in torch.arange(len(scene)).split(PART):
-        cameras = [scene.cameras[index] for index in examples]
-        yield scene_of(subject, classifier, light, cameras, scene.backgrounds[examples, 0, 0, 0])
+    for rows in torch.arange(len(scene)).split(PART):
+        yield replace(scene, examples=[scene.examples[row] for row in rows], lights=scene.lights[rows])
 
 
 def joined(found: Sequence[Outcome]) -> Outcome:

@@ -1,7 +1,7 @@
 """What an iteration of an attack costs, beside the classifier's own pass, by pixels and by examples at once."""
 
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,25 +26,18 @@ from renderer.camera import ring
 from renderer.image import ImageSettings
 from renderer.lights import load_light
 from renderer.visibility import choose
-from train.report.tables import markdown
 from train.run_folder.classifier import load_classifier
 from train.studies.figures import panels_beside, save
 from train.studies.paper.adversaries import ATTACKS
 from train.studies.paper.section import Study
-from train.studies.paper.subjects import GREYS, Subject, scene_of
+from train.studies.paper.subjects import GREYS, scene_of
 from train.studies.renderer_speed.measure import seconds
 from train.wideresnet import WideResNet
 
-TARGETS = {"lighting": 1.05, "geometry": 1.3}
-TRAINING, TRAINING_TARGET = "the training's, 100 examples, 32², WideResNet-16-4", 1.03
+TRAINING = "the training's, 100 examples, 32², WideResNet-16-4"
 PRETRAINED = "run:pretrained/none"
 EXAMPLES = 100  # at once, as in training
 BATCH = 32  # images per pass through the classifier, as in conf/attack.yaml
-ITERATION_COLUMNS = ["attack", "pixels", "classifier, ms", "renderer, ms", "iteration, ms"]
-RATIO_COLUMNS = [
-    *("attack", "on", "classifier's pass, ms", "renderer, ms", "iteration, ms"),
-    *("iteration / pass", "1 + renderer / pass", "target"),
-]
 COLOURS = ("#a9b8d8", "#e8743b")  # classifier, renderer
 
 
@@ -53,7 +46,7 @@ class Setup:
     """What the images show, every view on each background, and how they are drawn."""
 
     name: str
-    subject: Subject
+    subject: SceneObject
     samples: int
     normals: str
     views: int = 1
@@ -146,9 +139,8 @@ def training_step(study: Study, passes: int, turns: int) -> Iteration:
     """The training's attack at 32² on 100 examples of two meshes."""
     classifier = load_classifier(PRETRAINED)
     label, views = classifier.label(study.label), EXAMPLES // len(study.subjects) // len(GREYS)
-    objects = [SceneObject(item.label, item.mesh, item.gain) for item in study.subjects]
     behind, drawn = load_backgrounds(GREYS, classifier.size), ImageSettings(classifier.size)
-    scene = Scene.grid(objects, ring(views, 2.0), behind, load_light(study.light), drawn, choose())
+    scene = Scene.grid(study.subjects, ring(views, 2.0), behind, load_light(study.light), drawn, choose())
     with torch.no_grad():
         cast(WideResNet, classifier.function).head.bias[label] += 100
     labels = torch.full((len(scene),), label)
@@ -173,38 +165,6 @@ def covered(scene: Scene) -> int:
 def many(setup: Setup) -> Setup:
     """The same for 100 images."""
     return replace(setup, name=f"{setup.name}, {EXAMPLES} examples", views=EXAMPLES // len(GREYS), backgrounds=GREYS)
-
-
-def quartiles(values: Collection[float], digits: int = 1) -> str:
-    low, middle, high = np.quantile([*values], [0.25, 0.5, 0.75])
-    return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
-
-
-def iteration_table(measured: Sequence[Iteration]) -> str:
-    return markdown(
-        ITERATION_COLUMNS,
-        (
-            [each.kind, f"{each.pixels:,}", *map(quartiles, (each.inside, each.renderer, each.whole))]
-            for each in measured
-        ),
-    )
-
-
-def ratio_table(measured: Sequence[Iteration]) -> str:
-    return markdown(RATIO_COLUMNS, map(_ratios, measured))
-
-
-def _ratios(each: Iteration) -> list[str]:
-    ratio = 1 + each.renderer / each.bare
-    target = TRAINING_TARGET if each.setup == TRAINING else TARGETS[each.kind]
-    met = "met" if np.median(ratio) <= target else "not met"
-    return [
-        each.kind,
-        each.setup,
-        *map(quartiles, (each.bare, each.renderer, each.whole)),
-        *(quartiles(values, 3) for values in (np.divide(each.whole, each.bare), ratio)),
-        f"{target}: {met}",
-    ]
 
 
 def draw(measured: Sequence[Iteration], path: Path) -> None:

@@ -1,7 +1,6 @@
 """Adversarial against random perturbations in norm-balls of light, shape and pixels (Section 4.1 and appendix A)."""
 
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,21 +10,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
+from augment.objects import SceneObject
 from augment.seeding import generator
 from train.photographs.shares import share
 from train.report.tables import markdown
 from train.studies.figures import panels_beside, pyplot, save
-from train.studies.page import filled
-from train.studies.paper.balls import LEVELS, PART, SPACES, Outcome, attack_ball, joined, parts
+from train.studies.paper.balls import LEVELS, SPACES, Outcome, attack_ball, joined, parts
 from train.studies.paper.section import Section, SectionSettings, Study
-from train.studies.paper.shares import draw_shares, interval
-from train.studies.paper.subjects import Subject, finer, recognised_scene
+from train.studies.paper.shares import interval
+from train.studies.paper.subjects import finer, recognised_scene
+
+TITLE = "Adversarial against random perturbations"
 
 
 @dataclass
-class NormBallSettings(SectionSettings):
+class Settings(SectionSettings):
     """examples: of each mesh. steps: of a descent at most, and draws of a search."""
 
     examples: int
@@ -40,82 +40,66 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 
 
-def outcomes(subject: Subject, study: Study, settings: NormBallSettings) -> dict[tuple[str, float], Outcome]:
+def measure(study: Study, settings: Settings) -> Section:
+    """All balls of all meshes."""
+    found = {subject.name: outcomes(finer(subject), study, settings) for subject in study.subjects}
+    pooled = {ball: joined([each[ball] for each in found.values()]) for ball in next(iter(found.values()))}
+    records = [record(mesh, *ball, outcome) for mesh, balls in found.items() for ball, outcome in balls.items()]
+    together = [record("all", *ball, outcome) for ball, outcome in pooled.items()]
+    methods = [method.format(steps=settings.steps) for method in METHODS.values()]
+    header = ["space", "radius", *methods, "L∞ on the image", "pixels beyond half of it"]
+    values = {"count": settings.examples * len(found), "table": markdown(header, map(row, together))}
+    figures = {
+        "norm_balls.png": partial(draw_success, together, methods),
+        "norm_balls.spaces.png": partial(draw_examples, pooled, study.classifier, study.label),
+    }
+    return Section(values, records + together, figures)
+
+
+def outcomes(subject: SceneObject, study: Study, settings: Settings) -> dict[tuple[str, float], Outcome]:
     """All balls' outcomes over the same recognised examples of a subject."""
-    classifier = study.classifier
-    scene = recognised_scene(subject, classifier, study.light, settings.examples, study.seed)
+    scene = recognised_scene(subject, study.classifier, study.light, settings.examples, study.seed)
     draws = {name: generator(study.seed, subject.name, name) for name in SPACES}
     balls = [(name, radius) for name, space in SPACES.items() for radius in space.radii]
     found: dict[tuple[str, float], list[Outcome]] = {ball: [] for ball in balls}
-    for part in parts(subject, scene, classifier, study.light):
+    for part in parts(scene):
         for (name, radius), outcome in found.items():
-            outcome.append(attack_ball(part, classifier, study.label, name, radius, settings.steps, draws[name]))
+            outcome.append(attack_ball(part, study.classifier, study.label, name, radius, settings.steps, draws[name]))
     return {ball: joined(outcome) for ball, outcome in found.items()}
 
 
 def record(mesh: str, name: str, radius: float, outcome: Outcome) -> dict[str, Any]:
     """A ball's shares with their intervals, and averages: how far its images went, and the share of pixels that
     changed by more than half of the most that any did."""
-    shares = {method: share(int(hits.sum()), len(hits)) for method in METHODS for hits in [getattr(outcome, method)]}
     change = (outcome.images - outcome.before).abs().amax(1)
-    means = {
-        "reach": outcome.reach,
-        "changed_pixels": (change > outcome.reach.view(-1, 1, 1) / 2).double(),
-        "random_reach": outcome.random_reach,
-    }
+    changed = change > outcome.reach.view(-1, 1, 1) / 2
     return {
         "mesh": mesh,
         "space": name,
         "radius": radius,
-        **shares,
-        **{key: float(each.mean()) for key, each in means.items()},
+        **{method: share(int(getattr(outcome, method).sum()), len(change)) for method in METHODS},
+        "reach": float(outcome.reach.mean()),
+        "changed_pixels": float(changed.double().mean()),
     }
 
 
-def header(steps: int) -> list[str]:
-    methods = [method.format(steps=steps) for method in METHODS.values()]
-    return ["space", "radius", *methods, "L∞ on the image", "pixels beyond half of it", "L∞, one draw"]
-
-
-def row(found: dict[str, Any]) -> list[str]:
+def row(found: Mapping[str, Any]) -> list[str]:
     space = SPACES[found["space"]]
     radius = f"{found['radius']:g}" + (" (paper)" if found["radius"] in space.paper else "")
     shares = [interval(found[method]) for method in METHODS]
-    change = f"{found['reach']:.2f}", f"{found['changed_pixels']:.2%}", f"{found['random_reach']:.2f}"
-    return [space.title, radius, *shares, *change]
+    return [space.title, radius, *shares, f"{found['reach']:.2f}", f"{found['changed_pixels']:.2%}"]
 
 
-def at_paper_radius(pooled: Sequence[dict[str, Any]]) -> dict[str, str]:
-    """The cells of the comparison with the paper's figure: light_adversarial, shape_random and so on."""
-    return {
-        f"{SPACES[each['space']].title}_{method}": interval(each[method])
-        for each in pooled
-        for method in ("adversarial", "random")
-        if each["radius"] in SPACES[each["space"]].paper
-    }
-
-
-def median_confidence(images: Tensor, classifier: Classifier, label: str) -> float:
-    """In the label, over images (E, 3, H, W)."""
-    shares = logits_of(classifier, images[:, None], PART).softmax(2)
-    return float(shares[:, 0, classifier.label(label)].median())
-
-
-def fineness(subject: Subject) -> str:
-    mesh = subject.mesh
-    edges = np.diff(mesh.vertices[mesh.faces[:, [0, 1, 2, 0]]], axis=1)
-    return f"{len(mesh.vertices):,} with edges of {np.linalg.norm(edges, axis=2).mean():.3f} on average"
-
-
-def draw_success(pooled: Sequence[dict[str, Any]], steps: int, path: Path) -> None:
-    """Success against radius, a panel per space; the paper's radii are dashed."""
+def draw_success(pooled: Sequence[Mapping[str, Any]], labels: Sequence[str], path: Path) -> None:
+    """Success against radius, a panel per space, a line with its label per method; the paper's radii are dashed."""
     figure, panels = panels_beside(len(SPACES), (3.7, 4), layout="constrained")
     for panel, (name, space) in zip(panels, SPACES.items(), strict=True):
         here = [each for each in pooled if each["space"] == name]
-        for index, (method, style) in enumerate(STYLES.items()):
+        for index, (method, label) in enumerate(zip(METHODS, labels, strict=True)):
             radii = [radius * 1.06 ** (index - 1) for radius in space.radii]  # beside each other
-            shares, name = [each[method] for each in here], METHODS[method].format(steps=steps)
-            draw_shares(panel, radii, shares, label=name, capsize=3, **style)
+            value, low, high = (np.array([each[method][key] for each in here]) for key in ("value", "low", "high"))
+            error = np.maximum([value - low, high - value], 0)  # below 0 by rounding alone
+            panel.errorbar(radii, value, error, label=label, capsize=3, **STYLES[method])
         for radius in space.paper:
             panel.axvline(radius, color="#bbbbbb", linestyle=(0, (4, 4)), linewidth=1, zorder=0)
         panel.set(xscale="log", title=space.title, xlabel=f"L∞ radius {space.axis}", ylim=(-0.03, 1.03))
@@ -126,7 +110,7 @@ def draw_success(pooled: Sequence[dict[str, Any]], steps: int, path: Path) -> No
     save(figure, path)
 
 
-def most_comparable(found: dict[tuple[str, float], Outcome]) -> tuple[int, dict[tuple[str, str], float]]:
+def most_comparable(found: Mapping[tuple[str, float], Outcome]) -> tuple[int, dict[tuple[str, str], float]]:
     """The example whose adversaries come nearest to the paper's levels on the image, and for each space and level the
     radius of its nearest one."""
     off: dict[tuple[str, str], Tensor] = {}  # by space and level, (radii, E)
@@ -138,7 +122,7 @@ def most_comparable(found: dict[tuple[str, float], Outcome]) -> tuple[int, dict[
     return example, {key: SPACES[key[0]].radii[int(each[:, example].argmin())] for key, each in off.items()}
 
 
-def draw_examples(found: dict[tuple[str, float], Outcome], classifier: Classifier, label: str, path: Path) -> None:
+def draw_examples(found: Mapping[tuple[str, float], Outcome], classifier: Classifier, label: str, path: Path) -> None:
     """Adversaries of one example at about the same L∞ on the image, a row per level, each beside its difference."""
     example, chosen = most_comparable(found)
     before = next(iter(found.values())).before[example]
@@ -164,34 +148,3 @@ def draw_examples(found: dict[tuple[str, float], Outcome], classifier: Classifie
 def array(image: Tensor) -> np.ndarray:
     """(H, W, 3) of an image (3, H, W)."""
     return image.permute(1, 2, 0).numpy()
-
-
-def measure(study: Study, settings: NormBallSettings) -> Section:
-    """All balls of all meshes."""
-    begin = time.process_time()
-    chosen = [finer(subject) for subject in study.subjects]
-    found = {subject.name: outcomes(subject, study, settings) for subject in chosen}
-    pooled = {ball: joined([each[ball] for each in found.values()]) for ball in next(iter(found.values()))}
-    records = [record(mesh, *ball, outcome) for mesh, balls in found.items() for ball, outcome in balls.items()]
-    together = [record("all", *ball, outcome) for ball, outcome in pooled.items()]
-    before = next(iter(pooled.values())).before
-    text = filled(
-        __file__,
-        classifier=study.classifier.name,
-        label=study.label,
-        meshes=study.meshes,
-        count=settings.examples * len(found),
-        examples=settings.examples,
-        probe=study.light,
-        steps=settings.steps,
-        table=markdown(header(settings.steps), map(row, together)),
-        **at_paper_radius(together),
-        confidence=median_confidence(before, study.classifier, study.label),
-        fineness=" and ".join(map(fineness, chosen)),
-        minutes=(time.process_time() - begin) / 60,
-    )
-    figures = {
-        "norm_balls.png": partial(draw_success, together, settings.steps),
-        "norm_balls.spaces.png": partial(draw_examples, pooled, study.classifier, study.label),
-    }
-    return Section(text, records + together, figures)

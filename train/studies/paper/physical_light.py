@@ -1,7 +1,6 @@
 """What it costs an attack to find only light that something can emit."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -14,90 +13,68 @@ from augment.parameters import Lighting, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene
-from renderer.harmonics import basis, project, quadrature
+from renderer.harmonics import basis, project
 from renderer.transfer import DEGREE
 from train.photographs.shares import share
 from train.report.tables import markdown
-from train.studies.page import filled
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import interval
-from train.studies.paper.subjects import recognised_scene
+from train.studies.paper.subjects import PART, recognised_scene
 
-BATCH = 10  # examples in a pass through the classifier
-RADII = (0.02, 0.05, 0.1, 0.3, 1.0, None)
-HEADER = ["radius", "any light", "its negative radiance left out", "physical light"]
+TITLE = "Light that something can emit"
 
 
 @dataclass
-class PhysicalLightSettings(SectionSettings):
+class Settings(SectionSettings):
     """examples: of each mesh. steps: of a descent at most."""
 
     examples: int
     steps: int
 
 
-def measure(study: Study, settings: PhysicalLightSettings) -> Section:
+RADII = (0.02, 0.05, 0.1, 0.3, 1.0, None)
+HEADER = ["radius", "any light", "its negative radiance left out", "physical light"]
+
+
+def measure(study: Study, settings: Settings) -> Section:
     """Both attacks in all balls over the same images."""
-    fooled: dict[float | None, list[Tensor]] = {radius: [] for radius in RADII}
-    dips = []
-    for subject in study.subjects:
-        scene = recognised_scene(subject, study.classifier, study.light, settings.examples, study.seed)
-        for radius in RADII:
-            row, dip = _outcome(scene, study, radius, settings.steps)
-            fooled[radius].append(row)
-            dips.append(dip)
-    records = [_record(radius, torch.cat(rows, dim=1)) for radius, rows in fooled.items()]
-    cells = ([record["radius"] or "none", *map(interval, list(record.values())[1:])] for record in records)
-    text = filled(
-        __file__,
-        count=sum(rows.shape[1] for rows in fooled[None]),
-        meshes=study.meshes,
-        classifier=study.classifier.name,
-        label=study.label,
-        probe=study.light,
-        steps=settings.steps,
-        table=markdown(HEADER, cells),
-        dip=float(torch.cat(dips).median()),
-    )
-    return Section(text, records, {})
+    scenes = [
+        recognised_scene(subject, study.classifier, study.light, settings.examples, study.seed)
+        for subject in study.subjects
+    ]
+    records = []
+    for radius in RADII:
+        fooled = torch.cat([outcome(scene, study, radius, settings.steps) for scene in scenes], dim=1)
+        records.append(record(radius, fooled))
+    cells = ([each["radius"] or "none", *map(interval, list(each.values())[1:])] for each in records)
+    return Section({"count": fooled.shape[1], "table": markdown(HEADER, cells)}, records)
 
 
-def _record(radius: float | None, fooled: Tensor) -> dict[str, Any]:
-    return {"radius": radius} | {
-        name: share(int(row.sum()), len(row))
-        for name, row in zip(("signed", "clipped", "physical"), fooled, strict=True)
-    }
+def record(radius: float | None, fooled: Tensor) -> dict[str, Any]:
+    names = ("signed", "clipped", "physical")
+    return {"radius": radius} | {name: share(int(row.sum()), len(row)) for name, row in zip(names, fooled, strict=True)}
 
 
-def _outcome(scene: Scene, study: Study, radius: float | None, steps: int) -> tuple[Tensor, Tensor]:
-    """((3, E') whether images that are recognised at both starts are fooled by light of either kind and by the first
-    without its negative radiance, (E', 3) the least radiance of the first over its largest)."""
+def outcome(scene: Scene, study: Study, radius: float | None, steps: int) -> Tensor:
+    """(3, E') bool: whether images that are recognised at both starts are fooled by any light, by this without its
+    negative radiance, and by physical light."""
     label = study.classifier.label(study.label)
     goal = Goal(torch.full((len(scene), 1), label))
     step = StepSettings("linf", radius, *(("unit", 0.05) if radius is None else ("sign", radius / 4)))
     problems = [Perturbation(scene, [Lighting(scene, step, physical)]) for physical in (False, True)]
-    descent = DescentSettings(steps, batch_size=BATCH)
-    signed, physical = (
-        descend(study.classifier, problem, goal, descent, Phases(scene.lights.device)) for problem in problems
-    )
-    recognised = ~(signed.fooled_before | physical.fooled_before)
-    lights = signed.values.unflatten(1, (-1, 3))
-    images = problems[0].render(_without_negative(lights).flatten(1), problems[0].everything)
-    clipped = (logits_of(study.classifier, images, BATCH).argmax(2) != label).any(1)
-    radiance = torch.stack([_radiance(quadrature(4 * DEGREE)[0], light) for light in lights[recognised]])
-    fooled = torch.stack([signed.fooled, clipped, physical.fooled])
-    return fooled[:, recognised], radiance.amin(1) / radiance.amax(1)
+    descent = DescentSettings(steps, batch_size=PART)
+    signed, physical = (descend(study.classifier, problem, goal, descent, Phases()) for problem in problems)
+    clipped = torch.stack([without_negative(light) for light in signed.values.unflatten(1, (-1, 3))])
+    images = problems[0].render(clipped.flatten(1), problems[0].everything)
+    predicted = logits_of(study.classifier, images, PART).argmax(2)
+    fooled = torch.stack([signed.fooled, goal.reached(predicted), physical.fooled])
+    return fooled[:, ~(signed.fooled_before | physical.fooled_before)]
 
 
-def _without_negative(lights: Tensor) -> Tensor:
-    """Lights (E, 49, 3) as environment maps hold them, from which what is negative is left out."""
-    clipped = [project(partial(_positive_radiance, light), DEGREE) for light in lights]
-    return torch.stack(clipped).to(lights)
+def without_negative(light: Tensor) -> Tensor:
+    """A light (49, 3) as an environment map holds it, from which what is negative is left out."""
 
+    def radiance(directions: Tensor) -> Tensor:
+        return (basis(directions, DEGREE) @ light.to(directions)).clamp(min=0)
 
-def _positive_radiance(light: Tensor, directions: Tensor) -> Tensor:
-    return _radiance(directions, light).clamp(min=0)
-
-
-def _radiance(directions: Tensor, light: Tensor) -> Tensor:
-    return basis(directions, DEGREE) @ light.to(directions)
+    return project(radiance, DEGREE).to(light)

@@ -1,16 +1,21 @@
-"""What every section of docs/paper.md is measured with, and what it is."""
+"""What every section of docs/paper.md is measured with, and what it is.
+
+A section is a module with a TITLE, Settings, a function `measure`, and the Markdown beside it.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from augment.classifiers import Classifier
-from augment.objects import ObjectSettings
+from augment.objects import ObjectSettings, SceneObject
 from renderer.errors import require_range
+from train.attacks.settings import AttackExperimentSettings
+from train.command_line.configuration import composed, read_settings
 from train.fit.recipe import MOST
-from train.studies.paper.subjects import Subject
+from train.studies.paper.subjects import load_subject
 
 MOST_OF_EACH = 10**6
 
@@ -39,20 +44,27 @@ class Study:
     seed: int
 
     @cached_property
-    def subjects(self) -> list[Subject]:
+    def subjects(self) -> list[SceneObject]:
         """The meshes, loaded."""
-        return [Subject.load(item) for item in self.items]
+        return [load_subject(item) for item in self.items]
 
     @property
     def meshes(self) -> str:
         """Their names, as words."""
         return " and ".join(subject.name for subject in self.subjects)
 
+    def command(self, item: ObjectSettings, overrides: Sequence[str]) -> AttackExperimentSettings:
+        """What scripts/attack.py is told: its own configuration under overrides, but for the mesh and the light."""
+        config = composed("attack", overrides)
+        config.scene.meshes, config.scene.light = [asdict(item)], self.light
+        return read_settings(AttackExperimentSettings, config)
+
 
 @dataclass(frozen=True)
 class Section:
-    """text: Markdown. records: what was measured, a line each. figures: by file name, what draws each."""
+    """values: of the section's Markdown, beside the study and its settings. records: what was measured, a line each.
+    figures: by file name, what draws each."""
 
-    text: str
+    values: Mapping[str, object]
     records: Iterable[Mapping[str, Any]]
-    figures: Mapping[str, Callable[[Path], None]]
+    figures: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)

@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_folder
 from train.run_folder.classifier import load_classifier
 from train.settings import LARGEST_SEED, SceneSettings, read_object
-from train.studies.page import joined, versions, wrapped, write
+from train.studies.page import filled, joined, versions, wrapped, write
 from train.studies.paper import (
     gallery,
     norm_balls,
@@ -28,23 +27,18 @@ from train.studies.paper import (
     transfer,
     unseen_views,
 )
-from train.studies.paper.section import Section, SectionSettings, Study
+from train.studies.paper.section import Section, Study
 
-Measure = Callable[[Study, Any], Section]
-SECTIONS: dict[str, tuple[str, type[SectionSettings], Measure]] = {  # by their titles, in the order of the page
-    "norm_balls": ("Adversarial against random perturbations", norm_balls.NormBallSettings, norm_balls.measure),
-    "physical_light": (
-        "Light that something can emit",
-        physical_light.PhysicalLightSettings,
-        physical_light.measure,
-    ),
-    "survival": ("What survives outside", survival.SurvivalSettings, survival.measure),
-    "transfer": ("Transfer to unseen networks", transfer.TransferSettings, transfer.measure),
-    "unseen_views": ("Unseen views", unseen_views.UnseenViewSettings, unseen_views.measure),
-    "shaped_light": ("Light that a mesh shapes itself", shaped_light.ShapedLightSettings, shaped_light.measure),
-    "rendering_quality": ("Rendering quality", rendering_quality.QualitySettings, rendering_quality.measure),
-    "gallery": ("A gallery of attacks", gallery.GallerySettings, gallery.measure),
-    "run_time": ("Run time", run_time.RunTimeSettings, run_time.measure),
+SECTIONS = {  # in the order of the page
+    "norm_balls": norm_balls,
+    "physical_light": physical_light,
+    "survival": survival,
+    "transfer": transfer,
+    "unseen_views": unseen_views,
+    "shaped_light": shaped_light,
+    "rendering_quality": rendering_quality,
+    "gallery": gallery,
+    "run_time": run_time,
 }
 HEAD = """# The paper's tables and figures
 
@@ -76,27 +70,28 @@ def run(settings: PaperSettings) -> None:
     name = str(settings.section.get("name"))
     if name not in SECTIONS:
         raise InputError(f"section.name={name}: choose section={', '.join(SECTIONS)}")
-    title, kind, measure = SECTIONS[name]
-    section_settings = read_settings(kind, OmegaConf.create(settings.section), "section")
+    module = SECTIONS[name]
+    section_settings = read_settings(module.Settings, OmegaConf.create(settings.section), "section")
     items = [read_object(item, settings.label, index) for index, item in enumerate(settings.scene.meshes)]
     torch.set_num_threads(section_settings.threads)
     classifier = load_classifier(settings.classifier, settings.weights)
     study = Study(classifier, items, settings.scene.light, settings.label, settings.seed)
-    _write(out / "paper", name, title, measure(study, section_settings))
+    section = module.measure(study, section_settings)
+    _write_files(out / "paper", name, section)
+    told = filled(str(module.__file__), study=study, settings=section_settings, **section.values)
+    text = joined([module.TITLE, wrapped(told), f"```bash\n{command_line()}\n```", versions()])
+    page = out / "paper.md"
+    write(page, with_section(page.read_text("utf-8") if page.is_file() else "", module.TITLE, text))
 
 
-def _write(folder: Path, name: str, title: str, section: Section) -> None:
+def _write_files(folder: Path, name: str, section: Section) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.jsonl").write_text("".join(json.dumps(record) + "\n" for record in section.records), "utf-8")
     for figure, draw in section.figures.items():
         draw(folder / figure)
-    command = f"```bash\n{command_line()}\n```"
-    page = folder.with_suffix(".md")
-    text = joined([title, wrapped(section.text.strip()), command, versions()])
-    write(page, with_section(page.read_text("utf-8") if page.is_file() else "", title, text))
 
 
 def with_section(page: str, title: str, text: str) -> str:
     """The page with a section's text, which begins with its title, in place of the one before."""
     there = {block.partition("\n")[0]: block for block in re.split("^## ", page, flags=re.M)[1:]} | {title: text}
-    return joined([HEAD, *(f"## {there[each]}" for each, *_ in SECTIONS.values() if each in there)])
+    return joined([HEAD, *(f"## {there[each.TITLE]}" for each in SECTIONS.values() if each.TITLE in there)])

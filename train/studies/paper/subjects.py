@@ -1,8 +1,8 @@
 """Random images of a mesh that a classifier recognises, to be attacked."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -17,36 +17,32 @@ from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import InputError
 from renderer.image import ImageSettings
 from renderer.lights import load_light
-from renderer.mesh import Mesh
 from renderer.subdivision import subdivide
 from renderer.visibility import choose
 
 VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
 FIELDS_OF_VIEW = (2.0, 3.0)  # the paper's appendix on rendering quality
 GREYS = (0.0, 0.25, 0.5, 0.75, 1.0)
+PART = 10  # examples attacked or drawn at once
+LEAST_SHARE = 0.02  # recognised; below it the search for examples is given up
 
 
-@dataclass(frozen=True)
-class Subject:
-    """A mesh to attack and the class that it shows."""
-
-    name: str
-    mesh: Mesh
-    label: str
-    gain: float = 1.0
-
-    @classmethod
-    def load(cls, item: ObjectSettings) -> "Subject":
-        """InputError: as `load_object`."""
-        return cls(Path(item.mesh).stem, load_object(item).mesh, item.label, item.gain)
+def short_name(item: ObjectSettings) -> str:
+    """A mesh's name on the page."""
+    return Path(item.mesh).stem
 
 
-def finer(subject: Subject) -> Subject:
+def load_subject(item: ObjectSettings) -> SceneObject:
+    """A mesh to attack. InputError: as `load_object`."""
+    return replace(load_object(item), name=short_name(item))
+
+
+def finer(subject: SceneObject) -> SceneObject:
     """The subject with enough vertices for an attack on its shape."""
-    return replace(subject, mesh=subdivide(subject.mesh, VERTICES))
+    return replace(subject, mesh=subdivide(subject.mesh, VERTICES), own=None)
 
 
-def random_scene(subject: Subject, classifier: Classifier, light: str, count: int, draws: torch.Generator) -> Scene:
+def random_scene(subject: SceneObject, classifier: Classifier, light: str, count: int, draws: torch.Generator) -> Scene:
     """Views at π/3 off the zenith (the paper's) and any azimuth, with a field of view of 2 or 3, on a grey."""
     azimuths = (2 * math.pi * torch.rand(count, generator=draws)).tolist()
     fields = torch.randint(len(FIELDS_OF_VIEW), (count,), generator=draws).tolist()
@@ -59,7 +55,7 @@ def random_scene(subject: Subject, classifier: Classifier, light: str, count: in
 
 
 def scene_of(
-    subject: Subject,
+    subject: SceneObject,
     classifier: Classifier,
     light: str,
     cameras: Sequence[Sequence[Camera]],
@@ -70,7 +66,7 @@ def scene_of(
     """A subject before cameras (E × V), each example on a grey (E,)."""
     size = classifier.size
     return Scene(
-        [SceneObject("", subject.mesh, subject.gain)],
+        [subject],
         [Example(0, tuple(views), index) for index, views in enumerate(cameras)],
         greys.view(-1, 1, 1, 1).expand(-1, 3, size, size),
         load_light(light),
@@ -87,14 +83,25 @@ def recognised(scene: Scene, classifier: Classifier, label: str) -> Tensor:
     return (logits_of(classifier, images, 32).argmax(2) == classifier.label(label)).all(1)
 
 
-def recognised_scene(subject: Subject, classifier: Classifier, light: str, count: int, seed: int) -> Scene:
-    """`count` random examples of a subject that the classifier recognises, drawn until there are as many."""
-    draws, cameras, greys = generator(seed, subject.name), [], []
-    for _ in range(20):
-        scene = random_scene(subject, classifier, light, count, draws)
-        kept = recognised(scene, classifier, subject.label).nonzero().squeeze(1).tolist()
-        cameras += [scene.cameras[index] for index in kept]
-        greys += [float(scene.backgrounds[index, 0, 0, 0]) for index in kept]
-        if len(cameras) >= count:
-            return scene_of(subject, classifier, light, cameras[:count], torch.tensor(greys[:count]))
-    raise InputError(f"{classifier.name} recognises too few images of {subject.name}: {len(cameras)} of {20 * count}")
+def recognised_parts(
+    subject: SceneObject, classifier: Classifier, light: str, count: int, draws: torch.Generator, at_once: int = PART
+) -> Iterator[tuple[Scene, Tensor]]:
+    """Random scenes, each with those of its examples (A,) that the classifier recognises: `count` in all."""
+    found = drawn = 0
+    while found < count:
+        scene = random_scene(subject, classifier, light, at_once, draws)
+        kept = recognised(scene, classifier, subject.label).nonzero().squeeze(1)[: count - found]
+        if len(kept):
+            yield scene, kept
+        found, drawn = found + len(kept), drawn + len(scene)
+        if found < LEAST_SHARE * drawn - PART:
+            raise InputError(f"{classifier.name} recognises only {found} of {drawn} images of {subject.name}")
+
+
+def recognised_scene(subject: SceneObject, classifier: Classifier, light: str, count: int, seed: int) -> Scene:
+    """`count` random examples of a subject that the classifier recognises."""
+    draws = generator(seed, subject.name)
+    parts = list(recognised_parts(subject, classifier, light, count, draws, at_once=count))
+    cameras = [scene.cameras[index] for scene, kept in parts for index in kept]
+    greys = torch.cat([scene.backgrounds[kept, 0, 0, 0] for scene, kept in parts])
+    return scene_of(subject, classifier, light, cameras, greys)

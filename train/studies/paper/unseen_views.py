@@ -3,51 +3,60 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import pairwise
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from augment.classifiers import Classifier
+from augment.objects import SceneObject
 from augment.perturbation import Perturbation
 from augment.scene import Scene
 from augment.seeding import generator, stream_seed
-from train.photographs.shares import share
 from train.report.tables import markdown
-from train.studies.figures import panels_beside, save
-from train.studies.page import filled
-from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, recognised_parts, with_random_signs
+from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
-from train.studies.paper.shares import draw_shares, percent
-from train.studies.paper.subjects import Subject, finer, recognised_scene
+from train.studies.paper.shares import percent
+from train.studies.paper.subjects import finer, recognised_parts, recognised_scene
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-ATTACKED = (1, 5)
+TITLE = "Unseen views"
 
 
 @dataclass
-class UnseenViewSettings(SectionSettings):
+class Settings(SectionSettings):
     """sets: of attacked views, of each mesh. views: unseen ones for each set."""
 
     sets: int
     views: int
 
 
+ATTACKED = (1, 5)
 STATES = {
     "first": "adversary as found",
     "further": f"adversary {FURTHER} steps on",
     "random": "random change as large as the last",
 }
 PAPER = {"lighting": {1: 29.4, 5: 64.2}, "geometry": {1: 0.6, 5: 3.6}}
-BINS = (0, 15, 30, 60, 90, 180)  # degrees
 FAR = 90  # degrees
-COLOURS = {1: "#4269d0", 5: "#ef7a34"}
+
+
+def measure(study: Study, settings: Settings) -> Section:
+    """All sets of attacked views of every mesh."""
+    records = [
+        record
+        for subject in map(finer, study.subjects)
+        for index in range(settings.sets)
+        for record in unseen(subject, study.classifier, index, settings.views, study.light, study.seed)
+    ]
+    values = {
+        "table": results(records, study.label),
+        "far": far(records, study.label),
+        "sets": settings.sets * len(study.subjects),
+        "views": len(records),
+        "further": FURTHER,
+        "steps": STEPS,
+    }
+    return Section(values, records)
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,7 @@ class Together:
         return self.problem.start[:1]
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        every = torch.arange(len(self.problem.start))
+        every = self.problem.everything
         return self.problem.render(values.expand(len(every), -1), every).transpose(0, 1)
 
     def step(self, gradient: Tensor) -> Tensor:
@@ -81,15 +90,8 @@ def attack_views(
     return dict(zip(STATES, (first, further, random), strict=True))
 
 
-def summary(scene: Scene, kind: str, values: Tensor, classifier: Classifier, label: str) -> dict[str, Any]:
-    """How far values (1, D) went, and whether they fool the classifier in every view of a scene."""
-    problem, every = ATTACKS[kind].problem(scene), torch.arange(len(scene))
-    said = answers(problem, values.expand(len(scene), -1), every, classifier)
-    return {"distance": round(float((values - problem.start[:1]).norm()), 4), "fooled": label not in said}
-
-
 def unseen(
-    subject: Subject, classifier: Classifier, index: int, count: int, light: str, seed: int
+    subject: SceneObject, classifier: Classifier, index: int, count: int, light: str, seed: int
 ) -> Iterator[dict[str, Any]]:
     """A record per unseen view of a subject: what it is called under all that was found in one set of views."""
     draws = generator(seed, subject.name, "unseen views", index)
@@ -102,10 +104,6 @@ def unseen(
         for kind in ATTACKS
         for views, scene in scenes.items()
     }
-    attacked = {
-        f"{kind}, {views} attacked": summary(scenes[views], kind, values["further"], classifier, subject.label)
-        for (kind, views), values in found.items()
-    }
     for scene, kept in recognised_parts(subject, classifier, light, count, draws):
         said = {
             f"{kind}, {views} attacked": {
@@ -115,23 +113,15 @@ def unseen(
             for (kind, views), by_state in found.items()
         }
         for row, example in enumerate(kept.tolist()):
-            yield {
-                "mesh": subject.name,
-                "set": index,
-                "attacked": attacked,
-                "angle": {str(views): _angle(scene, example, seen) for views, seen in scenes.items()},
-                "answers": {
-                    attack: {state: named[row] for state, named in by_state.items()}
-                    for attack, by_state in said.items()
-                },
-            }
+            named = {attack: {state: names[row] for state, names in by.items()} for attack, by in said.items()}
+            angle = degrees_apart(scene, example, scenes[1])
+            yield {"mesh": subject.name, "set": index, "angle": angle, "answers": named}
 
 
-def _angle(scene: Scene, example: int, attacked: Scene) -> float:
-    """Degrees between an example's azimuth and the nearest that was attacked."""
-    azimuth = scene.cameras[example][0].azimuth
-    apart = [abs(math.remainder(azimuth - views[0].azimuth, 2 * math.pi)) for views in attacked.cameras]
-    return round(math.degrees(min(apart)), 2)
+def degrees_apart(scene: Scene, example: int, attacked: Scene) -> float:
+    """Between an example's azimuth and that of the one attacked view."""
+    ((other,),), (view,) = attacked.cameras, scene.cameras[example]
+    return round(math.degrees(abs(math.remainder(view.azimuth - other.azimuth, 2 * math.pi))), 2)
 
 
 def outcomes(records: Sequence[Mapping[str, Any]], kind: str, views: int, state: str, label: str) -> list[bool]:
@@ -158,77 +148,12 @@ def results(records: Sequence[Mapping[str, Any]], label: str) -> str:
     return markdown(["", "views attacked", *STATES.values(), "the paper's"], rows)
 
 
-def attacked_success(records: Sequence[Mapping[str, Any]]) -> str:
-    """In how many sets the attack reached its goal and how far it went, by kind and number of views."""
-    sets = list({(record["mesh"], record["set"]): record["attacked"] for record in records}.values())
-    parts = []
-    for attack in sets[0]:
-        fooled = sum(each[attack]["fooled"] for each in sets)
-        distance = np.median([each[attack]["distance"] for each in sets])
-        parts.append(f"{attack}: {fooled} of {len(sets)}, {distance:.2g}")
-    return "; ".join(parts)
-
-
 def far(records: Sequence[Mapping[str, Any]], label: str) -> str:
     """How the strongest adversaries of one view do near it and behind it."""
+    near = [record for record in records if record["angle"] <= FAR]
+    beyond = [record for record in records if record["angle"] > FAR]
     parts = []
     for kind in ATTACKS:
-        near, behind = (
-            percent(
-                outcomes([each for each in records if low <= each["angle"]["1"] <= high], kind, 1, "further", label)
-            )
-            for low, high in ((0, FAR), (FAR, 180))
-        )
-        parts.append(f"{near} within {FAR}° of the one attacked view and {behind} beyond ({kind})")
+        inside, outside = (percent(outcomes(each, kind, 1, "further", label)) for each in (near, beyond))
+        parts.append(f"{inside} within {FAR}° of the one attacked view and {outside} beyond ({kind})")
     return "; ".join(parts)
-
-
-def draw(records: Sequence[Mapping[str, Any]], label: str, path: Path) -> None:
-    """A panel per kind: success by angle, a line per number of attacked views."""
-    figure, panels = panels_beside(len(ATTACKS), (4.2, 3.2))
-    for panel, kind in zip(panels, ATTACKS, strict=True):
-        for views in ATTACKED:
-            _line(panel, records, kind, views, label)
-        panel.set(title=kind, xlabel="degrees to the nearest attacked view", xlim=(0, 180), ylim=(-2, 102))
-    panels[0].set_ylabel("unseen views fooled, %")
-    panels[-1].legend(frameon=False)
-    save(figure, path)
-
-
-def _line(panel: "Axes", records: Sequence[Mapping[str, Any]], kind: str, views: int, label: str) -> None:
-    angles = np.array([record["angle"][str(views)] for record in records])
-    fooled = np.array(outcomes(records, kind, views, "further", label))
-    places, shares = [], []
-    for low, high in pairwise(BINS):
-        here = (angles >= low) & (angles <= high)
-        if here.any():
-            places.append(angles[here].mean())
-            shares.append(share(int(fooled[here].sum()), int(here.sum())))
-    name = f"{views} view{'s' * (views > 1)} attacked"
-    draw_shares(panel, places, shares, scale=100, marker="o", capsize=2, color=COLOURS[views], label=name)
-
-
-def measure(study: Study, settings: UnseenViewSettings) -> Section:
-    """All sets of attacked views of every mesh."""
-    records = [
-        record
-        for subject in map(finer, study.subjects)
-        for index in range(settings.sets)
-        for record in unseen(subject, study.classifier, index, settings.views, study.light, study.seed)
-    ]
-    text = filled(
-        __file__,
-        classifier=study.classifier.name,
-        label=study.label,
-        table=results(records, study.label),
-        attacked=attacked_success(records),
-        far=far(records, study.label),
-        sets=settings.sets * len(study.subjects),
-        per_set=settings.views,
-        views=len(records),
-        meshes=study.meshes,
-        further=FURTHER,
-        steps=STEPS,
-        light=study.light,
-    )
-    return Section(text, records, {"unseen_views.png": partial(draw, records, study.label)})

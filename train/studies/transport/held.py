@@ -17,7 +17,7 @@ from augment.parameters import StepSettings
 from augment.perturbation import Perturbation
 from renderer.mesh import Mesh
 from train.report.tables import markdown
-from train.studies.paper.subjects import Subject, recognised_scene
+from train.studies.paper.subjects import recognised_scene
 
 STEP = StepSettings("linf", 0.01, "sign", 0.0005)
 EVERY = (1, 2, 5, 10, math.inf)  # steps, each of which moves every coordinate by the step's size
@@ -27,13 +27,14 @@ STEPS, EXAMPLES = 20, 16
 def table(mesh: Mesh, classifier: Classifier) -> str:
     """By how many steps shadows are held for; the mesh is a cup."""
     chosen, rows = held_transport.NEAR, []
-    drawn = recognised_scene(Subject("solid:cup", mesh, "cup"), classifier, "grace", EXAMPLES, 0)
+    cup = SceneObject("cup", mesh, name="solid:cup")
+    drawn = recognised_scene(cup, classifier, "grace", EXAMPLES, 0)
     settings = AttackSettings(geometry=STEP, max_steps=STEPS, margin=2.0)
     try:
         for every in EVERY:
             held_transport.NEAR = (every - 0.5) * STEP.step_size
             image = replace(drawn.settings, transport="shadows")
-            scene = replace(drawn, objects=[SceneObject("cup", mesh)], settings=image)
+            scene = replace(drawn, settings=image)
             start = time.process_time()
             attacked = attack(classifier, scene, settings=settings, force=True)
             taken = (time.process_time() - start) / int(attacked.steps.sum() + EXAMPLES)

@@ -37,9 +37,9 @@ def test_a_mesh_that_is_recognised_in_no_scene_is_counted_and_ends_nothing(tmp_p
     cells = {
         row.split(" | ")[0].strip("| "): row.strip(" |").split(" | ")[1:] for row in page.splitlines() if "|" in row
     }
-    assert cells["black"][:2] == ["0 of 2", "none of 0"]
-    assert cells["ball"][0] == "2 of 2" and cells["light"][0] == "2 of 4"
-    assert "were); *recognised*" in page and "within 1/255: 2 of 2." in " ".join(page.split())
+    assert cells["light"][0].endswith(" of 2")
+    words = " ".join(page.split())
+    assert "of 4 were); 2 have a scene" in words and "within 1/255: 2 of 2." in words
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_the_table_counts_what_still_fools_of_what_fooled(tmp_path, reproduce, m
         fooled = [record for record in here if record["fooled"]]
         (row,) = [line for line in page.splitlines() if line.startswith(f"| {name} |")]
         counts = [cell.rpartition("of ")[2] for cell in row.strip(" |").split(" | ")[1:]]
-        assert counts == [str(len(here))] * 2 + [str(len(fooled))] * 5
+        assert counts == [str(len(here))] + [str(len(fooled))] * 5
     same = sum(record["versions"]["reload"]["largest_difference"] <= 1 / 255 for record in records)
     assert f"same image within 1/255: {same} of {len(records)}" in " ".join(page.split())
     assert same == len(records)
