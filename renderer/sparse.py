@@ -9,7 +9,7 @@ from torch import Tensor
 
 TENSORS = ("function", "pixel", "weight")
 SPARSE = 1 / 16  # of all entries, below which those that are not zero are multiplied one by one in less time,
-SMALL = 2**16  # unless they are no more than this; see docs/performance_lights.md
+SMALL = 2**16  # unless they are no more than this; see docs/performance.md
 
 
 @dataclass(frozen=True)

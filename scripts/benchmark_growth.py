@@ -1,6 +1,7 @@
-"""How the cost of adversarial renders grows with their number, size, meshes and processes: docs/performance_growth.md
+"""How the cost of adversarial renders grows with their number, size, meshes and processes
 
-python scripts/benchmark_growth.py; three minutes on a free core, 23 where other work left it a tenth of one.
+python scripts/benchmark_growth.py writes a section of docs/performance.md, in three minutes on a free core, or in 23
+where other work left it a tenth of one.
 """
 
 from train.command_line.entry_points import script

@@ -1,6 +1,6 @@
 """What projectors and lamps cost, and how right they are: python scripts/benchmark_lights.py
 
-Writes docs/performance_lights.md. Takes a minute or two on one CPU thread, and needs the extra `shadows`.
+Writes a section of docs/performance.md. Takes a minute or two on one CPU thread, and needs the extra `shadows`.
 """
 
 from train.command_line.entry_points import script

@@ -1,6 +1,6 @@
 """Training speed against a plain loop over torchvision's DataLoader, in one run: python scripts/benchmark_training.py
 
-Writes docs/performance.md and a figure beside it. conf/benchmark_training.yaml has the settings.
+Writes a section of docs/performance.md. conf/benchmark_training.yaml has the settings.
 """
 
 from train.command_line.entry_points import script

@@ -56,6 +56,12 @@ def write(path: Path | None, text: str) -> None:
     print(f"written: {path}")
 
 
+def write_section(path: Path, section: str) -> None:
+    """Write a section of a page on performance, as `write` does, in place of the one of the same heading."""
+    page = path.read_text("utf-8") if path.is_file() else "# Performance\n"
+    write(path, with_section(page, section))
+
+
 def machine(device: torch.device) -> str:
     """One line: GPU, where that is the device, processor, threads, versions, and how busy the machine was."""
     gpu = f"{torch.cuda.get_device_name(device)}; " if device.type == "cuda" else ""

@@ -1,6 +1,6 @@
-"""docs/performance_lights.md: what lights in a scene cost, beside light from afar, and how right they are."""
+"""docs/performance.md: what lights in a scene cost, beside light from afar, and how right they are."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -28,7 +28,7 @@ from renderer.visibility import choose
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
 from train.report.tables import markdown
-from train.studies.page import filled, joined, machine, wrapped, write
+from train.studies.page import filled, machine, wrapped, write_section
 from train.studies.renderer_speed.measure import Clock, relative_error
 from train.studies.transport.cost import CupSettings, light_step, seconds
 
@@ -47,7 +47,7 @@ BASES: dict[str, Basis] = {
 
 
 def run(settings: CupSettings) -> None:
-    """Measure on one thread, and write the page."""
+    """Measure on one thread, and write the section."""
     out = writable_file(settings.out, "out")
     torch.set_num_threads(1)
     cup, clock = subdivide(normalise(solid("cup", 0)), settings.vertices), Clock(torch.device("cpu"), settings.rounds)
@@ -68,7 +68,7 @@ def run(settings: CupSettings) -> None:
         samples=SAMPLES[0],
         moved=_moved(cup, clock),
     )
-    write(out, joined([wrapped(text)]))
+    write_section(out, wrapped(text))
 
 
 def operator(mesh: Mesh, basis: Basis, size: int, samples: int = SAMPLES[0], **kind: Any) -> Operator:
@@ -118,11 +118,12 @@ def _errors(mesh: Mesh) -> str:
         light = torch.rand(basis.size, 3, generator=draws, dtype=torch.float64)
         weights = torch.randn(3, size**2, generator=draws, dtype=torch.float64)
         exact = _image_and_gradient(operator(mesh, basis, size, REFERENCE, dtype=torch.float64), light, weights)
+        errors = []
         for samples in SAMPLES:
             seen = _image_and_gradient(operator(mesh, basis, size, samples), light.float(), weights.float())
-            errors = (f"{relative_error(ours, true):.2%}" for ours, true in zip(seen, exact, strict=True))
-            rows.append([name, f"{samples}²", *errors])
-    return markdown(["light", "samples", "radiance", "gradient"], rows)
+            errors += [f"{relative_error(ours, true):.2%}" for ours, true in zip(seen, exact, strict=True)]
+        rows.append([name, *errors])
+    return markdown(["light", *(f"{what}, {n}²" for n in SAMPLES for what in ("radiance", "gradient"))], rows)
 
 
 def _image_and_gradient(built: Operator, light: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,26 +131,16 @@ def _image_and_gradient(built: Operator, light: Tensor, weights: Tensor) -> tupl
     return canvas, built.light_gradient(weights[:, built.pixels])
 
 
-class _Unobstructed(Rays):
-    """Casts none."""
-
-    def meet(self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None) -> Tensor:
-        return torch.full((len(origins),), -1)
-
-
 def _moved(mesh: Mesh, clock: Clock) -> str:
-    calls: dict[tuple[str, int], Callable[[], None]] = {}
+    """Milliseconds of a step by the places of lamps, in words."""
     places = torch.tensor(LAMPS.places).requires_grad_()
-    powers = torch.ones(len(places), 3)
+    powers, rays, calls = torch.ones(len(places), 3), Rays(mesh), {}
     for size in SIZES:
         settings = ImageSettings(size, SAMPLES[0])
         (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("software"))
         surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
-        for name, rays in (("cast anew", Rays(mesh)), ("held", _Unobstructed(mesh))):
-            calls[name, size] = partial(_step_by_places, rays, surface, albedo, places, powers)
-    times = clock.medians(calls)
-    rows = [[name, *(f"{times[name, size]:.3g} ms" for size in SIZES)] for name in ("cast anew", "held")]
-    return markdown(["shadows", *(f"step by places, {size}²" for size in SIZES)], rows)
+        calls[size] = partial(_step_by_places, rays, surface, albedo, places, powers)
+    return " and ".join(f"{taken:.3g} ms at {size}²" for size, taken in clock.medians(calls).items())
 
 
 def _step_by_places(rays: Rays, surface: Surface, albedo: Tensor, places: Tensor, powers: Tensor) -> None:

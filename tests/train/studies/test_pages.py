@@ -9,14 +9,14 @@ ROOT = Path(__file__).parents[3]
 STUDIES = ROOT / "train" / "studies"
 PAGES = {
     "accuracy/study": "accuracy",
-    "growth/study": "performance_growth",
+    "growth/study": "performance",
     "interruptions/page": "interruptions",
     "load/study": "load",
-    "placed_lights": "performance_lights",
+    "placed_lights": "performance",
     "reliability/page": "reliability",
     "renderer_speed/study": "performance_renderer",
     "renderer_speed/vertices": "performance_renderer",
-    "training_speed/page": "performance",
+    "training_speed/study": "performance",
     "transport/study": "transport",
     **{f"paper/{path.stem}": "paper" for path in STUDIES.glob("paper/*.md")},
 }
