@@ -40,10 +40,10 @@ from train.photographs.text import format_summary
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import checkpoint
 from train.run_folder.classifier import describe, start_from
+from train.run_folder.continuation import INPUTS, fingerprints, require_same_inputs, require_same_settings
 from train.run_folder.files import CONFIG, write_whole
-from train.run_folder.inputs import INPUTS, fingerprints, require_same_inputs
 from train.run_folder.logs import NoLog, RunLog, console
-from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, require_same_settings
+from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings
 
 
 def load_data(config: DictConfig) -> DataSet:

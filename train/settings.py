@@ -1,12 +1,11 @@
 """conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from augment.build import count_views
 from augment.objects import CompanionSettings, ObjectSettings
@@ -18,16 +17,10 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.subdivision import MOST_VERTICES
 from renderer.visibility import choose
-from train.command_line.configuration import as_dict, dotted, read_settings
+from train.command_line.configuration import read_settings
 from train.fit.recipe import TrainSettings
 from train.networks import WIDERESNET
-from train.run_folder.files import CONFIG, read_config
 
-# Where, how and with what a run was made: these do not decide its result, nor name a sweep's cell.
-CIRCUMSTANCES = (
-    *("run", "sweep", "launcher", "compare", "versions", "inputs", "renderer.cache"),
-    *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
-)
 OTHER = "other"  # in place of the class of a look-alike that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
@@ -213,48 +206,6 @@ class ExperimentSettings:
             if key.startswith("scene.look_alikes") and item.label == self.label:
                 raise InputError(f"{key} is of the class {self.label}: name it in scene.meshes, or leave it out")
         return objects
-
-
-def is_circumstance(key: str) -> bool:
-    """Whether a dotted key is one of the circumstances, or within one."""
-    return any(key == each or key.startswith(f"{each}.") for each in CIRCUMSTANCES)
-
-
-def decisive_settings(config: DictConfig) -> dict[str, object]:
-    """What decides a run's result, by dotted key: all but the circumstances, with `${run}` for its own folder."""
-    settings = as_dict(config, resolve=True)
-    own = re.compile(f"^{re.escape(str(settings.get('run')))}(?=/|$)")
-    return {
-        key: own.sub("${run}", value) if isinstance(value, str) else value
-        for key, value in dotted(settings)
-        if not is_circumstance(key)
-    }
-
-
-def differing_settings(folder: Path, config: DictConfig) -> Iterator[tuple[str, Any, Any]]:
-    """The decisive keys in which the run in a folder and a configuration differ, with both values.
-
-    A key that the run is older than has its default.
-    """
-    defaults = decisive_settings(OmegaConf.structured(ExperimentSettings))
-    found, asked = ({**defaults, **decisive_settings(each)} for each in (read_config(folder / CONFIG), config))
-    for key in sorted(found.keys() | asked.keys()):
-        if found.get(key) != asked.get(key):
-            yield key, found.get(key), asked.get(key)
-
-
-def require_same_settings(folder: Path, config: DictConfig) -> None:
-    """InputError where the run in a folder cannot go on under a configuration; with more epochs it can.
-
-    Nor does what comes after training have to be the same.
-    """
-    for key, found, asked in differing_settings(folder, config):
-        longer = key == "train.epochs" and isinstance(found, int) and asked > found
-        if not longer and not key.startswith("evaluate."):
-            raise InputError(
-                f"run={folder} was trained with {key}={found}, and train.resume=true asks for {asked}: resume with the "
-                f"settings of {folder / CONFIG}, or start in another folder with run="
-            )
 
 
 def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:

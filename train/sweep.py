@@ -33,10 +33,9 @@ from train.report.overview import format_spread, format_table
 from train.report.summary import is_finished, summarise
 from train.report.write import report_of
 from train.run_folder import checkpoint
+from train.run_folder.continuation import CIRCUMSTANCES, differing_settings, require_same_inputs
 from train.run_folder.files import FAILURE, locked, state
-from train.run_folder.inputs import require_same_inputs
 from train.run_folder.logs import console
-from train.settings import CIRCUMSTANCES, differing_settings
 
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 NEEDS = {  # launcher: its extra and the package in it

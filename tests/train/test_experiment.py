@@ -27,8 +27,9 @@ from train.fit import trainer
 from train.interruption import Interrupted
 from train.run_folder import checkpoint
 from train.run_folder.classifier import load_run
+from train.run_folder.continuation import require_same_settings
 from train.run_folder.logs import read_metrics
-from train.settings import ExperimentSettings, require_same_settings
+from train.settings import ExperimentSettings
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:

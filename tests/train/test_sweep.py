@@ -22,9 +22,9 @@ from train.command_line.entry_points import USER_ERROR
 from train.fit import trainer
 from train.run_folder import checkpoint
 from train.run_folder.checkpoint import LAST, content_hash
+from train.run_folder.continuation import decisive_settings
 from train.run_folder.files import FAILURE, LOCK, locked
 from train.run_folder.logs import read_metrics
-from train.settings import decisive_settings
 from train.sweep import cell_name, check_launcher, format_sweep, run_cell
 
 ROOT = Path(__file__).parents[2]

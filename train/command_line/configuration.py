@@ -1,6 +1,6 @@
 """A command's configuration, composed, and read into dataclasses or plain values; errors name the key at fault."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
@@ -81,6 +81,11 @@ def _fits(kind: type, key: str, value: object) -> bool:
 def as_dict(config: DictConfig, resolve: bool = False) -> dict[str, Any]:
     """The settings as plain dictionaries and lists."""
     return cast(dict[str, Any], OmegaConf.to_container(config, resolve=resolve))
+
+
+def is_within(key: str, groups: Collection[str]) -> bool:
+    """Whether a dotted key is one of the groups, or within one."""
+    return any(key == group or key.startswith(f"{group}.") for group in groups)
 
 
 def dotted(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:

@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from augment.parameters import KINDS
-from train.command_line.configuration import as_dict, composed, dotted
+from train.command_line.configuration import as_dict, composed, dotted, is_within
 from train.command_line.entry_points import quoted
 
 CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "inputs", "out", "train.resume", "data.images")
@@ -36,12 +36,8 @@ def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapp
     if own.get("evaluate.photos") and own.get("evaluate.photos") == own.get("data.images"):
         del own["evaluate.photos"]  # the run's own renders, which it makes again
     changed = {key: value for key, value in own.items() if key in defaults and value != defaults[key]}
-    overrides = [f"{key}={_value(value)}" for key, value in changed.items() if not _is_circumstance(key)]
+    overrides = [f"{key}={_value(value)}" for key, value in changed.items() if not is_within(key, CIRCUMSTANCES)]
     return shlex.join([*start.split(), *chosen, *overrides])
-
-
-def _is_circumstance(key: str) -> bool:
-    return any(key == each or key.startswith(f"{each}.") for each in CIRCUMSTANCES)
 
 
 def _value(value: object) -> str:

@@ -15,9 +15,9 @@ from renderer.errors import InputError
 from train.photographs.figures import FIGURES, find_figure
 from train.photographs.scoring import SUMMARY
 from train.photographs.text import format_interval
+from train.run_folder.continuation import decisive_settings
 from train.run_folder.files import CONFIG, read_config, read_json
 from train.run_folder.logs import METRICS, PHASES, read_metrics
-from train.settings import decisive_settings
 
 
 @dataclass(frozen=True)

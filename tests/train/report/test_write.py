@@ -19,8 +19,8 @@ from train.report import images, plots
 from train.report.command import training_command
 from train.report.summary import summarise
 from train.report.write import report_of, write_report
+from train.run_folder.continuation import decisive_settings
 from train.run_folder.files import locked
-from train.settings import decisive_settings
 
 HOSTILE = "<script>alert(1)</script>|*x*"
 

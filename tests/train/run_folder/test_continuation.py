@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.experiment import load_data, prepare
-from train.run_folder.inputs import INPUTS, fingerprints, require_same_inputs
+from train.run_folder.continuation import INPUTS, fingerprints, require_same_inputs
 from train.sweep import _check_same_settings
 
 
