@@ -41,7 +41,7 @@ def main(config: DictConfig) -> None:
         print(format_reloaded(adversary, images, logits, classifier.classes))
         if not settings.attack.kinds:
             return
-    others = load_others(settings, device)
+    others = load_others(settings, classifier, device)
     out = writable_folder(settings.out, "out")
     if any(out.glob(f"*/{LINES}")):  # whose examples would lie among the new ones
         raise InputError(f"out={out} holds the adversaries of an earlier call: choose another folder, or remove it")

@@ -43,16 +43,11 @@ def first_process_first() -> Iterator[None]:
         _wait()
 
 
-def announce(value: str) -> None:
-    """Tell the other processes, each of which waits in `announced`; the first one's to call."""
+def announced(value: str = "") -> str:
+    """What the first process has as the value; the others wait for it."""
+    values = [value]
     if processes.world_size() > 1:
-        dist.broadcast_object_list([value], src=0)
-
-
-def announced() -> str:
-    """What the first process announces."""
-    values = [""]
-    dist.broadcast_object_list(values, src=0)
+        dist.broadcast_object_list(values, src=0)
     return values[0]
 
 

@@ -22,7 +22,6 @@ from augment.scene import Conditions, Scene
 from augment.seeding import generator
 from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
-from renderer.errors import InputError
 from renderer.image import ImageSettings, to_bytes
 from renderer.lights import ambient, directional
 from renderer.mesh import Mesh, normalise
@@ -55,10 +54,6 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
 
     The cache keeps the images, not the operators: every one of those is used for four images and never again.
     """
-    if train < 1 or test < 1:
-        raise InputError(
-            f"data.train_per_class={train} and data.test_per_class={test} must be at least 1 image per class"
-        )
     settings = replace(SETTINGS, size=size)
     splits = [
         _render_split(per_class, seed, Part(name, even_light), settings, cache or TensorCache())

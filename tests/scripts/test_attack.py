@@ -126,6 +126,7 @@ def test_what_fools_is_shown_to_other_networks_from_other_sides_and_on_other_mes
 
 REFUSED = [
     (["transfer.classifiers=[{network: x}]"], "transfer.classifiers: network is not known: give names"),
+    (["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "has no class 'paer': choose one, such as pear"),
     (["transfer.classifiers=[squeezenet]"], "classifier=squeezenet is not known"),
     (["attack=geometry", "transfer.meshes=[a.glb]"], "transfer.meshes: attack=geometry belongs to what was attacked"),
     (["attack=pixels", "transfer.azimuths=[3]"], "transfer.azimuths: attack=pixels belongs to what was attacked"),

@@ -12,8 +12,7 @@ from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
 from renderer.errors import InputError
 from renderer.visibility import choose
-from train.attacks.scene import scene_of
-from train.attacks.search import search
+from train.attacks.search import scene_of, search
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 from train.settings import read_object
 

@@ -1,4 +1,4 @@
-"""A scene in which a classifier recognises a mesh, so that there is something to attack."""
+"""The scene that an attack shows a mesh in, or another in which the classifier recognises it."""
 
 import math
 import shlex
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from augment.attacks.run import logits_of
+from augment.build import build_scene
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
 from augment.scene import Scene
 from augment.seeding import generator
 from renderer.lights import PROBES, UNIFORM, load_light
-from train.attacks.scene import scene_of
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 
 POLAR, FIELD_OF_VIEW = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
@@ -24,6 +24,20 @@ LENS = 45.0  # degrees, of every other camera that is drawn where the scene is o
 LIGHT_GREY = 0.9  # as things are shown in catalogues
 EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)  # times the scene's own
 SURE = 0.5  # confidence, in every image, at which the search ends
+
+
+def scene_of(item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device) -> Scene:
+    """Views × backgrounds at `size` pixels per side, as an example each, or where views share what is attacked, an
+    example per background."""
+    return build_scene(
+        [item],
+        size,
+        settings.scene.views,
+        shared=settings.attack.shared,
+        **settings.scene.choices,
+        **settings.renderer.choices,
+        device=device,
+    )
 
 
 def search(

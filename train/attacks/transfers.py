@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from augment.attacks.transfer import Transfer
+from augment.classifiers import Classifier
 from augment.objects import load_object, on_ground
 from renderer.errors import InputError
 from train.attacks.settings import AttackExperimentSettings
@@ -20,8 +21,9 @@ from train.settings import read_object
 FILE = "transfer.jsonl"
 
 
-def load_others(settings: AttackExperimentSettings, device: torch.device) -> dict[str, Any]:
-    """The arguments of `Attacked.transfer`; none where nothing is asked for. InputError: as the loaders."""
+def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:
+    """The arguments of `Attacked.transfer`; none where nothing is asked for. InputError: as the loaders, and where a
+    classifier lacks a class."""
     asked, scene = settings.transfer, settings.scene
     named = [item if isinstance(item, dict) else {"classifier": item} for item in asked.classifiers]
     if unknown := next((key for item in named for key in item if key not in ("classifier", "weights")), None):
@@ -30,6 +32,8 @@ def load_others(settings: AttackExperimentSettings, device: torch.device) -> dic
     for classifier in classifiers:
         classifier.label(settings.label)  # before anything is attacked
     items = [read_object(item, settings.label, index, "transfer.meshes") for index, item in enumerate(asked.meshes)]
+    for item in items:
+        attacked.label(item.label)
     objects = [on_ground(load_object(item, scene.vertices), scene.ground) for item in items]
     others = {"classifiers": classifiers, "azimuths": asked.azimuths, "objects": objects}
     return {name: each for name, each in others.items() if each}

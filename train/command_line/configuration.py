@@ -41,6 +41,9 @@ def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") ->
         if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
             key = ".".join(filter(None, (parent, min(unset))))
             raise InputError(f"{key} is not set: give {key}=...")
+        for key, value in dotted(as_dict(config)):
+            if isinstance(value, int) and value not in (0, 1) and isinstance(OmegaConf.select(merged, key), bool):
+                raise InputError(f"{'.'.join(filter(None, (parent, key)))}={value}: give true or false")
         return cast(Settings, OmegaConf.to_object(merged))
     except _UNREADABLE as error:
         within = getattr(error, "full_key", None) or ""

@@ -1,7 +1,6 @@
 """A network that learns, one step at a time: its optimiser, schedule, distortions and the average of its weights."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -86,9 +85,14 @@ class Learner:
             group["lr"] = self.settings.learning_rate * SCHEDULES[self.settings.schedule](progress)
         images = self._distort(images, labels, number)
         self.optimizer.zero_grad(set_to_none=True)
-        with _one_error_out_of_memory(f"train.batch_size={self.settings.batch_size}"):
+        try:
             loss, hits = self._training_pass(images, labels, rendered)
             loss.backward()
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            setting = f"train.batch_size={self.settings.batch_size}"
+            raise InputError(f"{setting} needs more memory than there is: set a lower one") from error
         self.optimizer.step()
         if self._average:
             self._average.update(self.model)
@@ -129,14 +133,3 @@ class Learner:
         if self._soup:
             self._soup.load_state_dict(state["soup"])
         self.model.precision = self.selected.precision = state["precision"]
-
-
-@contextmanager
-def _one_error_out_of_memory(setting: str) -> Iterator[None]:
-    """InputError naming the setting where memory runs out."""
-    try:
-        yield
-    except (RuntimeError, MemoryError) as error:
-        if not is_out_of_memory(error):
-            raise
-        raise InputError(f"{setting} needs more memory than there is: set a lower one") from error

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from augment.parameters import KINDS
 from train.command_line.configuration import as_dict, composed, dotted, is_within
-from train.command_line.entry_points import quoted
+from train.command_line.overrides import quoted
 
 CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "inputs", "out", "train.resume", "data.images")
 DATA = ("cifar100", "npz", "folder")  # besides the default

@@ -89,14 +89,10 @@ class RunLog:
 class NoLog:
     """In place of a `RunLog`, for processes of a run that write nothing."""
 
-    def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
+    def _nothing(self, *_: object, **__: object) -> None:
         pass
 
-    def renders(self, images: Tensor, epoch: int) -> None:
-        pass
-
-    def specimens(self, specimens: Specimens, classes: Sequence[str], epoch: int) -> None:
-        pass
+    scalars = renders = specimens = _nothing
 
 
 Log = RunLog | NoLog

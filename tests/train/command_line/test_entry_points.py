@@ -19,10 +19,10 @@ from train.command_line.entry_points import (
     command_line,
     one_sentence,
     one_sentence_errors,
-    quoted,
     run_command,
 )
 from train.command_line.outputs import Folders
+from train.command_line.overrides import quoted
 from train.experiment import load_data, prepare
 from train.run_folder.checkpoint import LAST
 from train.run_folder.files import locked
@@ -146,6 +146,7 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_np
     "overrides, message",
     [
         (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
+        (["train.resume=2"], "train.resume=2: give true or false"),
         (["label=ornage"], "label of scene.meshes[0]: 'ornage' is not a class of the model: did you mean 'orange'?"),
         (["data.path=???"], "data.path is not set: give data.path=..."),
         (["scene.projector=[]"], "scene.projector: Cannot merge DictConfig with ListConfig"),
