@@ -7,11 +7,11 @@ __getattr__, __dir__, __all__ = attach(
     {
         "attacks.criteria": ["LeastLikely", "Misclassification", "Targeted"],
         "attacks.run": ["Attacked", "attack"],
-        "attacks.settings": ["AttackSettings", "SkylightSettings"],
+        "attacks.settings": ["AttackSettings"],
         "build": ["build_scene"],
         "classifiers": ["Classifier", "load_classifier"],
         "objects": ["CompanionSettings", "ObjectSettings"],
-        "parameters": ["StepSettings"],
+        "parameters": ["SkylightSettings", "StepSettings"],
         "placed_lights": ["LampsSettings", "ProjectorSettings"],
         "scene": ["Scene"],
         "service": ["AugmentationService"],

@@ -50,6 +50,15 @@ class StepSettings:
         require_range("attack: step_size", self.step_size, 1 / LARGEST, FACTOR)
 
 
+@dataclass
+class SkylightSettings(StepSettings):
+    """Where the sky begins: zenith and azimuth in degrees, turbidity."""
+
+    zenith: float = 45.0
+    azimuth: float = 0.0
+    turbidity: float = 3.0
+
+
 def direction(gradient: Tensor, step: str) -> Tensor:
     """The gradient (A, D) as a step: unit L2 norm per example (a zero gradient stays zero), raw, or its sign."""
     if step == "raw":
@@ -209,7 +218,9 @@ class Skylight(Kind):
 
     name = "skylight"
 
-    def __init__(self, scene: Scene, settings: StepSettings, zenith: float, azimuth: float, turbidity: float):
+    def __init__(self, scene: Scene, settings: SkylightSettings):
+        zenith, azimuth = math.radians(settings.zenith), math.radians(settings.azimuth)
+        turbidity = settings.turbidity
         start = torch.tensor([zenith, azimuth, turbidity / TURBIDITY_UNIT], dtype=torch.float64).to(scene.lights)
         super().__init__(scene, start.expand(len(scene), -1), settings)
         sky = mean_luminance(coefficients(zenith, azimuth, turbidity))

@@ -7,7 +7,6 @@ before.npy, after.npy (V, 3, size, size) unrounded. mitsuba/scene.xml shows it i
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -29,15 +28,10 @@ from renderer.files.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.files.placed_lights import load_placed, save_placed
 from renderer.image import ImageSettings, to_bytes
 from renderer.lights import load_light, save_light
-from renderer.mesh import Mesh, load_mesh
+from renderer.mesh import load_mesh
 
-DESCRIPTION, MESH, LIGHT, BACKGROUND, PIXELS = (
-    "adversary.json",
-    "mesh.glb",
-    "light.json",
-    "background.png",
-    "pixels.npy",
-)
+DESCRIPTION, MESH, LIGHT = "adversary.json", "mesh.glb", "light.json"
+BACKGROUND, PIXELS = "background.png", "pixels.npy"
 BEFORE, AFTER, MITSUBA = "before", "after", "mitsuba"
 MAP_HEIGHT = 256
 NOWHERE = 2.0**-8  # of the brightest radiance: what an .hdr file rounds off
@@ -102,6 +96,9 @@ def read_adversary(folder: Path) -> Adversary:
         background = description["background"]
         own = None if description.get("own_faces") is None else int(description["own_faces"])
         placed = [load_placed(folder / str(file)) for file in description.get("placed_lights", [])]
+        surface = load_mesh(mesh)
+        for camera in cameras:
+            camera.depths(surface.vertices)  # which refuses a mesh around the camera
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
@@ -109,7 +106,6 @@ def read_adversary(folder: Path) -> Adversary:
     require_range(f"{path}: gain", gain, 1 / FACTOR, FACTOR)
     if not cameras:
         raise InputError(f"{path} has no cameras: write it again")
-    surface = _before(cameras, load_mesh(mesh), path)
     shape = (len(cameras), 3, settings.size, settings.size)
     if own is not None:
         require_range(f"{path}: own_faces", own, 1, len(surface.faces))
@@ -131,16 +127,6 @@ def read_adversary(folder: Path) -> Adversary:
 
 def _camera(**described: float) -> Camera:
     return PerspectiveCamera(**described) if "distance" in described else OrthographicCamera(**described)
-
-
-def _before(cameras: Sequence[Camera], mesh: Mesh, path: Path) -> Mesh:
-    """The mesh; InputError naming the description of a camera that is within it."""
-    try:
-        for camera in cameras:
-            camera.depths(mesh.vertices)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    return mesh
 
 
 def _write_background(background: Tensor, folder: Path) -> float | str:

@@ -13,9 +13,9 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.adversary_folder import write_adversary
 from augment.attacks.checks import Checks
 from augment.attacks.figure import Exhibit, answer_caption, save_figure
-from augment.attacks.run import Attacked
+from augment.attacks.run import Attacked, answers
 from augment.attacks.verification import Verdict, require_renderers, verify
-from augment.scene import Conditions, Scene
+from augment.scene import Conditions
 from renderer.arguments import checked
 from renderer.basis import Basis
 from renderer.files.mesh_damage import mesh_damage
@@ -56,31 +56,31 @@ def write_files(
 
 def exhibits(attacked: Attacked, example: int) -> tuple[Exhibit, Exhibit]:
     """What an example shows before and after; its light only where the attack has changed it."""
-    problem, result = attacked.problem, attacked.result
+    problem, classes = attacked.problem, attacked.classifier.classes
     one = problem.everything[example : example + 1]
-    sides = [problem.conditions(values[one], one) for values in (problem.start, result.values)]
-    lit = [(side.light[0], problem.scene.basis_under(side, 0)) for side in sides]
-    changed = not torch.equal(lit[0][0], lit[1][0]) or lit[0][1] != lit[1][1]
-    spheres = [_spheres(problem.scene, *each, example) if changed else None for each in lit]
-    labels = [attacked.classifier.classes[label] for label in attacked.goal.decrease[example].tolist()]
+    sides = [problem.conditions(values[one], one) for values in (problem.start, attacked.result.values)]
+    lights = [(side.light[0], problem.scene.basis_under(side, 0)) for side in sides]
+    changed = not torch.equal(lights[0][0], lights[1][0]) or lights[0][1] != lights[1][1]
+    labels = [classes[label] for label in attacked.goal.decrease[example].tolist()]
 
-    def captions(logits: Tensor) -> list[tuple[str, ...]]:
-        answers = zip(logits[example].softmax(1), labels, strict=True)
-        return [answer_caption(view, attacked.classifier.classes, label) for view, label in answers]
+    def exhibit(images: Tensor, logits: Tensor, light: Tensor, basis: Basis) -> Exhibit:
+        views = zip(logits[example].softmax(1), labels, strict=True)
+        captions = [answer_caption(probabilities, classes, label) for probabilities, label in views]
+        cameras = problem.scene.cameras[example]
+        spheres = torch.stack([light_sphere(light, SPHERE, each, basis) for each in cameras]) if changed else None
+        return Exhibit(images[example], captions, spheres)
 
     return (
-        Exhibit(attacked.images_before[example], captions(attacked.logits_before), spheres[0]),
-        Exhibit(attacked.images[example], captions(attacked.logits), spheres[1]),
+        exhibit(attacked.images_before, attacked.logits_before, *lights[0]),
+        exhibit(attacked.images, attacked.logits, *lights[1]),
     )
-
-
-def _spheres(scene: Scene, light: Tensor, basis: Basis, example: int) -> Tensor:
-    return torch.stack([light_sphere(light, SPHERE, camera, basis) for camera in scene.cameras[example]])
 
 
 def _numbers(attacked: Attacked, example: int) -> dict[str, object]:
     result, classes = attacked.result, attacked.classifier.classes
-    before, after = (logits[example].softmax(1) for logits in (attacked.logits_before, attacked.logits))
+    before = answers(attacked.logits_before[example], classes)
+    one = slice(example, example + 1)
+    ends = (attacked.problem.split(values[one]) for values in (result.values, attacked.problem.start))
     return {
         "recognised": bool(attacked.recognised[example]),
         "fooled_before": bool(result.fooled_before[example]),
@@ -90,18 +90,11 @@ def _numbers(attacked: Attacked, example: int) -> dict[str, object]:
         "cost_before": float(result.cost_before[example]),
         "cost": float(result.cost[example]),
         "label": [classes[index] for index in attacked.goal.decrease[example].tolist()],
-        "answer_before": [classes[index] for index in before.argmax(1).tolist()],
-        "confidence_before": before.amax(1).tolist(),
-        "answer": [classes[index] for index in after.argmax(1).tolist()],
-        "confidence": after.amax(1).tolist(),
+        **{f"{key}_before": value for key, value in before.items()},
+        **answers(attacked.logits[example], classes),
         "largest_change": {
             kind.name: float((part - start).abs().max())
-            for kind, part, start in zip(
-                attacked.problem.kinds,
-                attacked.problem.split(result.values[example : example + 1]),
-                attacked.problem.split(attacked.problem.start[example : example + 1]),
-                strict=True,
-            )
+            for kind, part, start in zip(attacked.problem.kinds, *ends, strict=True)
         },
     }
 

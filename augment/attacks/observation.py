@@ -1,13 +1,15 @@
 """What a classifier is given of a rendered image: as it is, rounded to 8 bits, or as unsteady cameras might take it."""
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from PIL import Image
 from torch import Tensor, nn
 
-from augment.attacks.jpeg import as_jpeg
 from renderer.errors import require_range
 from renderer.image import clamp, to_bytes, to_unit
 
@@ -74,6 +76,17 @@ class Expected(nn.Module):
 def straight_through(images: Tensor, change: Callable[[Tensor], Tensor]) -> Tensor:
     """Changed images whose derivative is that of the images as they are."""
     return images + (change(images.detach()) - images.detach())
+
+
+def as_jpeg(images: Tensor, quality: int) -> Tensor:
+    """Images (..., 3, H, W) in [0, 1], float32 on the CPU, compressed at a quality from 1 to 100 and read back."""
+    compressed = []
+    for image in to_bytes(images).flatten(0, -4):
+        file = io.BytesIO()
+        Image.fromarray(image.permute(1, 2, 0).numpy()).save(file, "JPEG", quality=quality)
+        with Image.open(file) as read:
+            compressed.append(torch.from_numpy(np.array(read)).permute(2, 0, 1))
+    return to_unit(torch.stack(compressed)).view(images.shape)
 
 
 def _moved(images: Tensor, amounts: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -183,6 +183,12 @@ def logits_of(classifier: nn.Module, images: Tensor, batch_size: int) -> Tensor:
     flat = images.flatten(0, 1)
     logits = BatchSize(batch_size).map(lambda part: classifier(flat[part]), len(flat))
     return torch.cat(list(logits)).unflatten(0, images.shape[:2])
+
+
+def answers(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
+    """The classes of the highest logits (V, C) by name, and their probabilities, for JSON."""
+    best = logits.softmax(1).max(1)
+    return {"answer": [classes[index] for index in best.indices.tolist()], "confidence": best.values.tolist()}
 
 
 def require_recognised(scene: Scene, logits: Tensor, labels: Tensor, classifier: Classifier) -> None:

@@ -1,13 +1,13 @@
 """What an attack may change, by which steps, and for how long: the same for a training and for a single attack."""
 
-import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from torch import nn
 
 from augment.attacks.observation import Expected, Rounded, TransformationSettings
 from augment.descent import DescentSettings
-from augment.parameters import KINDS, Kind, Lighting, Skylight, StepSettings
+from augment.parameters import KINDS, Lighting, SkylightSettings, StepSettings
 from augment.perturbation import Perturbation
 from augment.scene import Scene
 from augment.seeding import generator
@@ -16,15 +16,6 @@ from renderer.errors import InputError, require_choice, require_range
 
 PHYSICAL, SIGNED = "physical", "signed"
 LIGHTS = (PHYSICAL, SIGNED)
-
-
-@dataclass
-class SkylightSettings(StepSettings):
-    """Where the sky begins: zenith and azimuth in degrees, turbidity."""
-
-    zenith: float = 45.0
-    azimuth: float = 0.0
-    turbidity: float = 3.0
 
 
 @dataclass
@@ -91,12 +82,5 @@ class AttackSettings:
         """What is changed of a scene, in light that is possible."""
         if self.light == PHYSICAL:
             scene = replace(scene, lights=scene.basis.nearest_physical(scene.lights))
-        return Perturbation(scene, [self._kind(name, scene, settings) for name, settings in self.kinds.items()])
-
-    def _kind(self, name: str, scene: Scene, settings: StepSettings) -> Kind:
-        if name == Lighting.name:
-            return Lighting(scene, settings, self.light == PHYSICAL)
-        if isinstance(settings, SkylightSettings):
-            angles = math.radians(settings.zenith), math.radians(settings.azimuth)
-            return Skylight(scene, settings, *angles, settings.turbidity)
-        return KINDS[name](scene, settings)
+        kinds = KINDS | {Lighting.name: partial(Lighting, physical=self.light == PHYSICAL)}
+        return Perturbation(scene, [kinds[name](scene, settings) for name, settings in self.kinds.items()])

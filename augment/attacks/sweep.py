@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.attacks.checks import fooled_by_draws
 from augment.attacks.run import Attacked
 from augment.attacks.settings import AttackSettings
-from augment.descent import Part, descend
+from augment.descent import Part, descend_in_parts
 from augment.phases import Phases
 from augment.progress import progress
 from augment.seeding import generator
@@ -47,18 +47,14 @@ def sweep(attacked: Attacked, scales: Sequence[float]) -> Sweep:
     for scale in progress(sorted(set(scales)), "radii"):
         radii.append({name: scale * (1.0 if kind.radius is None else kind.radius) for name, kind in kinds.items()})
         balls = within(settings, radii[-1]).problem(problem.scene)
-        for left in _parts(~fooled, problem.scene.at_once):
-            part = Part(balls, left, values[left])
-            result = descend(seen, part, goal.of(left), settings.descent(), Phases(values.device))
+        left = torch.nonzero(~fooled).squeeze(1)
+        if len(left):
+            part, phases = Part(balls, left, values[left]), Phases(values.device)
+            result = descend_in_parts(seen, part, goal.of(left), settings.descent(), phases, (), problem.scene.at_once)
             values[left], fooled[left] = result.values, result.fooled
         random = fooled_by_draws(attacked, random, settings.max_steps, partial(balls.sample, draws))
         found.append((fooled[attacked.recognised].cpu(), random[attacked.recognised].cpu()))
     return Sweep(radii, *map(torch.stack, zip(*found, strict=True)))
-
-
-def _parts(chosen: Tensor, at_once: int) -> list[Tensor]:
-    """The indices of what is chosen, so many at a time."""
-    return [part for part in torch.nonzero(chosen).squeeze(1).split(at_once) if len(part)]
 
 
 def within(settings: AttackSettings, radii: Mapping[str, float]) -> AttackSettings:

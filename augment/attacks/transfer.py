@@ -54,14 +54,16 @@ def transfer(
     """
     require_transferable([kind.name for kind in attacked.problem.kinds], azimuths, objects)
     pairs, own = _pairs(attacked), attacked.classifier
+
+    def judged(change: Callable[[Adversary], Adversary], kind: str, name: str, by: Classifier) -> Transfer:
+        return _judged(attacked, [(change(old), change(new)) for old, new in pairs], kind, name, by)
+
     for classifier in classifiers:
-        resized = [(_resized(old, classifier.size), _resized(new, classifier.size)) for old, new in pairs]
-        yield _judged(attacked, resized, "network", classifier.name, classifier)
+        yield judged(partial(_resized, size=classifier.size), "network", classifier.name, classifier)
     for angle in azimuths:
-        turned = _changed(pairs, partial(_turned, angle=math.radians(angle)))
-        yield _judged(attacked, turned, "azimuth", f"{angle:+g}°", own)
+        yield judged(partial(_turned, angle=math.radians(angle)), "azimuth", f"{angle:+g}°", own)
     for shown in objects:
-        yield _judged(attacked, _changed(pairs, partial(replace, shown=shown)), "mesh", Path(shown.name).name, own)
+        yield judged(partial(replace, shown=shown), "mesh", Path(shown.name).name, own)
 
 
 def require_transferable(kinds: Collection[str], azimuths: Collection[float], objects: Collection[Any]) -> None:
@@ -80,10 +82,6 @@ def _pairs(attacked: Attacked) -> list[Pair]:
         old, new = (Adversary.of(scene, example, each, *images) for each in ends)
         found.append((old, new))
     return found
-
-
-def _changed(pairs: Sequence[Pair], change: Callable[[Adversary], Adversary]) -> list[Pair]:
-    return [(change(old), change(new)) for old, new in pairs]
 
 
 def _resized(adversary: Adversary, size: int) -> Adversary:

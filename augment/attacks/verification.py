@@ -10,8 +10,8 @@ from torch import Tensor
 
 from augment.attacks.adversary import Adversary
 from augment.attacks.adversary_folder import MITSUBA, read_adversary
-from augment.attacks.jpeg import as_jpeg
-from augment.attacks.run import Attacked, logits_of
+from augment.attacks.observation import as_jpeg
+from augment.attacks.run import Attacked, answers, logits_of
 from renderer.errors import InputError
 from renderer.files.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.image import behind, clamp, develop_composite, to_bytes, to_unit
@@ -36,11 +36,9 @@ class Verdict:
 
     def of(self, example: int, classes: Sequence[str]) -> dict[str, Any]:
         """One example's numbers."""
-        best = self.logits[example].softmax(1).max(1)
         return {
             "fooled": bool(self.fooled[example]),
-            "answer": [classes[index] for index in best.indices.tolist()],
-            "confidence": best.values.tolist(),
+            **answers(self.logits[example], classes),
             "largest_difference": float(self.largest[example]),
             "mean_difference": float(self.mean[example]),
         }

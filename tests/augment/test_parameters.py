@@ -2,6 +2,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,19 @@ from torch import Tensor
 from augment import reshading
 from augment.descent import DescentSettings, descend
 from augment.goal import Goal
-from augment.parameters import KINDS, STEPS, Albedo, Geometry, Kind, Lighting, Pixels, Skylight, StepSettings, direction
+from augment.parameters import (
+    KINDS,
+    STEPS,
+    Albedo,
+    Geometry,
+    Kind,
+    Lighting,
+    Pixels,
+    Skylight,
+    SkylightSettings,
+    StepSettings,
+    direction,
+)
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
@@ -29,9 +42,16 @@ FREE = StepSettings()
 SKY = (0.9, 0.4, 3.0)
 EVERY = torch.arange(3)
 
-MAKERS: dict[str, Callable[[Scene], Kind]] = {
-    "skylight": partial(Skylight, settings=FREE, zenith=SKY[0], azimuth=SKY[1], turbidity=SKY[2])
-} | {kind.name: partial(kind, settings=FREE) for kind in (Lighting, Geometry, Albedo, Pixels)}
+
+def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
+    """Zenith and azimuth in radians, turbidity."""
+    zenith, azimuth, turbidity = start
+    return SkylightSettings(zenith=math.degrees(zenith), azimuth=math.degrees(azimuth), turbidity=turbidity, **steps)
+
+
+MAKERS: dict[str, Callable[[Scene], Kind]] = {"skylight": partial(Skylight, settings=sky_at(SKY))} | {
+    kind.name: partial(kind, settings=FREE) for kind in (Lighting, Geometry, Albedo, Pixels)
+}
 SIZES = {"lighting": 49 * 3, "skylight": 3, "geometry": 12 * 3, "albedo": 20 * 3, "pixels": 2 * 3 * 6 * 6}
 
 
@@ -261,7 +281,7 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
     )
     @settings(max_examples=80, deadline=None)
     def check(start: tuple, values: tuple, radius: float | None):
-        sky = Skylight(scene, StepSettings(norm, radius), *start)
+        sky = Skylight(scene, sky_at(start, norm=norm, radius=radius))
         problem = Perturbation(scene, [sky])
         centre, ends = sky.start[0], torch.tensor([[ZENITH[0], -99, 0.5], [ZENITH[1], 99, 2.5]], dtype=dtype)
         torch.testing.assert_close(centre * torch.tensor([1, 1, 4], dtype=dtype), torch.tensor(start, dtype=dtype))
@@ -286,7 +306,7 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
 def test_a_free_descent_over_the_sky_slides_along_the_end_of_its_domain(make_scene, make_linear):
     """With steps far beyond it, up to the horizon and to the haziest or clearest air."""
     scene, classes = make_scene(), torch.zeros(3, 2, dtype=torch.int64)
-    problem = Perturbation(scene, [Skylight(scene, StepSettings(step="sign", step_size=0.8), *SKY)])
+    problem = Perturbation(scene, [Skylight(scene, sky_at(SKY, step="sign", step_size=0.8))])
     values, _ = attack(make_linear(2, bias=50.0), problem, Goal(classes, classes + 1), steps=6)
     ends = torch.tensor([[0, math.pi / 2], [0.5, 2.5]], dtype=torch.float64)
     reached = (values[:, [0, 2], None] == ends).any(2)
@@ -296,7 +316,7 @@ def test_a_free_descent_over_the_sky_slides_along_the_end_of_its_domain(make_sce
 @pytest.mark.parametrize("start", [(-0.1, 0, 3), (1.6, 0, 3), (1, 0, 1.9), (1, 0, 10.1), (1, math.nan, 3)])
 def test_a_sky_that_starts_outside_its_domain_is_refused(make_scene, start):
     with pytest.raises(InputError, match=r"zenith=|turbidity=|azimuth holds"):
-        Skylight(make_scene(), FREE, *start)
+        Skylight(make_scene(), sky_at(start))
 
 
 @pytest.mark.parametrize(("scale", "tolerance"), [(1.0, EPS32), (1e30, EPS32), (1e-30, EPS32), (1e-40, 1e-4)])

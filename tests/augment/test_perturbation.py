@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from augment.descent import AttackResult, DescentSettings, descend
 from augment.goal import Goal
-from augment.parameters import Albedo, Geometry, Lighting, Pixels, Skylight, StepSettings
+from augment.parameters import Albedo, Geometry, Lighting, Pixels, Skylight, SkylightSettings, StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene
@@ -101,7 +101,7 @@ def test_views_that_share_what_is_attacked_add_their_gradients(make_scene, make_
         settings = StepSettings(step="raw")
         kind = {
             "lighting": lambda: Lighting(scene, settings),
-            "skylight": lambda: Skylight(scene, settings, 0.9, 0.4, 3.0),
+            "skylight": lambda: Skylight(scene, SkylightSettings(step="raw")),
             "geometry": lambda: Geometry(scene, settings),
             "albedo": lambda: Albedo(scene, settings),
         }[name]()

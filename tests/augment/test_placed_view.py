@@ -89,6 +89,6 @@ def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_the_same_image(kinds
 
 def test_a_sky_is_attacked_beside_a_projector():
     shown = scene(lamps=None)
-    problem = Perturbation(shown, [Skylight(shown, STEPS["skylight"], 0.8, 0.3, 3.0)])
+    problem = Perturbation(shown, [Skylight(shown, STEPS["skylight"])])
     light = problem.conditions(problem.start, EVERY).light
     assert torch.equal(light[:, 49:], shown.lights[:, 49:]) and not torch.equal(light[:, :49], shown.lights[:, :49])

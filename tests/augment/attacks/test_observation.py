@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 import augment
 from augment.attacks import observation
-from augment.attacks.jpeg import as_jpeg
-from augment.attacks.observation import Expected, Rounded, TransformationSettings
+from augment.attacks.observation import Expected, Rounded, TransformationSettings, as_jpeg
 from augment.seeding import generator
 from renderer.errors import InputError
 
