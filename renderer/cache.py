@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,7 @@ def source_key(*packages: Path) -> str:
     return content_key(torch.__version__, np.__version__, *((name, path.read_bytes()) for name, path in sorted(files)))
 
 
+COUNTS = ("faces", "unseen_faces", "closed")  # of a view, kept with its operator
 RENDERER = source_key(Path(__file__).parent)  # on import, so that it is the code that runs
 
 
@@ -118,39 +120,16 @@ def _checksum(key: str, content: bytes) -> bytes:
     return digest.digest()
 
 
-@dataclass
-class Tally:
-    """How many views came from disk and how many were built, and what was left out of them when they were.
-
-    faces and unseen_faces, which no sample sees, add up over the views; closed counts the views of closed meshes, whose
-    back faces are not drawn.
-    """
-
-    loaded: int = 0
-    built: int = 0
-    faces: int = 0
-    unseen_faces: int = 0
-    closed: int = 0
-
-    @property
-    def views(self) -> int:
-        return self.loaded + self.built
-
-    def add(self, built: int, views: Collection[Mapping[str, Tensor]]) -> None:
-        self.built += built
-        self.loaded += len(views) - built
-        for faces, unseen, closed in (view["counts"].tolist() for view in views):
-            self.faces += faces
-            self.unseen_faces += unseen
-            self.closed += closed
-
-
 class OperatorCache(TensorCache):
-    """Transfer operators, one file per mesh and view, so that 5 views find those that a run with 10 has built."""
+    """Transfer operators, one file per mesh and view, so that 5 views find those that a run with 10 has built.
+
+    tally: of all `views` asked for, how many were `built`, how many `closed` meshes they show, whose back faces are not
+    drawn, and how many `faces` they have, with the `unseen_faces`, which cover no sample.
+    """
 
     def __init__(self, folder: Path | None = None):
         super().__init__(folder)
-        self.tally = Tally()
+        self.tally: Counter[str] = Counter()
 
     def operators(
         self,
@@ -174,7 +153,9 @@ class OperatorCache(TensorCache):
                 operator = builder.operator(seen)
                 views[camera] = _pack(mesh, seen, operator)
                 self.write(keys[camera], views[camera])
-        self.tally.add(built=len(missing), views=views.values())
+        self.tally.update(views=len(views), built=len(missing))
+        for view in views.values():
+            self.tally.update(dict(zip(COUNTS, view["counts"].tolist(), strict=True)))
         return [_unpack(views[camera], settings, basis) for camera in cameras]
 
 

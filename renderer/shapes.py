@@ -31,9 +31,9 @@ def solid(name: str, seed: int = 0) -> Mesh:
     return known[name](np.random.default_rng(seed))
 
 
-def orange(rng: np.random.Generator, subdivisions: int = 4) -> Mesh:
-    """An oblate sphere of 20·4^subdivisions faces, with pores and a green-brown navel in a dimple on top."""
-    directions, faces = sphere(subdivisions)
+def orange(rng: np.random.Generator) -> Mesh:
+    """An oblate sphere with pores and a green-brown navel in a dimple on top."""
+    directions, faces = sphere()
     from_top = np.arccos(np.clip(directions[:, 2], -1, 1))
     pores = ripples(rng, directions, wavelength=0.2)
     dents = 0.01 * ripples(rng, directions, wavelength=2.0) - 0.04 * bump(from_top / 0.25)

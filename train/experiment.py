@@ -210,10 +210,10 @@ def _log_skipped(scene: Scene, cache: OperatorCache, start: float) -> None:
     covered = sum(len(stack.pixels) for stack in stacks) / len(stacks)
     console.info(
         "operators: %d views for %d examples, %d from the cache, %d built (%.2f s)%s",
-        tally.views,
+        tally["views"],
         len(scene),
-        tally.loaded,
-        tally.built,
+        tally["views"] - tally["built"],
+        tally["built"],
         time.perf_counter() - start,
         f"; not kept: {cache.problem}" if cache.problem else "",
     )
@@ -223,9 +223,9 @@ def _log_skipped(scene: Scene, cache: OperatorCache, start: float) -> None:
         COEFFICIENTS - len(live_coefficients(DEGREE)),
         COEFFICIENTS,
         100 * (1 - covered / scene.settings.size**2),
-        100 * tally.unseen_faces / tally.faces,
-        tally.closed,
-        tally.views,
+        100 * tally["unseen_faces"] / tally["faces"],
+        tally["closed"],
+        tally["views"],
     )
 
 

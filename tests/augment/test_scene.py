@@ -297,7 +297,7 @@ def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterised
         cache = OperatorCache(tmp_path)
         images.append(render(built(items, ring(3, 2), SETTINGS, cache), random_lights(18)))
         assert rasterised == calls
-    assert (cache.tally.loaded, cache.tally.built) == (6, 0)
+    assert (cache.tally["views"], cache.tally["built"]) == (6, 0)
     assert torch.equal(*images)
 
 

@@ -7,7 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from renderer.errors import InputError
-from renderer.shapes import LOOK_ALIKES, SOLIDS, orange, solid
+from renderer.shapes import LOOK_ALIKES, SOLIDS, solid
 
 EVERY = SOLIDS | LOOK_ALIKES
 SHELLS = dict.fromkeys(EVERY, 1) | {"cup": 2}  # a cup's handle is a shell of its own
@@ -148,11 +148,6 @@ class TestOrange:
         centres = mesh.vertices[mesh.faces].mean(axis=1)
         near_top = (np.hypot(centres[:, 0], centres[:, 1]) < 0.08) & (centres[:, 2] > 0)
         assert brightness[near_top].max() < 0.8 * brightness.mean()
-
-
-@pytest.mark.parametrize("subdivisions", range(5))
-def test_each_subdivision_of_the_orange_quadruples_its_faces(subdivisions):
-    assert len(orange(np.random.default_rng(0), subdivisions).faces) == 20 * 4**subdivisions
 
 
 def test_a_tables_volume_is_that_of_its_board_and_legs():
