@@ -10,8 +10,9 @@ from renderer.files.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh, normalise
 from renderer.shapes import solid
-from renderer.transport import rays
+from renderer.transport import radiosity, rays
 from train.run_folder.classifier import load_classifier
+from train.studies.quadrature import quadrature
 from train.studies.transport import beside_mitsuba, cost, held
 
 
@@ -19,7 +20,6 @@ from train.studies.transport import beside_mitsuba, cost, held
 def few_rays(monkeypatch):
     monkeypatch.setattr(rays, "DIRECTIONS", 64)
     monkeypatch.setattr(cost, "VIEWS", 1)
-    monkeypatch.setattr(cost, "CONVERGED", 1024)
 
 
 def pit() -> tuple[list, list]:
@@ -47,12 +47,12 @@ def test_costs_are_of_each_transport_against_direct_light(few_rays):
     assert rows[0][5].endswith("1.00 ×") and rows[3][5].endswith("1.00 ×")
 
 
-@pytest.mark.slow
-def test_more_rays_err_less_and_the_number_is_put_back(few_rays, monkeypatch):
-    monkeypatch.setattr(cost, "DIRECTIONS", (32, 512))
-    errors = [float(row[2].rstrip("%")) for row in cells(cost.errors_by_rays(solid("cup", 0), 12))]
-    assert errors[0] > 2 * errors[1] > 0
-    assert rays.DIRECTIONS == 64
+def test_another_number_of_rays_and_patches_is_put_back():
+    before = rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS
+    with pytest.raises(InputError), quadrature(32, 16, 8):
+        assert (rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS) == (32, 16, 8)
+        raise InputError("anything")
+    assert before == (rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS)
 
 
 @pytest.mark.slow

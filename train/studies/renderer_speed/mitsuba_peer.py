@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from renderer.errors import InputError
-from renderer.harmonics import basis
+from renderer.files.mitsuba_scene import DIFFERENTIABLE, TO_Z_UP, mitsuba, mitsuba_map
 from renderer.transfer import DEGREE
 from train.studies.renderer_speed.scenes import ALBEDO, CAMERA, View, coefficients
 
 NAME, SAMPLES = "Mitsuba 3", 16  # camera rays per pixel
-MAP_ROWS, MAP_COLUMNS = 32, 64  # bilinear texels this wide dim band l by l(l + 1) (π / 31)² / 12: band 2 by 0.5 %
-TO_Z_UP = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]  # its maps have y up and +z in the middle
+MAP_ROWS = 32  # bilinear texels this wide dim band l by l(l + 1) (π / 31)² / 12: band 2 by 0.5 %
 
 
 class MitsubaPeer:
@@ -31,18 +29,19 @@ class MitsubaPeer:
         self._mi, self._dr = on_one_thread()
         self._positions = view.mesh.vertices.astype(np.float32).ravel()
         self._light = coefficients(DEGREE).float().numpy()
-        numbered = self._mi.Bitmap(np.tile(np.arange(MAP_COLUMNS, dtype=np.float32)[:, None], (MAP_ROWS, 1, 3)))
+        numbered = self._mi.Bitmap(np.tile(np.arange(2 * MAP_ROWS, dtype=np.float32)[:, None], (MAP_ROWS, 1, 3)))
         description = {
             "type": "scene",
             "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1, "hide_emitters": True},
-            "light": {"type": "envmap", "bitmap": numbered, "to_world": self._mi.ScalarTransform4f(TO_Z_UP)},
+            "light": {"type": "envmap", "bitmap": numbered, "to_world": self._mi.ScalarTransform4f(np.array(TO_Z_UP))},
             "mesh": self._mesh(view.mesh.faces),
             "sensor": self._sensor(view.size),
         }
         self._scene = self._mi.load_dict(description)
         self._parameters = self._mi.traverse(self._scene)
         with_seam = np.array(self._parameters["light.data"])[0, :, 0].astype(int)  # its map repeats columns there
-        self._basis = _texel_basis()[:, with_seam]
+        by_coefficient = mitsuba_map(torch.eye(len(self._light), dtype=torch.float64), MAP_ROWS)  # (rows, columns, 49)
+        self._basis = by_coefficient.float().numpy()[:, with_seam]
         self._parameters["light.data"] = self._mi.TensorXf(self._basis @ self._light)
         self._parameters.update()
 
@@ -96,21 +95,8 @@ class MitsubaPeer:
 
 def on_one_thread() -> tuple[ModuleType, ModuleType]:
     """The modules (mitsuba, drjit). InputError: not installed, or no LLVM library."""
-    try:
+    with mitsuba(DIFFERENTIABLE) as module:
         import drjit
-        import mitsuba
 
-        mitsuba.set_variant("llvm_ad_rgb")
-    except ImportError as error:
-        advice = "pip install mitsuba, apt install libllvm19, set DRJIT_LIBLLVM_PATH to its libLLVM.so.19.1"
-        raise InputError(f"Mitsuba's variant llvm_ad_rgb does not start: {advice}") from error
-    drjit.set_thread_count(1)
-    return mitsuba, drjit
-
-
-def _texel_basis() -> np.ndarray:
-    """(rows, columns, 49) harmonics at the texels; there is a row at either pole."""
-    azimuth = math.pi - 2 * math.pi * (np.arange(MAP_COLUMNS) + 0.5) / MAP_COLUMNS
-    polar, azimuth = np.meshgrid(np.linspace(0, math.pi, MAP_ROWS), azimuth, indexing="ij")
-    directions = [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
-    return basis(torch.from_numpy(np.stack(directions, axis=-1)), DEGREE).numpy().astype(np.float32)
+        drjit.set_thread_count(1)
+    return module, drjit

@@ -18,16 +18,13 @@ from renderer.transfer import Operator, build_operators
 from renderer.transport import rays
 from renderer.visibility import choose
 from train.report.tables import markdown
-from train.studies.quadrature import quadrature
 from train.studies.renderer_speed import measure
 from train.studies.renderer_speed.measure import MOST_ROUNDS, Clock
 
 TRANSPORTS = ("direct", "shadows", "bounces:3")
 VIEWS, FIELD_OF_VIEW = 20, 2.2
-CONVERGED = 2**13  # directions
 RESOLUTION = 256  # of a depth map
 EACH = 8  # of them is timed
-DIRECTIONS = (128, 256, 512, 1024)
 
 
 @dataclass
@@ -93,19 +90,3 @@ def depth_maps(mesh: Mesh) -> float:
     ]
     points, backend = np.stack([camera.project(mesh.vertices) for camera in cameras]), choose("software")
     return EACH * seconds(lambda: backend.rasterise(points, mesh.faces, RESOLUTION, closed=mesh.closed))
-
-
-def errors_by_rays(mesh: Mesh, size: int) -> str:
-    """Time for 20 views, and the root mean square error of two of them, by the number of directions."""
-    light, rows = load_light("grace"), []
-    with quadrature(CONVERGED):
-        exact = [view.radiance(light) for view in operators(mesh, "shadows", size, 2)]
-    for count in DIRECTIONS:
-        with quadrature(count):
-            taken = seconds(lambda: operators(mesh, "shadows", size))
-            seen = operators(mesh, "shadows", size, 2)
-        off = [view.radiance(light) - true for view, true in zip(seen, exact, strict=True)]
-        error = torch.cat(off, dim=1).square().mean().sqrt() / torch.cat(exact, dim=1).max()
-        chosen = "default" if count == rays.DIRECTIONS else ""
-        rows.append([str(count), f"{taken:.2f}", f"{error:.2%}", chosen])
-    return markdown(["directions", f"s for {VIEWS} views", "error", ""], rows)

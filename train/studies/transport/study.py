@@ -40,8 +40,6 @@ def run(settings: CupSettings) -> None:
             {name: cost.painted(cup, color) if color else cup for name, color in COLORS.items()}, SIZES, clock
         ),
         size=SIZES[0],
-        converged=cost.CONVERGED,
-        by_rays=cost.errors_by_rays(cup, SIZES[0]),
         maps=cost.depth_maps(cup),
         resolution=cost.RESOLUTION,
         directions=DIRECTIONS,
