@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from train.command_line.entry_points import USER_ERROR
-from train.studies.interruptions.small_run import ROOT
+from train.studies.commands import Ending, finish, start
 from train.studies.reliability.corpus import write_corpus
 from train.studies.reliability.doors import BY_NAME
 
@@ -31,17 +30,16 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-def call(command: list[str], folder: Path) -> subprocess.CompletedProcess:
-    arguments = [str(ROOT / word) if word.startswith("scripts/") else word for word in command]
-    environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLCONFIGDIR": str(folder)}
-    return subprocess.run(
-        [sys.executable, *arguments],
-        cwd=folder,
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
+def call(command: list[str], folder: Path) -> Ending:
+    process = start(
+        command,
+        folder,
+        {"MPLCONFIGDIR": str(folder)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         preexec_fn=lambda: ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE) if os.geteuid() == 0 else None,
     )
+    return finish(process, patience=600)
 
 
 @pytest.mark.parametrize(
@@ -55,16 +53,16 @@ def call(command: list[str], folder: Path) -> subprocess.CompletedProcess:
 )
 def test_an_output_that_is_read_only_is_refused_by_its_key(folder, command, said):
     done = call(command, folder)
-    assert (done.returncode, done.stderr.count("\n")) == (USER_ERROR, 1) and done.stderr.startswith(f"error: {said}")
+    assert done.refusal and done.refusal.startswith(f"error: {said}")
 
 
 def test_a_current_folder_that_is_read_only_is_refused_by_the_key_of_what_would_be_written(folder):
     done = call(["-m", "train"], folder.with_name("locked"))
-    assert done.returncode == USER_ERROR and done.stderr.startswith("error: run=runs/") and done.stderr.count("\n") == 1
+    assert done.refusal and done.refusal.startswith("error: run=runs/")
 
 
 def test_a_cache_that_is_read_only_stops_no_run(folder):
     done = call(TRAIN.command(FRESH, "renderer.cache=../locked/cache"), folder)
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.errors
     assert "not kept: [Errno 13] Permission denied: '../locked/cache'" in (folder / "out" / "train.log").read_text()
     assert not list(folder.with_name("locked").iterdir())

@@ -27,11 +27,7 @@ def test_a_command_is_observed_on_a_terminal_to_its_end_and_until_ctrl_c(tmp_pat
     bar = observe(["-c", "from tqdm import tqdm; [*tqdm(range(9))]"], tmp_path, patience=60)
     assert bar.progress and 0 < bar.memory < whole.memory
     waits = observe(["-c", "while True: pass"], tmp_path, patience=1)
-    assert (
-        waits.status == 128 + signal.SIGINT
-        and 0 <= waits.cpu_after <= waits.cpu
-        and 0 < waits.after_signal < waits.seconds < 60
-    )
+    assert waits.status == 128 + signal.SIGINT and 1 <= waits.cpu < 60 and 0 < waits.after_signal < 60
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ STUDIES = ROOT / "train" / "studies"
 PAGES = {
     "accuracy/study": "accuracy",
     "growth/study": "performance",
-    "interruptions/page": "interruptions",
+    "interruptions/study": "interruptions",
     "load/study": "load",
     "placed_lights": "performance",
     "reliability/page": "reliability",

@@ -9,11 +9,12 @@ import pytest
 from renderer.errors import InputError
 from renderer.lights import load_light
 from renderer.mesh import load_mesh
+from train.studies.commands import Ending
 from train.studies.reliability.corpus import BESIDE, LIGHTS, MESHES, write_corpus
 from train.studies.reliability.damages import damages
 from train.studies.reliability.doors import BY_NAME, DOORS
 from train.studies.reliability.page import Outcome, failures, page
-from train.studies.reliability.process import Ending, Surroundings, forked, started
+from train.studies.reliability.process import Surroundings, forked, started
 from train.studies.reliability.study import _keep, _kept, outcome
 from train.studies.reliability.trials import Trial, all_trials, file_trials, name_trials
 

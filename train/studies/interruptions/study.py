@@ -1,30 +1,40 @@
 """Runs interrupted in every way, and what became of them."""
 
+import platform
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import torch
 from numpy.random import Generator
 
 from renderer.errors import InputError, require_range
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file, writable_folder
 from train.interruption import heed_interrupts
-from train.studies.interruptions.bench import Bench, Outcome, prepare
-from train.studies.interruptions.damages import DAMAGES, LIMITS, both_damaged, damaged, limited
-from train.studies.interruptions.disturbances import ask, ask_then_kill, disk_filled, interrupted, kill
-from train.studies.interruptions.page import failures, merged, page
-from train.studies.interruptions.small_run import write_inputs
-from train.studies.page import write
+from train.report.tables import markdown
+from train.studies.interruptions.cases import (
+    DAMAGES,
+    Outcome,
+    ask,
+    ask_then_kill,
+    damaged,
+    disk_filled,
+    interrupted,
+    kill,
+)
+from train.studies.interruptions.runs import Bench, prepare
+from train.studies.page import filled, joined, wrapped, write
 
 Case = Callable[[Bench, Generator], Outcome]
+HEADER = ["case", "runs", "stops", "faults"]
 
 
 @dataclass
@@ -50,36 +60,30 @@ def run(settings: InterruptionSettings) -> list[str]:
     heed_interrupts()
     out = writable_file(settings.out, "out") if settings.out else None
     with nullcontext(settings.keep) if settings.keep else TemporaryDirectory() as folder:
-        bench = prepare(write_inputs(_empty(Path(folder).absolute()), settings.epochs))
+        bench = prepare(_empty(Path(folder).absolute()), settings.epochs)
         cases = all_cases(settings)
+        seeds = np.random.default_rng(settings.seed).spawn(len(cases))
         with ThreadPoolExecutor(settings.jobs) as pool:
-            started = [pool.submit(_conduct, case, bench, settings.seed, number) for number, case in enumerate(cases)]
-        outcomes = merged([future.result() for future in started])
-    text = page(outcomes, bench, command_line())
-    write(out, text)
-    return failures(outcomes)
+            outcomes = list(pool.map(partial(_conduct, bench), cases, seeds))
+    write(out, page(outcomes, bench, command_line()))
+    return [fault for outcome in outcomes for fault in outcome.faults]
 
 
 def all_cases(settings: InterruptionSettings) -> list[Case]:
-    """Kills in as many parts as there are jobs, signals of each kind, draws of each damage and each full disk."""
-    kills, signals, draws, jobs = settings.kills, settings.signals, settings.draws, settings.jobs
-    shares = [kills // jobs + (job < kills % jobs) for job in range(jobs)]
+    kills, signals, draws = settings.kills, settings.signals, settings.draws
     return [
-        *(partial(interrupted, "SIGKILL", kill, share) for share in shares),
-        partial(interrupted, "SIGKILL after the last epoch", kill, signals, since=("scoring",)),
+        partial(interrupted, "SIGKILL", kill, kills),
+        partial(interrupted, "SIGKILL after the last epoch", kill, signals, since=(settings.epochs,)),
         *(partial(interrupted, n.name, partial(ask, n), signals) for n in (signal.SIGTERM, signal.SIGINT)),
         partial(interrupted, "SIGTERM, then SIGKILL", ask_then_kill, signals),
         partial(disk_filled, "disk filled", signals),
-        *(partial(limited, case, limit, draws) for case, limit in LIMITS.items()),
         *(partial(damaged, case, damage, draws) for case, damage in DAMAGES.items()),
-        partial(both_damaged, "both checkpoints damaged"),
     ]
 
 
-def _conduct(case: Case, bench: Bench, seed: int, number: int) -> Outcome:
-    """One case, in a folder of its own and with moments of its own."""
-    outcome = case(replace(bench, runs=bench.runs / str(number)), np.random.default_rng([seed, number]))
-    print(f"{outcome.case}: {len(failures([outcome]))} faults", file=sys.stderr)
+def _conduct(bench: Bench, case: Case, rng: Generator) -> Outcome:
+    outcome = case(bench, rng)
+    print(f"{outcome.case}: {len(outcome.faults)} faults", file=sys.stderr)
     return outcome
 
 
@@ -88,3 +92,23 @@ def _empty(folder: Path) -> Path:
     if any(folder.iterdir()):
         raise InputError(f"keep={folder} is not empty: choose another folder")
     return folder
+
+
+def page(outcomes: Sequence[Outcome], bench: Bench, command: str) -> str:
+    """Markdown."""
+    introduction = filled(
+        __file__,
+        command=command,
+        torch=torch.__version__,
+        machine=platform.machine(),
+        epochs=bench.epochs,
+        epoch=1000 * (bench.seconds[0] - bench.seconds[bench.epochs]) / bench.epochs,
+        start=bench.seconds[None] - bench.seconds[0],
+    )
+    faults = "\n".join(f"- {fault}" for outcome in outcomes for fault in outcome.faults)
+    return joined([wrapped(introduction), markdown(HEADER, map(_row, outcomes)), faults])
+
+
+def _row(outcome: Outcome) -> list[str]:
+    faults = str(len(outcome.faults)) if outcome.runs else "not done: it needs a privilege"
+    return [outcome.case, str(outcome.runs), str(outcome.stops or "-"), faults]

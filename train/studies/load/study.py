@@ -18,8 +18,7 @@ from train.studies.load.observed import Observed, observe
 from train.studies.page import filled, joined, machine, wrapped, write
 from train.studies.reliability.study import prepare
 
-HEADER = ["asked for", "ended", "s by the clock", "s of a core", "memory, MB", "bar"]
-HEADER += ["s from Ctrl-C to the end", "of a core"]
+HEADER = ["asked for", "ended", "s of a core", "memory, MB", "bar", "s from Ctrl-C to the end"]
 SIGNALLED = 130  # as a shell says it of Ctrl-C
 
 
@@ -84,6 +83,5 @@ def _both(name: str, count: int, corpus: Path, patience: float) -> tuple[Observe
 
 def _row(asked: str, whole: Observed, ended: Observed) -> list[str]:
     fate = {0: "as asked", USER_ERROR: "refused", SIGNALLED: "by Ctrl-C"}.get(whole.status, f"status {whole.status}")
-    seconds = [f"{whole.seconds:.0f}", f"{whole.cpu:.0f}"]
-    after = [f"{ended.after_signal:.1f}", f"{ended.cpu_after:.1f}"]
-    return [asked, fate, *seconds, f"{whole.memory / 1e6:,.0f}", "yes" if whole.progress else "no", *after]
+    memory, bar = f"{whole.memory / 1e6:,.0f}", "yes" if whole.progress else "no"
+    return [asked, fate, f"{whole.cpu:.0f}", memory, bar, f"{ended.after_signal:.1f}"]

@@ -10,17 +10,17 @@ from renderer.environment import to_map, write_map
 from renderer.files.mesh_export import export_mesh
 from renderer.lights import probe, save_light
 from renderer.shapes import solid
-from train.studies.interruptions.small_run import write_inputs
 
 LIGHTS = ("light.npy", "light.hdr", "light.exr", "light.json")
 MESHES = ("mesh.obj", "mesh.glb", "mesh.gltf", "mesh.ply", "mesh.stl", "mesh.off")
 BESIDE = {"mesh.mtl": "mesh.obj", "peel.png": "mesh.obj", "gltf_buffer_0.bin": "mesh.gltf"}  # and the mesh they serve
+CLASSES = ["apple", "orange", "pear"]
 RUN, PUBLISHED = "finished", "published"
 
 
 def write_corpus(folder: Path) -> None:
     """Fill an empty folder: data, photographs, meshes, lights, a background. A run and its network come later."""
-    write_inputs(folder, epochs=1)
+    write_inputs(folder)
     _write_photographs(folder / "photographs")
     _write_class_folders(folder / "images")
     _write_meshes(folder)
@@ -29,6 +29,32 @@ def write_corpus(folder: Path) -> None:
         write_map(folder / name, to_map(light, 8))
     save_light(folder / LIGHTS[3], light)
     Image.new("RGB", (20, 24), "gray").save(folder / "background.png")
+
+
+def write_inputs(folder: Path) -> None:
+    """Data and photographs, in an empty folder."""
+    rng = np.random.default_rng(0)
+    trained, tested = np.repeat(np.arange(len(CLASSES)), 20), np.repeat(np.arange(len(CLASSES)), 10)
+    np.savez(
+        folder / "data.npz",
+        train_images=_coloured_noise(rng, trained),
+        train_labels=trained,
+        test_images=_coloured_noise(rng, tested),
+        test_labels=tested,
+        classes=np.array(CLASSES),
+    )
+    for name in ("orange", "apple", "other_tomato"):
+        (folder / "photographs" / name).mkdir(parents=True)
+        for number in range(3):
+            pixels = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
+            Image.fromarray(pixels).save(folder / "photographs" / name / f"{number}.png")
+
+
+def _coloured_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
+    """Images (N, 3, 16, 16) uint8 whose channel `label` is a little brighter, so that accuracies move for long."""
+    images = rng.integers(0, 245, (len(labels), 3, 16, 16))
+    images[np.arange(len(labels)), labels] += 10
+    return images.astype(np.uint8)
 
 
 def _write_photographs(folder: Path) -> None:

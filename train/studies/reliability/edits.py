@@ -51,8 +51,8 @@ def swapped(old: str, new: str, pipe: str | None = None) -> Edit:
     return edit
 
 
-def flipped(seed: int) -> Edit:
-    """Five bytes."""
+def flipped(seed: int | np.random.Generator) -> Edit:
+    """Five bytes, wherever: one of padding that nobody reads may be among them, but not five."""
 
     def change(whole: bytes) -> bytes:
         changed, rng = bytearray(whole), np.random.default_rng(seed)

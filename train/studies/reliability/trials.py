@@ -3,19 +3,15 @@
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig
-
-from train.command_line.entry_points import USER_ERROR
+from train.command_line.configuration import as_dict, composed, dotted
+from train.studies.commands import Ending
 from train.studies.reliability.damages import damages
 from train.studies.reliability.doors import DOORS, Door, given
 from train.studies.reliability.edits import CODE_RAN
-from train.studies.reliability.process import PATIENCE, USUAL, Ending, Runner, Surroundings
+from train.studies.reliability.process import PATIENCE, USUAL, Runner, Surroundings
 
 NAMES = [
     *("2024", "1e3", "true", "null", "2024-01-01", "1.10", "0x10", "a b", " a", "a,b", "[a]", "{a}", "(a)", "-a", "~a"),
@@ -52,20 +48,15 @@ class Trial:
 
     def fault(self, ending: Ending) -> str | None:
         """What is wrong with an outcome; None for a success and for a refusal as it should be."""
-        lines = [
-            line for line in ending.errors.splitlines() if "found in sys.modules" not in line
-        ]  # runpy's, of a fork
-        match ending.status:
-            case None:
+        match ending.status, ending.refusal:
+            case None, _:
                 return "hung"
-            case 0 if self.refused:
-                return "taken"
-            case 0:
-                return None
-            case status if status != USER_ERROR or len(lines) != 1 or not lines[0].startswith("error: "):
-                return f"status {status}: {' | '.join(lines[-2:])}"
-        if self.named and not any(word in lines[0] for word in self.named):
-            return f"neither {' nor '.join(self.named)} is named: {lines[0]}"
+            case 0, _:
+                return "taken" if self.refused else None
+            case status, None:
+                return f"status {status}: {' | '.join(ending.errors.splitlines()[-2:])}"
+            case _, refusal if self.named and not any(word in refusal for word in self.named):
+                return f"neither {' nor '.join(self.named)} is named: {refusal}"
         return None
 
 
@@ -109,16 +100,12 @@ def name_trials(door: Door) -> Iterator[Trial]:
 
 def setting_trials(door: Door) -> Iterator[Trial]:
     """Values that each setting may not have been meant for."""
-    under_hydra = GlobalHydra.instance().is_initialized()
-    with nullcontext() if under_hydra else initialize_config_module("conf", version_base="1.3"):
-        groups = [override for override in door.arguments if override.startswith(("data=", "attack=", "augment="))]
-        keys = list(_leaves(compose(door.config, groups)))
+    groups = [override for override in door.arguments if override.startswith(("data=", "attack=", "augment="))]
+    keys = [key for key, _ in dotted(as_dict(composed(door.config, groups)))]
     for key in [*keys, "unknown"]:
         for value in VALUES:
-            command = door.command(f"{key}={value}")
-            yield Trial(
-                door, "settings", f"{key}={value}", command, (key, key.rpartition(".")[2], value.strip("'") or key)
-            )
+            setting, named = f"{key}={value}", (key, key.rpartition(".")[2], value.strip("'") or key)
+            yield Trial(door, "settings", setting, door.command(setting), named)
 
 
 def place_trials(door: Door) -> Iterator[Trial]:
@@ -129,12 +116,3 @@ def place_trials(door: Door) -> Iterator[Trial]:
         key = next(override.partition("=")[0] for override in door.arguments if f"={door.out}" in override)
         for place in NOWHERE:
             yield Trial(door, "outputs", f"{key}={place}", door.command(f"{key}={place}"), (key,), refused=True)
-
-
-def _leaves(node: DictConfig, prefix: str = "") -> Iterator[str]:
-    for key in node:
-        name, child = prefix + str(key), node._get_node(key)
-        if isinstance(child, DictConfig) and not child._is_none():
-            yield from _leaves(child, f"{name}.")
-        else:
-            yield name
