@@ -14,8 +14,8 @@ AS_THEY_ARE = ("#", "|", "!", "```")  # headings, tables, figures and code
 
 
 def joined(blocks: Iterable[str]) -> str:
-    """A page of Markdown blocks: headings, paragraphs, tables, figures."""
-    return "\n\n".join(block.strip() for block in blocks) + "\n"
+    """A page of Markdown blocks: headings, paragraphs, tables, figures; empty ones are left out."""
+    return "\n\n".join(block.strip() for block in blocks if block) + "\n"
 
 
 def filled(module: str, **values: object) -> str:

@@ -13,7 +13,7 @@ PAGES = {
     "interruptions/study": "interruptions",
     "load/study": "load",
     "placed_lights": "performance",
-    "reliability/page": "reliability",
+    "reliability/study": "reliability",
     "renderer_speed/study": "performance_renderer",
     "renderer_speed/vertices": "performance_renderer",
     "training_speed/study": "performance",

@@ -22,7 +22,7 @@ PRELOADED = ["train.studies.reliability.study", "train.studies.reliability.warm"
 
 @dataclass(frozen=True)
 class Surroundings:
-    """largest: bytes that no file of the command may exceed. output: where what it prints goes; None: to be read."""
+    """largest: bytes that no file of the command may exceed. output: where what it prints goes; None: nowhere."""
 
     largest: int | None = None
     output: str | None = None

@@ -1,12 +1,13 @@
 """Hostile inputs tried at every door, and what became of them."""
 
 import json
+import shutil
 import sys
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from shutil import rmtree
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -16,12 +17,16 @@ from renderer.errors import InputError, require_range
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
 from train.interruption import heed_interrupts
-from train.studies.page import write
+from train.report.tables import markdown
+from train.studies.page import filled, joined, versions, wrapped, write
 from train.studies.reliability.corpus import PUBLISHED, RUN, write_corpus
 from train.studies.reliability.doors import BY_NAME
-from train.studies.reliability.page import Outcome, failures, page
+from train.studies.reliability.edits import CODE_RAN
 from train.studies.reliability.process import PATIENCE, Runner, forked, started
 from train.studies.reliability.trials import Trial, all_trials
+
+KINDS = ("no file", "damaged", "forged", "odd names", "settings", "outputs")  # of trials
+FATES = ("used", "refused", "mishandled")
 
 
 @dataclass
@@ -43,6 +48,22 @@ class ReliabilitySettings:
             raise InputError(f"doors: {min(unknown)!r} is not known: choose from {', '.join(BY_NAME)}")
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """status: see `Ending`. fault: None where all was as it should be. started: whether its process was not forked."""
+
+    door: str
+    kind: str
+    name: str
+    status: int | None
+    fault: str | None
+    started: bool = False
+
+    @property
+    def fate(self) -> str:
+        return "mishandled" if self.fault else "refused" if self.status else "used"
+
+
 def run(settings: ReliabilitySettings) -> list[str]:
     """Print the page, and write it where it is asked for; everything that was mishandled, in words.
 
@@ -62,9 +83,8 @@ def run(settings: ReliabilitySettings) -> list[str]:
                 outcomes[number] = outcome(trials[number], corpus, runner)
                 _keep(file, outcomes[number])
     ordered = [outcomes[number] for number in sorted(outcomes)]
-    text = page(ordered, command_line(), len(trials), PATIENCE)
-    write(out, text)
-    return failures(outcomes.values())
+    write(out, page(ordered, command_line(), len(trials)))
+    return failures(ordered)
 
 
 def prepare(folder: Path) -> Path:
@@ -82,11 +102,41 @@ def prepare(folder: Path) -> Path:
 def outcome(trial: Trial, corpus: Path, run: Runner = forked) -> Outcome:
     """Of the trial in a copy of the corpus, which is removed."""
     folder = corpus.with_name("trial")
-    ending, fault = trial.conduct(corpus, folder, run)
-    rmtree(folder)
+    shutil.copytree(corpus, folder, symlinks=True)
+    trial.prepare(folder)
+    ending = run(trial.command, folder, trial.around, PATIENCE)
+    fault = "code ran" if (folder / CODE_RAN).exists() else trial.fault(ending)
+    shutil.rmtree(folder)
     if fault:
         print(f"{trial.door.name}: {trial.name!r}: {fault}", file=sys.stderr)
     return Outcome(trial.door.name, trial.kind, trial.name, ending.status, fault, run is started)
+
+
+def page(outcomes: Sequence[Outcome], command: str, number: int) -> str:
+    """Markdown. number: of the inputs there are."""
+    introduction = filled(
+        __file__,
+        command=command,
+        versions=versions(),
+        tried=len(outcomes),
+        all=number,
+        started=sum(each.started for each in outcomes),
+        patience=PATIENCE,
+    )
+    doors = dict.fromkeys(each.door for each in outcomes)
+    rows = [_row(door, [each for each in outcomes if each.door == door]) for door in doors]
+    table = markdown(["door", *KINDS, *FATES], [*rows, _row("all", outcomes)])
+    listed = "\n".join(f"- {fault}" for fault in failures(outcomes))
+    return joined([wrapped(introduction), table, listed])
+
+
+def _row(door: str, outcomes: Sequence[Outcome]) -> list[str | int]:
+    counts = Counter(word for each in outcomes for word in (each.kind, each.fate))
+    return [door, *(f"{counts[word]:,}" for word in (*KINDS, *FATES))]
+
+
+def failures(outcomes: Iterable[Outcome]) -> list[str]:
+    return [f"{each.door}: {each.name!r}: {each.fault}" for each in outcomes if each.fault]
 
 
 def _kept(file: Path, trials: Sequence[Trial]) -> dict[int, Outcome]:

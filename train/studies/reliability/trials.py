@@ -1,7 +1,6 @@
 """Every trial: a door, what is hostile about it, and what may come of it."""
 
 import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +9,7 @@ from train.command_line.configuration import as_dict, composed, dotted
 from train.studies.commands import Ending
 from train.studies.reliability.damages import damages
 from train.studies.reliability.doors import DOORS, Door, given
-from train.studies.reliability.edits import CODE_RAN
-from train.studies.reliability.process import PATIENCE, USUAL, Runner, Surroundings
+from train.studies.reliability.process import USUAL, Surroundings
 
 NAMES = [
     *("2024", "1e3", "true", "null", "2024-01-01", "1.10", "0x10", "a b", " a", "a,b", "[a]", "{a}", "(a)", "-a", "~a"),
@@ -38,13 +36,6 @@ class Trial:
     refused: bool = False
     prepare: Callable[[Path], object] = lambda folder: None
     around: Surroundings = USUAL
-
-    def conduct(self, corpus: Path, folder: Path, run: Runner) -> tuple[Ending, str | None]:
-        """How it ended, in a copy of the corpus, and what is wrong with that."""
-        shutil.copytree(corpus, folder, symlinks=True)
-        self.prepare(folder)
-        ending = run(self.command, folder, self.around, PATIENCE)
-        return ending, "code ran" if (folder / CODE_RAN).exists() else self.fault(ending)
 
     def fault(self, ending: Ending) -> str | None:
         """What is wrong with an outcome; None for a success and for a refusal as it should be."""
