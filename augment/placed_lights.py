@@ -60,7 +60,10 @@ class LampsSettings:
     def build(self) -> tuple[Lamps, Tensor]:
         """The basis, and the powers (L, 3)."""
         if isinstance(self.start, str):
-            return _read_lamps(Path(self.start))
+            lamps, powers = load_placed(Path(self.start))
+            if not isinstance(lamps, Lamps):
+                raise InputError(f"scene.lamps.start={self.start} describes a {lamps.name}: give lamps")
+            return lamps, lamps.nearest_physical(powers)
         try:
             places = tuple((float(x), float(y), float(z)) for x, y, z in self.places)
             start = torch.tensor(self.start, dtype=torch.float32).expand(len(places), 3)
@@ -72,10 +75,3 @@ class LampsSettings:
         if not ((start >= 0) & (start <= self.power)).all():  # NaN is neither
             raise InputError(f"scene.lamps.start={self.start}: give powers from 0 to scene.lamps.power={self.power:g}")
         return basis, basis.nearest_physical(start)
-
-
-def _read_lamps(path: Path) -> tuple[Lamps, Tensor]:
-    basis, powers = load_placed(path)
-    if not isinstance(basis, Lamps):
-        raise InputError(f"scene.lamps.start={path} describes a {basis.name}: give lamps")
-    return basis, basis.nearest_physical(powers)

@@ -1,6 +1,6 @@
 """Objects that move, are painted or stand under moved lamps, view by view: rasterised anew where vertices move."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, cached_property, partial, reduce
 
@@ -76,10 +76,11 @@ class Reshading:
         they were. added: to each face's linear albedo, (F, 3).
         """
         mesh, gain = self._objects[number].mesh, self._objects[number].gain
+        placed: Callable[[], PlacedView]
         if vertices is None:
             vertices, positions = self.vertices[number], mesh.vertices
             fragments, albedo = self.own(number, camera)
-            placed = cache(partial(self.placed_view, number, camera))
+            placed = partial(self.placed_view, number, camera)
         else:
             positions = vertices.detach().cpu().double().numpy()
             fragments, albedo = self._seen(number, camera, positions)

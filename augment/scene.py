@@ -88,7 +88,7 @@ class Scene:
     def __post_init__(self) -> None:
         require_fields(self)
         self._require_consistent()
-        self.examples = [_seen_whole(example, self.objects[example.object].radius) for example in self.examples]
+        self.examples = [self._seen_whole(example) for example in self.examples]
         self.backgrounds = self.backgrounds.to(self.lights)
         self.lights = self.lights.expand(len(self.examples), *self.lights.shape[-2:])
         self.views = len(self.examples[0].cameras)  # per example
@@ -255,11 +255,10 @@ class Scene:
             composite = seen + behind(coverage, there, self.settings.encoding)
             yield Layer([image], fragments.pixels, composite[None], coverage[None], [0])
 
+    def _seen_whole(self, row: Example) -> Example:
+        """The row, whose cameras see all of its object, near and far."""
+        radius = self.objects[row.object].radius
+        return replace(row, cameras=tuple(camera.seeing(radius) for camera in row.cameras))
+
     def _column(self, values: Iterable[int]) -> Tensor:
         return torch.tensor(list(values), device=self.lights.device)
-
-
-def _seen_whole(row: Example, radius: float) -> Example:
-    """The row, whose cameras see all that lies within a radius of the origin, near and far."""
-    cameras = tuple(camera.seeing(radius) for camera in row.cameras)
-    return row if cameras == row.cameras else replace(row, cameras=cameras)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.objects import SceneObject, another_individual
+from augment.objects import another_individual
 from augment.scene import Example, Scene
 from augment.snapshot import SnapshotSettings, draw_snapshot
 from renderer.arguments import require_fields
@@ -93,7 +93,7 @@ def _moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generato
     scale = _between(settings.scale, len(scene), draws)
     angles = _angles(settings.turn, len(scene), draws)
     rows = [
-        _turned(_moved(row, right, up, size), *angle)
+        _moved(row, right, up, size, *angle)
         for row, (right, up), size, angle in zip(scene.examples, place.tolist(), scale, angles, strict=True)
     ]
     changed: dict[str, Any] = {}
@@ -122,8 +122,7 @@ def _taken_anew(scene: Scene, settings: VariationSettings, draws: torch.Generato
         which = torch.randint(len(settings.lights), (len(rows),), generator=draws)
         changed["lights"] = torch.stack([load_light(light) for light in settings.lights])[which].to(scene.lights)
     if settings.lamps > 0:
-        shown = [scene.objects[row.object] for row in rows]
-        changed["lights"] = _in_lamplight(changed.get("lights", scene.lights), rows, shown, settings, draws)
+        changed["lights"] = _in_lamplight(changed.get("lights", scene.lights), scene, settings, draws)
     if settings.snapshot.changes:
         changed["taken"] = draw_snapshot(settings.snapshot, len(rows), scene.settings, draws).to(scene.lights.device)
     varied = replace(scene, examples=rows, **changed)
@@ -135,12 +134,19 @@ def _between(limits: Sequence[float], count: int, draws: torch.Generator) -> lis
     return (low + (high - low) * torch.rand(count, generator=draws, dtype=torch.float64)).exp().tolist()
 
 
-def _moved(row: Example, right: float, up: float, scale: float) -> Example:
-    def moved(camera: Camera) -> Camera:
+def _moved(row: Example, right: float, up: float, scale: float, polar: float, azimuth: float) -> Example:
+    """By shares of the frame's width, which shows the mesh so much larger, and by radians around it."""
+    cameras = []
+    for camera in row.cameras:
         width = camera.field_of_view / scale
-        return replace(camera, field_of_view=width, right=camera.right + right * width, up=camera.up + up * width)
+        place = {"right": camera.right + right * width, "up": camera.up + up * width}
+        turned = _turned(camera, polar, azimuth)
+        cameras.append(replace(turned, field_of_view=width, **place))
+    return replace(row, cameras=tuple(cameras))
 
-    return replace(row, cameras=tuple(moved(camera) for camera in row.cameras))
+
+def _turned(camera: Camera, polar: float, azimuth: float) -> Camera:
+    return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
 
 
 def _images(folder: Path, count: int, size: int, draws: torch.Generator) -> Tensor:
@@ -157,36 +163,23 @@ def _angles(most: float, count: int, draws: torch.Generator) -> list[list[float]
     return (math.radians(most) * (2 * torch.rand(count, 2, generator=draws, dtype=torch.float64) - 1)).tolist()
 
 
-def _turned(row: Example, polar: float, azimuth: float) -> Example:
-    def turned(camera: Camera) -> Camera:
-        return replace(camera, polar=camera.polar + polar, azimuth=camera.azimuth + azimuth)
-
-    return replace(row, cameras=tuple(turned(camera) for camera in row.cameras))
-
-
-def _in_lamplight(
-    lights: Tensor,
-    rows: Sequence[Example],
-    objects: Sequence[SceneObject],
-    settings: VariationSettings,
-    draws: torch.Generator,
-) -> Tensor:
+def _in_lamplight(lights: Tensor, scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Tensor:
     """The lights (E, 49, 3), some of them dimmed, with a white lamp that gives 1 to a surface facing it.
 
-    objects: what each row shows. What stands on a table has no lamp below it: one that is drawn there is mirrored.
+    What stands on a table has no lamp below it: one that is drawn there is mirrored.
     """
     low, high = settings.ambient
-    shape = (len(rows), 1, 1)
+    shape = (len(scene), 1, 1)
     ambient = low + (high - low) * torch.rand(shape, generator=draws)
     chosen = torch.rand(shape, generator=draws) < settings.lamps
-    angles = _angles(LAMP_REACH, len(rows), draws)
-    cameras = [_turned(row, *each).cameras[0] for row, each in zip(rows, angles, strict=True)]
-    towards = [torch.from_numpy(camera.axes()[2]) for camera in cameras]
-    for item, direction in zip(objects, towards, strict=True):
-        if item.ground is not None:
-            direction[2].abs_()
-    lamps = torch.stack([directional(direction, torch.ones(3)) for direction in towards]).to(lights)
-    return torch.where(chosen.to(lights.device), lamps + ambient.to(lights) * lights, lights)
+    lamps = []
+    for row, angles in zip(scene.examples, _angles(LAMP_REACH, len(scene), draws), strict=True):
+        towards = torch.from_numpy(_turned(row.cameras[0], *angles).axes()[2])
+        if scene.objects[row.object].ground is not None:
+            towards[2].abs_()
+        lamps.append(directional(towards, torch.ones(3)).to(lights))
+    lit = torch.stack(lamps) + ambient.to(lights) * lights
+    return torch.where(chosen.to(lights.device), lit, lights)
 
 
 def _with_lit_walls(scene: Scene) -> Scene:

@@ -6,6 +6,7 @@ Files of weights are read without running code from them, and checked against th
 import hashlib
 import importlib
 import re
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -179,16 +180,7 @@ def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | Path, na
     try:
         network.load_state_dict(state)
     except (RuntimeError, ValueError) as error:
-        difference = _first_difference(network, state) or str(error).splitlines()[0]
-        raise InputError(f"weights={source} are not of classifier={name}: {difference}; give that network's") from error
+        said = textwrap.shorten(str(error), 300)
+        raise InputError(f"weights={source} are not of classifier={name} ({said}): give that network's") from error
     if bad := next((key for key, value in network.state_dict().items() if not value.isfinite().all()), None):
         raise InputError(f"weights={source}: {bad} holds NaN or infinity, give weights that are finite")
-
-
-def _first_difference(network: nn.Module, state: Mapping[str, Tensor]) -> str | None:
-    expected = {key: tuple(value.shape) for key, value in network.state_dict().items()}
-    found = {key: tuple(value.shape) for key, value in state.items()}
-    for key in [*expected, *found]:
-        if expected.get(key) != found.get(key) and not key.endswith("num_batches_tracked"):  # old files lack these
-            return f"{key} has shape {found.get(key, 'none')} there and {expected.get(key, 'none')} in the network"
-    return None
