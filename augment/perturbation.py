@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from augment.parameters import Kind
+from augment.kind import Kind
 from augment.scene import Conditions, Scene
 
 

@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field
 
 from augment.attacks.settings import SIGNED, AttackSettings
-from augment.parameters import Albedo, Geometry, Lighting, StepSettings
+from augment.kind import StepSettings
+from augment.parameters import Albedo, Geometry, Lighting
 from augment.variation import VariationSettings
 from renderer.arguments import require_fields
 from renderer.errors import FACTOR, InputError, require_choice, require_range

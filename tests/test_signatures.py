@@ -18,7 +18,8 @@ import renderer
 from augment.classifiers import Classifier
 from augment.descent import AttackResult, DescentSettings, descend
 from augment.goal import Goal, adversarial_cost
-from augment.parameters import Lighting, StepSettings
+from augment.kind import StepSettings
+from augment.parameters import Lighting
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene

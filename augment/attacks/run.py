@@ -16,9 +16,9 @@ from augment.attacks.settings import AttackSettings
 from augment.classifiers.adapter import Classifier
 from augment.descent import AttackResult, descend_in_parts
 from augment.goal import Goal
+from augment.kind import StepSettings
 from augment.memory import BatchSize
 from augment.objects import SceneObject
-from augment.parameters import StepSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene

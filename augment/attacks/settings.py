@@ -7,7 +7,8 @@ from torch import nn
 
 from augment.attacks.observation import Expected, Rounded, TransformationSettings
 from augment.descent import DescentSettings
-from augment.parameters import KINDS, Lighting, SkylightSettings, StepSettings
+from augment.kind import StepSettings
+from augment.parameters import KINDS, Lighting, SkylightSettings
 from augment.perturbation import Perturbation
 from augment.scene import Scene
 from augment.seeding import generator

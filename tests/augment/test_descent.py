@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from augment.descent import AttackResult, DescentSettings, descend, descend_repeatedly
 from augment.goal import Goal
+from augment.kind import STEPS, direction
 from augment.norm_ball import NormBall
-from augment.parameters import STEPS, direction
 from augment.phases import Phases
 from renderer.errors import InputError
 

@@ -13,19 +13,8 @@ from torch import Tensor
 from augment import reshading
 from augment.descent import DescentSettings, descend
 from augment.goal import Goal
-from augment.parameters import (
-    KINDS,
-    STEPS,
-    Albedo,
-    Geometry,
-    Kind,
-    Lighting,
-    Pixels,
-    Skylight,
-    SkylightSettings,
-    StepSettings,
-    direction,
-)
+from augment.kind import STEPS, Kind, StepSettings, direction
+from augment.parameters import KINDS, Albedo, Geometry, Lighting, Pixels, Skylight, SkylightSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Scene

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from augment.descent import AttackResult, DescentSettings, descend
 from augment.goal import Goal
-from augment.parameters import Albedo, Geometry, Lighting, Pixels, Skylight, SkylightSettings, StepSettings
+from augment.kind import StepSettings
+from augment.parameters import Albedo, Geometry, Lighting, Pixels, Skylight, SkylightSettings
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene

@@ -8,7 +8,8 @@ import torch
 import augment
 from augment.attacks.adversary import Adversary
 from augment.attacks.adversary_folder import read_adversary, write_adversary
-from augment.parameters import Skylight, StepSettings
+from augment.kind import StepSettings
+from augment.parameters import Skylight
 from augment.perturbation import Perturbation
 from augment.placed_lights import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene

@@ -13,8 +13,9 @@ from augment.build import build_scene, count_views
 from augment.descent import DescentSettings, descend
 from augment.goal import Goal
 from augment.held_transport import NEAR
+from augment.kind import StepSettings
 from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object
-from augment.parameters import Albedo, Geometry, Lighting, StepSettings
+from augment.parameters import Albedo, Geometry, Lighting
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Conditions, Example, Scene

@@ -7,9 +7,9 @@ from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
 from augment.backgrounds import load_backgrounds
+from augment.kind import StepSettings
 from augment.labels import anything_but
 from augment.objects import ObjectSettings, load_object
-from augment.parameters import StepSettings
 from augment.phases import Phases
 from augment.scene import Conditions, Scene
 from augment.service import AugmentationService

@@ -7,7 +7,7 @@ import augment
 from augment.attacks.run import Attacked
 from augment.attacks.settings import AttackSettings
 from augment.attacks.sweep import sweep
-from augment.parameters import StepSettings
+from augment.kind import StepSettings
 
 SCALES = [0.3, 0.05, 1.0, 0.1]
 

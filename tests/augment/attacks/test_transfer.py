@@ -6,7 +6,7 @@ import torch
 
 import augment
 from augment.attacks.run import Attacked
-from augment.parameters import StepSettings
+from augment.kind import StepSettings
 from renderer.errors import InputError
 
 CLASSES, SIZE = ("orange", "lime", "sky"), 12

@@ -10,7 +10,8 @@ from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
 from augment.descent import DescentSettings, Part, Problem, descend
 from augment.goal import Goal
-from augment.parameters import Geometry, Kind, Lighting, StepSettings
+from augment.kind import Kind, StepSettings
+from augment.parameters import Geometry, Lighting
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene

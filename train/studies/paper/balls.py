@@ -10,7 +10,8 @@ from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
 from augment.descent import DescentSettings, descend
 from augment.goal import Goal
-from augment.parameters import KINDS, StepSettings
+from augment.kind import StepSettings
+from augment.parameters import KINDS
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene

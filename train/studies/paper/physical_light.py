@@ -9,7 +9,8 @@ from torch import Tensor
 from augment.attacks.run import logits_of
 from augment.descent import DescentSettings, descend
 from augment.goal import Goal
-from augment.parameters import Lighting, StepSettings
+from augment.kind import StepSettings
+from augment.parameters import Lighting
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene

@@ -12,8 +12,8 @@ from torch import Tensor
 from augment.attacks.run import attack, logits_of
 from augment.attacks.settings import AttackSettings
 from augment.classifiers import Classifier
+from augment.kind import StepSettings
 from augment.objects import SceneObject
-from augment.parameters import StepSettings
 from augment.scene import Scene
 from renderer.camera import Camera
 from renderer.environment import write_map

@@ -12,8 +12,8 @@ from augment.attacks.run import attack
 from augment.attacks.settings import AttackSettings
 from augment.classifiers import Classifier
 from augment.goal import Goal, adversarial_cost
+from augment.kind import StepSettings
 from augment.objects import SceneObject
-from augment.parameters import StepSettings
 from augment.perturbation import Perturbation
 from renderer.mesh import Mesh
 from train.report.tables import markdown

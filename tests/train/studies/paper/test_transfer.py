@@ -8,8 +8,9 @@ import trimesh
 
 from augment.classifiers import Classifier
 from augment.descent import DescentSettings
+from augment.kind import StepSettings
 from augment.objects import SceneObject
-from augment.parameters import Lighting, StepSettings
+from augment.parameters import Lighting
 from augment.seeding import generator
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
