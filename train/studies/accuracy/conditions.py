@@ -22,7 +22,6 @@ from train.studies.accuracy.measure import (
     by_operator,
     by_transport,
     light,
-    of_development,
     of_harmonics,
     with_vertex_normals,
     worst,
@@ -261,20 +260,3 @@ def images(size: int) -> Iterator[Row]:
         worst(map(of_nothing, (aside, behind, edge_on))),
         "an empty image: P = 0, gradients of 0",
     )
-
-
-def development() -> Iterator[Row]:
-    inside = [0.0, -0.0, 1.0, 1e-45, 1e-8, 0.0031, 0.0032, 0.5, 0.999, 0.75]
-    outside = [-1e8, -1.0, -1e-8, -1e-45, 1.001, 2.0, 1e8, 60.0, 0.5, 0.9]
-    coverage = torch.tensor([[1.0] * 8 + [0.5] * 2], dtype=torch.float64)
-    background = torch.tensor([[0.25]], dtype=torch.float64)
-
-    def developed(encoding: str, dtype: torch.dtype) -> Errors:
-        largest = min(1e8, torch.finfo(dtype).max)
-        radiance = torch.tensor([inside, outside], dtype=torch.float64).clamp(-largest, largest)
-        return of_development(radiance.to(dtype), coverage.to(dtype), background.to(dtype), encoding)
-
-    does = {"linear": "clamped to [0, 1]", "srgb": "clamped to [0, 1]; the curve's slope stays finite at 0"}
-    for encoding, behaviour in does.items():
-        errors = worst(developed(encoding, dtype) for dtype in DTYPES.values())
-        yield Row(f"`{encoding}`, {', '.join(DTYPES)}", errors, behaviour)

@@ -14,7 +14,7 @@ from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.harmonics import basis, basis_gradient
-from renderer.image import ImageSettings, develop
+from renderer.image import ImageSettings
 from renderer.mesh import Mesh
 from renderer.shading import radiance
 from renderer.transfer import build_operators
@@ -236,20 +236,6 @@ def of_harmonics(directions: Tensor, degrees: Iterable[int]) -> Errors:
         }
 
     return worst(at(degree) for degree in degrees)
-
-
-def of_development(radiance: Tensor, coverage: Tensor, background: Tensor, encoding: str) -> Errors:
-    """Of the image's values and of their gradient by the radiance.
-
-    At 0 and 1 themselves the clamp has no one gradient: torch's versions differ. There it only has to be finite.
-    """
-    radiance = radiance.clone().requires_grad_()
-    values = develop(radiance, coverage, background, encoding)
-    (gradient,) = torch.autograd.grad(values.sum(), radiance)
-    seen, covered, behind = (extended(each.detach().double().numpy()) for each in (radiance, coverage, background))
-    wide, slope, bounds = reference.develop(seen, covered, behind, encoding)
-    gradient = gradient.where(torch.from_numpy(~bounds), 0 * gradient)
-    return {"image value": error(values, wide), "gradient by radiance": error(gradient, slope * ~bounds)}
 
 
 def _upstream(rows: int, seed: int = 0) -> Tensor:

@@ -123,25 +123,6 @@ def irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
     return sum(value[:, None] * light[index] for index, value in reflected(normals, degree).items())
 
 
-def develop(
-    radiance: np.ndarray, coverage: np.ndarray, background: np.ndarray, encoding: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image values over a background, their derivative by the radiance, and where the radiance is a clamp's bound.
-
-    sRGB: IEC 61966-2-1.
-    """
-    if encoding == "srgb":
-        background = np.where(background <= 0.04045, background / 12.92, ((background + 0.055) / 1.055) ** 2.4)
-    linear = radiance + (1 - coverage) * background
-    bounds, inside, linear = (linear == 0) | (linear == 1), (linear > 0) & (linear < 1), linear.clip(0, 1)
-    if encoding == "linear":
-        return linear, inside * np.ones_like(linear), bounds
-    dark, power = linear <= 0.0031308, 1 / np.longdouble(2.4)
-    curve = 1.055 * linear**power - 0.055
-    slope = 1.055 * power * np.where(dark, 1, linear) ** (power - 1)
-    return np.where(dark, 12.92 * linear, curve), inside * np.where(dark, 12.92, slope), bounds
-
-
 def basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """(N, (degree + 1)²) harmonics of directions (3, N) of any length."""
     values = harmonics(unit(directions), range(degree + 1))

@@ -1,4 +1,4 @@
-"""docs/accuracy.md: every condition measured and every refusal tried, once."""
+"""docs/accuracy.md: every condition measured, once."""
 
 import platform
 from collections.abc import Sequence
@@ -9,14 +9,13 @@ import mpmath
 import numpy as np
 import torch
 
-from renderer.errors import InputError, require_range
+from renderer.errors import require_choice, require_range
 from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
 from train.report.tables import markdown, shown
 from train.studies.accuracy import conditions
 from train.studies.accuracy.conditions import Row
 from train.studies.accuracy.measure import Error
-from train.studies.accuracy.refusals import Refusal, refusals
 from train.studies.page import filled, joined, with_section, write
 
 Tables = dict[str, Sequence[Row]]  # by title
@@ -40,17 +39,15 @@ class AccuracySettings:
 
 
 def run(settings: AccuracySettings) -> list[str]:
-    """Write the page; everything that was not finite or not refused, in words."""
+    """Write the page; everything that was not finite, in words."""
     out = writable_file(settings.out, "out")
     torch.set_num_threads(1)
     tables = measure(settings)
     if settings.only:
-        write(out, with_section(out.read_text("utf-8"), _section(*tables.popitem())))
-        return failures(tables, [])
-    refused = list(refusals())
-    write(out, page(tables, refused))
-    print(f"{sum(map(len, tables.values()))} conditions and {len(refused)} refusals")
-    return failures(tables, refused)
+        write(out, with_section(out.read_text("utf-8"), _section(*next(iter(tables.items())))))
+    else:
+        write(out, page(tables))
+    return failures(tables)
 
 
 def measure(settings: AccuracySettings) -> Tables:
@@ -62,17 +59,15 @@ def measure(settings: AccuracySettings) -> Tables:
         "Lights": conditions.lights(settings.degree),
         "Number types": conditions.number_types(),
         "Images and cameras": conditions.images(settings.size),
-        "Radiance to image": conditions.development(),
         "Shadows and bounces": conditions.transports(),
     }
-    if settings.only not in (None, *rows):
-        raise InputError(f"only={settings.only}: choose one of {', '.join(rows)}")
+    if settings.only is not None:
+        require_choice("only", settings.only, rows)
     return {title: list(found) for title, found in rows.items() if settings.only in (None, title)}
 
 
-def page(tables: Tables, refused: Sequence[Refusal]) -> str:
+def page(tables: Tables) -> str:
     """Markdown."""
-    lines = [(f"`{each.call}`", each.argument, each.value if each.named else "**nothing**") for each in refused]
     text = filled(
         __file__,
         bits=np.finfo(np.longdouble).nmant + 1,
@@ -82,20 +77,19 @@ def page(tables: Tables, refused: Sequence[Refusal]) -> str:
         mpmath=mpmath.__version__,
         machine=platform.machine(),
         tables="\n\n".join(_section(*table) for table in tables.items()),
-        refusals=markdown(["call", "argument", "refused"], lines),
     )
     return joined([text])
 
 
-def failures(tables: Tables, refused: Sequence[Refusal]) -> list[str]:
-    """What was not finite or not refused, in words."""
+def failures(tables: Tables) -> list[str]:
+    """What was not finite, in words."""
     return [
         f"{row.condition}: {quantity} is not finite"
         for rows in tables.values()
         for row in rows
         for quantity, error in row.errors.items()
         if not isfinite(error.relative)
-    ] + [f"{each.call}, {each.argument} of {each.value}: no error that names it" for each in refused if not each.named]
+    ]
 
 
 def _section(title: str, rows: Sequence[Row]) -> str:

@@ -2,7 +2,6 @@
 
 from dataclasses import fields
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from train.command_line.configuration import read_settings
@@ -25,10 +24,7 @@ whole epoch, {images} images and {validation} to validate on, are scaled up from
 evaluation, for both arms; attack, input and output are whole, and as measured."""
 WHOLE = """A turn is a whole epoch, {images} images and {validation} to validate on; one contestant comes after the
 other."""
-ON_GPU = (
-    " (TF32 is {convolutions} in convolutions and {products} in matrix products, as torch leaves it; "
-    "`cudnn.benchmark` is {trial}, as for ours)"
-)
+ON_GPU = " (TF32 as torch leaves it, `cudnn.benchmark` as for ours)"
 
 
 def run(config: DictConfig) -> None:
@@ -70,22 +66,13 @@ def section(findings: Findings, facts: dict[str, str]) -> str:
         attacked=len(findings.turns[ADVERSARIAL]) - 1,
         attack_steps=shown(findings.attack_steps),
         turns=(SHORTENED if work.steps else WHOLE).format(**counts),
-        on_gpu=_on_gpu() if findings.device == "cuda" else "",
+        on_gpu=ON_GPU if findings.device == "cuda" else "",
         peaks=" and ".join(f"{shown(rate / 1e12)} TFLOP/s in {name} ({size:,}²)" for name, (rate, size) in best),
         targets=table_of(targets(findings)),
         rates=_rates(findings),
         seconds=_seconds(findings),
     )
     return wrapped(text)
-
-
-def _on_gpu() -> str:
-    flags = {
-        "convolutions": torch.backends.cudnn.allow_tf32,
-        "products": torch.backends.cuda.matmul.allow_tf32,
-        "trial": torch.backends.cudnn.benchmark,
-    }
-    return ON_GPU.format(**{name: "on" if flag else "off" for name, flag in flags.items()})
 
 
 def _rates(findings: Findings) -> str:
