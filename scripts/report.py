@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from renderer.errors import InputError
-from train.command_line.entry_points import quoted, script
+from train.command_line.entry_points import script
+from train.command_line.overrides import quoted
 from train.command_line.outputs import writable_folder
 from train.report.write import write_report
 
