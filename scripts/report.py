@@ -8,8 +8,8 @@ from pathlib import Path
 
 from renderer.errors import InputError
 from train.command_line.entry_points import script
-from train.command_line.overrides import quoted
 from train.command_line.outputs import writable_folder
+from train.command_line.overrides import quoted
 from train.report.write import write_report
 
 
