@@ -1,32 +1,32 @@
 """What lights are made of. An image is linear in any light of fixed place, so that each of these has operators."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from renderer.convex import Ball
+from renderer.convex import Ball, nearest_in_box
 from renderer.harmonics import basis, irradiance_basis, live_coefficients
 
 
-@runtime_checkable
-class Functions(Protocol):
-    """`size` functions of light; a light is a coefficient (size, 3) of each, RGB. Equal ones have equal fields."""
+class Functions(ABC):
+    """`size` functions of light; a light is a coefficient (size, 3) of each, RGB. Equal ones have equal fields.
+
+    name: in files and messages. signed: whether coefficients that nothing can emit are of use, too.
+    """
+
+    name: ClassVar[str]
+    signed: ClassVar[bool] = False
 
     @property
-    def name(self) -> str:
-        """In files and messages."""
-
-    @property
-    def signed(self) -> bool:
-        """Whether coefficients that nothing can emit are of use, too."""
-
-    @property
+    @abstractmethod
     def size(self) -> int:
         """How many functions there are."""
 
+    @abstractmethod
     def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
         """The light (..., size, 3) nearest to the coefficients that something can emit.
 
@@ -34,16 +34,19 @@ class Functions(Protocol):
         """
 
 
-class Distant(Functions, Protocol):
+class Distant(Functions):
     """Light from so far away that all of a scene is in the same."""
 
     @property
+    @abstractmethod
     def live(self) -> Tensor:
         """(K,) ascending indices of those that reach a diffuse surface under an open sky; see `Operator.kept`."""
 
+    @abstractmethod
     def irradiance(self, normals: Tensor) -> Tensor:
         """(N, K) at unit normals (N, 3), per unit of each live coefficient."""
 
+    @abstractmethod
     def radiance(self, directions: Tensor) -> Tensor:
         """(N, size) that comes from unit directions (N, 3), per unit of each coefficient."""
 
@@ -60,10 +63,18 @@ class Reach:
     irradiance: Tensor
 
 
-@runtime_checkable
-class Placed(Functions, Protocol):
-    """Light from places, which throws shadows. Outside of it there is none, so that no coefficient is negative."""
+class Placed(Functions):
+    """Light from places, which throws shadows. Outside of it there is none, so that no coefficient is negative.
 
+    power: the largest coefficient.
+    """
+
+    power: float
+
+    def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
+        return nearest_in_box(coefficients, 0, self.power, within)
+
+    @abstractmethod
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
         """All ways to surface points (S, 3) of unit normals (S, 3), were nothing in between."""
 
@@ -108,7 +119,7 @@ def parts_of(basis: Basis) -> list[tuple[slice, Distant | Placed]]:
 
 
 @dataclass(frozen=True)
-class Harmonics:
+class Harmonics(Distant):
     """Distant light as real spherical harmonics. Any coefficients render, negative radiance included (the paper's);
     only such exist whose radiance is nowhere negative."""
 

@@ -48,17 +48,13 @@ class Fragments:
     sample: Tensor
     depths: Tensor | None = None
 
+    @cached_property
     def barycentric(self) -> Tensor:
         """(S, 3) float64 weights of the faces' corners at the samples, clipped into the face: corners were snapped.
 
         What is linear on a face is, under perspective, a quotient of linear functions in the image: both of it are
         interpolated there (Heckbert and Moreton 1991).
         """
-        return self._barycentric.T
-
-    @cached_property
-    def _barycentric(self) -> Tensor:
-        """(3, S): colours, texture coordinates and normals all ask for it."""
         outlines = self.outlines.permute(2, 1, 0)
         edges = outlines[:, 1:] - outlines[:, :1]
         (bx, cx), (by, cy) = edges
@@ -76,7 +72,7 @@ class Fragments:
             if nearness is not None:
                 weight.mul_(nearness.index_select(1, face))
             weight.div_(weight.sum(0))
-        return weights
+        return weights.T
 
     def positions(self) -> Tensor:
         """(S, 2) float64 places of the samples, in the same coordinates as `outlines`."""
@@ -89,7 +85,7 @@ class Fragments:
     def interpolate(self, corners: Tensor) -> Tensor:
         """(S, D) values at the samples of faces whose corners have values (G, 3, D); differentiable in them."""
         rows = corners.permute(1, 2, 0).flatten(0, 1).contiguous()
-        return _Interpolation.apply(rows, self.face, self._barycentric).T
+        return _Interpolation.apply(rows, self.face, self.barycentric.T).T
 
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(pixel (R,), face (R,), albedo (R, C)): neighbouring samples of one face in one pixel as one, since they

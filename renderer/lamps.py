@@ -8,15 +8,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from renderer.basis import Basis, Reach, Sum, parts_of
-from renderer.convex import Ball, nearest_in_box
+from renderer.basis import Basis, Placed, Reach, Sum, parts_of
 from renderer.errors import FACTOR, InputError, require_range
 
 SHARES, RAYS = 4, 8  # neighbouring samples look at other points of a disc, in turns of so many, at so many each
 
 
 @dataclass(frozen=True)
-class Lamps:
+class Lamps(Placed):
     """A coefficient for each of the places (x, y, z): the irradiance head on at distance 1, from which it falls with
     the square. power: the largest; the least is 0.
 
@@ -30,7 +29,6 @@ class Lamps:
     radius: float = 0.0
 
     name = "lamps"
-    signed = False
 
     def __post_init__(self) -> None:
         if not self.places or not all(len(place) == 3 and any(place) for place in self.places):
@@ -46,9 +44,6 @@ class Lamps:
     @property
     def size(self) -> int:
         return len(self.places)
-
-    def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        return nearest_in_box(coefficients, 0, self.power, within)
 
     def reach(self, points: Tensor, normals: Tensor, places: Tensor | None = None) -> Reach:
         """places: (L, 3) of the lamps, in place of their own; the irradiance is differentiable in them, too."""

@@ -6,16 +6,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from renderer.basis import Reach
+from renderer.basis import Placed, Reach
 from renderer.camera import OrthographicCamera
-from renderer.convex import Ball, nearest_in_box
 from renderer.errors import FACTOR, require_range
 
 LARGEST = 256  # pixels per side
 
 
 @dataclass(frozen=True)
-class Projector:
+class Projector(Placed):
     """Patterns of pixels² coefficients, row by row from the top left, as a screen shows them.
 
     It stands at polar angle θ off +z and azimuth φ off +x, in radians, `distance` from the origin, which it aims at;
@@ -32,7 +31,6 @@ class Projector:
     power: float = 1.0
 
     name = "projector"
-    signed = False
 
     def __post_init__(self) -> None:
         require_range("projector.pixels", self.pixels, 1, LARGEST)
@@ -46,9 +44,6 @@ class Projector:
     @property
     def size(self) -> int:
         return self.pixels**2
-
-    def nearest_physical(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        return nearest_in_box(coefficients, 0, self.power, within)
 
     def reach(self, points: Tensor, normals: Tensor) -> Reach:
         """One pixel reaches a point."""

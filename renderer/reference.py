@@ -25,7 +25,7 @@ def radiance(
         at_samples = unit(doubled_area_vectors(corners))[fragments.face]
     else:
         at_corners = vertex_normals(vertices, smooth_faces)[fragments.corners[fragments.face]]
-        at_samples = unit((fragments.barycentric().to(vertices)[:, :, None] * at_corners).sum(1))
+        at_samples = unit((fragments.barycentric.to(vertices)[:, :, None] * at_corners).sum(1))
     normals = at_samples * fragments.facing.to(vertices)[fragments.face]
     shade = irradiance(normals, light) * albedo / fragments.samples**2
     return shade.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel, shade).T

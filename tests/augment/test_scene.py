@@ -21,6 +21,7 @@ from augment.phases import Phases
 from augment.scene import Conditions, Example, Scene
 from augment.service import AugmentationService
 from augment.service_settings import AugmentationSettings, TrainingAttackSettings
+from renderer.basis import Distant
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera, ring
 from renderer.convex import nearest_in_box
@@ -392,11 +393,10 @@ def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_its_own_values_only(mixed
 
 
 @dataclass(frozen=True)
-class Lamps:
+class Lamps(Distant):
     """A basis that the package does not have: three lamps far away, along the axes, of power from 0 to 1."""
 
     name = "lamps"
-    signed = False
     size = 3
     live = torch.arange(3)
 

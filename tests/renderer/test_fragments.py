@@ -84,7 +84,7 @@ def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(
     fragments = fragments_of(open_shell(), ImageSettings(8, 4))
     fragments = replace(fragments, outlines=fragments.outlines + shift)
     outside = 0
-    for weight, face, at in zip(fragments.barycentric(), fragments.face, fragments.positions(), strict=True):
+    for weight, face, at in zip(fragments.barycentric, fragments.face, fragments.positions(), strict=True):
         corners = np.vstack([fragments.outlines[face].T, np.ones(3)])
         solved = np.linalg.solve(corners, [*at, 1])
         outside += solved.min() < 0
@@ -98,7 +98,7 @@ def test_barycentric_weights_solve_for_the_sample_and_are_clipped_into_the_face(
 )
 def test_an_outline_without_area_has_finite_barycentric_weights(flatten):
     fragments = fragments_of(open_shell(), ImageSettings(4, 1))
-    weights = replace(fragments, outlines=flatten(fragments.outlines).expand(-1, -1, 2)).barycentric()
+    weights = replace(fragments, outlines=flatten(fragments.outlines).expand(-1, -1, 2)).barycentric
     assert (weights >= 0).all()
     torch.testing.assert_close(weights.sum(1), torch.ones(len(weights), dtype=torch.float64), rtol=0, atol=4 * EPS)
 
@@ -154,7 +154,7 @@ def test_a_mesh_outside_the_image_has_no_fragments(closed):
     fragments = fragments_of((9 + vertices, faces), ImageSettings(4, 2), OrthographicCamera(0, 0, 2.0), closed)
     shapes = {name: tuple(value.shape) for name, value in vars(fragments).items() if isinstance(value, torch.Tensor)}
     assert {shape[0] for shape in shapes.values()} == {0}
-    assert fragments.barycentric().shape == (0, 3) and fragments.positions().shape == (0, 2)
+    assert fragments.barycentric.shape == (0, 3) and fragments.positions().shape == (0, 2)
     pixel, face, albedo = fragments.merge(torch.zeros(0, 3))
     assert (len(pixel), len(face), albedo.shape) == (0, 0, (0, 3))
 

@@ -138,7 +138,7 @@ def test_each_coefficient_is_that_of_the_slow_ray_caster(mesh, normals):
     if normals == "smooth":
         smooth = reference.vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces))
         at_corners = smooth[seen.corners] * seen.facing[:, None]
-    weights = seen.barycentric()[..., None]
+    weights = seen.barycentric[..., None]
     at = (weights * own[seen.face]).sum(1) + 1e-5 * planes[seen.face] * np.abs(mesh.vertices).max()
     cosine = (reference.unit((weights * at_corners[seen.face]).sum(1)) @ directions.T).clamp(min=0)
     cosine[planes[seen.face] @ directions.T <= 0] = 0

@@ -197,7 +197,7 @@ def with_vertex_normals(setup: Setup) -> Errors:
     image = radiance(fragments, vertices, light, _albedo(setup, fragments), smooth_faces=faces)
     (gradient,) = torch.autograd.grad(image, vertices, upstream.T.to(image))
     move = _upstream(len(vertices), seed=1)
-    parts = vertices.detach().double(), fragments.barycentric(), light.double(), upstream, move
+    parts = vertices.detach().double(), fragments.barycentric, light.double(), upstream, move
     placed, barycentric, lit, above, along = (extended(part.numpy()) for part in parts)
 
     def shade(vertices: np.ndarray) -> np.ndarray:
