@@ -23,7 +23,7 @@ from renderer.harmonics import basis, equirectangular
 
 SUFFIXES = (".npy", ".hdr", ".exr")
 FEWEST_ROWS = 8  # fewer give even radiance from everywhere a direction, by 16 % at 4: see `to_map`
-BLOCK = 2**14  # directions at a time: bounds the memory
+BLOCK = 2**12  # directions at a time: they stay in the cache
 LARGEST_MAP = 4096  # MB, which a damaged header may exceed
 
 
