@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from renderer.image import to_bytes
@@ -25,3 +26,14 @@ class Tile:
     def of(image: Tensor, caption: tuple[str, ...]) -> "Tile":
         """Of an image (3, H, W) of values in [0, 1]."""
         return Tile(to_bytes(image.detach().cpu()).permute(1, 2, 0).numpy(), caption)
+
+    def captioned(self) -> Image.Image:
+        """The image over its caption, as wide as the wider of them."""
+        font, image = ImageFont.load_default(CAPTION_SIZE), Image.fromarray(self.image)
+        width = max([image.width, *(round(font.getlength(line) + 0.5) for line in self.caption)])
+        captioned = Image.new("RGB", (width, image.height + 2 + LINE_HEIGHT * len(self.caption)), PAPER)
+        captioned.paste(image)
+        for number, line in enumerate(self.caption):
+            position = (0, image.height + 2 + number * LINE_HEIGHT)
+            ImageDraw.Draw(captioned).text(position, line, FAINT if number else INK, font)
+        return captioned

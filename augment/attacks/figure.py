@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
-from renderer.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
+from renderer.tiles import GAP, INK, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
 
 SIDE = 192  # px: smaller images are enlarged by a whole factor to at least this width
 COLUMNS = "columns"  # the text in a .png that says where its tiles are
@@ -103,7 +103,7 @@ def _difference_tiles(differences: Tensor) -> list[Tile]:
 def _draw(columns: Sequence[Column]) -> tuple[Image.Image, list[list[tuple[int, int]]]]:
     """The sheet, and where each column's tiles have their left upper corner on it."""
     title_font = ImageFont.load_default(TITLE_SIZE)
-    images = [[_captioned(tile) for tile in tiles] for _, tiles in columns]
+    images = [[tile.captioned() for tile in tiles] for _, tiles in columns]
     widths = [
         max(round(title_font.getlength(title) + 0.5), *(image.width for image in column))
         for (title, _), column in zip(columns, images, strict=True)
@@ -126,14 +126,3 @@ def _starts(first: int, sizes: Sequence[int]) -> list[int]:
 def _enlarged(tile: Tile) -> Tile:
     scale = -(-SIDE // tile.image.shape[1])
     return Tile(tile.image.repeat(scale, 0).repeat(scale, 1), tile.caption)
-
-
-def _captioned(tile: Tile) -> Image.Image:
-    """The tile's image over its caption, as wide as the wider of them."""
-    font, image = ImageFont.load_default(CAPTION_SIZE), Image.fromarray(tile.image)
-    width = max([image.width, *(round(font.getlength(line) + 0.5) for line in tile.caption)])
-    captioned = Image.new("RGB", (width, image.height + 2 + LINE_HEIGHT * len(tile.caption)), PAPER)
-    captioned.paste(image)
-    for line, text in enumerate(tile.caption):
-        ImageDraw.Draw(captioned).text((0, image.height + 2 + line * LINE_HEIGHT), text, FAINT if line else INK, font)
-    return captioned

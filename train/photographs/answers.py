@@ -94,6 +94,17 @@ def rank_classes(
     return answers
 
 
+def outcomes(answers: Sequence[Answer], label: str) -> tuple[list[Answer], list[Answer], list[Answer]]:
+    """Hits, misses and false alarms of `label`, each from the surest to the least sure."""
+    ordered = sorted(answers, key=lambda answer: -answer.probability)
+    mine = [answer for answer in ordered if answer.photograph.label == label]
+    return (
+        [answer for answer in mine if answer.prediction == label],
+        [answer for answer in mine if answer.prediction != label],
+        [answer for answer in ordered if answer.photograph.label != label and answer.prediction == label],
+    )
+
+
 def write_answers(path: Path, answers: Sequence[Answer], label: str) -> None:
     """Write the answers about the class `label`; what is None is left empty."""
     header = ["path", "label", "source", "look_alikes", "prediction", "probability", "true_probability", "true_rank"]

@@ -1,15 +1,16 @@
 """A sheet of small images with captions, in titled sections: what to show of the answers, and its drawing."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import TypeVar
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from renderer.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
-from train.photographs.answers import Answer
+from renderer.tiles import CAPTION_SIZE, GAP, INK, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
+from train.photographs.answers import Answer, outcomes
 
 TILES_PER_SECTION = 40
 COLUMNS = 10
@@ -19,7 +20,7 @@ FRAME = 4
 CELL = IMAGE + 2 * FRAME
 CAPTION_WIDTH = CELL + GAP - 4
 Item = TypeVar("Item")
-SHEET_WIDTH = 2 * MARGIN + COLUMNS * CELL + (COLUMNS - 1) * GAP
+SECTION_WIDTH = COLUMNS * (CELL + GAP)
 
 
 @dataclass(frozen=True)
@@ -30,39 +31,26 @@ class Section:
     colour: str
     tiles: Sequence[Tile]
 
-    @property
-    def cell_height(self) -> int:
-        lines = max((len(tile.caption) for tile in self.tiles), default=0)
-        return CELL + lines * LINE_HEIGHT + GAP
-
-    @property
-    def height(self) -> int:
-        rows = -(-len(self.tiles) // COLUMNS)
-        return TITLE_HEIGHT + rows * self.cell_height + GAP
-
 
 def choose_sections(answers: Sequence[Answer], images: torch.Tensor, label: str) -> list[Section]:
     """Hits, misses and false alarms; `images` are the answers' images, (N, 3, H, W) uint8 sRGB."""
-    asked = list(zip(answers, images.permute(0, 2, 3, 1).numpy(), strict=True))
-    mine = [pair for pair in asked if pair[0].photograph.label == label]
-    others = [pair for pair in asked if pair[0].photograph.label != label]
-    hits = [pair for pair in mine if pair[0].prediction == label]
-    misses = [pair for pair in mine if pair[0].prediction != label]
-    alarms = [pair for pair in others if pair[0].prediction == label]
+    paths = [answer.photograph.path for answer in answers]
+    shown = dict(zip(paths, images.permute(0, 2, 3, 1).numpy(), strict=True))
+    hits, misses, alarms = outcomes(answers, label)
+    mine = len(hits) + len(misses)
+    others = len(answers) - mine
     return [
-        _section(f"{label}, recognised: {len(hits)} of {len(mine)}", "#2e9e5b", hits),
-        _section(f"{label}, called something else: {len(misses)} of {len(mine)}", "#d03b3b", misses),
-        _section(f"other things called {label}: {len(alarms)} of {len(others)}", "#e8a317", alarms),
+        _section(f"{label}, recognised: {len(hits)} of {mine}", "#2e9e5b", hits, shown),
+        _section(f"{label}, called something else: {len(misses)} of {mine}", "#d03b3b", misses, shown),
+        _section(f"other things called {label}: {len(alarms)} of {others}", "#e8a317", alarms, shown),
     ]
 
 
-def _section(title: str, colour: str, asked: Sequence[tuple[Answer, np.ndarray]]) -> Section:
-    """The surest answers first; where there are too many, evenly drawn down to the least sure."""
-    ordered = sorted(asked, key=lambda pair: -pair[0].probability)
-    if len(ordered) > TILES_PER_SECTION:
+def _section(title: str, colour: str, answers: Sequence[Answer], shown: Mapping[PurePosixPath, np.ndarray]) -> Section:
+    if len(answers) > TILES_PER_SECTION:
         title += f" ({TILES_PER_SECTION} drawn evenly from the surest to the least sure)"
-        ordered = evenly(ordered, TILES_PER_SECTION)
-    return Section(title, colour, [Tile(image, caption(answer)) for answer, image in ordered])
+    drawn = evenly(answers, TILES_PER_SECTION)
+    return Section(title, colour, [Tile(shown[answer.photograph.path], caption(answer)) for answer in drawn])
 
 
 def evenly(ordered: Sequence[Item], count: int) -> list[Item]:
@@ -87,37 +75,35 @@ def draw_contact_sheet(sections: Sequence[Section]) -> Image.Image:
     Images are enlarged without smoothing, so that one sees the pixels that the classifier saw.
     A section without tiles keeps its title.
     """
-    height = 2 * MARGIN + sum(section.height for section in sections)
-    sheet = Image.new("RGB", (SHEET_WIDTH, height), PAPER)
-    top = MARGIN
-    for section in sections:
-        _draw_section(sheet, section, top)
-        top += section.height
+    drawn = [_draw_section(section) for section in sections]
+    size = 2 * MARGIN + SECTION_WIDTH - GAP, 2 * MARGIN + sum(image.height for image in drawn)
+    sheet, top = Image.new("RGB", size, PAPER), MARGIN
+    for image in drawn:
+        sheet.paste(image, (MARGIN, top))
+        top += image.height
     return sheet
 
 
-def _draw_section(sheet: Image.Image, section: Section, top: int) -> None:
-    draw = ImageDraw.Draw(sheet)
-    draw.text((MARGIN, top), section.title, INK, ImageFont.load_default(TITLE_SIZE))
-    for index, tile in enumerate(section.tiles):
+def _draw_section(section: Section) -> Image.Image:
+    tiles = [_framed(tile, section.colour).captioned() for tile in section.tiles]
+    row_height = max((tile.height for tile in tiles), default=0) + GAP
+    rows = -(-len(tiles) // COLUMNS)
+    image = Image.new("RGB", (SECTION_WIDTH, TITLE_HEIGHT + rows * row_height + GAP), PAPER)
+    ImageDraw.Draw(image).text((0, 0), section.title, INK, ImageFont.load_default(TITLE_SIZE))
+    for index, tile in enumerate(tiles):
         row, column = divmod(index, COLUMNS)
-        left = MARGIN + column * (CELL + GAP)
-        _draw_tile(sheet, tile, section.colour, left, top + TITLE_HEIGHT + row * section.cell_height)
+        image.paste(tile, (column * (CELL + GAP), TITLE_HEIGHT + row * row_height))
+    return image
 
 
-def _draw_tile(sheet: Image.Image, tile: Tile, colour: str, left: int, top: int) -> None:
-    draw = ImageDraw.Draw(sheet)
-    draw.rectangle((left, top, left + CELL - 1, top + CELL - 1), fill=colour)
+def _framed(tile: Tile, colour: str) -> Tile:
     image = Image.fromarray(tile.image).resize((IMAGE, IMAGE), Image.Resampling.NEAREST)
-    sheet.paste(image, (left + FRAME, top + FRAME))
-    font = ImageFont.load_default(CAPTION_SIZE)
-    for line, text in enumerate(tile.caption):
-        position = (left, top + CELL + 2 + line * LINE_HEIGHT)
-        draw.text(position, _shortened(text, font), FAINT if line else INK, font)
+    return Tile(np.asarray(ImageOps.expand(image, FRAME, colour)), tuple(map(_shortened, tile.caption)))
 
 
-def _shortened(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
+def _shortened(text: str) -> str:
     """The longest start of the text that fits under a tile, with an ellipsis where some was cut."""
+    font = ImageFont.load_default(CAPTION_SIZE)
     if font.getlength(text) <= CAPTION_WIDTH:
         return text
     while text and font.getlength(text + "…") > CAPTION_WIDTH:

@@ -106,7 +106,7 @@ def sections(attacks: Sequence[Attack]) -> Iterator[Section]:
 
 
 def _blocks(attack: Attack) -> Iterator[Block]:
-    for example in evenly(attack.examples, EXAMPLES) if attack.examples else []:
+    for example in evenly(attack.examples, EXAMPLES):
         yield from _galleries(attack.folder / f"example_{example.number:03d}.png", example)
     header = ["example", "label", "before", "after", "outcome"]
     rows = [[each.number, each.label, each.before, each.after, each.outcome] for each in attack.examples[:MOST_ROWS]]

@@ -2,13 +2,14 @@
 
 import io
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from PIL import Image
 
 from renderer.errors import InputError
 from renderer.files.image_files import read_square
-from train.photographs.answers import Answer
+from train.photographs.answers import Answer, outcomes
 from train.photographs.contact_sheet import caption, evenly
 from train.report.blocks import Gallery, Illustration
 from train.run_folder.specimens import SUFFIX, Side, read_specimens
@@ -41,7 +42,7 @@ def from_file(path: Path, alt: str, widest: int, text: str = "") -> list[Illustr
 def first_middle_last(paths: Sequence[Path]) -> list[tuple[int, Path]]:
     """Of files named epoch_NUMBER, with the numbers."""
     numbered = sorted((int(path.stem.removeprefix("epoch_")), path) for path in paths if path.stem[6:].isdigit())
-    return evenly(numbered, 3) if numbered else []
+    return evenly(numbered, 3)
 
 
 def renders(folder: Path, arm: str) -> Gallery:
@@ -56,15 +57,25 @@ def renders(folder: Path, arm: str) -> Gallery:
     )
 
 
-def specimens(folder: Path, arm: str) -> Iterator[Gallery]:
-    """What fooled in the first, middle and last epoch with specimens: renders and lights, before and after."""
+def _specimens(folder: Path) -> Iterator[tuple[int, list[tuple[str, Side, Side]]]]:
+    """Those of a run's first, middle and last epoch with specimens: the epoch, and label, before and after of each."""
     for epoch, path in first_middle_last([*(folder / "renders").glob(f"epoch_*{SUFFIX}")]):
-        try:
-            rows = read_specimens(path)
-        except InputError:
-            continue
-        shown = [image for label, *sides in rows for image in _sides(label, sides)]
-        yield Gallery(f"{arm}, epoch {epoch}", shown)
+        with suppress(InputError):
+            yield epoch, read_specimens(path)
+
+
+def specimens(folder: Path, arm: str) -> Iterator[Gallery]:
+    """What fooled in a run: renders and lights, before and after."""
+    for epoch, rows in _specimens(folder):
+        yield Gallery(f"{arm}, epoch {epoch}", [image for label, *sides in rows for image in _sides(label, sides)])
+
+
+def turned(folder: Path, count: int) -> list[tuple[Side, Side]]:
+    """Before and after, of the newest of a run's specimens that were called by their label before, and not after."""
+    for _, rows in reversed([*_specimens(folder)]):
+        if found := [(before, after) for label, before, after in rows if before.answer == label != after.answer]:
+            return found[:count]
+    return []
 
 
 def _sides(label: str, sides: Sequence[Side]) -> Iterator[Illustration]:
@@ -78,20 +89,11 @@ def _sides(label: str, sides: Sequence[Side]) -> Iterator[Illustration]:
 
 
 def photographs(answers: Sequence[Answer], folder: Path, label: str, arm: str) -> Iterator[Gallery]:
-    """Hits, misses and false alarms from the surest to the least sure, with the network's answers."""
-    mine = [answer for answer in answers if answer.photograph.label == label]
-    kinds = {
-        "recognised": [answer for answer in mine if answer.prediction == label],
-        "called something else": [answer for answer in mine if answer.prediction != label],
-        f"others called {label}": [
-            answer for answer in answers if answer.photograph.label != label and answer.prediction == label
-        ],
-    }
-    for kind, group in kinds.items():
-        chosen = evenly(sorted(group, key=lambda answer: -answer.probability), TILES) if group else []
-        tiles = [image for answer in chosen for image in _photograph(answer, folder)]
-        if tiles:
-            yield Gallery(f"{arm}: {kind}, {len(tiles)} of {len(group)}", tiles)
+    """Hits, misses and false alarms, with the network's answers."""
+    kinds = "recognised", "called something else", f"others called {label}"
+    for kind, group in zip(kinds, outcomes(answers, label), strict=True):
+        tiles = [image for answer in evenly(group, TILES) for image in _photograph(answer, folder)]
+        yield Gallery(f"{arm}: {kind}, {len(tiles)} of {len(group)}", tiles)
 
 
 def _photograph(answer: Answer, folder: Path) -> list[Illustration]:
@@ -104,15 +106,3 @@ def _photograph(answer: Answer, folder: Path) -> list[Illustration]:
         return []
     said = " / ".join(caption(answer))
     return [encoded(Image.fromarray(square), f"{answer.photograph.label}, called {said}", TILE, said)]
-
-
-def turned(folder: Path, count: int) -> list[tuple[Side, Side]]:
-    """Before and after, of the newest of a run's specimens that were called by their label before, and not after."""
-    for _, path in reversed(first_middle_last([*(folder / "renders").glob(f"epoch_*{SUFFIX}")])):
-        try:
-            rows = read_specimens(path)
-        except InputError:
-            continue
-        if found := [(before, after) for label, before, after in rows if before.answer == label != after.answer]:
-            return found[:count]
-    return []

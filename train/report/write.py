@@ -16,7 +16,7 @@ from train.report.attacks import sections as attack_sections
 from train.report.blocks import Block, Code, Gallery, Illustration, Section
 from train.report.folders import find
 from train.report.headline import headline
-from train.report.tables import Table, shown
+from train.report.tables import Table, markdown, shown
 
 PAGE, MARKDOWN, IMAGES, HEADLINE = "report.html", "report.md", "report_files", "report.png"
 MIME = {"svg": "image/svg+xml", "png": "image/png", "jpeg": "image/jpeg"}
@@ -73,17 +73,13 @@ def _rendered(template: str, parts: Sequence[Section], about: str, source: Calla
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"kind": _kind, "shown": shown, "source": source, "md": _escaped, "fenced": _fenced}
+    environment.filters |= {"shown": shown, "source": source, "md": _escaped, "table": _table, "fenced": _fenced}
     return environment.get_template(template).render(sections=parts, about=about)
 
 
 def _from_here(text: str) -> str:
     """With paths below the current folder relative to it, so that the commands run in any clone."""
     return re.sub(rf"(?<![\w./-]){re.escape(os.getcwd())}/", "", text)
-
-
-def _kind(block: Block) -> str:
-    return {Table: "table", Gallery: "gallery", Code: "code"}.get(type(block), "text")
 
 
 def _data_uri(image: Illustration) -> str:
@@ -102,6 +98,11 @@ def _escaped(text: object) -> str:
     """A name from a file as Markdown's text: neither markup nor HTML."""
     plain = " ".join(html.escape(str(text), quote=False).split())
     return re.sub(r"([\\`*_\[\]|#!])", r"\\\1", plain)
+
+
+def _table(table: Table) -> str:
+    header, *rows = ([_escaped(shown(cell)) for cell in row] for row in (table.header, *table.rows))
+    return markdown(header, rows)
 
 
 def _fenced(text: str) -> str:
