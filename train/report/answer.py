@@ -7,7 +7,7 @@ from renderer.errors import InputError
 from train.photographs.figures import OVERALL, figure_title
 from train.report.arms import Arms, Score
 from train.report.attacks import Attack
-from train.report.comparison import difference, read_evaluations
+from train.report.comparison import difference, read_evaluation, require_comparable
 from train.report.photographs import scored, scored_on, scores_of
 
 RATE = "recall_at/0.10"  # what tells discernment: recall at equal false alarms
@@ -44,13 +44,15 @@ def _difference(runs: Arms, name: str) -> str:
         return ""
     (reference, base), *_, (arm, group) = runs.items()
     try:
-        evaluations = read_evaluations([*base, *group], [], name)
-        figure = difference(evaluations[len(base) :], evaluations[: len(base)], OVERALL, RATE)
+        label = base[0].config.label
+        others, first = ([read_evaluation(run, name, label) for run in each] for each in (group, base))
+        require_comparable([*first, *others], name)
+        figure = difference(others, first, OVERALL, RATE)
     except InputError:
         return ""
     if not figure:
         return ""
-    title = figure_title(RATE, base[0].config.label)
+    title = figure_title(RATE, label)
     sure = "" if figure["low"] > 0 or figure["high"] < 0 else ", so that no difference is shown"
     value = f"{figure['value']:+.3f} [{figure['low']:+.3f}, {figure['high']:+.3f}]"
     return f"; {arm} minus {reference} in {title} is {value}{sure}"

@@ -30,11 +30,12 @@ from train.settings import PHOTOGRAPHS
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A run's answers about the class `label`, pooled by source; OVERALL, the last, lacks those of excluded sources."""
+    """A run's answers about the class `label`, and their pools by source; OVERALL, the last, lacks excluded sources."""
 
     run: RunSummary
-    pools: dict[str, Pool]
     label: str
+    answers: list[Answer]
+    pools: dict[str, Pool]
 
     @property
     def seed(self) -> int:
@@ -51,24 +52,25 @@ class Evaluation:
         return {source: replicate_figures(pool, self.label) for source, pool in self.pools.items()}
 
 
-def read_evaluations(runs: Sequence[RunSummary], exclude: Sequence[str], photographs: str) -> list[Evaluation]:
-    """What is in the sub-folder `photographs` of the runs that were scored; exclude: sources to leave out of OVERALL.
+def read_evaluation(run: RunSummary, photographs: str, label: str, exclude: Sequence[str] = ()) -> Evaluation:
+    """What is in the sub-folder `photographs` of a run; exclude: sources to leave out of OVERALL.
 
-    InputError for a sub-folder (but the usual one) or source that is nowhere, and for runs that were scored on
-    different photographs.
+    InputError as of `read_answers`, and for a source that is nowhere.
     """
-    scored = [run for run in runs if photographs in run.photographs]
-    if not scored and photographs != PHOTOGRAPHS:
-        raise InputError(f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files")
-    label = runs[0].config.label
-    answers = [read_answers(run.folder / photographs / ANSWERS, label) for run in scored]
-    for run, said in zip(scored, answers, strict=True):
-        if [answer.photograph for answer in said] != [answer.photograph for answer in answers[0]]:
+    answers = read_answers(run.folder / photographs / ANSWERS, label)
+    return Evaluation(run, label, answers, _pool(answers, label, exclude))
+
+
+def require_comparable(evaluations: Sequence[Evaluation], photographs: str) -> None:
+    """InputError where runs were scored on different photographs."""
+    first, *others = evaluations
+    for other in others:
+        if [answer.photograph for answer in other.answers] != [answer.photograph for answer in first.answers]:
             raise InputError(
-                f"{run.folder / photographs} has other photographs or sources than {scored[0].folder / photographs}: "
-                "score both networks on the same folder with scripts/evaluate_photos.py"
+                f"{other.run.folder / photographs} has other photographs or sources than "
+                f"{first.run.folder / photographs}: score both networks on the same folder with "
+                "scripts/evaluate_photos.py"
             )
-    return [Evaluation(run, _pool(said, label, exclude), label) for run, said in zip(scored, answers, strict=True)]
 
 
 def _pool(answers: Sequence[Answer], label: str, exclude: Sequence[str]) -> dict[str, Pool]:
@@ -107,13 +109,19 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photog
     Runs that differ only in the seed are a group; a table for each group shows how far it is from the first one.
     exclude: sources that the pooled figures leave out; photographs: the sub-folder of each run with its scores.
 
-    InputError as of `read_evaluations`, and for a run whose files lack what is shown.
+    InputError as of `read_evaluation` and `require_comparable`, for a sub-folder (but the usual one) that no run has,
+    and for a run whose files lack what is shown.
     """
     for run in runs:
         with complete(run.folder):
             _accuracy_table([run]), _seconds_table([run])
     tables = [_accuracy_table(runs), _seconds_table(runs)]
-    if evaluations := read_evaluations(runs, exclude, photographs):
+    scored = [run for run in runs if photographs in run.photographs]
+    if not scored and photographs != PHOTOGRAPHS:
+        raise InputError(f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files")
+    if scored:
+        evaluations = [read_evaluation(run, photographs, runs[0].config.label, exclude) for run in scored]
+        require_comparable(evaluations, photographs)
         pooled = f"all but {', '.join(exclude)}" if exclude else "all"
         tables[1:1] = [
             *(_figure_table(evaluations, name, pooled) for name in FIGURES),

@@ -2,25 +2,23 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from renderer.errors import InputError
 from train.command_line.configuration import as_dict
 from train.photographs.answers import ANSWERS, read_answers
-from train.photographs.figures import figure_title, find_figure, pool_all
+from train.photographs.figures import OVERALL, figure_title, find_figure
 from train.photographs.ranking import Ranking
-from train.photographs.text import format_interval
 from train.report import images, plots
 from train.report.arms import Arms, Score, score
 from train.report.blocks import Block, Gallery, Illustration, Section
-from train.report.comparison import difference_tables, read_evaluations
-from train.report.summary import RunSummary, complete
+from train.report.comparison import Evaluation, difference_tables, read_evaluation, require_comparable
+from train.report.summary import RunSummary
 from train.report.tables import Table
 from train.settings import PHOTOGRAPHS
 
 FIGURES = ("recall", "false_alarms", "auc", "recall_at/0.10")
 MOST_SOURCES = 30
-ByArm = dict[str, Score | None]
+Evaluations = Mapping[str, Sequence[Evaluation]]  # by arm
 
 
 def scored(arms: Arms, name: str) -> dict[str, list[RunSummary]]:
@@ -52,59 +50,46 @@ def sections(arms: Arms, name: str) -> Iterator[Section]:
 
 
 def _by_source(runs: Arms, name: str) -> Iterator[Block]:
-    every = [run for group in runs.values() for run in group]
-    label = every[0].config.label
+    label = next(iter(runs.values()))[0].config.label
     try:
-        scores = _scores(runs, name)
-        yield Gallery("", [image for image in _plots(runs, scores, name, label) if image])
+        evaluations = {arm: [read_evaluation(run, name, label) for run in group] for arm, group in runs.items()}
+        scores = {figure: _scores(evaluations, figure) for figure in FIGURES}
+        yield Gallery("", [image for image in _plots(evaluations, scores, label) if image])
         yield "Lines on bars, and brackets: of one seed its 95 % interval, of several the lowest and the highest."
         for figure, by_source in scores.items():
             rows = [[source, *(found or "-" for found in by_arm.values())] for source, by_arm in by_source.items()]
             yield Table(figure_title(figure, label), ["source", *runs], rows)
-        yield from difference_tables(read_evaluations(every, [], name), "all")
+        every = [evaluation for group in evaluations.values() for evaluation in group]
+        require_comparable(every, name)
+        yield from difference_tables(every, "all")
     except InputError as error:
         yield str(error)
 
 
-def _scores(runs: Arms, name: str) -> dict[str, dict[str, ByArm]]:
-    """By figure, source and arm, without the sources that have none of a figure."""
-    parts = {arm: [_parts(run, name) for run in group] for arm, group in runs.items()}
-    sources = [*dict.fromkeys(source for group in parts.values() for part in group for source in part)][:MOST_SOURCES]
-    found = {figure: {source: _by_arm(parts, source, figure) for source in sources} for figure in FIGURES}
-    return {
-        figure: {source: by_arm for source, by_arm in by_source.items() if any(by_arm.values())}
-        for figure, by_source in found.items()
+def _scores(evaluations: Evaluations, figure: str) -> dict[str, dict[str, Score | None]]:
+    """By source and arm, all sources together first; without those that have none of the figure."""
+    every = [evaluation for group in evaluations.values() for evaluation in group]
+    sources = dict.fromkeys(source for evaluation in every for source in (OVERALL, *evaluation.pools))
+    if len(sources) == 2:  # which together are the one
+        del sources[OVERALL]
+    found = {
+        source or "all": {
+            arm: score(find_figure(each.figures.get(source, {}), figure) for each in group)
+            for arm, group in evaluations.items()
+        }
+        for source in [*sources][:MOST_SOURCES]
     }
-
-
-def _by_arm(parts: Mapping[str, Sequence[dict[str, Any]]], source: str, figure: str) -> ByArm:
-    return {arm: score(find_figure(part.get(source, {}), figure) for part in group) for arm, group in parts.items()}
-
-
-def _parts(run: RunSummary, name: str) -> dict[str, dict[str, Any]]:
-    """A run's figures by source, those of all together first where there are several."""
-    summary = run.photographs[name]
-    with complete(run.folder):
-        sources = summary.get("by_source", {})
-        for source in sources.values():
-            [format_interval(find_figure(source, figure)) for figure in FIGURES]
-    return sources if len(sources) == 1 else {"all": summary, **sources}
+    return {source: by_arm for source, by_arm in found.items() if any(by_arm.values())}
 
 
 def _plots(
-    runs: Arms, scores: Mapping[str, Mapping[str, ByArm]], name: str, label: str
+    evaluations: Evaluations, scores: Mapping[str, Mapping[str, Mapping[str, Score | None]]], label: str
 ) -> Iterator[Illustration | None]:
-    rankings = {arm: [*_rankings(group, name, label)] for arm, group in runs.items()}
+    pools = {arm: [each.pools[OVERALL].scores for each in group] for arm, group in evaluations.items()}
+    rankings = {arm: [Ranking(*each) for each in group if all(each)] for arm, group in pools.items()}
     yield plots.roc(rankings, label, "ROC")
-    for figure in FIGURES:
-        yield plots.bars(scores[figure], f"{figure_title(figure, label)}, by source or pattern")
-
-
-def _rankings(group: Sequence[RunSummary], name: str, label: str) -> Iterator[Ranking]:
-    for run in group:
-        pool = pool_all(read_answers(run.folder / name / ANSWERS, label), label)
-        if all(pool.scores):
-            yield Ranking(*pool.scores)
+    for figure, found in scores.items():
+        yield plots.bars(found, f"{figure_title(figure, label)}, by source or pattern")
 
 
 def _tiles(arm: str, run: RunSummary, name: str) -> Iterator[Block]:
