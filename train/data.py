@@ -89,7 +89,8 @@ def load_cifar100(path: str) -> DataSet:
             f"data.path={path}: CIFAR-100 is not there and cannot be downloaded ({error}); "
             "fetch it on a machine with a network, or use data=npz"
         ) from error
-    splits = [Split(_channels_first(part.data), torch.tensor(part.targets)) for part in (train, test)]
+    images = (torch.from_numpy(part.data).permute(0, 3, 1, 2).contiguous() for part in (train, test))
+    splits = [Split(each, torch.tensor(part.targets)) for each, part in zip(images, (train, test), strict=True)]
     return DataSet(tuple(train.classes), *splits)
 
 
@@ -168,7 +169,3 @@ def _npz_split(path: str, arrays: dict[str, np.ndarray], part: str, classes: int
     if not len(labels) or labels.min() < 0 or labels.max() >= classes:
         raise InputError(f"data.path={path}: {part}_labels must hold labels 0 to {classes - 1}, one at least")
     return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
-
-
-def _channels_first(images: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2)))

@@ -1,7 +1,6 @@
 """One run from its configuration: data, scene, network, training, scores on the test set and on photographs."""
 
 import platform
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -12,18 +11,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from augment import processes
-from augment.build import build_scene
-from augment.labels import anything_but
 from augment.phases import Phases
-from augment.scene import Scene
 from augment.seeding import stream_seed
-from augment.service import AugmentationService
-from renderer.cache import OperatorCache, TensorCache, cache_folder
+from renderer.cache import TensorCache, cache_folder
 from renderer.errors import InputError, require_choice
-from renderer.harmonics import live_coefficients
 from renderer.image import LARGEST_SIZE
-from renderer.transfer import COEFFICIENTS, DEGREE
-from train.classes import class_index
 from train.command_line.configuration import as_dict, read_settings
 from train.command_line.entry_points import NO_ROOM
 from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
@@ -43,7 +35,8 @@ from train.run_folder.classifier import describe, start_from
 from train.run_folder.continuation import INPUTS, fingerprints, require_same_inputs, require_same_settings
 from train.run_folder.files import CONFIG, write_whole
 from train.run_folder.logs import NoLog, RunLog, console
-from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings
+from train.service import build_service
+from train.settings import SMALLEST_SIZE, ExperimentSettings
 
 
 def load_data(config: DictConfig) -> DataSet:
@@ -138,7 +131,7 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
     facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
     if settings.train.init_from:
         start_from(network, facts, Path(settings.train.init_from))
-    service = _build_service(settings, data, device, phases)
+    service = build_service(settings, data, device, phases)
     model = MixedPrecision(network.to(device), precision)
     described = describe(network, **facts)
     return Trainer(settings.train, model, described, service, phases, folder, settings.seed)
@@ -173,60 +166,6 @@ def _write_config(config: DictConfig, folder: Path) -> None:
         "numpy": np.__version__,
     }
     write_whole(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
-
-
-def _build_service(
-    settings: ExperimentSettings, data: DataSet, device: torch.device, phases: Phases
-) -> AugmentationService:
-    scene, labels, label = None, torch.zeros(0, dtype=torch.int64), None
-    if settings.augment.renders:
-        with phases("operators"), first_process_first():
-            scene = _build_scene(settings, data, device)
-        under_study = class_index(data.classes, settings.label, "label")
-        number = {OTHER: anything_but(under_study)} | {name: index for index, name in enumerate(data.classes)}
-        labels = torch.tensor([number[name] for name in scene.labels])
-        label = under_study if settings.scene.look_alikes else None
-    return AugmentationService(settings.augment, scene, labels.to(device), settings.seed, phases, label)
-
-
-def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
-    for key, item in settings.objects.items():
-        if item.label != OTHER:
-            class_index(data.classes, item.label, f"label of {key}")
-    choices, start = settings.renderer.choices, time.perf_counter()
-    console.info("visibility: %s", choices["visibility"].description)
-    objects = list(settings.objects.values())
-    built = build_scene(objects, data.size, settings.views, **settings.scene.choices, **choices, device=device)
-    if settings.augment.relights:
-        _log_skipped(built, choices["operators"], start)
-    else:
-        console.info("operators: none are kept, since views are rasterised in every epoch")
-    return built
-
-
-def _log_skipped(scene: Scene, cache: OperatorCache, start: float) -> None:
-    """Say what the examples share and what was left out of them."""
-    stacks, tally = scene.stacks, cache.tally
-    covered = sum(len(stack.pixels) for stack in stacks) / len(stacks)
-    console.info(
-        "operators: %d views for %d examples, %d from the cache, %d built (%.2f s)%s",
-        tally["views"],
-        len(scene),
-        tally["views"] - tally["built"],
-        tally["built"],
-        time.perf_counter() - start,
-        f"; not kept: {cache.problem}" if cache.problem else "",
-    )
-    console.info(
-        "skipped: rasterisation in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background), "
-        "%.0f %% of the faces (seen by no sample), back faces in %d of %d views (closed meshes)",
-        COEFFICIENTS - len(live_coefficients(DEGREE)),
-        COEFFICIENTS,
-        100 * (1 - covered / scene.settings.size**2),
-        100 * tally["unseen_faces"] / tally["faces"],
-        tally["closed"],
-        tally["views"],
-    )
 
 
 def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:

@@ -16,8 +16,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
@@ -79,18 +78,12 @@ def check_launcher(arguments: Sequence[str]) -> None:
     chosen = [argument.removeprefix("launcher=") for argument in arguments if argument.startswith("launcher=")]
     for launcher in NEEDS.keys() & set(chosen):
         extra, package = NEEDS[launcher]
-        if not _is_installed(package):
-            raise InputError(f'launcher={launcher} needs {package}: pip install ".[{extra}]"')
+        try:
+            importlib.metadata.distribution(package)
+        except importlib.metadata.PackageNotFoundError as error:
+            raise InputError(f'launcher={launcher} needs {package}: pip install ".[{extra}]"') from error
         if launcher == "slurm" and not shutil.which("sbatch"):
             raise InputError("launcher=slurm needs Slurm's sbatch, which is not here: start the sweep on the cluster")
-
-
-def _is_installed(package: str) -> bool:
-    try:
-        importlib.metadata.distribution(package)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 def run_cell(config: DictConfig, folder: Path) -> None:
@@ -161,7 +154,8 @@ class SweepReport(Callback):
                 raise InputError(f"the sweep asks twice for {folder}: give each value once")
             _check_same_settings(folder, cell)
         atexit.register(self._print)  # where the launcher raises, or a signal stops the sweep:
-        self._handler = signal.signal(signal.SIGTERM, _stop)
+        # an exception, so that launchers end their processes
+        self._handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
 
     @_one_outcome
     def on_multirun_end(self, config: DictConfig, **_: object) -> None:
@@ -174,10 +168,6 @@ class SweepReport(Callback):
 
     def _print(self) -> None:
         print(format_sweep(self.folders), flush=True)
-
-
-def _stop(number: int, _: FrameType | None) -> NoReturn:
-    sys.exit(128 + number)  # an exception, so that launchers end their processes
 
 
 def _compose_cells(sweep: DictConfig) -> list[tuple[Path, DictConfig]]:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from augment.attacks.sweep import Sweep
 from train.photographs.shares import counted, share
@@ -21,20 +20,16 @@ ALL = "all"
 def curve(found: Mapping[str, Sweep]) -> list[dict[str, Any]]:
     """A record for each mesh, and where there are several for all of them, each method and radius: the share fooled of
     what was recognised before, with its 95 % Wilson interval; radii by the name of what is attacked."""
-    together = {ALL: _pooled([*found.values()])} if len(found) > 1 else {}
+    together = {}
+    if len(found) > 1:
+        pooled = (torch.cat([getattr(each, method) for each in found.values()], dim=1) for method in METHODS)
+        together[ALL] = Sweep(next(iter(found.values())).radii, *pooled)
     return [
         {"mesh": mesh, "method": method, **radii, **share(int(fooled.sum()), len(fooled))}
         for mesh, sweep in {**found, **together}.items()
         for method in METHODS
         for radii, fooled in zip(sweep.radii, getattr(sweep, method), strict=True)
     ]
-
-
-def _pooled(found: Sequence[Sweep]) -> Sweep:
-    def joined(method: str) -> Tensor:
-        return torch.cat([getattr(each, method) for each in found], dim=1)
-
-    return Sweep(found[0].radii, *map(joined, METHODS))
 
 
 def format_curve(sweep: Sweep) -> str:

@@ -73,9 +73,10 @@ class Trainer:
         InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked for it.
         """
         mixed = with_room(train, len(self.service))
+        share, every = self.settings.images_per_epoch, self.service.settings.every
         with Interruption() as interruption:
             while self.epoch < self.settings.epochs:
-                rounds = self._rounds(len(train))
+                rounds = rounds_of_epoch(len(train), len(self.service), self.seed, self.epoch, share, every)
                 if self._under_way is None:
                     self.learner.begin_epoch()
                     self._under_way = EpochUnderWay.begun(self._regenerate(rounds[0], log))
@@ -115,11 +116,6 @@ class Trainer:
             self._under_way = EpochUnderWay.from_state_dict(state["under_way"], self.learner.device)
         self.epoch, self.history = state["epoch"], state["history"]
         self.best_accuracy, self.best_epoch = state["validation_accuracy_best"], state["epoch_best"]
-
-    def _rounds(self, images: int) -> list[Round]:
-        """Of the epoch under way."""
-        every = self.service.settings.every
-        return rounds_of_epoch(images, len(self.service), self.seed, self.epoch, self.settings.images_per_epoch, every)
 
     def _regenerate(self, now: Round, log: Log) -> Renders:
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))

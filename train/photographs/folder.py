@@ -12,11 +12,12 @@ from typing import NoReturn
 import numpy as np
 import torch
 
+from augment.classifiers.adapter import nearest
 from augment.memory import require_memory
 from augment.progress import progress
 from renderer.errors import InputError, require_file
 from renderer.files.image_files import read_square
-from train.classes import class_index, nearest_class
+from train.classes import class_index
 from train.run_folder.logs import console
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
@@ -131,8 +132,8 @@ def _check_layout(folder: Path, paths: Sequence[PurePosixPath], classes: Sequenc
     for name in names:
         if name not in classes and not name.startswith(FOREIGN):
             raise InputError(
-                f"{folder / name} is not named after a class of the model (the nearest is "
-                f"'{nearest_class(classes, name)}'): rename it, to {FOREIGN}{name} if the model lacks its class"
+                f"{folder / name} is not named after a class of the model (such as "
+                f"{nearest(name, classes)}): rename it, to {FOREIGN}{name} if the model lacks its class"
             )
     loose = [path for path in paths if len(path.parts) == 1]
     if names and loose:

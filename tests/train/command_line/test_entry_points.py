@@ -147,7 +147,10 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_np
     [
         (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
         (["train.resume=2"], "train.resume=2: give true or false"),
-        (["label=ornage"], "label of scene.meshes[0]: 'ornage' is not a class of the model: did you mean 'orange'?"),
+        (
+            ["label=ornage"],
+            "label of scene.meshes[0]: 'ornage' is not a class of the model: choose one, such as orange, apple, pear",
+        ),
         (["data.path=???"], "data.path is not set: give data.path=..."),
         (["scene.projector=[]"], "scene.projector: Cannot merge DictConfig with ListConfig"),
         (["train=3"], "train: Merge error: int is not a subclass of TrainSettings. value: 3"),

@@ -1,0 +1,73 @@
+"""The renders that a run's settings ask for: the scene, its labels, and the service that regenerates them."""
+
+import time
+
+import torch
+
+from augment.build import build_scene
+from augment.labels import anything_but
+from augment.phases import Phases
+from augment.scene import Scene
+from augment.service import AugmentationService
+from renderer.cache import OperatorCache
+from renderer.harmonics import live_coefficients
+from renderer.transfer import COEFFICIENTS, DEGREE
+from train.classes import class_index
+from train.data import DataSet
+from train.distributed import first_process_first
+from train.run_folder.logs import console
+from train.settings import OTHER, ExperimentSettings
+
+
+def build_service(
+    settings: ExperimentSettings, data: DataSet, device: torch.device, phases: Phases
+) -> AugmentationService:
+    scene, labels, label = None, torch.zeros(0, dtype=torch.int64), None
+    if settings.augment.renders:
+        with phases("operators"), first_process_first():
+            scene = _build_scene(settings, data, device)
+        under_study = class_index(data.classes, settings.label, "label")
+        number = {OTHER: anything_but(under_study)} | {name: index for index, name in enumerate(data.classes)}
+        labels = torch.tensor([number[name] for name in scene.labels])
+        label = under_study if settings.scene.look_alikes else None
+    return AugmentationService(settings.augment, scene, labels.to(device), settings.seed, phases, label)
+
+
+def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
+    for key, item in settings.objects.items():
+        if item.label != OTHER:
+            class_index(data.classes, item.label, f"label of {key}")
+    choices, start = settings.renderer.choices, time.perf_counter()
+    console.info("visibility: %s", choices["visibility"].description)
+    objects = list(settings.objects.values())
+    built = build_scene(objects, data.size, settings.views, **settings.scene.choices, **choices, device=device)
+    if settings.augment.relights:
+        _log_skipped(built, choices["operators"], start)
+    else:
+        console.info("operators: none are kept, since views are rasterised in every epoch")
+    return built
+
+
+def _log_skipped(scene: Scene, cache: OperatorCache, start: float) -> None:
+    """Say what the examples share and what was left out of them."""
+    stacks, tally = scene.stacks, cache.tally
+    covered = sum(len(stack.pixels) for stack in stacks) / len(stacks)
+    console.info(
+        "operators: %d views for %d examples, %d from the cache, %d built (%.2f s)%s",
+        tally["views"],
+        len(scene),
+        tally["views"] - tally["built"],
+        tally["built"],
+        time.perf_counter() - start,
+        f"; not kept: {cache.problem}" if cache.problem else "",
+    )
+    console.info(
+        "skipped: rasterisation in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background), "
+        "%.0f %% of the faces (seen by no sample), back faces in %d of %d views (closed meshes)",
+        COEFFICIENTS - len(live_coefficients(DEGREE)),
+        COEFFICIENTS,
+        100 * (1 - covered / scene.settings.size**2),
+        100 * tally["unseen_faces"] / tally["faces"],
+        tally["closed"],
+        tally["views"],
+    )
