@@ -17,20 +17,18 @@ STEPS = ("unit", "raw", "sign")
 
 
 @dataclass
-class StepSettings:
-    """How far values may go and how far they go at once.
+class StepSettings(NormBall):
+    """A norm-ball, and how far values go in it at once.
 
-    norm, radius: see `NormBall`. step: the gradient at unit L2 norm, as it is, or its sign. step_size: times that.
+    step: the gradient at unit L2 norm, as it is, or its sign. step_size: times that.
     """
 
-    norm: str = "linf"
-    radius: float | None = None
     step: str = "unit"
     step_size: float = 0.05
 
     def __post_init__(self) -> None:
         require_fields(self)
-        NormBall(self.norm, self.radius)
+        super().__post_init__()
         require_choice("attack: step", self.step, STEPS)
         require_range("attack: step_size", self.step_size, 1 / LARGEST, FACTOR)
 
@@ -56,7 +54,6 @@ class Kind(ABC):
 
     def __init__(self, scene: Scene, start: Tensor, settings: StepSettings, used: Tensor | None = None):
         self.scene, self.start, self.settings, self.used = scene, start, settings, used
-        self.ball = NormBall(settings.norm, settings.radius)
 
     @abstractmethod
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
@@ -64,17 +61,17 @@ class Kind(ABC):
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         """The nearest values (A, D) of the examples (A,) within the norm-ball and what is physically possible."""
-        return self.ball.project(values, self.start[examples], self.within_domain)
+        return self.settings.project(values, self.start[examples], self.within_domain)
 
     def sample(self, generator: torch.Generator, examples: Tensor) -> Tensor:
         """Uniform draws (A, D) from the balls of the examples (A,), within the domain."""
         used = None if self.used is None else self.used[examples]
-        return self.project(self.ball.sample(self.start[examples], generator, used), examples)
+        return self.project(self.settings.sample(self.start[examples], generator, used), examples)
 
     def sample_as_far(self, values: Tensor, generator: torch.Generator, examples: Tensor) -> Tensor:
         """`sample` where there is a radius; else a random direction at the L2 distance of values (A, D) from the
         start, within the domain."""
-        if self.ball.radius is not None:
+        if self.settings.radius is not None:
             return self.sample(generator, examples)
         start = self.start[examples].to(values)
         offset = torch.randn(values.shape, generator=generator).to(values)

@@ -171,9 +171,7 @@ class AugmentationService:
         draws = generator(self._seed, number, "restart")
         restarts = (problem.sample(draws)[mine] for _ in range(attack.restarts))
         seen = attack.observed(model, stream_seed(self._seed, number))
-        result = descend_in_parts(
-            seen, part, goal.of(mine), attack.descent(), self._phases, restarts, problem.scene.at_once
-        )
+        result = descend_in_parts(seen, part, goal.of(mine), attack, self._phases, restarts, problem.scene.at_once)
         result = result.merged(mine, len(problem.start))
         if self.settings.lights == "continue":
             self._continued = result.values

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from augment.attacks.run import Attacked, logits_of
-from augment.descent import DescentSettings, descend
+from augment.descent import descend
 from augment.phases import Phases
 from augment.seeding import generator
 
@@ -43,15 +44,14 @@ class Checks:
         return [warning for warning, holds in found.items() if holds]
 
 
-def check(attacked: Attacked, descent: DescentSettings, seed: int) -> Checks:
+def check(attacked: Attacked) -> Checks:
     """Search at random and descend for ten times as long, beside an attack that is done."""
-    result = attacked.result
+    result, tries = attacked.result, attacked.settings.max_steps
     open_cases = ~result.fooled_before
     fell = (result.cost < result.cost_before) | result.fooled
-    draws = generator(seed, "random search")
-    random = fooled_by_draws(
-        attacked, result.fooled_before, descent.max_steps, lambda: attacked.problem.sample_as_far(result.values, draws)
-    )
+    draws = generator(attacked.seed, "random search")
+    draw = partial(attacked.problem.sample_as_far, result.values, draws)
+    random = fooled_by_draws(attacked, result.fooled_before, tries, draw)
     return Checks(
         cost_before=float(result.cost_before.mean()),
         cost=float(result.cost.mean()),
@@ -59,7 +59,7 @@ def check(attacked: Attacked, descent: DescentSettings, seed: int) -> Checks:
         zero_gradient=_share(result.zero_gradient),
         success=_share(attacked.success[attacked.recognised]),
         random_search=_share(random[attacked.recognised]),
-        success_by_steps=_success_by_steps(attacked, descent, seed),
+        success_by_steps=_success_by_steps(attacked),
     )
 
 
@@ -78,11 +78,12 @@ def fooled_by_draws(attacked: Attacked, fooled: Tensor, tries: int, draw: Callab
     return fooled
 
 
-def _success_by_steps(attacked: Attacked, descent: DescentSettings, seed: int) -> dict[int, float]:
-    longest = replace(descent, max_steps=descent.max_steps * max(GROWTH))
-    seen, phases = attacked.settings.observed(attacked.classifier, seed), Phases(attacked.problem.start.device)
+def _success_by_steps(attacked: Attacked) -> dict[int, float]:
+    settings, phases = attacked.settings, Phases(attacked.problem.start.device)
+    longest = replace(settings, max_steps=settings.max_steps * max(GROWTH))
+    seen = settings.observed(attacked.classifier, attacked.seed)
     result = descend(seen, attacked.problem, attacked.goal, longest, phases)
-    limits = [descent.max_steps * factor for factor in GROWTH]
+    limits = [settings.max_steps * factor for factor in GROWTH]
     return {limit: _share((result.fooled & (result.fooled_at <= limit))[attacked.recognised]) for limit in limits}
 
 

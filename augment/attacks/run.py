@@ -92,7 +92,7 @@ class Attacked:
         """Random search with as many tries, and success as steps grow: see `augment.attacks.checks.Checks`."""
         from augment.attacks.checks import check
 
-        return check(self, self.settings.descent(), self.seed)
+        return check(self)
 
     @checked
     def sweep(self, scales: Sequence[float]) -> Sweep:
@@ -161,7 +161,7 @@ def attack(
     starts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))
     with phases("attack"):
         seen = settings.observed(classifier, seed)
-        result = descend_in_parts(seen, problem, goal, settings.descent(), phases, starts, scene.at_once)
+        result = descend_in_parts(seen, problem, goal, settings, phases, starts, scene.at_once)
         images = _with_own_transport(problem, result)
     after = logits_of(settings.judge(classifier), images, settings.batch_size)
     seconds = phases.take()

@@ -20,13 +20,12 @@ LIGHTS = (PHYSICAL, SIGNED)
 
 
 @dataclass
-class AttackSettings:
+class AttackSettings(DescentSettings):
     """None for what stays as it is. restarts: further starts, drawn from the norm-balls, where nothing is fooled yet.
 
     light: "physical", only what something can emit (of harmonics: radiance nowhere negative), whatever is attacked,
     beginning with the nearest such light to the scene's; or "signed", any coefficients.
-    max_steps, shorten, batch_size, margin: see `DescentSettings`. rounded: the classifier is given images of 8 bits.
-    expectation: over random changes of them.
+    rounded: the classifier is given images of 8 bits. expectation: over random changes of them.
     """
 
     lighting: StepSettings | None = None
@@ -38,23 +37,20 @@ class AttackSettings:
     albedo: StepSettings | None = None
     pixels: StepSettings | None = None
     light: str = "physical"
-    max_steps: int = 30
-    shorten: bool = False
     restarts: int = 0
     batch_size: int = 32
-    margin: float = 0.0
     rounded: bool = False
     expectation: TransformationSettings = field(default_factory=TransformationSettings)
 
     def __post_init__(self) -> None:
         require_fields(self)
+        super().__post_init__()
         if self.lighting and self.skylight:
             raise InputError("attack: lighting and skylight both set the light: choose one of them")
         require_choice("attack.light", self.light, LIGHTS)
         require_range("attack.restarts", self.restarts, 0, 10**6)
         if self.restarts and any(settings.radius is None for settings in self.kinds.values()):
             raise InputError("attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0")
-        self.descent()
 
     @property
     def kinds(self) -> dict[str, StepSettings]:
@@ -65,10 +61,6 @@ class AttackSettings:
         """InputError where nothing is to be changed."""
         if not self.kinds:
             raise InputError(f"attack: name what to change, such as attack=lighting; there are {', '.join(KINDS)}")
-
-    def descent(self) -> DescentSettings:
-        """How long a descent lasts."""
-        return DescentSettings(self.max_steps, self.shorten, self.batch_size, self.margin)
 
     def judge(self, classifier: nn.Module) -> nn.Module:
         """A classifier that is given 8 bits, where they are rounded."""

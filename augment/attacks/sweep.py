@@ -50,7 +50,7 @@ def sweep(attacked: Attacked, scales: Sequence[float]) -> Sweep:
         left = torch.nonzero(~fooled).squeeze(1)
         if len(left):
             part, phases = Part(balls, left, values[left]), Phases(values.device)
-            result = descend_in_parts(seen, part, goal.of(left), settings.descent(), phases, (), problem.scene.at_once)
+            result = descend_in_parts(seen, part, goal.of(left), settings, phases, (), problem.scene.at_once)
             values[left], fooled[left] = result.values, result.fooled
         random = fooled_by_draws(attacked, random, settings.max_steps, partial(balls.sample, draws))
         found.append((fooled[attacked.recognised].cpu(), random[attacked.recognised].cpu()))

@@ -157,7 +157,8 @@ def reaches(problem: Perturbation, values: Tensor) -> list[Tensor]:
     """How far each kind has gone, as a share of its radius."""
     parts = zip(problem.kinds, problem.split(values - problem.start), strict=True)
     return [
-        (part.norm(dim=1) if kind.ball.norm == "l2" else part.abs().amax(1)) / kind.ball.radius for kind, part in parts
+        (part.norm(dim=1) if kind.settings.norm == "l2" else part.abs().amax(1)) / kind.settings.radius
+        for kind, part in parts
     ]
 
 
@@ -183,7 +184,7 @@ def test_each_kind_steps_and_is_projected_as_if_it_were_alone(make_scene):
     for kind, part, step, nearest in zip(problem.kinds, parts, steps, projected, strict=True):
         unit = part / part.norm(dim=1, keepdim=True)
         torch.testing.assert_close(step, kind.settings.step_size * unit, rtol=0, atol=16 * EPS)
-        assert torch.equal(nearest, kind.ball.project(part[chosen], kind.start[chosen]))
+        assert torch.equal(nearest, kind.settings.project(part[chosen], kind.start[chosen]))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

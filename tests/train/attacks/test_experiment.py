@@ -8,10 +8,10 @@ from hydra import compose, initialize_config_module
 from torch import Tensor
 
 from augment.attacks import run
-from augment.attacks.checks import Checks, check
+from augment.attacks.checks import Checks
 from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings, descend_in_parts
+from augment.descent import descend_in_parts
 from augment.goal import adversarial_cost
 from augment.parameters import KINDS
 from renderer.camera import ring
@@ -283,11 +283,11 @@ def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_f
         f"2 of 2 images of solid:orange:0 are not recognised as 'orange' before any attack (the first: {best}): "
         "change the scene, or set attack.force=true"
     )
-    done = attacked("scene.views=2", "attack.force=true", classifier=deaf)
+    done = attacked("scene.views=2", "attack.force=true", "attack.max_steps=1", classifier=deaf)
     assert done.result.fooled_before.all() and not done.result.steps.any()
     assert done.result.zero_gradient.all()
     assert format_attack("mesh", done, None).startswith("mesh: lighting against callable: none of 2 examples was")
-    found = check(done, DescentSettings(1), 0)
+    found = done.check()
     assert (found.success, found.random_search, set(found.success_by_steps.values())) == (0, 0, {0})
 
 
@@ -326,9 +326,8 @@ def test_what_is_attacked_stands_in_the_scene_without_being_named(kind):
 
 
 def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
-    settings = DescentSettings(3)
     done = attacked("attack.max_steps=3", "scene.backgrounds=[0.3,0.5,0.7]", "attack.lighting.step_size=0.1")
-    found = check(done, settings, 0)
+    found = done.check()
     assert found.cost_before == pytest.approx(float(done.result.cost_before.mean()))
     assert found.cost == pytest.approx(float(done.result.cost.mean())) and found.cost < found.cost_before
     assert found.cost_fell == 1 and found.zero_gradient == 0 and 0 <= found.random_search <= 1
@@ -336,12 +335,12 @@ def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
     assert list(found.success_by_steps) == [3, 9, 30]
     # A longer descent repeats the shorter one: nothing here is drawn.
     assert shares == sorted(shares) and shares[0] == found.success < shares[-1] == 1
-    assert found == check(done, settings, 0)
+    assert found == done.check()
 
 
 def test_checks_count_what_fools_within_the_steps_also_where_a_margin_sends_it_on():
     done = attacked("attack.max_steps=3", "attack.margin=100", "attack.light=signed", "attack.lighting.step_size=0.2")
-    found = check(done, done.settings.descent(), 0)
+    found = done.check()
     assert found.success == 1 and found.success_by_steps == {3: 1, 9: 1, 30: 1}
 
 
@@ -353,8 +352,9 @@ def test_random_search_that_does_as_well_is_a_warning():
         margin = width - (images.mean((1, 2, 3)) - brightness - width / 2).abs()
         return torch.stack([margin, 0 * margin], dim=1)
 
-    done = attacked("attack.lighting.radius=0.1", classifier=Classifier(narrow, SIZE, CLASSES[:2]))
-    found = check(done, DescentSettings(8), 0)
+    network = Classifier(narrow, SIZE, CLASSES[:2])
+    done = attacked("attack.lighting.radius=0.1", "attack.max_steps=8", classifier=network)
+    found = done.check()
     assert not done.result.fooled_before.any() and found.success == found.random_search == 1
     assert found.warnings == ["random search does as well or better"]
 

@@ -9,12 +9,10 @@ import trimesh
 from hydra import compose, initialize_config_module
 
 from augment.attacks.adversary_folder import MAP_HEIGHT
-from augment.attacks.checks import check
 from augment.attacks.figure import read_figure
 from augment.attacks.files import LINES, write_files
 from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings
 from renderer.environment import read_map, to_map
 from renderer.files.mesh_damage import mesh_damage
 from renderer.files.mitsuba_scene import mitsuba_map
@@ -50,7 +48,7 @@ def written(done: Attacked, folder: Path) -> list[dict]:
 
 def test_each_example_has_a_line_and_a_last_one_holds_the_checks(tmp_path):
     done = attacked("scene.backgrounds=[0.4,0.6]", "target=lime")
-    checks = check(done, DescentSettings(2), 0)
+    checks = done.check()
     write_files(done, checks, tmp_path)
     *lines, last = [json.loads(line) for line in (tmp_path / LINES).read_text().splitlines()]
     by_steps = {str(steps): share for steps, share in checks.success_by_steps.items()}
