@@ -5,16 +5,17 @@ import numpy as np
 import pytest
 
 from renderer.mesh import load_mesh
-from train.studies.load.loads import write_sphere
+from train.studies.load import loads
 from train.studies.load.observed import observe
 from train.studies.load.study import LoadSettings, run
 
 
-def test_a_sphere_of_many_faces_is_a_mesh(tmp_path):
-    write_sphere(tmp_path / "sphere.ply", 1000)
+@pytest.mark.parametrize("count", [2, 1000, 30_000])
+def test_a_sphere_has_about_as_many_faces_as_asked_for(tmp_path, count):
+    assert loads.faces(tmp_path, count)[-1] == "scene.meshes=[sphere.ply]"
     mesh = load_mesh(tmp_path / "sphere.ply")
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1, rtol=1e-6)
-    assert 900 <= len(mesh.faces) <= 1100
+    assert len(mesh.faces) == pytest.approx(count, rel=0.1, abs=100)
 
 
 def test_a_command_is_observed_on_a_terminal_to_its_end_and_until_ctrl_c(tmp_path):
