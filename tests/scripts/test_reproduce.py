@@ -8,18 +8,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from train.command_line.configuration import read_settings
+from train.command_line.configuration import composed, read_settings
 from train.settings import ExperimentSettings
 
 ROOT = Path(__file__).parents[2]
 
 
 def settings(name: str, *overrides: str) -> OmegaConf:
-    with initialize_config_module("conf", version_base="1.3"):
-        return compose(name, list(overrides))
+    return composed(name, overrides)
 
 
 STUB = """#!{python}

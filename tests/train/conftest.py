@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
+from train.command_line.configuration import composed
 from train.experiment import load_data, run
 
 CLASSES = ["apple", "orange", "pear"]
@@ -75,12 +75,7 @@ def photos(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def tiny(tiny_npz) -> Callable[..., DictConfig]:
     """The real configuration, small; arguments are further overrides."""
-
-    def composed(*overrides: str) -> DictConfig:
-        with initialize_config_module("conf", version_base="1.3"):
-            return compose("train", [*TINY, f"data.path={tiny_npz}", *overrides])
-
-    return composed
+    return lambda *overrides: composed("train", [*TINY, f"data.path={tiny_npz}", *overrides])
 
 
 @pytest.fixture(scope="session")

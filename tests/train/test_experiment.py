@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from augment.labels import anything_but
 from augment.variation import VariationSettings
 from renderer.errors import InputError
-from train.command_line.configuration import read_settings
+from train.command_line.configuration import composed, read_settings
 from train.data import DataSet
 from train.experiment import load_data, prepare, run
 from train.fit import trainer
@@ -695,15 +694,13 @@ def test_photographs_of_an_unknown_label_are_refused_before_the_first_epoch(tiny
 @pytest.mark.parametrize("choices", [["experiment=demo"], ["experiment=cpu"], ["experiment=paper"]])
 def test_every_experiment_is_a_configuration_that_runs_on_other_data_too(tiny_npz, choices):
     """The command line's data set wins over the experiment's, and no photographs are asked for."""
-    with initialize_config_module("conf", version_base="1.3"):
-        config = compose("train", [*choices, "data=npz", f"data.path={tiny_npz}", "run=here"])
+    config = composed("train", [*choices, "data=npz", f"data.path={tiny_npz}", "run=here"])
     assert read_settings(ExperimentSettings, config).evaluate.photos is None
     assert len(load_data(config).train) == 60
 
 
 def test_the_papers_renders_are_as_they_are_and_have_no_look_alikes():
-    with initialize_config_module("conf", version_base="1.3"):
-        settings = read_settings(ExperimentSettings, compose("train", ["experiment=paper", "run=here"]))
+    settings = read_settings(ExperimentSettings, composed("train", ["experiment=paper", "run=here"]))
     assert settings.augment.vary == VariationSettings() and settings.scene.look_alikes == []
 
 
@@ -722,8 +719,7 @@ def test_another_class_takes_a_label_meshes_and_look_alikes_alone(tiny, tmp_path
 
 
 def test_the_demonstration_is_scored_on_the_images_that_it_renders():
-    with initialize_config_module("conf", version_base="1.3"):
-        settings = read_settings(ExperimentSettings, compose("train", ["run=here"]))
+    settings = read_settings(ExperimentSettings, composed("train", ["run=here"]))
     assert settings.evaluate.photos == settings.data.images == "here/rendered_images"
 
 
@@ -731,8 +727,7 @@ def test_training_takes_the_attacks_of_scripts_attack_and_the_papers_where_none_
     """The keys that were there before any other kind set the paper's step on the light."""
 
     def kinds(*overrides: str) -> dict:
-        with initialize_config_module("conf", version_base="1.3"):
-            settings = read_settings(ExperimentSettings, compose("train", ["run=here", *overrides]))
+        settings = read_settings(ExperimentSettings, composed("train", ["run=here", *overrides]))
         return {name: asdict(each) for name, each in settings.augment.attack.kinds.items()}
 
     paper = {"norm": "linf", "radius": None, "step": "unit", "step_size": 0.05}
@@ -740,8 +735,7 @@ def test_training_takes_the_attacks_of_scripts_attack_and_the_papers_where_none_
     assert kinds("augment.attack.step=sign", "augment.attack.step_size=0.1") == {
         "lighting": paper | {"step": "sign", "step_size": 0.1}
     }
-    with initialize_config_module("conf", version_base="1.3"):
-        alone = compose("attack", ["attack=[geometry,lighting]"]).attack
+    alone = composed("attack", ["attack=[geometry,lighting]"]).attack
     both = kinds("attack@augment.attack=[geometry,lighting]", "augment.attack.geometry.radius=0.01")
     assert both == {"lighting": dict(alone.lighting), "geometry": dict(alone.geometry) | {"radius": 0.01}}
 

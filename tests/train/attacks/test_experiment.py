@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from torch import Tensor
 
 from augment.attacks import run
@@ -20,7 +19,7 @@ from renderer.lights import probe
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
-from train.command_line.configuration import read_settings
+from train.command_line.configuration import composed, read_settings
 from train.settings import read_object
 
 CPU = torch.device("cpu")
@@ -46,8 +45,7 @@ def configured(*overrides: str) -> AttackExperimentSettings:
     """The real configuration; arguments are further overrides."""
     small = ["renderer.visibility=software", "renderer.cache=null", "attack.checks=false", "attack.max_steps=8"]
     small += ["attack.margin=0", "attack.rounded=false"]
-    with initialize_config_module("conf", version_base="1.3"):
-        return read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
+    return read_settings(AttackExperimentSettings, composed("attack", [*small, *overrides]))
 
 
 STANDING = {  # the light of a kind that is placed in the scene, a little of it from the start

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hydra import compose, initialize_config_module
 
 from augment.attacks.adversary_folder import MAP_HEIGHT
 from augment.attacks.figure import read_figure
@@ -20,7 +19,7 @@ from renderer.lights import load_light
 from renderer.mesh import load_mesh
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
-from train.command_line.configuration import read_settings
+from train.command_line.configuration import composed, read_settings
 from train.settings import read_object
 
 CLASSES = ("orange", "lime", "sky")
@@ -34,8 +33,7 @@ def attacked(*overrides: str) -> Attacked:
         "attack.force=true",
         "attack.light=signed",
     ]
-    with initialize_config_module("conf", version_base="1.3"):
-        settings = read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
+    settings = read_settings(AttackExperimentSettings, composed("attack", [*small, *overrides]))
     by_colour = Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES, "by_colour")
     return attack_mesh(read_object("solid:orange:0", "orange", 0), settings, by_colour, torch.device("cpu"))
 

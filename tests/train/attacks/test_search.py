@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from torch import Tensor
 
 from augment.classifiers import Classifier
@@ -14,7 +13,7 @@ from renderer.errors import InputError
 from train.attacks.experiment import attacks
 from train.attacks.search import LENS, LIGHT_GREY, _candidates, overrides, search
 from train.attacks.settings import AttackExperimentSettings
-from train.command_line.configuration import read_settings
+from train.command_line.configuration import composed, read_settings
 from train.settings import read_object
 
 CPU = torch.device("cpu")
@@ -23,8 +22,7 @@ CHANGED = ("polar", "azimuth", "field_of_view", "perspective", "light", "exposur
 
 def configured(*more: str) -> AttackExperimentSettings:
     small = ["renderer.visibility=software", "renderer.cache=null", "attack.checks=false", "attack.max_steps=1"]
-    with initialize_config_module("conf", version_base="1.3"):
-        return read_settings(AttackExperimentSettings, compose("attack", [*small, "attack.light=signed", *more]))
+    return read_settings(AttackExperimentSettings, composed("attack", [*small, "attack.light=signed", *more]))
 
 
 def bright_and_small(images: Tensor) -> Tensor:

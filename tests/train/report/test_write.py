@@ -11,10 +11,10 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
 from PIL import Image
 
 from renderer.errors import InputError
+from train.command_line.configuration import composed
 from train.report import images, plots
 from train.report.command import training_command
 from train.report.summary import summarise
@@ -105,8 +105,7 @@ def test_the_lights_that_fooled_are_shown(page):
 def test_the_command_makes_the_same_settings_again(tmp_path, made_up_run, overrides):
     config = summarise(made_up_run(tmp_path / "run", "adversarial", None, *overrides)).config
     words = shlex.split(training_command(config))[3:]
-    with initialize_config_module("conf", version_base="1.3"):
-        again = compose("train", words)
+    again = composed("train", words)
     expected, found = ({**decisive_settings(each), "data.images": None} for each in (config, again))
     assert {key: value for key, value in found.items() if key in expected} == expected
 

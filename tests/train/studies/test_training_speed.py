@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from torch import nn
 
 from renderer.errors import InputError
+from train.command_line.configuration import composed
 from train.data import Split, load_npz
 from train.fit.epoch import Round, training_batches
 from train.fit.recipe import TrainSettings
@@ -47,8 +47,7 @@ TINY = [
 
 
 def settings(name: str, *overrides: str) -> OmegaConf:
-    with initialize_config_module("conf", version_base="1.3"):
-        return compose(name, list(overrides))
+    return composed(name, overrides)
 
 
 @pytest.fixture

@@ -3,9 +3,8 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 
-from train.command_line.configuration import read_settings
+from train.command_line.configuration import composed, read_settings
 from train.studies.paper import study
 
 
@@ -17,8 +16,7 @@ def reproduce(monkeypatch) -> Callable:
         monkeypatch.setattr(study, "load_classifier", lambda *_: classifier)
         monkeypatch.setattr(torch, "set_num_threads", lambda threads: None)
         monkeypatch.setattr(sys, "argv", ["scripts/reproduce_paper.py", *overrides])
-        with initialize_config_module("conf", version_base="1.3"):
-            config = compose("reproduce_paper", list(overrides))
+        config = composed("reproduce_paper", overrides)
         study.run(read_settings(study.PaperSettings, config))
 
     return run
