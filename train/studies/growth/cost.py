@@ -10,6 +10,7 @@ from multiprocessing.queues import SimpleQueue
 from operator import attrgetter
 
 import torch
+from torch.multiprocessing.spawn import start_processes
 
 from augment.build import build_scene
 from augment.phases import Phases
@@ -53,24 +54,18 @@ class Cost:
 
 
 def measure(load: Load) -> Cost:
-    """Of the slowest process, of as many as it has, on one thread each. RuntimeError where one of them fails."""
+    """Of the slowest process, of as many as it has, on one thread each. ProcessException where one of them fails."""
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     costs = context.SimpleQueue()
-    started = [context.Process(target=_attack, args=(load, rank, port, costs)) for rank in range(load.processes)]
-    for process in started:
-        process.start()
-    for process in started:
-        process.join()
-    if any(process.exitcode for process in started):
-        raise RuntimeError(f"{load} ended with {[process.exitcode for process in started]}")
-    return max((costs.get() for _ in started), key=attrgetter("attack"))
+    start_processes(_attack, (load, port, costs), load.processes, start_method="forkserver")
+    return max((costs.get() for _ in range(load.processes)), key=attrgetter("attack"))
 
 
-def _attack(load: Load, rank: int, port: int, costs: "SimpleQueue[Cost]") -> None:
+def _attack(rank: int, load: Load, port: int, costs: "SimpleQueue[Cost]") -> None:
     torch.set_num_threads(1)
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(load.processes)}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}

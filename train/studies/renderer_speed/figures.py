@@ -22,50 +22,38 @@ def draw_fronts(path: Path, panels: Sequence[Sequence[Row]]) -> None:
     for ax, rows in zip(axes.flat, panels, strict=False):
         front = pareto_front(rows)
         ax.plot([row.time_ms for row in front], [row.error for row in front], "k-", lw=1, zorder=1, label="front")
-        for name, group in _groups(rows).items():
-            ax.plot([row.time_ms for row in group], [row.error for row in group], "o", ms=5, label=name)
+        few = len(rows) <= FEW
+        for name, group in _grouped(rows, "setting" if few else "degree").items():
+            label = name if few else f"degree {name}"
+            ax.plot([row.time_ms for row in group], [row.error for row in group], "o", ms=5, label=label)
         for row in rows:
             if row.default:
                 ax.plot(row.time_ms, row.error, "*", ms=15, color=RED, label="default")
         ax.set(title=rows[0].panel, xlabel="milliseconds", ylabel="relative error")
         _logarithmic(ax, "x", *("y" if min(row.error for row in rows) > 0 else ""))
-        columns = 1 if len(rows) <= FEW else 4
-        ax.legend(fontsize=8, ncols=columns, loc="upper center", bbox_to_anchor=(0.5, -0.12))  # it hides no setting
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12)}  # where it hides no setting
+        ax.legend(fontsize=8, ncols=1 if few else 4, **below)
     for ax in axes.flat[len(panels) :]:
         ax.axis("off")
     save(figure, path, dpi=100)
 
 
-def _groups(rows: Sequence[Row]) -> Mapping[str, Sequence[Row]]:
-    """What has a colour and a name: each setting if they are few, or else each degree."""
-    if len(rows) <= FEW:
-        return {row.setting: [row] for row in rows}
-    degrees = dict.fromkeys(row.degree for row in rows)
-    return {f"degree {degree}": [row for row in rows if row.degree == degree] for degree in degrees}
-
-
 def draw_scaling(path: Path, points: Sequence[Point], workloads: Sequence[Sequence[Row]]) -> None:
-    """Time and memory of a gradient by its variables, and time of each kind of work by size, vertices and lights."""
-    figure, axes = pyplot().subplots(2, 3, figsize=(16, 10), layout="tight")
-    methods = list(dict.fromkeys(point.method for point in points))
-    lines = {method: [point for point in points if point.method == method] for method in methods}
+    """Time and memory of a gradient by its variables, and time of each kind of work by size and by vertices."""
+    figure, axes = pyplot().subplots(2, 2, figsize=(12, 10), layout="tight")
     for ax, quantity, unit in ((axes[0, 0], "time_ms", "milliseconds"), (axes[0, 1], "memory_mb", "peak MB allocated")):
-        _draw_lines(ax, lines, "variables", quantity)
+        _draw_lines(ax, _grouped(points, "method"), "variables", quantity)
         ax.set(title=f"gradient by the vertices, {points[0].size}², visibility kept", xlabel="variables", ylabel=unit)
-    by_size, by_vertices, by_lights = workloads
-    _draw_lines(axes[0, 2], {by_lights[0].panel: by_lights}, "batch", "time_ms")
-    axes[0, 2].set(title=by_lights[0].panel, xlabel="lights", ylabel="milliseconds per light")
-    for ax, rows, axis in ((axes[1, 0], by_size, "size"), (axes[1, 1], by_vertices, "vertices")):
-        _draw_lines(ax, _by_work(rows), axis, "time_ms")
+    for ax, rows, axis in zip(axes[1], workloads, ("size", "vertices"), strict=True):
+        _draw_lines(ax, _grouped(rows, "setting"), axis, "time_ms")
         ax.set(title=rows[0].panel, xlabel=axis, ylabel="milliseconds")
-    stepping = [row for row in by_size if row.setting in ("light step", "vertex step, refreshed")]
-    _draw_lines(axes[1, 2], _by_work(stepping), "size", "error")
-    axes[1, 2].set(title=by_size[0].panel, xlabel="size", ylabel="relative error")
     save(figure, path, dpi=100)
 
 
-def _by_work(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    return {work: [row for row in rows if row.setting == work] for work in dict.fromkeys(row.setting for row in rows)}
+def _grouped(lines: Sequence[Any], name: str) -> dict[Any, list[Any]]:
+    """By one of their fields."""
+    values = dict.fromkeys(getattr(line, name) for line in lines)
+    return {value: [line for line in lines if getattr(line, name) == value] for value in values}
 
 
 def _draw_lines(ax: "Axes", lines: Mapping[str, Sequence[Any]], x: str, y: str) -> None:

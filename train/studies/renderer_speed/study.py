@@ -107,7 +107,7 @@ def _measure(bench: Bench, meshes: Sequence[Mesh], out: Path, description: str, 
     by_light = [bench.timed(comparison.by_light(bench, size, not without)) for size in (plan.small, plan.large)]
     of_vertices, section = vertices.measure(bench, not without, description)
     print("measured: comparisons", flush=True)
-    workloads = [*(scaling.workloads(bench, axis) for axis in ("size", "vertices")), scaling.batches(bench)]
+    workloads, by_lights = [scaling.workloads(bench, axis) for axis in ("size", "vertices")], scaling.batches(bench)
     points, reference = scaling.measure(bench), Converged(bench.view(plan.mesh, plan.large))
     print("measured: workloads", flush=True)
     text = filled(
@@ -128,12 +128,12 @@ def _measure(bench: Bench, meshes: Sequence[Mesh], out: Path, description: str, 
         by_light="\n\n".join(map(results.compared, by_light)),
         vertices=section,
         savings=skipping.table(bench, meshes),
-        by_lights=", ".join(f"{row.setting} {shown(row.time_ms)} ms" for row in workloads[-1]),
+        by_lights=", ".join(f"{row.setting} {shown(row.time_ms)} ms" for row in by_lights),
         by_variables=scaling.table(points),
     )
     write(out / PAGE, joined([wrapped(text)]))
     fronts = [*choices, descent, *by_light, of_vertices]
-    growth = (asdict(row) for rows in workloads for row in rows)
+    growth = (asdict(row) for rows in (*workloads, by_lights) for row in rows)
     results.write_csv(out / "renderer_pareto.csv", [*results.records(fronts), *growth])
     results.write_csv(out / "renderer_scaling.csv", [asdict(point) for point in points])
     figures.draw_fronts(out / "renderer_pareto.png", fronts)
