@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.backgrounds import load_background
 from renderer.arguments import require_fields
 from renderer.errors import InputError, require_range
-from renderer.files.placed_lights import load_placed
+from renderer.files.light_files import read_light
 from renderer.lamps import Lamps
 from renderer.projector import Projector
 
@@ -60,9 +60,7 @@ class LampsSettings:
     def build(self) -> tuple[Lamps, Tensor]:
         """The basis, and the powers (L, 3)."""
         if isinstance(self.start, str):
-            lamps, powers = load_placed(Path(self.start))
-            if not isinstance(lamps, Lamps):
-                raise InputError(f"scene.lamps.start={self.start} describes a {lamps.name}: give lamps")
+            lamps, powers = read_light(Path(self.start), Lamps)
             return lamps, lamps.nearest_physical(powers)
         try:
             places = tuple((float(x), float(y), float(z)) for x, y, z in self.places)

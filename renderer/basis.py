@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from renderer.convex import Ball, nearest_in_box
-from renderer.harmonics import basis, irradiance_basis, live_coefficients
+from renderer.errors import require_range
+from renderer.harmonics import MAX_DEGREE, basis, irradiance_basis, live_coefficients
 
 
 class Functions(ABC):
@@ -127,6 +128,9 @@ class Harmonics(Distant):
 
     name = "harmonics"
     signed = True
+
+    def __post_init__(self) -> None:
+        require_range("the degree of harmonics", self.degree, 0, MAX_DEGREE)
 
     def __str__(self) -> str:
         return f"{self.name} of degree {self.degree}"

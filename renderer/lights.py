@@ -3,7 +3,6 @@
 Coefficients live in world axes (z up) and follow the index of `renderer.harmonics`.
 """
 
-import json
 import math
 from pathlib import Path
 
@@ -11,9 +10,10 @@ import torch
 from torch import Tensor
 
 from renderer.arguments import checked
-from renderer.basis import HARMONICS, Basis
+from renderer.basis import HARMONICS, Harmonics
 from renderer.environment import SUFFIXES, read_panorama
-from renderer.errors import FACTOR, InputError, require_bounded, require_file
+from renderer.errors import FACTOR, InputError, require_bounded
+from renderer.files.light_files import read_light
 from renderer.harmonics import basis, live_coefficients, project, rotate
 from renderer.mesh import Y_UP_TO_Z_UP
 from renderer.transfer import COEFFICIENTS, DEGREE
@@ -40,7 +40,7 @@ PROBES, UNIFORM = tuple(_PUBLISHED_PROBES), "uniform"
 @checked
 def load_light(light: str) -> Tensor:
     """Coefficients (49, 3) float32 of a named probe, of `uniform` light, in which a surface shows its albedo, of an
-    environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as `save_light` writes it).
+    environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as `renderer.save_light` writes it).
 
     A map is scaled to the mean luminance of the grace probe, since maps come in any unit, and may be negative in
     places, as series are that were written as a map; coefficients stay as they are.
@@ -52,29 +52,16 @@ def load_light(light: str) -> Tensor:
     if light == UNIFORM:
         return ambient(torch.full((3,), 1 / math.pi))
     if suffix == ".json":
-        return _read_coefficients(Path(light))
+        found, coefficients = read_light(Path(light), Harmonics)
+        if found != HARMONICS:
+            raise InputError(f"light {light} is of {found}: give one of {HARMONICS}")
+        return coefficients
     if suffix in SUFFIXES:
         return _read_light_map(Path(light)).float()
     raise InputError(
         f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or the path of an environment map "
         f"({', '.join(SUFFIXES)}) or of coefficients (.json)"
     )
-
-
-@checked
-def save_light(path: Path, coefficients: Tensor, basis: Basis = HARMONICS) -> None:
-    """Write the name of a basis and coefficients (size, 3), a row [r, g, b] each, as JSON.
-
-    `load_light` reads float32 back to the bit. InputError: another shape, NaN, or a file that cannot be written.
-    """
-    require_bounded(coefficients=coefficients)
-    if coefficients.shape != (basis.size, 3):
-        raise InputError(f"coefficients {tuple(coefficients.shape)} are not of {basis}: give {(basis.size, 3)}")
-    rows = ",\n".join(json.dumps(row, allow_nan=False) for row in coefficients.tolist())
-    try:
-        path.write_text(f'{{"basis": {json.dumps(basis.name)}, "coefficients": [\n{rows}\n]}}\n', encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"light {path} cannot be written: {error}") from error
 
 
 def probe(name: str) -> Tensor:
@@ -129,22 +116,3 @@ def _read_light_map(path: Path) -> Tensor:
     if not (scaled.abs() <= FACTOR).all():
         raise InputError(f"environment map {path} is nearly as negative as it is bright: give a map with light in it")
     return scaled
-
-
-def _read_coefficients(path: Path) -> Tensor:
-    require_file(path, "give the path of a .json file of coefficients")
-    try:
-        light = json.loads(path.read_text(encoding="utf-8-sig"))
-        if not isinstance(light, dict):  # the rows alone, of harmonics
-            light = {"basis": HARMONICS.name, "coefficients": light}
-        coefficients = torch.tensor(light["coefficients"], dtype=torch.float32)
-    except (KeyError, ValueError, TypeError, RuntimeError, OverflowError, RecursionError, OSError) as error:
-        raise InputError(f"light {path} is not a readable list of coefficients: {error}") from error
-    if light.get("basis") != HARMONICS.name:
-        raise InputError(f"light {path} has the basis {light.get('basis')!r}: give a light of {HARMONICS.name}")
-    if coefficients.shape != (COEFFICIENTS, 3) or not (coefficients.abs() <= FACTOR).all():  # NaN is not
-        raise InputError(
-            f"light {path} has shape {tuple(coefficients.shape)}: it must hold {COEFFICIENTS} rows [r, g, b] of finite "
-            f"numbers, no larger than {FACTOR:g}"
-        )
-    return coefficients

@@ -15,7 +15,8 @@ from PIL import Image
 
 from renderer.environment import read_map, write_map
 from renderer.errors import InputError
-from renderer.lights import load_light, probe, save_light
+from renderer.files.light_files import save_light
+from renderer.lights import load_light, probe
 from train.data import load_npz
 from train.photographs.answers import ANSWERS, Answer, read_answers, write_answers
 from train.photographs.folder import Photograph, find_photographs, load_photographs

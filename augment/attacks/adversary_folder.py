@@ -23,12 +23,14 @@ from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.environment import negative_share, to_map, write_map
 from renderer.errors import FACTOR, InputError, require_bounded, require_file, require_range
 from renderer.files.array_files import read_numbers
+from renderer.files.light_files import read_light, save_light
 from renderer.files.mesh_export import export_mesh
 from renderer.files.mitsuba_scene import mitsuba_map, write_mitsuba_scene
-from renderer.files.placed_lights import load_placed, save_placed
 from renderer.image import ImageSettings, to_bytes
-from renderer.lights import load_light, save_light
+from renderer.lamps import Lamps
+from renderer.lights import load_light
 from renderer.mesh import load_mesh
+from renderer.projector import Projector
 
 DESCRIPTION, MESH, LIGHT = "adversary.json", "mesh.glb", "light.json"
 BACKGROUND, PIXELS = "background.png", "pixels.npy"
@@ -45,7 +47,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     (where, sky), *placed = parts_of(adversary.basis)
     save_light(folder / LIGHT, adversary.light[where], sky)
     for own, basis in placed:
-        save_placed(folder / f"{basis.name}.json", adversary.light[own], basis)
+        save_light(folder / f"{basis.name}.json", adversary.light[own], basis)
     description = {
         "label": shown.label,
         "name": Path(shown.name).name,
@@ -95,7 +97,7 @@ def read_adversary(folder: Path) -> Adversary:
         mesh, light, pixels = (folder / str(description.get(key)) for key in ("mesh", "light", "pixels"))
         background = description["background"]
         own = None if description.get("own_faces") is None else int(description["own_faces"])
-        placed = [load_placed(folder / str(file)) for file in description.get("placed_lights", [])]
+        placed = [read_light(folder / str(each), Projector, Lamps) for each in description.get("placed_lights", [])]
         surface = load_mesh(mesh)
         for camera in cameras:
             camera.depths(surface.vertices)  # which refuses a mesh around the camera

@@ -180,7 +180,7 @@ def test_lamps_are_moved_within_their_ball_and_stand_where_they_ended_when_read_
     torch.testing.assert_close(found.render(choose("software")), done.images[1], rtol=0, atol=1e-6)
     standing, powers = LampsSettings(start=str(tmp_path / "lamps.json")).build()
     assert standing == lamps and torch.equal(powers, after.light[-len(powers) :])
-    with pytest.raises(InputError, match=r"scene\.lamps\.start=.*projector\.json describes a projector: give lamps"):
+    with pytest.raises(InputError, match=r"projector\.json: its basis is 'projector', give one of lamps"):
         LampsSettings(start=str(tmp_path / "projector.json")).build()
 
 

@@ -15,8 +15,9 @@ from PIL import Image
 
 from renderer.environment import SUFFIXES, negative_share, read_map, to_map, write_map
 from renderer.errors import InputError
+from renderer.files.light_files import save_light
 from renderer.harmonics import basis, equirectangular, project
-from renderer.lights import load_light, mean_luminance, probe, save_light
+from renderer.lights import load_light, mean_luminance, probe
 from renderer.transfer import DEGREE
 
 ROOT = Path(__file__).parents[2]

@@ -12,6 +12,7 @@ from scipy.special import eval_legendre
 from renderer.camera import OrthographicCamera
 from renderer.environment import SUFFIXES, to_map, write_map
 from renderer.errors import InputError
+from renderer.files.light_files import save_light
 from renderer.harmonics import basis, irradiance_basis, live_coefficients, project
 from renderer.lights import (
     PROBES,
@@ -20,7 +21,6 @@ from renderer.lights import (
     load_light,
     perturb,
     probe,
-    save_light,
 )
 from renderer.mesh import Mesh
 from renderer.rendering import render
@@ -263,25 +263,34 @@ def test_coefficients_that_are_not_finite_are_not_saved(tmp_path):
 
 
 ROWS = [[1, 0.5, -2]] * 49
+DEGREE_1 = json.dumps({"basis": "harmonics", "degree": 1, "coefficients": ROWS[:4]})
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        pytest.param("", "not a readable list", id="empty"),
-        pytest.param(json.dumps(ROWS)[:-1], "not a readable list", id="truncated"),
-        pytest.param(json.dumps({"basis": "harmonics"}), "not a readable list", id="no coefficients"),
-        pytest.param(json.dumps({"basis": "lamps", "coefficients": ROWS}), "has the basis 'lamps'", id="another basis"),
-        pytest.param("\udcff", "not a readable list", id="bytes"),
-        pytest.param('{"light": 1}', "not a readable list", id="object"),
-        pytest.param('"grace"', "not a readable list", id="text"),
-        pytest.param("null", "not a readable list", id="null"),
-        pytest.param(json.dumps([*ROWS[:48], [1, 2]]), "not a readable list", id="ragged"),
-        pytest.param(json.dumps([*ROWS[:48], [1, 2, 10**400]]), "not a readable list", id="beyond float"),
-        pytest.param(json.dumps(ROWS[:9]), "has shape (9, 3): it must hold 49 rows [r, g, b]", id="9 rows"),
-        pytest.param("[]", "has shape (0,)", id="no rows"),
-        pytest.param("1.5", "has shape ()", id="number"),
+        pytest.param("", "does not describe a light", id="empty"),
+        pytest.param(json.dumps(ROWS)[:-1], "does not describe a light", id="truncated"),
+        pytest.param(json.dumps({"basis": "harmonics"}), "does not describe a light", id="no coefficients"),
+        pytest.param(
+            json.dumps({"basis": "lamps", "coefficients": ROWS}),
+            "its basis is 'lamps', give one of harmonics",
+            id="another basis",
+        ),
+        pytest.param("\udcff", "does not describe a light", id="bytes"),
+        pytest.param('{"light": 1}', "does not describe a light", id="object"),
+        pytest.param('"grace"', "does not describe a light", id="text"),
+        pytest.param("null", "does not describe a light", id="null"),
+        pytest.param(json.dumps([*ROWS[:48], [1, 2]]), "does not describe a light", id="ragged"),
+        pytest.param(json.dumps([*ROWS[:48], [1, 2, 10**400]]), "does not describe a light", id="beyond float"),
+        pytest.param(json.dumps(ROWS[:9]), "has coefficients (9, 3): give 49 rows [r, g, b]", id="9 rows"),
+        pytest.param("[]", "has coefficients (0,)", id="no rows"),
+        pytest.param("1.5", "has coefficients ()", id="number"),
         pytest.param(json.dumps([*ROWS[:48], [1, 2, math.nan]]), "of finite numbers", id="NaN"),
+        pytest.param(DEGREE_1, "is of harmonics of degree 1: give one of harmonics of degree 6", id="degree"),
+        pytest.param(
+            '{"basis": "harmonics", "degree": 21, "coefficients": []}', "harmonics=21 must be", id="degree 21"
+        ),
     ],
 )
 def test_a_file_that_holds_no_coefficients_is_refused_by_name(tmp_path, content, message):

@@ -7,8 +7,9 @@ import trimesh
 from PIL import Image
 
 from renderer.environment import to_map, write_map
+from renderer.files.light_files import save_light
 from renderer.files.mesh_export import export_mesh
-from renderer.lights import probe, save_light
+from renderer.lights import probe
 from renderer.shapes import solid
 
 LIGHTS = ("light.npy", "light.hdr", "light.exr", "light.json")
