@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import cast
@@ -19,7 +20,7 @@ from train.settings import ExperimentSettings
 from train.studies.training_speed.arm import Arm
 from train.studies.training_speed.baseline import Baseline, build_loader
 from train.studies.training_speed.findings import ADVERSARIAL, BASELINE, PLAIN, PRODUCTS, Findings, Turn, Workload
-from train.studies.training_speed.peak import Products, forward_multiply_adds
+from train.studies.training_speed.peak import forward_multiply_adds, products
 from train.wideresnet import WideResNet
 
 IMAGES, CLASSES, SIZE = 50_000, 100, 32  # CIFAR-100's
@@ -80,7 +81,7 @@ def measure(settings: BenchmarkSettings, config: DictConfig, data: DataSet, devi
         makers: dict[str, Callable[[], Contestant]] = {
             PLAIN: lambda: Arm(plain, data, Path(folder, "plain"), train[: work.trained].to(device), validation),
             BASELINE: lambda: Baseline(network, loader, recipe, device),
-            PRODUCTS: lambda: Products(device),
+            PRODUCTS: lambda: partial(products, device),
             ADVERSARIAL: lambda: Arm(
                 adversarial, data, Path(folder, "adversarial"), train[: work.beside_renders].to(device), validation
             ),

@@ -21,30 +21,23 @@ def forward_multiply_adds(network: nn.Module, size: int) -> int:
     return counter.get_total_flops() // 2
 
 
-class Products:
+def products(device: torch.device) -> dict[tuple[str, int], float]:
     """Operations per second (two per multiply-add) of square matrix products, by precision and size."""
+    phases = Phases(device)
 
-    def __init__(self, device: torch.device):
-        self._device = device
-        self._phases = Phases(device)
-
-    def __call__(self) -> dict[tuple[str, int], float]:
-        return {
-            (name, size): 2 * size**3 / self._seconds(*self._matrices(dtype, size))
-            for name, dtype in PRECISIONS.items()
-            for size in SIZES[self._device.type]
-        }
-
-    def _matrices(self, dtype: torch.dtype, size: int) -> Tensor:
-        return torch.randn(3, size, size, device=self._device).to(dtype)
-
-    def _seconds(self, left: Tensor, right: Tensor, out: Tensor) -> float:
+    def seconds(left: Tensor, right: Tensor, out: Tensor) -> float:
         """Of one product: the mean of a burst, after one that warms up."""
         torch.mm(left, right, out=out)
-        count, seconds = 0, 0.0
-        while seconds < BURST:
-            with self._phases("product"):
+        count, taken = 0, 0.0
+        while taken < BURST:
+            with phases("product"):
                 torch.mm(left, right, out=out)
-            seconds += self._phases.take()["product"]
+            taken += phases.take()["product"]
             count += 1
-        return seconds / count
+        return taken / count
+
+    return {
+        (name, size): 2 * size**3 / seconds(*torch.randn(3, size, size, device=device).to(dtype))
+        for name, dtype in PRECISIONS.items()
+        for size in SIZES[device.type]
+    }
