@@ -57,7 +57,7 @@ def write(path: Path | None, text: str) -> None:
 
 
 def write_section(path: Path, section: str) -> None:
-    """Write a section of a page on performance, as `write` does, in place of the one of the same heading."""
+    """`write` a page with a section in place of the one of the same heading; a page that is new is on performance."""
     page = path.read_text("utf-8") if path.is_file() else "# Performance\n"
     write(path, with_section(page, section))
 

@@ -16,7 +16,7 @@ from train.report.tables import markdown, shown
 from train.studies.accuracy import conditions
 from train.studies.accuracy.conditions import Row
 from train.studies.accuracy.measure import Error
-from train.studies.page import filled, joined, with_section, write
+from train.studies.page import filled, joined, write, write_section
 
 Tables = dict[str, Sequence[Row]]  # by title
 
@@ -44,7 +44,7 @@ def run(settings: AccuracySettings) -> list[str]:
     torch.set_num_threads(1)
     tables = measure(settings)
     if settings.only:
-        write(out, with_section(out.read_text("utf-8"), _section(*next(iter(tables.items())))))
+        write_section(out, _section(*next(iter(tables.items()))))
     else:
         write(out, page(tables))
     return failures(tables)

@@ -17,7 +17,7 @@ from train.command_line.outputs import writable_folder
 from train.device import choose_device
 from train.report.tables import markdown, shown
 from train.settings import SceneSettings, read_object
-from train.studies.page import filled, joined, machine, with_section, wrapped, write
+from train.studies.page import filled, joined, machine, wrapped, write, write_section
 from train.studies.renderer_speed import (
     comparison,
     figures,
@@ -69,7 +69,7 @@ def run(settings: RendererSpeedSettings) -> None:
     without = _without_mitsuba(settings.peers)
     if settings.only:
         _, section = vertices.measure(bench, not without, description)
-        return write(out / PAGE, with_section((out / PAGE).read_text("utf-8"), section))
+        return write_section(out / PAGE, section)
     named = [read_object(item, "", index) for index, item in enumerate(settings.scene.meshes)]
     meshes = [load_object(item).mesh for item in named] or [solid("orange", seed) for seed in (0, 1)]
     _measure(bench, meshes, out, description, without)

@@ -18,7 +18,6 @@ from train.studies.transport import beside_mitsuba, cost, held
 from train.studies.transport.cost import CupSettings
 
 SIZES = (32, 224)
-COLORS = {"several colours": None, "one grey": (0.5, 0.5, 0.5), "one colour": (0.9, 0.5, 0.2)}
 
 
 def run(settings: CupSettings) -> None:
@@ -29,6 +28,8 @@ def run(settings: CupSettings) -> None:
     torch.set_num_threads(1)
     coarse, clock = normalise(solid("cup", 0)), Clock(torch.device("cpu"), settings.rounds)
     cup = subdivide(coarse, settings.vertices)
+    grey, orange = cost.painted(cup, (0.5, 0.5, 0.5)), cost.painted(cup, (0.9, 0.5, 0.2))
+    meshes = {"several colours": cup, "one grey": grey, "one colour": orange}
     text = filled(
         __file__,
         command=command_line(),
@@ -36,9 +37,7 @@ def run(settings: CupSettings) -> None:
         faces=len(cup.faces),
         vertices=len(cup.vertices),
         views=cost.VIEWS,
-        costs=cost.costs(
-            {name: cost.painted(cup, color) if color else cup for name, color in COLORS.items()}, SIZES, clock
-        ),
+        costs=cost.costs(meshes, SIZES, clock),
         size=SIZES[0],
         maps=cost.depth_maps(cup),
         resolution=cost.RESOLUTION,
