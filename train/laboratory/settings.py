@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from renderer.errors import FACTOR, InputError, require_limits, require_range
+from renderer.errors import FACTOR, InputError, require_choice, require_limits, require_range
 from renderer.image import LARGEST_SIZE
 from train.laboratory.patterns import FAMILIES
 from train.settings import LARGEST_SEED
@@ -39,8 +39,8 @@ class LabSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if unknown := [name for name in self.patterns if name not in FAMILIES]:
-            raise InputError(f"patterns: {unknown[0]!r} is not known: choose from {', '.join(FAMILIES)}")
+        for name in self.patterns:
+            require_choice("patterns", name, FAMILIES)
         kinds = [*self.patterns, *map(environment_name, self.environments)]
         if not kinds or self.lights < 1 or self.lights % len(kinds):
             raise InputError(

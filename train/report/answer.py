@@ -7,7 +7,7 @@ from renderer.errors import InputError
 from train.photographs.figures import OVERALL, figure_title
 from train.report.arms import Arms, Score
 from train.report.attacks import Attack
-from train.report.comparison import difference, read_evaluation, require_comparable
+from train.report.comparison import difference, format_difference, read_evaluation, require_comparable
 from train.report.photographs import scored, scored_on, scores_of
 
 RATE = "recall_at/0.10"  # what tells discernment: recall at equal false alarms
@@ -54,8 +54,7 @@ def _difference(runs: Arms, name: str) -> str:
         return ""
     title = figure_title(RATE, label)
     sure = "" if figure["low"] > 0 or figure["high"] < 0 else ", so that no difference is shown"
-    value = f"{figure['value']:+.3f} [{figure['low']:+.3f}, {figure['high']:+.3f}]"
-    return f"; {arm} minus {reference} in {title} is {value}{sure}"
+    return f"; {arm} minus {reference} in {title} is {format_difference(figure)}{sure}"
 
 
 def of_attacks(attacks: Sequence[Attack]) -> str:

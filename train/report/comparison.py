@@ -168,7 +168,7 @@ def difference_tables(evaluations: Sequence[Evaluation], pooled: str) -> list[Ta
     tables = []
     for group in others:
         rows = [
-            [source or pooled, *(_format_difference(difference(group, reference, source, name)) for name in FIGURES)]
+            [source or pooled, *(format_difference(difference(group, reference, source, name)) for name in FIGURES)]
             for source in evaluations[0].pools
         ]
         header = ["source", *(figure_title(name, evaluations[0].label) for name in FIGURES)]
@@ -183,7 +183,8 @@ def _format_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) 
     return f"different seeds ({len(group)} and {len(reference)})"
 
 
-def _format_difference(figure: dict[str, Any]) -> str:
+def format_difference(figure: dict[str, Any]) -> str:
+    """Of `difference`, with its sign; "-" where it is unknown."""
     return f"{figure['value']:+.3f} [{figure['low']:+.3f}, {figure['high']:+.3f}]" if figure else "-"
 
 

@@ -3,8 +3,9 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from omegaconf import DictConfig, OmegaConf
+
 from renderer.errors import InputError
-from train.command_line.configuration import as_dict
 from train.photographs.answers import ANSWERS, read_answers
 from train.photographs.figures import OVERALL, figure_title, find_figure
 from train.photographs.ranking import Ranking
@@ -108,12 +109,12 @@ def _tiles(arm: str, run: RunSummary, name: str) -> Iterator[Block]:
 
 def photographs_folder(run: RunSummary, name: str) -> Path | None:
     """Where the images were that a run was scored on, as its configuration has it."""
-    photos = as_dict(run.config).get("evaluate", {}).get("photos")
-    found = photos.get(name) if isinstance(photos, dict) else photos
+    photos = OmegaConf.select(run.config, "evaluate.photos")
+    found = photos.get(name) if isinstance(photos, DictConfig) else photos
     return Path(found) if isinstance(found, str) else None
 
 
 def scored_on(run: RunSummary, name: str) -> str:
     """What the images are that a run was scored on, in the sub-folder `name`."""
-    own = as_dict(run.config).get("data", {}).get("images")
+    own = OmegaConf.select(run.config, "data.images")
     return "held-out renders" if own and photographs_folder(run, name) == Path(own) else name

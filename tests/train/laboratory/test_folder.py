@@ -110,7 +110,7 @@ REFUSED = [
     ({"lights": 5}, "lights=5 must be a positive multiple of the 2 patterns"),
     ({"lights": 0}, "lights=0 must be a positive multiple"),
     ({"patterns": []}, "must be a positive multiple of the 0 patterns"),
-    ({"patterns": ["stripe"]}, "patterns: 'stripe' is not known: choose from solid, gradient, stripes"),
+    ({"patterns": ["stripe"]}, "patterns=stripe: choose one of solid, gradient, stripes"),
     ({"brightness": [2.0, 1.0]}, r"brightness=\[2.0, 1.0\]: give \[least, most\]"),
     ({"brightness": [1.0]}, r"brightness=\[1.0\]: give \[least, most\]"),
     ({"brightness": [1.0, 1e30]}, r"brightness=\[1.0, 1e\+30\]: give \[least, most\], both from 1e-05 to 100000"),

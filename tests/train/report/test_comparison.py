@@ -9,6 +9,7 @@ from train.photographs.answers import Answer, write_answers
 from train.photographs.folder import Photograph
 from train.report.comparison import format_comparison
 from train.report.summary import summarise
+from train.report.write import write_report
 
 TITLES = [
     "Photographs: orange recognised", "Photographs: others called orange", "Photographs: AUC",
@@ -100,6 +101,14 @@ def test_another_folder_of_photographs_is_compared_by_its_name(scored_run, read_
     assert "Photographs: AUC" in compare(read_markdown, folders, photographs="lab")
     with pytest.raises(InputError, match=r"^photographs=lib: no run has a sub-folder of that name"):
         compare(read_markdown, folders, photographs="lib")
+
+
+def test_a_report_of_runs_scored_on_different_photographs_shows_each_and_says_so(scored_run, tmp_path):
+    runs = [scored_run("none", STUDIO_AND_WEB), scored_run("random", {**STUDIO_AND_WEB, "web": ([1], [0])})]
+    text = write_report(runs, tmp_path / "out").read_text()
+    assert f"{runs[1]}/photographs has other photographs or sources than {runs[0]}/photographs" in text
+    assert re.search(r'alt="ROC; AUC: none 0\.\d+, random 0\.\d+"', text)
+    assert re.search(r'alt="orange recognised, by source or pattern\. all: none 0\.55, random 0\.86', text)
 
 
 def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run, read_markdown):
