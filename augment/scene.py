@@ -108,7 +108,7 @@ class Scene:
             raise InputError("nothing is to be rendered: name one mesh, one view and one background or more")
         if self.lights.shape[-2:] != (self.basis.size, 3):
             raise InputError(
-                f"light of shape {tuple(self.lights.shape)} is not of {self.basis}: give {self.basis.size} rows"
+                f"lights of shape {tuple(self.lights.shape)} is not of {self.basis}: give {self.basis.size} rows"
             )
         behind, size = self.backgrounds, self.settings.size
         if not (behind.is_floating_point() and behind.shape[1:] in ((1, size, size), (3, size, size))):

@@ -81,7 +81,7 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
         "load_classifier": (augment.load_classifier, {"name": "none", "weights": "none.pt"}),
         "build_scene": (augment.build_scene, {"meshes": [(mesh, "a")], "size": 8, "vertices": 0, "operators": None}
                         | {"device": "cpu"} | OF_SCENE | SMALL),
-        "Scene": (augment.Scene, {"objects": scene.objects, "examples": scene.examples, "light": light, "taken": None}
+        "Scene": (augment.Scene, {"objects": scene.objects, "examples": scene.examples, "lights": light, "taken": None}
                   | {"backgrounds": torch.zeros(1, 3, 8, 8), "settings": image, "backend": scene.backend}),
         "attack": (augment.attack, {"classifier": classifier, "scene": scene, "settings": settings, "force": True}
                    | {"criterion": augment.Misclassification(), "seed": 0}),

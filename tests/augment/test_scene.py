@@ -434,7 +434,7 @@ def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its
 
 
 def test_a_light_of_another_basis_is_refused():
-    with pytest.raises(InputError, match=r"light of shape \(9, 3\) is not of harmonics of degree 6: give 49 rows"):
+    with pytest.raises(InputError, match=r"lights of shape \(9, 3\) is not of harmonics of degree 6: give 49 rows"):
         plate = SceneObject("plate", solid("plate"))
         Scene.grid([plate], ring(1, 2.0), load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, BACKEND)
 
