@@ -18,6 +18,11 @@ class InputError(ValueError):
     """
 
 
+def in_one_line(error: Exception) -> str:
+    """What an error says, or its kind where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def is_out_of_memory(error: Exception) -> bool:
     """Whether memory ran out: a GPU's, that of torch's allocator on the CPU, or Python's."""
     return isinstance(error, torch.OutOfMemoryError | MemoryError) or "can't allocate memory" in str(error)

@@ -17,7 +17,7 @@ import train.command_line.entry_points as command
 from augment import processes
 from train.command_line.overrides import quoted
 from train.data import DataSet
-from train.distributed import announced, first_process_first, process_group
+from train.distributed import broadcast, first_process_first, process_group
 from train.experiment import load_data, prepare, write_images
 from train.interruption import Interrupted
 from train.report.overview import format_table
@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
     if processes.rank() == 0:
-        announced(str(folder))
+        broadcast(str(folder))
     config.run = str(folder)
     if hydra_config.mode == RunMode.MULTIRUN:
         run_cell(config, folder)
@@ -91,7 +91,7 @@ def start() -> None:
     with process_group():
         if processes.rank() > 0:
             console.setLevel("WARNING")
-            sys.argv.append(f"run={quoted(announced())}")
+            sys.argv.append(f"run={quoted(broadcast())}")
         sys.argv[1:] = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
         command.run_command(main, "train")
 

@@ -43,8 +43,8 @@ def first_process_first() -> Iterator[None]:
         _wait()
 
 
-def announced(value: str = "") -> str:
-    """What the first process has as the value; the others wait for it."""
+def broadcast(value: str = "") -> str:
+    """The first process's value, which the others wait for."""
     values = [value]
     if processes.world_size() > 1:
         dist.broadcast_object_list(values, src=0)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from augment.classifiers.adapter import Normalised, nearest
 from augment.classifiers.python_function import call_python
 from augment.model_state import eval_mode
-from renderer.errors import InputError
+from renderer.errors import InputError, in_one_line
 from train.wideresnet import WideResNet
 
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
@@ -84,9 +84,8 @@ def _require_logits(network: nn.Module, name: str, classes: int, size: int) -> N
         with eval_mode(network):
             logits = network(torch.zeros(2, 3, size, size))
     except (RuntimeError, ValueError, AssertionError, TypeError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
-            f"model={name} takes no images of {size} pixels per side ({reason}): choose another"
+            f"model={name} takes no images of {size} pixels per side ({in_one_line(error)}): choose another"
         ) from error
     if not isinstance(logits, Tensor) or logits.shape != (2, classes):
         found = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__

@@ -34,28 +34,30 @@ def _no_other_hydra() -> Iterator[None]:
 
 def read_settings(kind: type[Settings], config: DictConfig, parent: str = "") -> Settings:
     """The dataclass from its configuration; InputError naming the key that is unknown, unset or of the wrong type."""
+
+    def named(key: str) -> str:
+        return ".".join(filter(None, (parent, key)))
+
     try:
         merged = OmegaConf.merge(OmegaConf.structured(kind), config)
         for nested in _nested(merged):
-            raise InputError(f"{'.'.join(filter(None, (parent, nested)))}: {_PLAIN}")
+            raise InputError(f"{named(nested)}: {_PLAIN}")
         if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
-            key = ".".join(filter(None, (parent, min(unset))))
-            raise InputError(f"{key} is not set: give {key}=...")
+            raise InputError(f"{named(min(unset))} is not set: give {named(min(unset))}=...")
         for key, value in dotted(as_dict(config)):
             if isinstance(value, int) and value not in (0, 1) and isinstance(OmegaConf.select(merged, key), bool):
-                raise InputError(f"{'.'.join(filter(None, (parent, key)))}={value}: give true or false")
+                raise InputError(f"{named(key)}={value}: give true or false")
         return cast(Settings, OmegaConf.to_object(merged))
     except _UNREADABLE as error:
         within = getattr(error, "full_key", None) or ""
         said = str(getattr(error, "msg", error)).splitlines()[0]
         if said.startswith(("Cannot convert 'DictConfig'", "Cannot convert 'ListConfig'")):
-            raise InputError(f"{'.'.join(filter(None, (parent, within)))}: {_PLAIN}") from error
+            raise InputError(f"{named(within)}: {_PLAIN}") from error
         at_fault = (
             key for key, value in dotted(as_dict(config)) if key.startswith(within) and not _fits(kind, key, value)
         )
-        key = ".".join(filter(None, (parent, next(at_fault, within))))
         said = "give a list, as in [a,b]" if "is not a ListConfig" in said else said
-        raise InputError(f"{key}: {said}") from error
+        raise InputError(f"{named(next(at_fault, within))}: {said}") from error
 
 
 def _nested(node: Any) -> Iterator[str]:

@@ -118,7 +118,6 @@ class Learner:
         return {
             "model": self.model.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "schedule": self.settings.schedule,
             "average": self._average.state_dict() if self._average else None,
             "soup": self._soup.state_dict() if self._soup else None,
             "precision": self.model.precision,

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from renderer.errors import InputError
+from renderer.errors import InputError, in_one_line
 from train.device import PRECISIONS
 from train.fit.trainer import Trainer
 from train.run_folder.checkpoint import LAST, load_newest
@@ -35,7 +35,7 @@ def resume(trainer: Trainer) -> None:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise InputError(
-            f"the checkpoint in {folder} holds what no run wrote ({' '.join(str(error).split())}): restore {LAST}, or "
+            f"the checkpoint in {folder} holds what no run wrote ({in_one_line(error)}): restore {LAST}, or "
             "start in another folder with run="
         ) from error
 

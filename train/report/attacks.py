@@ -12,7 +12,7 @@ from PIL import Image
 
 from augment.attacks.figure import read_figure
 from augment.attacks.files import LINES
-from renderer.errors import InputError
+from renderer.errors import InputError, in_one_line
 from renderer.tiles import Tile
 from train.photographs.contact_sheet import evenly
 from train.report.blocks import Block, Code, Gallery, Illustration, Section
@@ -76,7 +76,7 @@ def read_attack(folder: Path) -> Attack:
             raise ValueError("the checks are no object")
         return Attack(folder, examples, checks)
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(f"{path} is damaged or no file of an attack ({' '.join(str(error).split())})") from error
+        raise InputError(f"{path} is damaged or no file of an attack ({in_one_line(error)})") from error
 
 
 def _read_example(line: dict[str, Any]) -> Example:

@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 from omegaconf._utils import get_yaml_loader
 
-from renderer.errors import InputError
+from renderer.errors import InputError, in_one_line
 
 CONFIG, LOCK, FAILURE = "config.yaml", ".lock", "failed.txt"
 LARGEST_CONFIG, LARGEST_FILE = 2**20, 2**28  # bytes; a run has written 300 for each of its epochs
@@ -172,5 +172,5 @@ def _escaped(value: Any) -> Any:
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
-    reason = " ".join(str(error).split()) or type(error).__name__
-    return InputError(f"{path} is damaged or no file that `python -m train` wrote ({reason}): use another run")
+    said = in_one_line(error)
+    return InputError(f"{path} is damaged or no file that `python -m train` wrote ({said}): use another run")

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from augment.specimens import MOST, Specimens
-from renderer.errors import InputError
+from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
 from renderer.light_sphere import light_sphere
 
@@ -62,7 +62,7 @@ def read_specimens(path: Path) -> list[tuple[str, Side, Side]]:
         sides = [_sides(tensors, answers, name, len(labels)) for name in NAMES]
         return list(zip(labels, *sides, strict=True))
     except Exception as error:  # safetensors raises a kind of its own
-        raise InputError(f"{path} is damaged or of another version ({' '.join(str(error).split())})") from error
+        raise InputError(f"{path} is damaged or of another version ({in_one_line(error)})") from error
 
 
 def _sides(tensors: dict[str, Tensor], answers: dict[str, Any], name: str, count: int) -> list[Side]:

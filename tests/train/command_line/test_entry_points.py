@@ -93,7 +93,7 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     rows = [line.split("|")[1].strip() for line in done.stdout.splitlines() if line.startswith("|")]
-    assert [row for row in rows if set(row) != {"-"}] == ["augment", "none", "adversarial"] * 2
+    assert [row for row in rows if row in ("augment", "none", "adversarial")] == ["augment", "none", "adversarial"] * 2
     for folder in (tmp_path / "here", tmp_path / "here" / "none"):
         assert (folder / LAST).is_file() and (folder / "photographs" / "contact_sheet.png").is_file()
     assert (tmp_path / "here" / "train.log").read_text() == done.stdout
