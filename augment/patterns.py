@@ -17,12 +17,12 @@ def draw_patterns(count: int, size: int, draws: torch.Generator) -> Tensor:
 
 
 def _pattern(points: Tensor, draws: torch.Generator) -> Tensor:
-    angle, period, *place = _uniform(4, draws) * torch.tensor([2 * math.pi, 1.0, 1.0, 1.0])
+    angle, period, *place = torch.rand(4, generator=draws) * torch.tensor([2 * math.pi, 1.0, 1.0, 1.0])
     turn = torch.stack([torch.stack([angle.cos(), -angle.sin()]), torch.stack([angle.sin(), angle.cos()])])
     across = torch.einsum("ij,jyx->iyx", turn, points)
     family = FAMILIES[int(torch.randint(len(FAMILIES), (), generator=draws))]
     share = family(across / (0.25 + 0.75 * period), torch.stack(place))
-    first, second = _colour(draws), _colour(draws) * _uniform(1, draws)  # the darker one down to nothing
+    first, second = _colour(draws), _colour(draws) * torch.rand(1, generator=draws)  # the darker one down to nothing
     return second[:, None, None] + share * (first - second)[:, None, None]
 
 
@@ -52,11 +52,7 @@ FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (_stripes, _checkers,
 
 def _colour(draws: torch.Generator) -> Tensor:
     """(3,) linear, of any hue, from white to pure; the largest channel is 1."""
-    hue, saturation = _uniform(2, draws)
+    hue, saturation = torch.rand(2, generator=draws)
     ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6  # of the hexcone (Smith 1978)
     pure = ((ramps - 3).abs() - 1).clamp(0, 1)
     return decode(1 - saturation * (1 - pure), "srgb")
-
-
-def _uniform(count: int, draws: torch.Generator) -> Tensor:
-    return torch.rand(count, generator=draws)

@@ -55,13 +55,11 @@ class VariationSettings:
 
     def __post_init__(self) -> None:
         require_fields(self)
-        if not 0 <= self.place <= 1:
-            raise InputError(f"augment.vary.place={self.place} must be a share of the frame's width, from 0 to 1")
-        require_range("augment.vary.turn", self.turn, 0, 180)
-        require_range("augment.vary.lamps", self.lamps, 0, 1)
+        for name, most in (("place", 1), ("turn", 180), ("lamps", 1)):
+            require_range(f"augment.vary.{name}", getattr(self, name), 0, most)
         require_limits("augment.vary.ambient", self.ambient, 0, 1)
-        require_limits("augment.vary.scale", self.scale, 1 / FACTOR, FACTOR)
-        require_limits("augment.vary.exposure", self.exposure, 1 / FACTOR, FACTOR)
+        for name in ("scale", "exposure"):
+            require_limits(f"augment.vary.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
 
     @property
     def moves(self) -> bool:

@@ -6,7 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import Normalised, nearest
+from augment.classifiers.adapter import Normalised
+from augment.classifiers.imagenet import require_architecture
 from augment.classifiers.python_function import call_python
 from augment.model_state import eval_mode
 from renderer.errors import InputError, in_one_line
@@ -48,11 +49,8 @@ def build_network(
 def _torchvision_network(name: str, classes: int, size: int) -> nn.Module:
     from torchvision import models
 
-    architecture, choices = name.removeprefix(TORCHVISION), models.list_models(module=models)
-    if architecture not in choices:
-        raise InputError(
-            f"model={name} is no classifier of torchvision: choose one, such as {nearest(architecture, choices)}"
-        )
+    architecture = name.removeprefix(TORCHVISION)
+    require_architecture(architecture, f"model={name}")
     options = {"image_size": size} if architecture.startswith("vit_") else _OPTIONS.get(architecture, {})
     try:
         return models.get_model(architecture, weights=None, num_classes=classes, **options)

