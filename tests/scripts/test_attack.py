@@ -138,7 +138,7 @@ REFUSED = [
     (["attack.lighting.radius=-1"], "attack: radius=-1.0 must be at least 0"),
     (["attack.restarts=1"], "attack.restarts draws from the norm-balls"),
     (["scene.views=0"], "scene.views=0 must be at least 1"),
-    (["scene.backgrounds=[absent.png]"], "scene.backgrounds: absent.png cannot be read"),
+    (["scene.backgrounds=[absent.png]"], "scene.backgrounds: absent.png does not exist"),
     (["label=ornage"], "has no class 'ornage': choose one, such as orange"),
     (["target=[apple,pear]", "attack.shared=true"], "target=['apple', 'pear'] names 2 classes for 1 views"),
     (["classifier=alexnet"], "classifier=alexnet is not known: choose one of "),

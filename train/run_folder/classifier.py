@@ -1,6 +1,7 @@
 """A run's network, as a file beside what it takes to use it, to begin with, to publish, and as a classifier."""
 
 import json
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,15 +29,13 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
 
 def load_weights(network: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
     """Fill the network; InputError naming the file where the weights belong to another architecture."""
-    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in weights.items()}
-    if expected != found:
-        name = next(iter(sorted(set(expected.items()) ^ set(found.items()))))[0]
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        said = textwrap.shorten(str(error), 300)
         raise InputError(
-            f"checkpoint {path} is from another architecture: {name} has shape {found.get(name, 'none')} there and "
-            f"{expected.get(name, 'none')} here; use the model settings that it was trained with"
-        )
-    network.load_state_dict(weights)
+            f"checkpoint {path} is from another architecture ({said}): use the model settings that it was trained with"
+        ) from error
 
 
 def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:

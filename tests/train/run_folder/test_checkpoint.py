@@ -173,12 +173,12 @@ def test_the_newest_whole_checkpoint_is_taken_and_what_is_wrong_with_a_newer_one
 
 def test_weights_of_another_architecture_are_named(network):
     other = WideResNet(3, 10, 1)
-    with pytest.raises(InputError, match=r"a\.pt is from another architecture: head.bias has shape \(2,\) there"):
+    with pytest.raises(InputError, match=r"a\.pt is from another architecture \(.* size mismatch for head.weight"):
         load_weights(other, network.state_dict(), Path("a.pt"))
     deeper = WideResNet(2, 16, 1)
-    with pytest.raises(InputError, match=r"groups.0.1.conv1.weight has shape none there"):
+    with pytest.raises(InputError, match=r'Missing key\(s\) in state_dict: "groups.0.1.'):
         load_weights(deeper, network.state_dict(), Path("a.pt"))
-    with pytest.raises(InputError, match=r"groups.0.1.conv1.weight has shape \(16, 16, 3, 3\) there and none here"):
+    with pytest.raises(InputError, match=r'Unexpected key\(s\) in state_dict: "groups.0.1.'):
         load_weights(network, deeper.state_dict(), Path("a.pt"))
 
 
