@@ -31,6 +31,13 @@ class Settings(SectionSettings):
     targets: list[str]
 
 
+LIKE_THE_PAPER = [  # any light, an end where the classifier is fooled, no shadows
+    "attack.light=signed",
+    "attack.margin=0",
+    "attack.rounded=false",
+    "renderer.transport=direct",
+    "renderer.cache=null",
+]
 LIMIT = 150_000  # bytes of a committed image; above it the colours are reduced
 
 
@@ -75,10 +82,9 @@ def measure(study: Study, settings: Settings) -> Section:
         raise InputError("scene.meshes of section=gallery has two: the solid to attack, and the orange under the sky")
     lamp, orange = study.items
     records, images, figures = [], [], {}
-    chosen = ["attack.light=signed", f"attack.max_steps={settings.steps}", f"seed={study.seed}"]
-    drawn = ["renderer.transport=direct", "renderer.cache=null"]
+    asked = [*LIKE_THE_PAPER, f"attack.max_steps={settings.steps}", f"seed={study.seed}"]
     for case in cases(lamp, orange, settings.targets):
-        told = replace(study.command(case.item, [*case.overrides, *chosen, *drawn]), target=case.target)
+        told = replace(study.command(case.item, [*case.overrides, *asked]), target=case.target)
         attacked = attack_mesh(case.item, told, study.classifier, torch.device("cpu"))
         records.append(record(case, attacked))
         figures[f"gallery_{case.name}.png"] = partial(save_small, attacked)
