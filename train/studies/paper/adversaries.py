@@ -1,4 +1,4 @@
-"""What Tables 3 and 4 share: attacks by light and by shape, random changes as large, and what a classifier answers."""
+"""What Tables 3 and 4 share: attacks by light and by shape, random changes as large."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from augment.attacks.run import logits_of
 from augment.classifiers import Classifier
 from augment.descent import DescentSettings, Part, Problem, descend
 from augment.goal import Goal
@@ -15,7 +14,6 @@ from augment.parameters import Geometry, Lighting
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene
-from train.studies.paper.subjects import PART
 
 STEPS = 30  # the paper's appendix C
 FURTHER = 10  # steps that an adversary goes on for
@@ -68,12 +66,3 @@ def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> 
     """
     signs = 2 * torch.randint(2, values.shape, generator=draws) - 1
     return start + (values - start) * signs.to(values)
-
-
-@torch.no_grad()
-def answers(problem: Problem, values: Tensor, examples: Tensor, classifier: Classifier) -> list[str]:
-    """What a classifier calls the only view of each of the examples (A,) under values (A, D)."""
-    found = []
-    for part, rows in zip(values.split(PART), examples.split(PART), strict=True):
-        found += logits_of(classifier, problem.render(part, rows), PART)[:, 0].argmax(1).tolist()
-    return [classifier.classes[index] for index in found]

@@ -1,7 +1,7 @@
 """Attacks and uniform draws in norm-balls of light, shape and pixels."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from augment.parameters import KINDS
 from augment.perturbation import Perturbation
 from augment.phases import Phases
 from augment.scene import Scene
-from train.studies.paper.subjects import PART
+from train.studies.paper.subjects import PART, part_of
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def attack_ball(
 def parts(scene: Scene) -> Iterator[Scene]:
     """A scene's examples a few at a time: the gradient of a shape keeps all its images' samples."""
     for rows in torch.arange(len(scene)).split(PART):
-        yield replace(scene, examples=[scene.examples[row] for row in rows], lights=scene.lights[rows])
+        yield part_of(scene, rows)
 
 
 def joined(found: Sequence[Outcome]) -> Outcome:

@@ -123,7 +123,7 @@ def stubborn(
     before, count = [[camera] for camera in cameras], len(cameras)
     scene = scene_of(setup.subject, classifier, light, before, torch.tensor(greys), setup.samples, setup.normals)
     problem = ATTACKS[kind].problem(scene)
-    images = problem.render(problem.start, torch.arange(count)).detach()[:, 0]
+    images = problem.images(problem.start)[:, 0]
     label = torch.full((count, 1), classifier.label(setup.subject.label))
     least_likely = torch.cat([classifier(part).argmin(1, keepdim=True) for part in images.split(BATCH)])
     descent = DescentSettings(passes - 1, shorten=kind == "geometry", batch_size=BATCH)

@@ -10,7 +10,7 @@ import torch
 
 from augment.descent import DescentSettings, descend
 from augment.goal import Goal
-from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.objects import ObjectSettings, SceneObject
 from train.photographs.shares import share
 from train.report.tables import markdown
 from train.studies.paper.adversaries import ATTACKS
@@ -26,7 +26,7 @@ from train.studies.paper.iterations import (
     training_step,
 )
 from train.studies.paper.section import Section, SectionSettings, Study
-from train.studies.paper.subjects import finer, recognised_scene, scene_of
+from train.studies.paper.subjects import finer, greys_of, load_subject, recognised_scene, scene_of
 from train.studies.renderer_speed.measure import seconds
 
 TITLE = "Run time"
@@ -43,7 +43,7 @@ class Settings(SectionSettings):
 
 
 FIELDS = (2.0, 2.8, 4.0, 5.7, 8.0)  # each halves the pixels of the one before
-SOLID = ObjectSettings("solid:orange", "orange")
+SOLID = "solid:orange"
 MANY_PASSES = 2  # of a timed descent on many examples at once, which takes its time
 FEWER = 10  # iterations, the paper's
 QUANTILES = {"quartile": 0.25, "median": 0.5, "third quartile": 0.75, "90 %": 0.9, "most": 1.0}
@@ -55,7 +55,7 @@ def measure(study: Study, settings: Settings) -> Section:
     """Iterations by pixels and against the classifier's pass, and whole attacks."""
     first = finer(study.subjects[0])
     textured = Setup(f"{first.name}, textured, smooth, 2×2 samples", first, 2, "smooth")
-    plain = Setup("solid:orange, flat, 1 sample", finer(load_object(SOLID)), 1, "flat")
+    plain = Setup("solid:orange, flat, 1 sample", finer(load_subject(ObjectSettings(SOLID, study.label))), 1, "flat")
 
     def measured(setup: Setup, fields: Sequence[float], passes: int) -> list[Iteration]:
         return [
@@ -114,7 +114,9 @@ def attacks(subject: SceneObject, study: Study, settings: Settings) -> Iterator[
     scene = recognised_scene(subject, classifier, study.light, settings.examples, study.seed)
     goal = Goal(torch.tensor([[classifier.label(subject.label)]]))
     for example in range(len(scene)):
-        one = scene_of(subject, classifier, study.light, [scene.cameras[example]], scene.backgrounds[example, :1, 0, 0])
+        one = scene_of(
+            subject, classifier, study.light, [scene.cameras[example]], greys_of(scene)[example : example + 1]
+        )
         prepared = seconds(partial(getattr, one, "stacks"))
         problem = ATTACKS["lighting"].problem(one)
         start = time.process_time()

@@ -9,9 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment.attacks.run import attack, logits_of
+from augment.attacks.run import attack
 from augment.attacks.settings import AttackSettings
-from augment.classifiers import Classifier
 from augment.kind import StepSettings
 from augment.objects import SceneObject
 from augment.scene import Scene
@@ -25,7 +24,7 @@ from renderer.visibility import choose
 from train.report.tables import markdown
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
-from train.studies.paper.subjects import recognised_scene
+from train.studies.paper.subjects import answers, recognised_scene
 
 TITLE = "Light that a mesh shapes itself"
 
@@ -72,16 +71,16 @@ def adversaries(subject: SceneObject, study: Study, settings: Settings) -> Itera
         attacked = attack(network, scene, settings=stepping, force=True)
         if before is None:  # the light is the same under every transport
             start = attacked.problem.conditions(attacked.problem.start, attacked.problem.everything).light
-            before = said(network, path_traced(scene, start))
-        after = said(network, path_traced(scene, attacked.conditions.light))
-        here = zip(*(said(network, each) for each in (attacked.images_before, attacked.images)), strict=True)
-        for answers, traced in zip(here, zip(before, after, strict=True), strict=True):
+            before = answers(network, path_traced(scene, start))
+        after = answers(network, path_traced(scene, attacked.conditions.light))
+        here = zip(*(answers(network, each) for each in (attacked.images_before, attacked.images)), strict=True)
+        for said, traced in zip(here, zip(before, after, strict=True), strict=True):
             yield {
                 "mesh": subject.name,
                 "label": subject.label,
                 "transport": transport,
                 "kept": round(kept, 3),
-                "here": answers,
+                "here": said,
                 "traced": traced,
             }
 
@@ -108,11 +107,6 @@ def path_traced(scene: Scene, lights: Tensor) -> Tensor:
         added = behind(seen[:, 3:], scene.backgrounds[row.background], settings.encoding)
         images.append(develop_composite(seen[:, :3] + added, settings.encoding))
     return torch.stack(images)
-
-
-def said(classifier: Classifier, images: Tensor) -> list[str]:
-    """What a classifier calls the one view of each of E examples (E, 1, 3, size, size)."""
-    return [classifier.classes[index] for index in logits_of(classifier, images, 32)[:, 0].argmax(1).tolist()]
 
 
 def results(records: Sequence[Mapping[str, Any]]) -> str:

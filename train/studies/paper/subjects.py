@@ -75,24 +75,35 @@ def scene_of(
     )
 
 
-def recognised(scene: Scene, classifier: Classifier, label: str) -> Tensor:
-    """(E,) whether the classifier gives all views of an example the label."""
-    examples = torch.arange(len(scene))
-    with torch.no_grad():
-        images = torch.cat([scene.render(scene.conditions(part), part) for part in examples.split(16)])
-    return (logits_of(classifier, images, 32).argmax(2) == classifier.label(label)).all(1)
+def part_of(scene: Scene, rows: Tensor) -> Scene:
+    """Some examples (A,) of a scene."""
+    return replace(scene, examples=[scene.examples[row] for row in rows], lights=scene.lights[rows])
+
+
+def greys_of(scene: Scene) -> Tensor:
+    """(E,) that its examples are on."""
+    return scene.backgrounds[[example.background for example in scene.examples], 0, 0, 0]
+
+
+def answers(classifier: Classifier, images: Tensor) -> list[str]:
+    """What a classifier calls the one view of each of E examples (E, 1, 3, size, size)."""
+    return [classifier.classes[index] for index in logits_of(classifier, images, PART)[:, 0].argmax(1).tolist()]
 
 
 def recognised_parts(
     subject: SceneObject, classifier: Classifier, light: str, count: int, draws: torch.Generator, at_once: int = PART
-) -> Iterator[tuple[Scene, Tensor]]:
-    """Random scenes, each with those of its examples (A,) that the classifier recognises: `count` in all."""
+) -> Iterator[Scene]:
+    """Random scenes of so many examples at most, which the classifier recognises: `count` in all."""
     found = drawn = 0
     while found < count:
         scene = random_scene(subject, classifier, light, at_once, draws)
-        kept = recognised(scene, classifier, subject.label).nonzero().squeeze(1)[: count - found]
+        examples = torch.arange(len(scene))
+        with torch.no_grad():
+            images = torch.cat([scene.render(scene.conditions(part), part) for part in examples.split(16)])
+        right = [answer == subject.label for answer in answers(classifier, images)]
+        kept = examples[torch.tensor(right)][: count - found]
         if len(kept):
-            yield scene, kept
+            yield part_of(scene, kept)
         found, drawn = found + len(kept), drawn + len(scene)
         if found < LEAST_SHARE * drawn - PART:
             raise InputError(f"{classifier.name} recognises only {found} of {drawn} images of {subject.name}")
@@ -102,6 +113,5 @@ def recognised_scene(subject: SceneObject, classifier: Classifier, light: str, c
     """`count` random examples of a subject that the classifier recognises."""
     draws = generator(seed, subject.name)
     parts = list(recognised_parts(subject, classifier, light, count, draws, at_once=count))
-    cameras = [scene.cameras[index] for scene, kept in parts for index in kept]
-    greys = torch.cat([scene.backgrounds[kept, 0, 0, 0] for scene, kept in parts])
-    return scene_of(subject, classifier, light, cameras, greys)
+    cameras = [views for scene in parts for views in scene.cameras]
+    return scene_of(subject, classifier, light, cameras, torch.cat([greys_of(scene) for scene in parts]))

@@ -7,15 +7,14 @@ from typing import Any
 import torch
 
 from augment.classifiers import Classifier
-from augment.descent import Part
 from augment.objects import SceneObject
 from augment.seeding import generator
 from train.report.tables import markdown
 from train.run_folder.classifier import load_classifier
-from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, with_random_signs
+from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
-from train.studies.paper.subjects import finer, recognised_parts, scene_of
+from train.studies.paper.subjects import answers, finer, greys_of, recognised_parts, scene_of
 
 TITLE = "Transfer to unseen networks"
 
@@ -66,21 +65,20 @@ def transfer(
     subject: SceneObject, seen_by: Sequence[Classifier], count: int, light: str, draws: torch.Generator
 ) -> Iterator[dict[str, Any]]:
     """A record per kind of attack on the first network and example: what all networks call it in every state."""
-    for scene, kept in recognised_parts(subject, seen_by[0], light, count, draws):
-        greys = scene.backgrounds[:, 0, 0, 0]
+    for scene in recognised_parts(subject, seen_by[0], light, count, draws):
+        greys = greys_of(scene)
         scenes = [scene, *(scene_of(subject, target, light, scene.cameras, greys) for target in seen_by[1:])]
         for kind, attack in ATTACKS.items():
             problems = [attack.problem(each) for each in scenes]
-            start = problems[0].start[kept]
-            attacked = Part(problems[0], kept, start)
-            first, further = attack.adversaries(attacked, seen_by[0], subject.label, views=1)
+            start = problems[0].start
+            first, further = attack.adversaries(problems[0], seen_by[0], subject.label, views=1)
             random = [with_random_signs(values, start, draws) for values in (first, further)]
             states = dict(zip(STATES, (start, first, random[0], further, random[1]), strict=True))
             said = {
-                network.name: {state: answers(problem, values, kept, network) for state, values in states.items()}
+                network.name: {state: answers(network, problem.images(values)) for state, values in states.items()}
                 for network, problem in zip(seen_by, problems, strict=True)
             }
-            for row in range(len(kept)):
+            for row in range(len(scene)):
                 named = {name: {state: found[row] for state, found in by.items()} for name, by in said.items()}
                 yield {"kind": kind, "mesh": subject.name, "answers": named}
 

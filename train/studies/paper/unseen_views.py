@@ -14,10 +14,10 @@ from augment.perturbation import Perturbation
 from augment.scene import Scene
 from augment.seeding import generator, stream_seed
 from train.report.tables import markdown
-from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, answers, with_random_signs
+from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
 from train.studies.paper.shares import percent
-from train.studies.paper.subjects import finer, recognised_parts, recognised_scene
+from train.studies.paper.subjects import answers, finer, recognised_parts, recognised_scene
 
 TITLE = "Unseen views"
 
@@ -104,17 +104,17 @@ def unseen(
         for kind in ATTACKS
         for views, scene in scenes.items()
     }
-    for scene, kept in recognised_parts(subject, classifier, light, count, draws):
+    for scene in recognised_parts(subject, classifier, light, count, draws):
         said = {
             f"{kind}, {views} attacked": {
-                state: answers(ATTACKS[kind].problem(scene), values.expand(len(kept), -1), kept, classifier)
+                state: answers(classifier, ATTACKS[kind].problem(scene).images(values.expand(len(scene), -1)))
                 for state, values in by_state.items()
             }
             for (kind, views), by_state in found.items()
         }
-        for row, example in enumerate(kept.tolist()):
+        for row in range(len(scene)):
             named = {attack: {state: names[row] for state, names in by.items()} for attack, by in said.items()}
-            angle = degrees_apart(scene, example, scenes[1])
+            angle = degrees_apart(scene, row, scenes[1])
             yield {"mesh": subject.name, "set": index, "angle": angle, "answers": named}
 
 

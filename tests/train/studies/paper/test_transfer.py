@@ -17,9 +17,9 @@ from renderer.errors import InputError
 from renderer.files.mesh_export import export_mesh
 from renderer.mesh import Mesh
 from train.studies.paper import adversaries, subjects, transfer, unseen_views
-from train.studies.paper.adversaries import ATTACKS, FURTHER, answers, with_random_signs
+from train.studies.paper.adversaries import ATTACKS, FURTHER, with_random_signs
 from train.studies.paper.shares import percent
-from train.studies.paper.subjects import recognised_parts, scene_of
+from train.studies.paper.subjects import answers, recognised_parts, scene_of
 
 SIZE = 12
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
@@ -101,7 +101,7 @@ def test_random_signs_go_as_far_in_every_entry_and_to_either_side():
 
 def test_examples_are_drawn_until_as_many_are_recognised_as_were_asked(monkeypatch):
     parts = list(recognised_parts(SUBJECT, by_brightness(), "grace", 5, generator(0, "test"), at_once=2))
-    assert sum(len(kept) for _, kept in parts) == 5
+    assert sum(map(len, parts)) == 5
     monkeypatch.setattr(subjects, "LEAST_SHARE", 0.5)
     with pytest.raises(InputError, match="always coal recognises only 0"):
         list(recognised_parts(SUBJECT, always("coal"), "grace", 1, generator(0, "test")))
@@ -182,8 +182,8 @@ def test_the_angle_to_the_attacked_view_goes_either_way_round():
 def test_darkness_fools_every_view_and_the_start_none():
     scene, classifier = a_scene(3, by_brightness(0.1)), by_brightness(0.1)
     problem = ATTACKS["lighting"].problem(scene)
-    assert answers(problem, 0 * problem.start, problem.everything, classifier) == ["coal"] * 3
-    assert answers(problem, problem.start, problem.everything, classifier) == ["orange"] * 3
+    assert answers(classifier, problem.images(0 * problem.start)) == ["coal"] * 3
+    assert answers(classifier, problem.images(problem.start)) == ["orange"] * 3
 
 
 def test_each_unseen_view_has_an_answer_for_each_attack(short):
@@ -207,7 +207,6 @@ def test_each_unseen_view_has_an_answer_for_each_attack(short):
 )
 def test_a_section_has_data_and_text_without_folders(section, settings, lines, short, tmp_path, monkeypatch, reproduce):
     monkeypatch.setattr(subjects, "VERTICES", 0)
-    monkeypatch.setattr(adversaries, "PART", 2)
     monkeypatch.setattr(transfer, "load_classifier", lambda name: by_brightness(name=name))
     export_mesh(SUBJECT.mesh, tmp_path / "ball.glb")
     meshes, out = f"scene.meshes=[{{mesh:{tmp_path}/ball.glb,gain:1.5}}]", f"out={tmp_path}"
