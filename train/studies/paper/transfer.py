@@ -48,7 +48,7 @@ def measure(study: Study, settings: Settings) -> Section:
         "table": results(records, [network.name for network in seen_by], study.label),
         "further": FURTHER,
         "steps": STEPS,
-        "examples": len(records) // len(ATTACKS),
+        "examples": settings.examples * len(study.subjects),
     }
     return Section(values, records)
 
@@ -64,7 +64,7 @@ def networks(source: Classifier, settings: Settings) -> list[Classifier]:
 def transfer(
     subject: SceneObject, seen_by: Sequence[Classifier], count: int, light: str, draws: torch.Generator
 ) -> Iterator[dict[str, Any]]:
-    """A record per kind of attack on the first network and example: what all networks call it in every state."""
+    """For some examples and each kind of attack on the first network: what all networks call them in every state."""
     for scene in recognised_parts(subject, seen_by[0], light, count, draws):
         greys = greys_of(scene)
         scenes = [scene, *(scene_of(subject, target, light, scene.cameras, greys) for target in seen_by[1:])]
@@ -78,9 +78,7 @@ def transfer(
                 network.name: {state: answers(network, problem.images(values)) for state, values in states.items()}
                 for network, problem in zip(seen_by, problems, strict=True)
             }
-            for row in range(len(scene)):
-                named = {name: {state: found[row] for state, found in by.items()} for name, by in said.items()}
-                yield {"kind": kind, "mesh": subject.name, "answers": named}
+            yield {"kind": kind, "mesh": subject.name, "answers": said}
 
 
 def outcomes(records: Iterable[Mapping[str, Any]], network: str, state: str, source: str, label: str) -> list[bool]:
@@ -88,10 +86,12 @@ def outcomes(records: Iterable[Mapping[str, Any]], network: str, state: str, sou
     source at that strength."""
     strength = state.removesuffix("_random")
     return [
-        record["answers"][network][state] != label
-        for record in records
-        if record["answers"][network]["before"] == label
-        and (network == source or record["answers"][source][strength] != label)
+        answer != label
+        for said in (record["answers"] for record in records)
+        for before, answer, of_source in zip(
+            said[network]["before"], said[network][state], said[source][strength], strict=True
+        )
+        if before == label and (network == source or of_source != label)
     ]
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from augment.objects import SceneObject
 from augment.perturbation import Perturbation
 from augment.scene import Scene
 from augment.seeding import generator, stream_seed
+from renderer.camera import Camera
 from train.report.tables import markdown
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
@@ -52,7 +54,7 @@ def measure(study: Study, settings: Settings) -> Section:
         "table": results(records, study.label),
         "far": far(records, study.label),
         "sets": settings.sets * len(study.subjects),
-        "views": len(records),
+        "views": settings.sets * settings.views * len(study.subjects),
         "further": FURTHER,
         "steps": STEPS,
     }
@@ -93,67 +95,64 @@ def attack_views(
 def unseen(
     subject: SceneObject, classifier: Classifier, index: int, count: int, light: str, seed: int
 ) -> Iterator[dict[str, Any]]:
-    """A record per unseen view of a subject: what it is called under all that was found in one set of views."""
+    """A record per attack on one set of views of a subject: what unseen views are called under all that it found, and
+    their degrees from the one attacked view."""
     draws = generator(seed, subject.name, "unseen views", index)
-    scenes = {
+    attacked = {
         views: recognised_scene(subject, classifier, light, views, stream_seed(seed, "attacked", views, index))
         for views in ATTACKED
     }
     found = {
         (kind, views): attack_views(scene, kind, classifier, subject.label, draws)
         for kind in ATTACKS
-        for views, scene in scenes.items()
+        for views, scene in attacked.items()
     }
-    for scene in recognised_parts(subject, classifier, light, count, draws):
+    scenes = list(recognised_parts(subject, classifier, light, count, draws))
+    angles = [degrees_apart(views[0], attacked[1].cameras[0][0]) for scene in scenes for views in scene.cameras]
+    for (kind, views), by_state in found.items():
+        problems = [ATTACKS[kind].problem(scene) for scene in scenes]
         said = {
-            f"{kind}, {views} attacked": {
-                state: answers(classifier, ATTACKS[kind].problem(scene).images(values.expand(len(scene), -1)))
-                for state, values in by_state.items()
-            }
-            for (kind, views), by_state in found.items()
+            state: [
+                name for each in problems for name in answers(classifier, each.images(values.expand_as(each.start)))
+            ]
+            for state, values in by_state.items()
         }
-        for row in range(len(scene)):
-            named = {attack: {state: names[row] for state, names in by.items()} for attack, by in said.items()}
-            angle = degrees_apart(scene, row, scenes[1])
-            yield {"mesh": subject.name, "set": index, "angle": angle, "answers": named}
+        yield {"mesh": subject.name, "set": index, "kind": kind, "attacked": views, "angle": angles, "answers": said}
 
 
-def degrees_apart(scene: Scene, example: int, attacked: Scene) -> float:
-    """Between an example's azimuth and that of the one attacked view."""
-    ((other,),), (view,) = attacked.cameras, scene.cameras[example]
-    return round(math.degrees(abs(math.remainder(view.azimuth - other.azimuth, 2 * math.pi))), 2)
-
-
-def outcomes(records: Sequence[Mapping[str, Any]], kind: str, views: int, state: str, label: str) -> list[bool]:
-    return [record["answers"][f"{kind}, {views} attacked"][state] != label for record in records]
-
-
-def cell(records: Sequence[Mapping[str, Any]], kind: str, views: int, state: str, label: str) -> str:
-    """The share of all views, and the lowest and highest of the sets."""
-    sets: dict[tuple[str, int], list[bool]] = {(record["mesh"], record["set"]): [] for record in records}
-    found = outcomes(records, kind, views, state, label)
-    for record, outcome in zip(records, found, strict=True):
-        sets[record["mesh"], record["set"]].append(outcome)
-    shares = [100 * sum(some) / len(some) for some in sets.values()]
-    return f"{percent(found)}; {min(shares):.0f} to {max(shares):.0f} %"
+def degrees_apart(one: Camera, other: Camera) -> float:
+    """About the vertical."""
+    return round(math.degrees(abs(math.remainder(one.azimuth - other.azimuth, 2 * math.pi))), 2)
 
 
 def results(records: Sequence[Mapping[str, Any]], label: str) -> str:
     """A row per kind of attack and number of views, the paper's share last."""
-    rows = [
-        [kind, str(views), *(cell(records, kind, views, state, label) for state in STATES), f"{paper} %"]
-        for kind, by_views in PAPER.items()
-        for views, paper in by_views.items()
-    ]
+    rows = []
+    for kind, by_views in PAPER.items():
+        for views, paper in by_views.items():
+            here = [record for record in records if (record["kind"], record["attacked"]) == (kind, views)]
+            cells = (cell([record["answers"][state] for record in here], label) for state in STATES)
+            rows.append([kind, str(views), *cells, f"{paper} %"])
     return markdown(["", "views attacked", *STATES.values(), "the paper's"], rows)
+
+
+def cell(sets: Sequence[Sequence[str]], label: str) -> str:
+    """The share of all views fooled, and the lowest and highest of the sets."""
+    fooled = [[answer != label for answer in answers] for answers in sets]
+    shares = [100 * sum(some) / len(some) for some in fooled]
+    return f"{percent(list(chain(*fooled)))}; {min(shares):.0f} to {max(shares):.0f} %"
 
 
 def far(records: Sequence[Mapping[str, Any]], label: str) -> str:
     """How the strongest adversaries of one view do near it and behind it."""
-    near = [record for record in records if record["angle"] <= FAR]
-    beyond = [record for record in records if record["angle"] > FAR]
     parts = []
     for kind in ATTACKS:
-        inside, outside = (percent(outcomes(each, kind, 1, "further", label)) for each in (near, beyond))
-        parts.append(f"{inside} within {FAR}° of the one attacked view and {outside} beyond ({kind})")
+        seen = [
+            (angle <= FAR, answer != label)
+            for record in records
+            if (record["kind"], record["attacked"]) == (kind, 1)
+            for angle, answer in zip(record["angle"], record["answers"]["further"], strict=True)
+        ]
+        near, beyond = (percent([fooled for inside, fooled in seen if inside == side]) for side in (True, False))
+        parts.append(f"{near} within {FAR}° of the one attacked view and {beyond} beyond ({kind})")
     return "; ".join(parts)
