@@ -106,44 +106,38 @@ class Setup:
         return build_fragments(mesh.vertices, mesh.faces, [self.camera], self.settings, self.backend, mesh.closed)[0]
 
 
-def by_operator(setup: Setup, dtype: torch.dtype = torch.float32) -> Errors:
-    """Of the image and its gradient by the light, through an operator kept in `dtype`."""
+def by_operator(setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarray | None = None) -> Errors:
+    """Of the image and its gradient by the light, through an operator kept in `dtype`. lost: (P, (degree + 1)², 3) what
+    the image loses per unit of each coefficient, against light that nothing is in the way of."""
     [operator] = build_operators(
         setup.mesh, [setup.camera], setup.settings, setup.backend, basis=Harmonics(setup.degree), dtype=dtype
     )
     view, light = setup.view(), setup.light.to(dtype)
     upstream = _upstream(len(view.pixels))
-    wide = reference.image(view, setup.lift(light.double().numpy()))
-    gradient = reference.light_gradient(view, setup.lift(upstream.double().numpy()), setup.degree)
+    lit, above = setup.lift(light.double().numpy()), setup.lift(upstream.double().numpy())
+    image, gradient = reference.image(view, lit), reference.light_gradient(view, above, setup.degree)
+    if lost is not None:
+        image, gradient = image - (lost * lit).sum(axis=1), gradient - (lost * above[:, None]).sum(axis=0)
     return {
-        IMAGE: error(operator.radiance(light).T, wide),
+        IMAGE: error(operator.radiance(light).T, image),
         LIGHT_GRADIENT: error(operator.light_gradient(upstream.to(dtype).T), gradient),
     }
 
 
 def by_transport(setup: Setup, bounces: int = 0, dtype: torch.dtype = torch.float32) -> Errors:
-    """Of the image and its gradient by the light under transport=shadows or bounces:N, one sample per pixel, which then
-    casts all rays: these, and where they start, the reference takes as they are; and of bounces the patches."""
-    mesh = setup.mesh
+    """`by_operator` under transport=shadows or bounces:N, one sample per pixel, which then casts all rays: these, and
+    where they start, the reference takes as they are; and of bounces the patches."""
+    mesh, kind = setup.mesh, "bounces" if bounces else "shadows"
     settings = replace(setup.settings, samples=1, transport=f"bounces:{bounces}" if bounces else "shadows")
     setup = replace(setup, settings=settings)
-    [operator] = build_operators(mesh, [setup.camera], settings, setup.backend, dtype=dtype)
-    view, light = setup.view(), setup.light.to(dtype)
-    surface, directions = Surface.of(mesh, setup.fragments(), settings), extended(sphere(DIRECTIONS).numpy())
-    points, upstream = _starts(surface, Rays(mesh)), _upstream(len(view.pixels))
+    view, directions = setup.view(), extended(sphere(DIRECTIONS).numpy())
+    points = _starts(Surface.of(mesh, setup.fragments(), settings), Rays(mesh))
     lost = reference_transport.shadow(view, points, extended(mesh.vertices[mesh.faces]), directions, setup.degree)
     if bounces:
         patches, looked = _patches(mesh)
         sent = reference_transport.radiosity(patches, looked, setup.degree, bounces)
         lost = lost - reference_transport.bounced(view, points, patches, sent, directions)
-    lit, above = extended(light.double().numpy()), extended(upstream.double().numpy())
-    image = reference.image(view, lit) - (lost * lit).sum(axis=1)
-    gradient = reference.light_gradient(view, above, setup.degree) - (lost * above[:, None]).sum(axis=0)
-    kind = "bounces" if bounces else "shadows"
-    return {
-        f"{IMAGE}, {kind}": error(operator.radiance(light).T, image),
-        f"{LIGHT_GRADIENT}, {kind}": error(operator.light_gradient(upstream.to(dtype).T), gradient),
-    }
+    return {f"{name}, {kind}": error for name, error in by_operator(setup, dtype, lost).items()}
 
 
 def _starts(surface: Surface, rays: Rays) -> np.ndarray:

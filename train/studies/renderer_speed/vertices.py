@@ -37,10 +37,12 @@ def measure(bench: Bench, with_mitsuba: bool, machine: str) -> tuple[list[Row], 
 def _rasterising(bench: Bench) -> Target:
     """One view of each mesh of the plan, but for the largest, at each size up to the large one."""
     backends = [each for each in bench.backends if each.name in (COMPILED, PLAIN)]
+    if len(backends) < 2:
+        return compiled({}, 0)
     counts = [count for count in bench.plan.vertices if count <= MOST]
     sizes = [size for size in bench.plan.sizes if size <= bench.plan.large]
     ratios, unlike = {}, 0
-    for count, size in product(counts, sizes) if len(backends) == 2 else ():
+    for count, size in product(counts, sizes):
         mesh = ellipsoid(count)
         points = CAMERA.project(mesh.vertices)[None]
         calls = {each.name: partial(each.rasterise, points, mesh.faces, size, closed=True) for each in backends}
