@@ -63,7 +63,7 @@ class Conditions:
     places: Float[Tensor, "A L 3"] | None = None
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Scene:
     """E examples of V views each, over backgrounds (B, 3 or 1, size, size) of values in [0, 1].
 

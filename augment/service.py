@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ from augment.seeding import generator, stream_seed
 from augment.service_settings import AugmentationSettings
 from augment.specimens import Specimens, choose_specimens
 from augment.variation import vary
-from renderer.arguments import checked
+from renderer.arguments import checked, require_fields
 from renderer.errors import InputError, require_range
 from renderer.lights import perturb
 
@@ -55,36 +55,29 @@ class Renders(Dataset[tuple[Tensor, int]]):
         return self.images[index].cpu(), int(self.labels[index])
 
 
+@dataclass(eq=False, repr=False)
 class AugmentationService:
     """Holds the scene and, where lights continue, the adversaries' values from one regeneration to the next.
 
     Where several processes train together, each attacks its share of the examples, and all get all renders.
+    scene: None where nothing is rendered; one view per example. labels: (E,) int64, see `augment.labels`.
+    label: the class that is to be told from look-alikes, the examples of all other labels: attacks light these
+    towards it. None: every attack leads away from the example's own class.
     """
 
-    @checked
-    def __init__(
-        self,
-        settings: AugmentationSettings,
-        scene: Scene | None,
-        labels: Tensor,
-        seed: int,
-        phases: Phases,
-        label: int | None = None,
-    ):
-        """scene: None where nothing is rendered; one view per example. labels: (E,) int64, see `augment.labels`.
+    settings: AugmentationSettings
+    scene: Scene | None
+    labels: Tensor
+    seed: int
+    phases: Phases
+    label: int | None = None
+    _continued: Tensor | None = field(default=None, init=False)
 
-        label: the class that is to be told from look-alikes, the examples of all other labels: attacks light these
-        towards it. None: every attack leads away from the example's own class.
-        """
-        if scene is None and settings.renders:
+    def __post_init__(self) -> None:
+        require_fields(self)
+        settings = self.settings
+        if self.scene is None and settings.renders:
             raise InputError(f"augment.arm={settings.arm} renders augment.examples={settings.examples}: give a scene")
-        self.settings = settings
-        self._scene = scene
-        self._labels = labels
-        self.label = label
-        self._seed = seed
-        self._phases = phases
-        self._continued: Tensor | None = None
 
     @classmethod
     @checked
@@ -114,7 +107,7 @@ class AugmentationService:
 
     def __len__(self) -> int:
         """Examples per regeneration."""
-        return len(self._labels) if self.settings.renders else 0
+        return len(self.labels) if self.settings.renders else 0
 
     @checked
     def regenerate(self, model: nn.Module, number: int) -> Renders:
@@ -124,11 +117,11 @@ class AugmentationService:
         repeats it.
         """
         require_range("number", number, 0, math.inf)
-        if self._scene is None or not self.settings.renders:
-            return Renders(torch.zeros(0, 3, 1, 1), self._labels[:0], {})
+        if self.scene is None or not self.settings.renders:
+            return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
         random = self.settings.arm == "random"
         lights = self.settings.random.candidates if random else 1
-        scene = vary(self._scene, self.settings.vary, generator(self._seed, number, "rows"), lights)
+        scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"), lights)
         make = self._random if random else self._adversarial
         return make(model, self.settings.attack.problem(scene), number)
 
@@ -142,49 +135,49 @@ class AugmentationService:
             return
         if "values" not in state:
             raise InputError("the checkpoint continues lights as an older version kept them: resume with that version")
-        if len(state["values"]) != len(self._labels):
+        if len(state["values"]) != len(self.labels):
             raise InputError(
                 f"augment.examples: the checkpoint continues {len(state['values'])} examples and the scene has "
-                f"{len(self._labels)}; resume with the settings of the run"
+                f"{len(self.labels)}; resume with the settings of the run"
             )
-        self._continued = state["values"].to(self._labels.device)
+        self._continued = state["values"].to(self.labels.device)
 
     def _random(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
         values = self._perturbed(problem, number)
         images = problem.images(values)[:, 0]
-        with as_found(model), torch.no_grad(), self._phases("attack_classifier"):
+        with as_found(model), torch.no_grad(), self.phases("attack_classifier"):
             batches = BatchSize(self.settings.attack.batch_size).map(lambda part: model(images[part]), len(images))
             logits = torch.cat(list(batches))
-        labels = self._labels.repeat(self.settings.random.candidates)
+        labels = self.labels.repeat(self.settings.random.candidates)
         require_known(labels, logits)
         fooled, losses = ~is_right(logits.argmax(1), labels), label_loss(logits, labels)
         worst = losses.unflatten(0, (-1, len(self))).argmax(0) * len(self) + torch.arange(len(self)).to(labels)
         diagnostics = {"fooled": _mean(fooled[worst]), "loss": _mean(losses[worst])}
         kept = torch.zeros_like(fooled).index_fill(0, worst, True)
         specimens = choose_specimens(model, problem, values, fooled & kept, labels)
-        return Renders(images[worst], self._labels, diagnostics | _changes(problem, values), specimens)
+        return Renders(images[worst], self.labels, diagnostics | _changes(problem, values), specimens)
 
     def _adversarial(self, model: nn.Module, problem: Perturbation, number: int) -> Renders:
         attack, goal = self.settings.attack, self._goal()
         mine = processes.share(len(problem.start)).to(problem.start.device)
         part = Part(problem, mine, self._start(problem, number)[mine])
-        draws = generator(self._seed, number, "restart")
+        draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[mine] for _ in range(attack.restarts))
-        seen = attack.observed(model, stream_seed(self._seed, number))
-        result = descend_in_parts(seen, part, goal.of(mine), attack, self._phases, restarts, problem.scene.at_once)
+        seen = attack.observed(model, stream_seed(self.seed, number))
+        result = descend_in_parts(seen, part, goal.of(mine), attack, self.phases, restarts, problem.scene.at_once)
         result = result.merged(mine, len(problem.start))
         if self.settings.lights == "continue":
             self._continued = result.values
         diagnostics = self._attack_diagnostics(result) | _changes(problem, result.values)
         newly_fooled = result.fooled & ~result.fooled_before
-        specimens = choose_specimens(model, problem, result.values, newly_fooled, self._labels)
-        return Renders(result.images[:, 0], self._labels, diagnostics, specimens)
+        specimens = choose_specimens(model, problem, result.values, newly_fooled, self.labels)
+        return Renders(result.images[:, 0], self.labels, diagnostics, specimens)
 
     def _goal(self) -> Goal:
         if self.label is None:
-            return Goal(self._labels[:, None])
-        decrease = torch.where(self._labels < 0, NO_CLASS, self._labels)
-        increase = torch.where(self._labels == self.label, NO_CLASS, self.label)
+            return Goal(self.labels[:, None])
+        decrease = torch.where(self.labels < 0, NO_CLASS, self.labels)
+        increase = torch.where(self.labels == self.label, NO_CLASS, self.label)
         return Goal(decrease[:, None], increase[:, None])
 
     def _start(self, problem: Perturbation, number: int) -> Tensor:
@@ -198,11 +191,11 @@ class AugmentationService:
         for kind, start in zip(problem.kinds, problem.split(problem.start), strict=True):
             if isinstance(kind, Lighting):
                 none = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
-                draws = generator(self._seed, number, "lights")
+                draws = generator(self.seed, number, "lights")
                 offsets = perturb(none, len(start), random.amplitude, random.radius, draws)
                 drawn.append(start + offsets.flatten(1).to(start))
             else:
-                drawn.append(kind.sample(generator(self._seed, number, kind.name), problem.everything).to(start))
+                drawn.append(kind.sample(generator(self.seed, number, kind.name), problem.everything).to(start))
         return problem.project(torch.cat(drawn, dim=1), problem.everything)
 
     def _attack_diagnostics(self, result: AttackResult) -> dict[str, float]:

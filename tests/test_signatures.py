@@ -125,7 +125,7 @@ def test_of_scenes_attacks_and_the_service():
     logits = checked(Classifier.forward)(classifier, renders.images)
     checked(adversarial_cost)(logits, renders.labels, 1 - renders.labels)
 
-    scene = service._scene
+    scene = service.scene
     problem, everything = Perturbation(scene, [Lighting(scene, StepSettings())]), torch.arange(2)
     conditions = checked(Scene.conditions)(scene, everything)
     check_fields(conditions)

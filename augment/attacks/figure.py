@@ -54,11 +54,7 @@ def save_figure(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
         if exhibit.spheres is not None:
             columns.append((title, _tiles(exhibit.spheres, [()] * len(exhibit.spheres))))
     columns = [(title, [*map(_enlarged, tiles)]) for title, tiles in columns]
-    sheet, corners = _draw(columns)
-    told = [
-        {"title": title, "tiles": [_told(*each) for each in zip(tiles, places, strict=True)]}
-        for (title, tiles), places in zip(columns, corners, strict=True)
-    ]
+    sheet, told = _draw(columns)
     info = PngInfo()
     info.add_text(COLUMNS, json.dumps(told), zip=True)
     sheet.save(path, pnginfo=info)
@@ -73,11 +69,6 @@ def read_figure(path: Path) -> list[Column]:
         return [(str(column["title"]), [_cut(tile, pixels) for tile in column["tiles"]]) for column in told]
     except Exception as error:  # Pillow raises almost anything at a broken file
         raise ValueError(f"{path} is no image of an attack") from error
-
-
-def _told(tile: Tile, corner: tuple[int, int]) -> dict[str, object]:
-    height, width, _ = tile.image.shape
-    return {"left": corner[0], "top": corner[1], "width": width, "height": height, "caption": tile.caption}
 
 
 def _cut(tile: dict[str, Any], pixels: np.ndarray) -> Tile:
@@ -100,8 +91,8 @@ def _difference_tiles(differences: Tensor) -> list[Tile]:
     return _tiles((1 + gain * differences) / 2, captions)
 
 
-def _draw(columns: Sequence[Column]) -> tuple[Image.Image, list[list[tuple[int, int]]]]:
-    """The sheet, and where each column's tiles have their left upper corner on it."""
+def _draw(columns: Sequence[Column]) -> tuple[Image.Image, list[dict[str, Any]]]:
+    """The sheet, and where on it each column's tiles are, for JSON."""
     title_font = ImageFont.load_default(TITLE_SIZE)
     images = [[tile.captioned() for tile in tiles] for _, tiles in columns]
     widths = [
@@ -111,11 +102,16 @@ def _draw(columns: Sequence[Column]) -> tuple[Image.Image, list[list[tuple[int, 
     heights = [max(image.height for image in row) for row in zip(*images, strict=True)]
     lefts, tops = _starts(MARGIN, widths), _starts(MARGIN + TITLE_HEIGHT, heights)
     sheet = Image.new("RGB", (lefts[-1] + widths[-1] + MARGIN, tops[-1] + heights[-1] + MARGIN), PAPER)
-    for (title, _), column, left in zip(columns, images, lefts, strict=True):
+    told = []
+    for (title, tiles), column, left in zip(columns, images, lefts, strict=True):
         ImageDraw.Draw(sheet).text((left, MARGIN), title, INK, title_font)
-        for image, top in zip(column, tops, strict=True):
+        places = []
+        for tile, image, top in zip(tiles, column, tops, strict=True):
             sheet.paste(image, (left, top))
-    return sheet, [[(left, top) for top in tops] for left in lefts]
+            height, width, _ = tile.image.shape
+            places.append({"left": left, "top": top, "width": width, "height": height, "caption": tile.caption})
+        told.append({"title": title, "tiles": places})
+    return sheet, told
 
 
 def _starts(first: int, sizes: Sequence[int]) -> list[int]:
