@@ -8,7 +8,7 @@ lights before the same cameras, so that nothing but the thing itself tells one f
 import csv
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -33,20 +33,11 @@ from train.run_folder.logs import console
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)
 VIEWS, BACKGROUNDS = 5, 4  # images per individual: every view on every background, each in a light of its own
-HELD_OUT_PER_CLASS = 60
+HELD_OUT, HELD_OUT_PER_CLASS = "held out", 60
 SOURCE = "rendered, hard light"
 CODE = RENDERER + source_key(Path(augment.__file__).parent, Path(__file__).parent)
 
 Lights = Callable[[Tensor, torch.Generator], Tensor]
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of the data: its name, its light, and whether all classes have the same draws of light and camera."""
-
-    name: str
-    light: Lights
-    same_for_all: bool = False
 
 
 def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
@@ -56,8 +47,8 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
     """
     settings = replace(SETTINGS, size=size)
     splits = [
-        _render_split(per_class, seed, Part(name, even_light), settings, cache or TensorCache())
-        for per_class, name in [(train, "train"), (test, "test")]
+        _render_split(name, per_class, seed, settings, cache or TensorCache())
+        for name, per_class in [("train", train), ("test", test)]
     ]
     return DataSet(CLASSES, *splits)
 
@@ -65,8 +56,7 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
 def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None = None) -> None:
     """Class folders of PNG images in hard light; photos.csv calls them rendered and numbers the lights."""
     settings = replace(SETTINGS, size=size)
-    part = Part("held out", hard_light, same_for_all=True)
-    split = _render_split(HELD_OUT_PER_CLASS, seed, part, settings, cache or TensorCache())
+    split = _render_split(HELD_OUT, HELD_OUT_PER_CLASS, seed, settings, cache or TensorCache())
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
@@ -94,30 +84,32 @@ def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
     return ambient(0.06 * tint) + directional(direction, strength * tint)
 
 
-def _render_split(per_class: int, seed: int, part: Part, settings: ImageSettings, cache: TensorCache) -> Split:
-    key = content_key(CODE, CLASSES, per_class, seed, part.name, settings)
+def _render_split(part: str, per_class: int, seed: int, settings: ImageSettings, cache: TensorCache) -> Split:
+    key = content_key(CODE, CLASSES, per_class, seed, part, settings)
     kept = cache.read(key)
     if kept is None:
-        kept = {"images": _render(per_class, seed, part, settings)}
+        kept = {"images": _render(part, per_class, seed, settings)}
         cache.write(key, kept)
         source = f"rendered; not kept: {cache.problem}" if cache.problem else "rendered"
     else:
         source = "from the cache"
-    console.info("%s images: %d %s", part.name, len(kept["images"]), source)
+    console.info("%s images: %d %s", part, len(kept["images"]), source)
     return Split(kept["images"], torch.arange(len(CLASSES)).repeat_interleave(per_class))
 
 
-def _render(per_class: int, seed: int, part: Part, settings: ImageSettings) -> Tensor:
-    """Images of every class, in order: uint8 (classes × per_class, 3, size, size)."""
+def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:
+    """Images of every class, in order: uint8 (classes × per_class, 3, size, size). Held out, all classes have the same
+    draws of light and camera."""
     backend = choose("software")
     individuals = math.ceil(per_class / (VIEWS * BACKGROUNDS))
-    draws = seeds = generator(seed, part.name)
+    light = hard_light if part == HELD_OUT else even_light
+    draws = seeds = generator(seed, part)
     images = []
     for name in CLASSES:
-        if part.same_for_all:
-            draws, seeds = generator(seed, part.name), generator(seed, part.name, name)
+        if part == HELD_OUT:
+            draws, seeds = generator(seed, part), generator(seed, part, name)
         meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(individuals))
-        portraits = [_portraits(name, mesh, part.light, settings, backend, draws) for mesh in meshes]
+        portraits = [_portraits(name, mesh, light, settings, backend, draws) for mesh in meshes]
         images.append(torch.cat(portraits)[:per_class])
     return torch.cat(images)
 

@@ -5,6 +5,7 @@ import time
 import torch
 
 from augment.build import build_scene
+from augment.classifiers.adapter import class_index
 from augment.labels import anything_but
 from augment.phases import Phases
 from augment.scene import Scene
@@ -12,7 +13,6 @@ from augment.service import AugmentationService
 from renderer.cache import OperatorCache
 from renderer.harmonics import live_coefficients
 from renderer.transfer import COEFFICIENTS, DEGREE
-from train.classes import class_index
 from train.data import DataSet
 from train.distributed import first_process_first
 from train.run_folder.logs import console

@@ -81,12 +81,7 @@ class Classifier(nn.Module):
     @checked
     def label(self, class_name: str) -> int:
         """The index of a class; InputError with the nearest names for one that the classifier lacks."""
-        if class_name not in self.classes:
-            raise InputError(
-                f"classifier={self.name} has no class {class_name!r}: choose one, such as "
-                f"{nearest(class_name, self.classes)}"
-            )
-        return self.classes.index(class_name)
+        return class_index(self.classes, class_name, f"classifier={self.name}")
 
 
 class Normalised(nn.Module):
@@ -109,6 +104,13 @@ class Normalised(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         ordered = images.flip(1) if self.bgr else images
         return self.network(((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last))
+
+
+def class_index(classes: Sequence[str], name: str, key: str) -> int:
+    """The label of a class name; InputError, naming the key that it came from, where the list lacks it."""
+    if name not in classes:
+        raise InputError(f"{key}: {name!r} is not a class of the model: choose one, such as {nearest(name, classes)}")
+    return classes.index(name)
 
 
 def nearest(name: str, choices: Iterable[str]) -> str:

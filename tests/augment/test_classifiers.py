@@ -16,7 +16,7 @@ from torch import nn
 from torchvision.models import WeightsEnum, get_model, get_model_weights, list_models, squeezenet1_0, squeezenet1_1
 
 from augment.classifiers import Classifier, load_classifier
-from augment.classifiers.adapter import Normalised, nearest
+from augment.classifiers.adapter import Normalised, class_index, nearest
 from augment.classifiers.imagenet import build_network, imagenet_classes, published_weights
 from renderer.errors import InputError
 
@@ -162,7 +162,9 @@ def test_logits_need_no_gradient_where_none_is_asked_for():
 )
 def test_a_class_that_the_classifier_lacks_is_answered_with_the_nearest(name, suggested):
     classifier = Classifier(lambda images: images, 8, CLASSES, name="mine")
-    with pytest.raises(InputError, match=f"^classifier=mine has no class '{name}': choose one, such as .*{suggested}"):
+    with pytest.raises(
+        InputError, match=f"^classifier=mine: '{name}' is not a class of the model: choose one, such as .*{suggested}"
+    ):
         classifier.label(name)
 
 
@@ -478,3 +480,10 @@ def test_squeezenet_recognises_oranges_only_in_the_right_order_of_channels(orang
     images = oranges(classifier.size)
     assert share_called_orange(classifier, images) > 0.4
     assert share_called_orange(classifier, images.flip(1)) < 0.05
+
+
+def test_a_class_is_found_by_name_or_refused_with_its_key_and_the_nearest():
+    classes = ("apple", "orange", "sweet_pepper")
+    assert [class_index(classes, name, "label") for name in classes] == [0, 1, 2]
+    with pytest.raises(InputError, match=r"^label: 'ornage' is not a class of the model: choose one, such as orange, "):
+        class_index(classes, "ornage", "label")

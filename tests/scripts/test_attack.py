@@ -126,7 +126,10 @@ def test_what_fools_is_shown_to_other_networks_from_other_sides_and_on_other_mes
 
 REFUSED = [
     (["transfer.classifiers=[{network: x}]"], "transfer.classifiers: network is not known: give names"),
-    (["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "has no class 'paer': choose one, such as pear"),
+    (
+        ["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"],
+        "'paer' is not a class of the model: choose one, such as pear",
+    ),
     (["transfer.classifiers=[squeezenet]"], "classifier=squeezenet is not known"),
     (["attack=geometry", "transfer.meshes=[a.glb]"], "transfer.meshes: attack=geometry belongs to what was attacked"),
     (["attack=pixels", "transfer.azimuths=[3]"], "transfer.azimuths: attack=pixels belongs to what was attacked"),
@@ -139,7 +142,7 @@ REFUSED = [
     (["attack.restarts=1"], "attack.restarts draws from the norm-balls"),
     (["scene.views=0"], "scene.views=0 must be at least 1"),
     (["scene.backgrounds=[absent.png]"], "scene.backgrounds: absent.png does not exist"),
-    (["label=ornage"], "has no class 'ornage': choose one, such as orange"),
+    (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
     (["target=[apple,pear]", "attack.shared=true"], "target=['apple', 'pear'] names 2 classes for 1 views"),
     (["classifier=alexnet"], "classifier=alexnet is not known: choose one of "),
     (["attack.verify=blender"], "attack.verify=blender: choose one of reload, mitsuba"),

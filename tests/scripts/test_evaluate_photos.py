@@ -105,4 +105,6 @@ def test_a_network_that_cannot_be_meant_is_one_sentence(evaluate, capsys, overri
 
 def test_a_class_that_a_network_lacks_is_refused_by_the_names_of_both(call, run, photos, capsys):
     assert call("evaluate_photos", f"run={run}", f"photos={photos}", "label=pear") == USER_ERROR
-    assert capsys.readouterr().err.startswith(f"error: classifier=run:{run} has no class 'pear': choose one, such as ")
+    assert capsys.readouterr().err.startswith(
+        f"error: classifier=run:{run}: 'pear' is not a class of the model: choose one, such as "
+    )

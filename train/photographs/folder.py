@@ -12,12 +12,11 @@ from typing import NoReturn
 import numpy as np
 import torch
 
-from augment.classifiers.adapter import nearest
+from augment.classifiers.adapter import class_index, nearest
 from augment.memory import require_memory
 from augment.progress import progress
 from renderer.errors import InputError, require_file
 from renderer.files.image_files import read_square
-from train.classes import class_index
 from train.run_folder.logs import console
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")

@@ -54,7 +54,7 @@ def test_another_network_sees_a_render_at_its_size_and_has_its_own_order_of_clas
     finer = augment.build_scene([("solid:orange", "orange")], 3 * SIZE, 2, backgrounds=[0.4])
     images = finer.render(done.conditions, torch.arange(2))
     torch.testing.assert_close(found.after, network(found.classes, 3 * SIZE)(images[:, 0])[:, None], rtol=0, atol=1e-4)
-    with pytest.raises(InputError, match="has no class 'sky'"):
+    with pytest.raises(InputError, match="'sky' is not a class of the model"):
         next(done.transfer([network(("orange", "lime"))]))
 
 
