@@ -66,9 +66,10 @@ class Camera(ABC):
         right = [-sin_azimuth, cos_azimuth, 0.0]
         return np.array([right, np.cross(back, right), back])
 
-    def position(self) -> np.ndarray:
-        """(3,) where it stands."""
-        return np.array([-self.right, -self.up, self.distance]) @ self.axes()
+    def pose(self) -> np.ndarray:
+        """(4, 4) its axes and, last, where it stands, as columns in world coordinates."""
+        axes, place = self.axes(), np.array([-self.right, -self.up, self.distance])
+        return np.vstack([np.column_stack([axes.T, place @ axes]), [0, 0, 0, 1]])
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:

@@ -123,10 +123,8 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
 
 def _camera_node(camera: Camera, index: int) -> dict[str, Any]:
     """Where a camera stands, y up; it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
-    pose = np.eye(4)
-    pose[:3, :3] = camera.axes().T
-    pose[:3, 3] = camera.position()
-    return {"camera": index, "name": f"view {index}", "matrix": (Y_UP_TO_Z_UP.T @ pose).T.ravel().tolist()}
+    matrix = Y_UP_TO_Z_UP.T @ camera.pose()
+    return {"camera": index, "name": f"view {index}", "matrix": matrix.T.ravel().tolist()}
 
 
 def _ply(mesh: Mesh, normals: np.ndarray) -> bytes:

@@ -140,10 +140,8 @@ def _emitters(
 
 def _pose(camera: Camera, scale: float) -> str:
     """Mitsuba's cameras and projectors look along +z and have x to the left."""
-    right, up, back = camera.axes()
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([-scale * right, scale * up, -back], axis=1)
-    pose[:3, 3] = camera.position()
+    pose = camera.pose()
+    pose[:3] *= [-scale, scale, -1, 1]
     return " ".join(f"{value:.17g}" for value in pose.ravel())
 
 

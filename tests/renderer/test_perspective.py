@@ -21,6 +21,7 @@ from renderer.visibility import choose
 
 SOFTWARE = choose("software")
 CAMERA = PerspectiveCamera(0.9, 0.4, 2.4, right=0.2, up=-0.1, distance=1.9)
+POSITION = CAMERA.pose()[:3, 3]
 BACKENDS = [
     "software",
     pytest.param("compiled", marks=pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")),
@@ -48,12 +49,12 @@ def nearest(mesh: Mesh, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
     systems = np.empty((len(directions), len(edges), 3, 3))
     systems[..., :2], systems[..., 2] = edges, -directions[:, None]
-    u, v, t = (np.linalg.inv(systems) @ (CAMERA.position() - corners[:, 0])[..., None])[..., 0].transpose(2, 0, 1)
+    u, v, t = (np.linalg.inv(systems) @ (POSITION - corners[:, 0])[..., None])[..., 0].transpose(2, 0, 1)
     t = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0), t, np.inf)
     first = t.argmin(axis=1)
     length = t[np.arange(len(t)), first]
     hit = np.isfinite(length)
-    return np.where(hit, first, -1), CAMERA.position() + directions * np.where(hit, length, 0)[:, None]
+    return np.where(hit, first, -1), POSITION + directions * np.where(hit, length, 0)[:, None]
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -75,7 +76,7 @@ def test_which_side_of_a_face_is_seen_depends_on_where_the_face_is():
     [seen] = build_fragments(mesh.vertices, mesh.faces, [CAMERA], ImageSettings(64, 1), SOFTWARE)
     corners = mesh.vertices[seen.corners]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    towards = np.sign(((CAMERA.position() - corners[:, 0]) * normals).sum(axis=1))
+    towards = np.sign(((POSITION - corners[:, 0]) * normals).sum(axis=1))
     np.testing.assert_array_equal(seen.facing[:, 0], towards)
     assert (towards != np.sign(normals @ CAMERA.axes()[2])).sum() > 5
 
