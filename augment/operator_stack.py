@@ -1,7 +1,6 @@
 """Operators over a common set of pixels, so that one product renders all images that they are seen in."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -80,7 +79,7 @@ def _joined(operators: Sequence[Operator], pixels: Tensor, device: torch.device 
         counts.append(0 if own is None else len(own.function))
         if own is not None:
             places = torch.searchsorted(pixels, operator.pixels)
-            placed.append(replace(own, pixel=places[own.pixel]))
+            placed.append(own._replace(pixel=places[own.pixel]))
     entries = joined(*placed)
     return entries and entries.to(device), torch.tensor(counts, device=device).cumsum(0)
 

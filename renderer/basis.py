@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -52,8 +52,7 @@ class Distant(Functions):
         """(N, size) that comes from unit directions (N, 3), per unit of each coefficient."""
 
 
-@dataclass(frozen=True)
-class Reach:
+class Reach(NamedTuple):
     """E ways on which light goes: point, function: (E,) int64, to which surface point and of which function of a basis.
     place: (E, 3), where it comes from. irradiance: (E,) per unit of the function's coefficient, differentiable in the
     surface's points and normals; which ways there are is held."""

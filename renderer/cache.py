@@ -19,7 +19,6 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from renderer import sparse
 from renderer.basis import HARMONICS, Basis
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
@@ -162,10 +161,10 @@ class OperatorCache(TensorCache):
 def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
     counts = torch.tensor([len(mesh.faces), len(mesh.faces) - len(seen.faces), mesh.closed])
     dense = {name: getattr(operator, name) for name in TENSORS}
-    few = {} if operator.sparse is None else {name: getattr(operator.sparse, name) for name in sparse.TENSORS}
+    few = {} if operator.sparse is None else operator.sparse._asdict()
     return dense | few | {"counts": counts}
 
 
 def _unpack(view: Mapping[str, Tensor], settings: ImageSettings, basis: Basis) -> Operator:
-    few = Sparse(*(view[name] for name in sparse.TENSORS)) if sparse.TENSORS[0] in view else None
+    few = Sparse(*(view[name] for name in Sparse._fields)) if "weight" in view else None
     return Operator(**{name: view[name] for name in TENSORS}, settings=settings, basis=basis, sparse=few)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-TENSORS = ("function", "pixel", "weight")
 SPARSE = 1 / 16  # of all entries, below which those that are not zero are multiplied one by one in less time,
 SMALL = 2**16  # unless they are no more than this; see docs/performance.md
 
 
-@dataclass(frozen=True)
-class Sparse:
+class Sparse(NamedTuple):
     """N entries: function, pixel (N,) int64; weight (N, C), radiance per unit of the function's
     coefficient, of one channel or of three."""
 
@@ -34,10 +32,10 @@ class Sparse:
 
     def taken(self, entries: Tensor) -> Sparse:
         """Some of the entries (M,), or the same more than once."""
-        return Sparse(self.function[entries], self.pixel[entries], self.weight[entries])
+        return Sparse(*(each[entries] for each in self))
 
     def to(self, device: torch.device | str) -> Sparse:
-        return Sparse(self.function.to(device), self.pixel.to(device), self.weight.to(device))
+        return Sparse(*(each.to(device) for each in self))
 
     def radiance(self, lights: Tensor, image: Tensor, pixels: int) -> Tensor:
         """(B, 3, P) of B images in a light each, (B, size, 3): entries, of three channels, are of image (N,).
@@ -57,6 +55,4 @@ class Sparse:
 def joined(*parts: Sparse | None) -> Sparse | None:
     """The entries of all; None where there are none."""
     there = [part for part in parts if part is not None]
-    if not there:
-        return None
-    return Sparse(*(torch.cat([getattr(part, name) for part in there]) for name in TENSORS))
+    return Sparse(*map(torch.cat, zip(*there, strict=True))) if there else None

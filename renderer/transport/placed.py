@@ -41,4 +41,4 @@ def lit(rays: Rays, surface: Surface, reach: Reach) -> Reach:
         directions, lengths = unit_vectors((reach.place - origins).T)
         above = (directions.T * planes).sum(1) > 0
         free = above & (rays.meet(origins, directions.T, lengths) < 0)
-    return Reach(reach.point[free], reach.function[free], reach.place[free], reach.irradiance[free])
+    return Reach(*(each[free] for each in reach))

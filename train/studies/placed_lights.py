@@ -87,7 +87,7 @@ def all_entries() -> Iterator[None]:
 
 
 def megabytes(built: Operator) -> float:
-    few = [] if built.sparse is None else [getattr(built.sparse, name) for name in sparse.TENSORS]
+    few = built.sparse or ()
     return sum(each.nbytes for each in (built.transfer, *few)) / 1e6
 
 
