@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
@@ -159,12 +158,8 @@ def _write_config(config: DictConfig, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     resolved = as_dict(config, resolve=True)
     resolved[INPUTS] = fingerprints(config)
-    resolved["versions"] = {
-        "python": platform.python_version(),
-        "torch": str(torch.__version__),
-        "torchvision": version("torchvision"),
-        "numpy": np.__version__,
-    }
+    packages = {name: version(name) for name in ("torch", "torchvision", "numpy")}
+    resolved["versions"] = {"python": platform.python_version(), **packages}
     write_whole(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
 
 
