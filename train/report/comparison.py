@@ -1,6 +1,6 @@
 """Finished runs side by side: accuracy, time, figures on photographs by source, and how far arms differ in them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,7 +22,7 @@ from train.photographs.figures import (
     replicate_figures,
 )
 from train.photographs.text import format_interval
-from train.report.summary import RunSummary, complete, group_by_settings, name_among
+from train.report.summary import RunSummary, complete, name_among
 from train.report.tables import Table
 from train.run_folder.logs import PHASES
 from train.settings import PHOTOGRAPHS
@@ -123,10 +123,11 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photog
         evaluations = [read_evaluation(run, photographs, runs[0].config.label, exclude) for run in scored]
         require_comparable(evaluations, photographs)
         pooled = f"all but {', '.join(exclude)}" if exclude else "all"
-        tables[1:1] = [
-            *(_figure_table(evaluations, name, pooled) for name in FIGURES),
-            *difference_tables(evaluations, pooled),
-        ]
+        arms: dict[str, list[Evaluation]] = {}
+        for evaluation in evaluations:
+            arms.setdefault(name_among(evaluation.run, scored), []).append(evaluation)
+        names = [f"{name_among(run, scored)}, seed {run.config.seed}" for run in scored]
+        tables[1:1] = [*_figure_tables(evaluations, names, pooled), *difference_tables(arms, pooled)]
     return "\n\n".join(f"### {table.title}\n\n{table}" for table in tables)
 
 
@@ -145,36 +146,27 @@ def _accuracy_table(runs: Sequence[RunSummary]) -> Table:
     return Table("Accuracy on the test set", header, rows)
 
 
-def _figure_table(evaluations: Sequence[Evaluation], name: str, pooled: str) -> Table:
-    """A figure by source, a column per run; without the sources that have none."""
-    rows = [
-        [source or pooled, *(format_interval(find_figure(run.figures[source], name)) for run in evaluations)]
-        for source in evaluations[0].pools
-    ]
-    header = ["source", *(f"{_name(run, evaluations)}, seed {run.seed}" for run in evaluations)]
-    title = f"Photographs: {figure_title(name, evaluations[0].label)}"
-    return Table(title, header, [row for row in rows if set(row[1:]) != {"-"}])
-
-
-def _name(evaluation: Evaluation, evaluations: Sequence[Evaluation]) -> str:
-    return name_among(evaluation.run, [other.run for other in evaluations])
-
-
-def difference_tables(evaluations: Sequence[Evaluation], pooled: str) -> list[Table]:
-    """A table for each group of runs but the first: how far it is from the first, by source and figure."""
-    by_folder = {evaluation.run.folder: evaluation for evaluation in evaluations}
-    groups = group_by_settings([evaluation.run for evaluation in evaluations])
-    reference, *others = [[by_folder[run.folder] for run in group] for group in groups]
-    tables = []
-    for group in others:
+def _figure_tables(evaluations: Sequence[Evaluation], names: Sequence[str], pooled: str) -> Iterator[Table]:
+    """Each figure by source, a column per run; without the sources that have none."""
+    for figure in FIGURES:
         rows = [
-            [source or pooled, *(format_difference(difference(group, reference, source, name)) for name in FIGURES)]
+            [source or pooled, *(format_interval(find_figure(run.figures[source], figure)) for run in evaluations)]
             for source in evaluations[0].pools
         ]
-        header = ["source", *(figure_title(name, evaluations[0].label) for name in FIGURES)]
-        names = f"{_name(group[0], evaluations)} minus {_name(reference[0], evaluations)}"
-        tables.append(Table(f"{names}, {_format_seeds(group, reference)}", header, rows))
-    return tables
+        title = f"Photographs: {figure_title(figure, evaluations[0].label)}"
+        yield Table(title, ["source", *names], [row for row in rows if set(row[1:]) != {"-"}])
+
+
+def difference_tables(arms: Mapping[str, Sequence[Evaluation]], pooled: str) -> Iterator[Table]:
+    """A table for each arm but the first: how far it is from the first, by source and figure."""
+    (first, reference), *others = arms.items()
+    header = ["source", *(figure_title(figure, reference[0].label) for figure in FIGURES)]
+    for arm, group in others:
+        rows = [
+            [source or pooled, *(format_difference(difference(group, reference, source, name)) for name in FIGURES)]
+            for source in reference[0].pools
+        ]
+        yield Table(f"{arm} minus {first}, {_format_seeds(group, reference)}", header, rows)
 
 
 def _format_seeds(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> str:

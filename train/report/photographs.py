@@ -60,9 +60,8 @@ def _by_source(runs: Arms, name: str) -> Iterator[Block]:
         for figure, by_source in scores.items():
             rows = [[source, *(found or "-" for found in by_arm.values())] for source, by_arm in by_source.items()]
             yield Table(figure_title(figure, label), ["source", *runs], rows)
-        every = [evaluation for group in evaluations.values() for evaluation in group]
-        require_comparable(every, name)
-        yield from difference_tables(every, "all")
+        require_comparable([each for group in evaluations.values() for each in group], name)
+        yield from difference_tables(evaluations, "all")
     except InputError as error:
         yield str(error)
 
