@@ -1,6 +1,6 @@
 """Tables of finished runs: accuracy, time and figures on photographs, of each run and as means over seeds."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -29,37 +29,32 @@ def format_spread(runs: Sequence[RunSummary]) -> str:
     return _joined(spread_tables(["augment", *varied, "seeds"], names, groups)) if groups else ""
 
 
-def run_tables(header: Sequence[str], names: Names, runs: Sequence[RunSummary]) -> list[Table]:
+def run_tables(header: Sequence[str], names: Names, runs: Sequence[RunSummary]) -> Iterator[Table]:
     """A row per run: one table of accuracy and time, and one for each folder of photographs of the figures on it."""
-    scores = [[f"{run.accuracy:.3f}", f"{run.epoch_seconds:.1f}"] for run in runs]
-    tables = [_beside(names, scores, "", [*header, "test accuracy", "seconds per epoch"])]
+    named = [*zip(names, runs, strict=True)]
+    rows = [[*name, f"{run.accuracy:.3f}", f"{run.epoch_seconds:.1f}"] for name, run in named]
+    yield Table("", [*header, "test accuracy", "seconds per epoch"], rows)
     for folder in _folders(runs):
-        figures = [[format_interval(figure) for figure in run.figures(folder)] for run in runs]
-        tables.append(_beside(names, figures, folder, [*header, *_titles(runs)]))
-    return tables
+        rows = [[*name, *map(format_interval, run.figures(folder))] for name, run in named]
+        yield Table(folder, [*header, *_titles(runs)], rows)
 
 
-def spread_tables(header: Sequence[str], names: Names, groups: Sequence[Sequence[RunSummary]]) -> list[Table]:
+def spread_tables(header: Sequence[str], names: Names, groups: Sequence[Sequence[RunSummary]]) -> Iterator[Table]:
     """Those tables, but for the time, with a row per group of runs: mean ± standard deviation."""
-    runs = [run for group in groups for run in group]
-    accuracies = [[_spread([run.accuracy for run in group])] for group in groups]
-    tables = [_beside(names, accuracies, "", [*header, "test accuracy"])]
+    runs, named = [run for group in groups for run in group], [*zip(names, groups, strict=True)]
+    rows = [[*name, _spread([run.accuracy for run in group])] for name, group in named]
+    yield Table("", [*header, "test accuracy"], rows)
     for folder in _folders(runs):
-        figures = [[_spread(values) for values in _values(group, folder)] for group in groups]
-        tables.append(_beside(names, figures, folder, [*header, *_titles(runs)]))
-    return tables
+        rows = [[*name, *_spreads(group, folder)] for name, group in named]
+        yield Table(folder, [*header, *_titles(runs)], rows)
 
 
 def _settings(run: RunSummary, varied: Sequence[str]) -> list[str]:
     return [run.arm, *(str(run.settings.get(key)) for key in varied)]
 
 
-def _joined(tables: Sequence[Table]) -> str:
+def _joined(tables: Iterable[Table]) -> str:
     return "\n\n".join(f"{table.title}:\n{table}" if table.title else str(table) for table in tables)
-
-
-def _beside(names: Names, cells: Iterable[Iterable[str]], title: str, header: Sequence[str]) -> Table:
-    return Table(title, header, [[*name, *row] for name, row in zip(names, cells, strict=True)])
 
 
 def _folders(runs: Sequence[RunSummary]) -> list[str]:
@@ -71,9 +66,9 @@ def _titles(runs: Sequence[RunSummary]) -> list[str]:
     return [figure_title(name, runs[0].config.label) for name in FIGURES]
 
 
-def _values(group: Sequence[RunSummary], folder: str) -> list[tuple[float | None, ...]]:
-    """Each figure's values over the runs of a group."""
-    return [*zip(*([figure.get("value") for figure in run.figures(folder)] for run in group), strict=True)]
+def _spreads(group: Sequence[RunSummary], folder: str) -> Iterator[str]:
+    for figures in zip(*(run.figures(folder) for run in group), strict=True):
+        yield _spread([figure.get("value") for figure in figures])
 
 
 def _spread(values: Sequence[float | None]) -> str:

@@ -37,7 +37,8 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
         told.insert(0, answer.of_runs(few, name))
     first = Section("In short", [*told, Gallery("", [top] if top else []), *found.problems])
     parts = [first, *sections.of_runs(arms, found.unfinished), *attack_sections(found.attacks)]
-    parts = [part for part in map(_without_empty, parts) if part.blocks]
+    parts = [Section(part.title, [*filter(_holds_something, part.blocks)]) for part in parts]
+    parts = [part for part in parts if part.blocks]
     done, every = len(found.runs), len(found.runs) + len(found.unfinished)
     about = f"{done} of {every} runs finished, {len(found.attacks)} attacks"
 
@@ -50,10 +51,6 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     text = _rendered("page.md.jinja", parts, about, lambda image: _beside(image, out))
     (out / MARKDOWN).write_text(_from_here(re.sub(r"\n{3,}", "\n\n", text)), encoding="utf-8", errors="replace")
     return out / PAGE
-
-
-def _without_empty(section: Section) -> Section:
-    return Section(section.title, [block for block in section.blocks if _holds_something(block)])
 
 
 def _holds_something(block: Block) -> bool:
