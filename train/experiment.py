@@ -158,8 +158,12 @@ def _write_config(config: DictConfig, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     resolved = as_dict(config, resolve=True)
     resolved[INPUTS] = fingerprints(config)
-    packages = {name: version(name) for name in ("torch", "torchvision", "numpy")}
-    resolved["versions"] = {"python": platform.python_version(), **packages}
+    resolved["versions"] = {
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "torchvision": version("torchvision"),
+        "numpy": version("numpy"),
+    }
     write_whole(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
 
 
