@@ -34,50 +34,44 @@ class Converged:
         found = {shift: _coverage(view, each, shift) for shift in product(range(SHIFTS), range(SHIFTS))}
         halves = [[part for shift, part in found.items() if sum(shift) % 2 == half] for half in (0, 1)]
         self._halves = [_mean(half, len(view.mesh.faces)) for half in halves]
-        self._pixel, self._face, self._weight = _mean([*found.values()], len(view.mesh.faces))
-        self._seen = torch.unique(self._face)
-        self._faces = torch.from_numpy(view.mesh.faces)
+        self._whole = _mean([*found.values()], len(view.mesh.faces))
 
-    def image(self, irradiance: Irradiance) -> Tensor:
-        """(3, size, size) radiance under a light given as its irradiance of unit normals (N, 3) → (N, 3)."""
-        return self._image(irradiance, self._pixel, self._face, self._weight)
+    def image(self, irradiance: Irradiance, vertices: Tensor | None = None) -> Tensor:
+        """(3, size, size) radiance under a light given as its irradiance of unit normals (N, 3) → (N, 3).
+
+        vertices: that are shaded, (V, 3), in place of the view's own, which are seen.
+        """
+        return self._image(irradiance, self._vertices() if vertices is None else vertices, *self._whole)
 
     def uncertainty(self, irradiance: Irradiance) -> float:
         """The image's own relative error, as half the difference between two halves of its samples."""
-        first, second = (self._image(irradiance, *half) for half in self._halves)
+        first, second = (self._image(irradiance, self._vertices(), *half) for half in self._halves)
         return float((first - second).norm() / (first + second).norm())
 
     def light_gradient(self, degree: int = 20) -> Tensor:
         """((degree + 1)², 3): the image gradient pulled back to the light's coefficients."""
         light = torch.zeros((degree + 1) ** 2, 3, dtype=torch.float64, requires_grad=True)
-        shade = reference.irradiance(self._normals(self._vertices()), light)
-        return torch.autograd.grad((shade * self._pulled()).sum(), light)[0]
+        return self._pulled_back(self.image(lambda normals: reference.irradiance(normals, light)), light)
 
     def vertex_gradient(self, irradiance: Irradiance) -> Tensor:
         """(V, 3): the image gradient pulled back to the vertices, with visibility held fixed."""
         vertices = self._vertices().requires_grad_()
-        return torch.autograd.grad((irradiance(self._normals(vertices)) * self._pulled()).sum(), vertices)[0]
+        return self._pulled_back(self.image(irradiance, vertices), vertices)
 
     def _vertices(self) -> Tensor:
         return torch.from_numpy(self.view.mesh.vertices)
 
-    def _normals(self, vertices: Tensor) -> Tensor:
-        """(G, 3) of the faces seen; all of them face the camera, the mesh being closed."""
-        return reference.unit(reference.doubled_area_vectors(vertices[self._faces[self._seen]]))
-
-    def _image(self, irradiance: Irradiance, pixel: Tensor, face: Tensor, weight: Tensor) -> Tensor:
-        shade = torch.zeros(len(self._faces), 3, dtype=torch.float64)
-        shade[self._seen] = irradiance(self._normals(self._vertices())) * torch.tensor(ALBEDO, dtype=torch.float64)
+    def _image(self, irradiance: Irradiance, vertices: Tensor, pixel: Tensor, face: Tensor, weight: Tensor) -> Tensor:
+        """Of the faces seen, all of which face the camera, the mesh being closed."""
+        seen, face = face.unique(return_inverse=True)
+        normals = reference.unit(reference.doubled_area_vectors(vertices[torch.from_numpy(self.view.mesh.faces)[seen]]))
+        shade = irradiance(normals) * torch.tensor(ALBEDO, dtype=torch.float64)
         size = self.view.size
         pixels = torch.zeros(size**2, 3, dtype=torch.float64).index_add(0, pixel, shade[face] * weight[:, None])
         return pixels.T.unflatten(1, (size, size))
 
-    def _pulled(self) -> Tensor:
-        """(G, 3) the image gradient's sum over what each seen face covers, times albedo."""
-        image_gradient = self.view.image_gradient.cpu().flatten(1).T
-        sums = torch.zeros(len(self._faces), 3, dtype=torch.float64)
-        sums.index_add_(0, self._face, image_gradient[self._pixel] * self._weight[:, None])
-        return sums[self._seen] * torch.tensor(ALBEDO, dtype=torch.float64)
+    def _pulled_back(self, image: Tensor, variable: Tensor) -> Tensor:
+        return torch.autograd.grad((image * self.view.image_gradient.cpu()).sum(), variable)[0]
 
 
 class Exact:
