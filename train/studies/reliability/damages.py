@@ -38,21 +38,13 @@ PERHAPS_DAMAGED = {  # not every byte counts in every format
     "without its last byte": replaced(lambda whole: whole[:-1]),
     **{f"bytes flipped, draw {seed}": flipped(seed) for seed in range(3)},
 }
-OPTIONAL = (
-    "photos.csv",
-    "summary.json",
-    "photographs.csv",
-    "metrics.jsonl",
-    "last.pt",
-    "0.png",
-    "4.jpg",
-)  # may be missing
+MAY_BE_MISSING = ("photos.csv", "summary.json", "photographs.csv", "metrics.jsonl", "last.pt", "0.png", "4.jpg")
 
 
 def damages(file: str) -> Iterator[Damage]:
     """All of a file of the corpus."""
     for name, edit in NO_FILE.items():
-        yield Damage("no file", name, edit, not file.endswith(OPTIONAL))
+        yield Damage("no file", name, edit, not file.endswith(MAY_BE_MISSING))
     for name, edit in (DAMAGED | PERHAPS_DAMAGED).items():
         yield Damage("damaged", name, edit, name in DAMAGED and not file.endswith("photographs.csv"))
     for refused, forgeries in ((True, REFUSED), (False, EITHER)):

@@ -3,12 +3,14 @@
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from train.command_line.configuration import as_dict, composed, dotted
 from train.studies.commands import Ending
 from train.studies.reliability.damages import damages
 from train.studies.reliability.doors import DOORS, Door, given
+from train.studies.reliability.edits import Edit
 from train.studies.reliability.process import USUAL, Surroundings
 
 NAMES = [
@@ -66,13 +68,14 @@ def file_trials(door: Door) -> Iterator[Trial]:
             command = door.command(key.replace("{}", given(file)))
             named = (file.rpartition("/")[2], given(file), key.partition("=")[0])
             for damage in damages(file):
-
-                def prepare(folder: Path, edit: Callable[[Path], object] = damage.edit, file: str = file) -> None:
-                    edit(folder / file)
-
                 words = (*named, "label") if "classes" in damage.name else named  # that lack it are told by the key
                 refused = damage.refused and file != door.renewed and damage.name not in door.meant
+                prepare = partial(_damage, damage.edit, file)
                 yield Trial(door, damage.kind, f"{file}: {damage.name}", command, words, refused, prepare)
+
+
+def _damage(edit: Edit, file: str, folder: Path) -> None:
+    edit(folder / file)
 
 
 def name_trials(door: Door) -> Iterator[Trial]:
@@ -81,12 +84,13 @@ def name_trials(door: Door) -> Iterator[Trial]:
         good = given(files[0])
         for name in NAMES:
             odd = name + Path(good).suffix
+            command = door.command(key.replace("{}", odd))
+            yield Trial(door, "odd names", f"{key}: {name!r}", command, prepare=partial(_rename, good, odd))
 
-            def prepare(folder: Path, good: str = good, odd: str = odd) -> None:
-                if len(odd) < 256:
-                    os.rename(folder / good, folder / odd)
 
-            yield Trial(door, "odd names", f"{key}: {name!r}", door.command(key.replace("{}", odd)), prepare=prepare)
+def _rename(good: str, odd: str, folder: Path) -> None:
+    if len(odd) < 256:  # which file systems take
+        os.rename(folder / good, folder / odd)
 
 
 def setting_trials(door: Door) -> Iterator[Trial]:
