@@ -109,8 +109,10 @@ def pickled_code(path: Path) -> None:
     torch.save(Code(), path)
 
 
-def safetensors(header: str) -> Edit:
-    return content(struct.pack("<Q", len(header)) + header.encode())
+def safetensors(**header: object) -> Edit:
+    """A file that ends after the header."""
+    text = json.dumps(header).encode()
+    return content(struct.pack("<Q", len(text)) + text)
 
 
 def array(values: np.ndarray) -> Edit:

@@ -30,9 +30,7 @@ GREY = np.full((4, 8, 3), 0.5, dtype=np.float32)
 BOMB = "a: &a [1, 1, 1]\n" + "".join(
     f"{next_}: &{next_} [{', '.join(9 * [f'*{name}'])}]\n" for name, next_ in zip("abcdefgh", "bcdefghi", strict=True)
 )
-DEEP = (
-    '{"__metadata__":{"architecture":"{\\"depth\\":1000000000,\\"width\\":1,\\"dropout\\":0,\\"classes\\":[\\"a\\"]}"}}'
-)
+DEEP = {"depth": 10**9, "width": 1, "dropout": 0, "classes": ["a"]}
 
 
 def _rows(value: object) -> str:
@@ -146,10 +144,10 @@ REFUSED: dict[str, dict[str, Edit]] = {
     },
     ".safetensors": {
         "a header of 10¹²": content((10**12).to_bytes(8, "little")),
-        "10 TB": safetensors('{"a":{"dtype":"F32","shape":[10000000000000],"data_offsets":[0,40000000000000]}}'),
-        "no description": safetensors("{}"),
-        "a list for a description": safetensors('{"__metadata__":{"architecture":"[]"}}'),
-        "depth 10⁹": safetensors(DEEP),
+        "10 TB": safetensors(a={"dtype": "F32", "shape": [10**13], "data_offsets": [0, 4 * 10**13]}),
+        "no description": safetensors(),
+        "a list for a description": safetensors(__metadata__={"architecture": "[]"}),
+        "depth 10⁹": safetensors(__metadata__={"architecture": json.dumps(DEEP)}),
     },
     "config.yaml": {
         "a bomb": content(BOMB),
