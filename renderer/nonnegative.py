@@ -41,7 +41,7 @@ def _programmes(lights: Tensor, within: Ball | None) -> "Sequence[_Programme]":
     """One of each light, if a sphere holds its channels together, and else one of each channel."""
     wanted = _by_channel(lights)
     if within is None:
-        return [_Programme(light, np.full_like(light, -np.inf), np.full_like(light, np.inf)) for light in wanted]
+        return [_Programme(light) for light in wanted]
     if within.norm == "linf":
         return [_Programme(*each) for each in zip(wanted, *map(_by_channel, within.ends), strict=True)]
     shape = len(lights), lights.shape[2], lights.shape[1]
@@ -57,9 +57,9 @@ def _by_channel(lights: Tensor) -> Array:
 class _Programme:
     """The lights (C, K) nearest to those wanted, between ends, and non-negative in the directions that are held."""
 
-    def __init__(self, wanted: Array, low: Array, high: Array):
-        self.wanted, self.low, self.high = wanted, low, high
-        self.nearest = wanted.clip(low, high)
+    def __init__(self, wanted: Array, low: Array | float = -np.inf, high: Array | float = np.inf):
+        self.wanted, self.nearest = wanted, wanted.clip(low, high)
+        self.low, self.high = np.broadcast_to(low, wanted.shape), np.broadcast_to(high, wanted.shape)
         self._held = [wanted[:0]] * len(wanted)  # harmonics (M, K) in the directions, of each light
 
     def hold(self, rows: Sequence[Array]) -> None:
@@ -84,7 +84,7 @@ class _InSphere(_Programme):
     """
 
     def __init__(self, wanted: Array, centre: Array, radius: float):
-        super().__init__(wanted, np.full_like(wanted, -np.inf), np.full_like(wanted, np.inf))
+        super().__init__(wanted)
         self._centre, self._radius, self._offset = centre, radius, wanted - centre
         self._least = self._share = min(radius / max(float(np.linalg.norm(self._offset)), _TINY), 1.0)
         self.nearest = self._place()
