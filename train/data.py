@@ -89,8 +89,10 @@ def load_cifar100(path: str) -> DataSet:
             f"data.path={path}: CIFAR-100 is not there and cannot be downloaded ({error}); "
             "fetch it on a machine with a network, or use data=npz"
         ) from error
-    images = (torch.from_numpy(part.data).permute(0, 3, 1, 2).contiguous() for part in (train, test))
-    splits = [Split(each, torch.tensor(part.targets)) for each, part in zip(images, (train, test), strict=True)]
+    splits = [
+        Split(torch.from_numpy(part.data).permute(0, 3, 1, 2).contiguous(), torch.tensor(part.targets))
+        for part in (train, test)
+    ]
     return DataSet(tuple(train.classes), *splits)
 
 

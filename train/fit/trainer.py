@@ -73,10 +73,10 @@ class Trainer:
         InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked for it.
         """
         mixed = with_room(train, len(self.service))
-        share, every = self.settings.images_per_epoch, self.service.settings.every
+        shown, every = self.settings.images_per_epoch, self.service.settings.every
         with Interruption() as interruption:
             while self.epoch < self.settings.epochs:
-                rounds = rounds_of_epoch(len(train), len(self.service), self.seed, self.epoch, share, every)
+                rounds = rounds_of_epoch(len(train), len(self.service), self.seed, self.epoch, shown, every)
                 if self._under_way is None:
                     self.learner.begin_epoch()
                     self._under_way = EpochUnderWay.begun(self._regenerate(rounds[0], log))

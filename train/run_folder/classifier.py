@@ -89,6 +89,9 @@ def load_run(
     path, state = load_selected(Path(run))
     shape = dict(state["architecture"])
     stored_size = _pop_size(shape, path)
+    if size and stored_size and size != stored_size:
+        raise InputError(f"size={size}: {path} was trained on images of {stored_size} pixels per side; leave size out")
+    size = stored_size or size or SIZE
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         raise InputError(
@@ -99,13 +102,11 @@ def load_run(
         classes = tuple(map(str, shape.pop("classes")))
         if not classes:
             raise ValueError("it has no classes")
-        network = build_network(classes, stored_size or size or SIZE, **shape)
+        network = build_network(classes, size, **shape)
     except (TypeError, ValueError, KeyError, AttributeError, RuntimeError) as error:
         raise InputError(f"checkpoint {path} is from another architecture than can be built: {error}") from error
-    if size and stored_size and size != stored_size:
-        raise InputError(f"size={size}: {path} was trained on images of {stored_size} pixels per side; leave size out")
     load_weights(network, state["model"], path)
-    return Classifier(network, stored_size or size or SIZE, classes, f"run:{run}")
+    return Classifier(network, size, classes, f"run:{run}")
 
 
 def _pop_size(shape: dict[str, Any], path: Path) -> int | None:
