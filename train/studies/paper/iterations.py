@@ -91,25 +91,15 @@ def classifier_pass(model: nn.Module, images: Tensor, labels: Tensor, batch_size
 
 
 def milliseconds(
-    attack: Callable[[Stopwatch], None],
-    model: nn.Module,
-    images: Tensor,
-    labels: Tensor,
-    batch_size: int,
-    passes: int,
-    turns: int,
+    attack: Callable[[Stopwatch], None], alone: Callable[[], None], passes: int, turns: int
 ) -> list[tuple[float, ...]]:
-    """Bare, whole and inside of an `Iteration`. attack: of so many passes, given a stopwatch; the first rehearses."""
-
-    def passes_alone() -> None:
-        for _ in range(passes):
-            classifier_pass(model, images, labels, batch_size)
-
+    """Bare, whole and inside of an `Iteration`. attack: of so many passes, given a stopwatch. alone: one of them. The
+    first turn rehearses."""
     rows = []
     for _ in range(turns + 1):
         watch = Stopwatch()
         whole = seconds(partial(attack, watch))
-        bare = seconds(passes_alone)
+        bare = sum(seconds(alone) for _ in range(passes))
         rows.append([1000 * value / passes for value in (bare, whole, watch.seconds)])
     return [tuple(column) for column in zip(*rows[1:], strict=True)]
 
@@ -119,19 +109,19 @@ def stubborn(
 ) -> Iteration:
     """An attack that never succeeds, since its targets are the least likely classes."""
     views = ring(setup.views, field)
-    cameras, greys = zip(*product(views, setup.backgrounds), strict=True)
-    before, count = [[camera] for camera in cameras], len(cameras)
-    scene = scene_of(setup.subject, classifier, light, before, torch.tensor(greys), setup.samples, setup.normals)
+    cameras, greys = zip(*product(([view] for view in views), setup.backgrounds), strict=True)
+    scene = scene_of(setup.subject, classifier, light, cameras, torch.tensor(greys), setup.samples, setup.normals)
     problem = ATTACKS[kind].problem(scene)
     images = problem.images(problem.start)[:, 0]
-    label = torch.full((count, 1), classifier.label(setup.subject.label))
+    label = torch.full((len(scene), 1), classifier.label(setup.subject.label))
     least_likely = torch.cat([classifier(part).argmin(1, keepdim=True) for part in images.split(BATCH)])
     descent = DescentSettings(passes - 1, shorten=kind == "geometry", batch_size=BATCH)
+    alone = partial(classifier_pass, classifier, images, label[:, 0], BATCH)
 
     def attack(watch: Stopwatch) -> None:
         descend(classifier, problem, Goal(label, least_likely), descent, watch)
 
-    found = milliseconds(attack, classifier, images, label[:, 0], BATCH, passes, turns)
+    found = milliseconds(attack, alone, passes, turns)
     return Iteration(setup.name, kind, covered(scene), *found)
 
 
@@ -153,7 +143,8 @@ def training_step(study: Study, passes: int, turns: int) -> Iteration:
 
     everything = torch.arange(len(scene))
     images = scene.render(scene.conditions(everything), everything)[:, 0]
-    found = milliseconds(regenerate, classifier, images, labels, len(scene), passes, turns)
+    alone = partial(classifier_pass, classifier, images, labels, len(scene))
+    found = milliseconds(regenerate, alone, passes, turns)
     return Iteration(TRAINING, "lighting", len(scene.stacks[0].pixels), *found)
 
 
