@@ -20,9 +20,8 @@ class Checks:
     """Shares of the examples, in [0, 1], and mean costs.
 
     cost_fell: of those that were not fooled to begin with. success, random_search and success_by_steps: of those that
-    were recognised before. random_search: fooled by any of as many draws as the attack
-    had passes, each as far from the start as the attack may go or went. success_by_steps: fooled within the steps, ×3
-    and ×10.
+    were recognised before. random_search: fooled by any of as many draws as the attack had passes, each as far from the
+    start as the attack may go or went. success_by_steps: fooled within the steps, ×3 and ×10.
     """
 
     cost_before: float
@@ -46,12 +45,11 @@ class Checks:
 
 def check(attacked: Attacked) -> Checks:
     """Search at random and descend for ten times as long, beside an attack that is done."""
-    result, tries = attacked.result, attacked.settings.max_steps
+    result, draws = attacked.result, generator(attacked.seed, "random search")
     open_cases = ~result.fooled_before
     fell = (result.cost < result.cost_before) | result.fooled
-    draws = generator(attacked.seed, "random search")
     draw = partial(attacked.problem.sample_as_far, result.values, draws)
-    random = fooled_by_draws(attacked, result.fooled_before, tries, draw)
+    random = fooled_by_draws(attacked, result.fooled_before, draw)
     return Checks(
         cost_before=float(result.cost_before.mean()),
         cost=float(result.cost.mean()),
@@ -63,10 +61,10 @@ def check(attacked: Attacked) -> Checks:
     )
 
 
-def fooled_by_draws(attacked: Attacked, fooled: Tensor, tries: int, draw: Callable[[], Tensor]) -> Tensor:
-    """(E,) bool: whether `fooled` (E,) says so, or any of so many draws (E, D) fools."""
+def fooled_by_draws(attacked: Attacked, fooled: Tensor, draw: Callable[[], Tensor]) -> Tensor:
+    """(E,) bool: whether `fooled` (E,) says so, or any of as many draws (E, D) as the attack had steps fools."""
     fooled = fooled.clone()
-    for _ in range(tries):
+    for _ in range(attacked.settings.max_steps):
         left = torch.nonzero(~fooled).squeeze(1)
         if not len(left):
             break

@@ -52,7 +52,7 @@ def sweep(attacked: Attacked, scales: Sequence[float]) -> Sweep:
             part, phases = Part(balls, left, values[left]), Phases(values.device)
             result = descend_in_parts(seen, part, goal.of(left), settings, phases, (), problem.scene.at_once)
             values[left], fooled[left] = result.values, result.fooled
-        random = fooled_by_draws(attacked, random, settings.max_steps, partial(balls.sample, draws))
+        random = fooled_by_draws(attacked, random, partial(balls.sample, draws))
         found.append((fooled[attacked.recognised].cpu(), random[attacked.recognised].cpu()))
     return Sweep(radii, *map(torch.stack, zip(*found, strict=True)))
 
