@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from train.networks import PYTHON, model_title
-from train.photographs.figures import FIGURES, figure_title
+from train.photographs.figures import figure_title
 from train.photographs.text import format_interval
 from train.report.summary import RunSummary, complete, summarise
 from train.report.tables import aligned
@@ -62,7 +62,7 @@ def _card(run: RunSummary, name: str) -> str:
         *(
             (f"{folder}: {figure_title(name, config.label)}", format_interval(figure))
             for folder in run.photographs
-            for name, figure in zip(FIGURES, run.figures(folder), strict=True)
+            for name, figure in run.figures(folder).items()
         ),
         ("versions", ", ".join(f"{name} {version}" for name, version in config.versions.items())),
     ]

@@ -35,7 +35,7 @@ def run_tables(header: Sequence[str], names: Names, runs: Sequence[RunSummary]) 
     rows = [[*name, f"{run.accuracy:.3f}", f"{run.epoch_seconds:.1f}"] for name, run in named]
     yield Table("", [*header, "test accuracy", "seconds per epoch"], rows)
     for folder in _folders(runs):
-        rows = [[*name, *map(format_interval, run.figures(folder))] for name, run in named]
+        rows = [[*name, *map(format_interval, run.figures(folder).values())] for name, run in named]
         yield Table(folder, [*header, *_titles(runs)], rows)
 
 
@@ -67,7 +67,7 @@ def _titles(runs: Sequence[RunSummary]) -> list[str]:
 
 
 def _spreads(group: Sequence[RunSummary], folder: str) -> Iterator[str]:
-    for figures in zip(*(run.figures(folder) for run in group), strict=True):
+    for figures in zip(*(run.figures(folder).values() for run in group), strict=True):
         yield _spread([figure.get("value") for figure in figures])
 
 

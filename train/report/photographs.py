@@ -36,9 +36,7 @@ def most_scored(arms: Arms) -> str:
 
 def scores_of(runs: Arms, name: str, figure: str) -> dict[str, Score]:
     """A figure on the images `name`, of the arms that have it."""
-    found = {
-        arm: score(find_figure(run.photographs.get(name, {}), figure) for run in group) for arm, group in runs.items()
-    }
+    found = {arm: score(run.figures(name)[figure] for run in group) for arm, group in runs.items()}
     return {arm: each for arm, each in found.items() if each}
 
 

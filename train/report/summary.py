@@ -51,9 +51,9 @@ class RunSummary:
     def settings(self) -> dict[str, object]:
         return decisive_settings(self.config)
 
-    def figures(self, name: str) -> list[dict[str, Any]]:
-        """FIGURES on the photographs `name`; empty ones where it was not scored on them."""
-        return [find_figure(self.photographs.get(name, {}), figure) for figure in FIGURES]
+    def figures(self, name: str) -> dict[str, dict[str, Any]]:
+        """Each of FIGURES on the photographs `name`; empty where it was not scored on them."""
+        return {figure: find_figure(self.photographs.get(name, {}), figure) for figure in FIGURES}
 
 
 def is_finished(folder: Path) -> bool:
@@ -94,7 +94,7 @@ def _require_shown(run: RunSummary) -> None:
         raise ValueError(f"test/accuracy is {run.accuracy}")
     _ = run.settings, f"{run.epoch_seconds:.1f}"
     for name in run.photographs:
-        [format_interval(figure) for figure in run.figures(name)]
+        [format_interval(figure) for figure in run.figures(name).values()]
 
 
 @contextmanager
