@@ -58,7 +58,7 @@ def find(folders: Sequence[Path]) -> Found:
     if not paths:
         raise InputError(f"runs: {', '.join(map(str, folders))} holds no run and no attack: give other folders")
     if len(damaged) == len(paths):
-        raise InputError(f"runs: no run and no attack there can be read, first of all: {damaged[0]}")
+        raise InputError(f"runs: nothing there can be read: {damaged[0]}")
     found.runs.sort(key=lambda run: ARMS.index(run.arm) if run.arm in ARMS else len(ARMS))
     return found
 
