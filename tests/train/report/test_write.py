@@ -133,9 +133,7 @@ def test_where_nothing_can_be_read_one_sentence_says_why(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "metrics.jsonl").write_bytes(b"\xff{\n")
-    with pytest.raises(
-        InputError, match=rf"^runs: nothing there can be read: {tmp_path}/a/metrics.jsonl"
-    ):
+    with pytest.raises(InputError, match=rf"^runs: nothing there can be read: {tmp_path}/a/metrics.jsonl"):
         write_report([tmp_path], tmp_path)
     (tmp_path / "b" / "metrics.jsonl").write_text("")
     assert "/a</td><td" in write_report([tmp_path], tmp_path).read_text()
