@@ -1,4 +1,4 @@
-"""Interrupt training runs in many ways and show that they end as if nothing had happened; docs/interruptions.md"""
+"""Interrupt training runs in many ways, and compare their ends: python scripts/check_interruptions.py"""
 
 from train.command_line.entry_points import script
 from train.studies.interruptions.study import InterruptionSettings, run
