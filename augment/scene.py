@@ -115,6 +115,9 @@ class Scene:
             raise InputError(f"backgrounds of {behind.dtype} {tuple(behind.shape)}: give images (B, 3, {size}, {size})")
         if not (behind.min() >= 0 and behind.max() <= 1):
             raise InputError("scene.backgrounds: give values in [0, 1]")
+        for name, given in (("object", self.objects), ("background", behind)):
+            if not all(0 <= getattr(example, name) < len(given) for example in self.examples):
+                raise InputError(f"examples name a {name} that is not among the {len(given)} of {name}s")
 
     def _relit_views(self) -> Relighting:
         # without the scene, which each epoch replaces, tied to itself

@@ -30,6 +30,14 @@ def per_degree(function: Callable[..., Constant]) -> Callable[..., Constant]:
     return cache(torch.inference_mode(False)(function))
 
 
+def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
+    """The degree of a light's coefficients. InputError: no degree has that many."""
+    degree = math.isqrt(len(light)) - 1 if light.ndim == 2 else -1
+    if degree < 0 or light.shape != ((degree + 1) ** 2, 3):
+        raise InputError(f"light has shape {tuple(light.shape)}: give ((degree + 1)², 3) coefficients")
+    return degree
+
+
 def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch coefficients"]:
     """Real spherical harmonics of directions. Differentiable, by `basis_gradient`.
 

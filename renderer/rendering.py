@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -17,6 +16,7 @@ from renderer.basis import Harmonics
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
+from renderer.harmonics import degree_of
 from renderer.image import ImageSettings, as_background, compose
 from renderer.mesh import Mesh
 from renderer.shading import radiance
@@ -70,7 +70,7 @@ def render(
     backgrounds = as_background(background, size, light).expand(len(views), -1, -1, -1)
     smooth_faces = torch.from_numpy(mesh.faces).to(light.device) if normals == "smooth" else None
     moved = replace(mesh, vertices=positions)
-    indirect = build_transport(moved, settings, gain, Harmonics(math.isqrt(len(light)) - 1))
+    indirect = build_transport(moved, settings, gain, Harmonics(degree_of(light)))
     images = []
     for view, behind in zip(views, backgrounds, strict=True):
         seen = view.to(light.device)

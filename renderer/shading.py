@@ -15,10 +15,11 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import InputError, require_bounded, require_finite
+from renderer.errors import require_bounded, require_finite
 from renderer.fragments import Fragments
 from renderer.harmonics import (
     bands,
+    degree_of,
     homogeneous_gradients,
     lambertian_factors,
     live_coefficients,
@@ -82,8 +83,7 @@ def irradiance(normals: Float[Tensor, "N 3"], light: Float[Tensor, "coefficients
 def _irradiance(normals: Tensor, light: Tensor, dtype: torch.dtype) -> Tensor:
     """`irradiance` of finite normals (3, N), which become unit vectors in their own dtype, computed in another."""
     require_bounded(light=light)
-    if light.ndim != 2 or light.shape[1] != 3 or math.isqrt(len(light)) ** 2 != len(light) or not len(light):
-        raise InputError(f"light has shape {tuple(light.shape)}: give ((degree + 1)², 3) coefficients")
+    degree_of(light)
     return _Irradiance.apply(normals, light.to(dtype))
 
 
