@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,9 +13,10 @@ from augment.objects import SceneObject
 from augment.seeding import generator
 from train.report.tables import markdown
 from train.run_folder.classifier import load_classifier
+from train.studies.figures import panels_beside, save
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
-from train.studies.paper.shares import percent
+from train.studies.paper.shares import draw_shares, percent
 from train.studies.paper.subjects import answers, finer, greys_of, recognised_parts, scene_of
 
 TITLE = "Transfer to unseen networks"
@@ -35,6 +38,12 @@ COLUMNS = {
     "further": f"adversary {FURTHER} steps on",
     "further_random": "random change as large",
 }
+STYLES: dict[str, dict[str, Any]] = {
+    "first": {"color": "#4269d0", "fmt": "o"},
+    "first_random": {"color": "#4269d0", "fmt": "o", "markerfacecolor": "white"},
+    "further": {"color": "#c2410c", "fmt": "s"},
+    "further_random": {"color": "#c2410c", "fmt": "s", "markerfacecolor": "white"},
+}
 
 
 def measure(study: Study, settings: Settings) -> Section:
@@ -44,13 +53,14 @@ def measure(study: Study, settings: Settings) -> Section:
     for subject in study.subjects:
         draws = generator(study.seed, subject.name, "transfer")
         records += transfer(finer(subject), seen_by, settings.examples, study.light, draws)
+    names = [network.name for network in seen_by]
     values = {
-        "table": results(records, [network.name for network in seen_by], study.label),
+        "table": results(records, names, study.label),
         "further": FURTHER,
         "steps": STEPS,
         "examples": settings.examples * len(study.subjects),
     }
-    return Section(values, records)
+    return Section(values, records, {"transfer.png": partial(draw, records, names, study.label)})
 
 
 def networks(source: Classifier, settings: Settings) -> list[Classifier]:
@@ -104,3 +114,20 @@ def results(records: Sequence[Mapping[str, Any]], names: Sequence[str], label: s
             cells = [percent(outcomes(here, name, state, names[0], label)) for state in COLUMNS]
             rows.append([kind, f"{name}, attacked" if name == names[0] else name, *cells])
     return markdown(["attack", "network", *COLUMNS.values()], rows)
+
+
+def draw(records: Sequence[Mapping[str, Any]], names: Sequence[str], label: str, path: Path) -> None:
+    """A panel per kind of attack, the networks side by side, adversaries filled and random changes hollow."""
+    figure, panels = panels_beside(len(ATTACKS), (4.2, 3.6), layout="constrained")
+    for panel, kind in zip(panels, ATTACKS, strict=True):
+        here = [record for record in records if record["kind"] == kind]
+        for index, (state, title) in enumerate(COLUMNS.items()):
+            found = [outcomes(here, name, state, names[0], label) for name in names]
+            places = [place + 0.12 * (index - 1.5) for place in range(len(names))]
+            draw_shares(panel, places, found, label=title, **STYLES[state])
+        ticks = [name.removeprefix("run:").replace("_", "\n").replace("/", "/\n") for name in names]
+        panel.set_xticks(range(len(names)), ticks, fontsize=7)
+        panel.set(title=kind, ylim=(-2, 102))
+    panels[0].set_ylabel("fooled, % of recognised")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    save(figure, path)

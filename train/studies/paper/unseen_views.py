@@ -3,7 +3,9 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from functools import partial
+from itertools import chain, pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,9 +18,10 @@ from augment.scene import Scene
 from augment.seeding import generator, stream_seed
 from renderer.camera import Camera
 from train.report.tables import markdown
+from train.studies.figures import panels_beside, save
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
-from train.studies.paper.shares import percent
+from train.studies.paper.shares import draw_shares, percent
 from train.studies.paper.subjects import answers, finer, recognised_parts, recognised_scene
 
 TITLE = "Unseen views"
@@ -40,6 +43,7 @@ STATES = {
 }
 PAPER = {"lighting": {1: 29.4, 5: 64.2}, "geometry": {1: 0.6, 5: 3.6}}
 FAR = 90  # degrees
+BINS = (0, 15, 30, 60, FAR, 180)
 
 
 def measure(study: Study, settings: Settings) -> Section:
@@ -58,7 +62,7 @@ def measure(study: Study, settings: Settings) -> Section:
         "further": FURTHER,
         "steps": STEPS,
     }
-    return Section(values, records)
+    return Section(values, records, {"unseen_views.png": partial(draw, records, study.label)})
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,7 @@ def unseen(
     subject: SceneObject, classifier: Classifier, index: int, count: int, light: str, seed: int
 ) -> Iterator[dict[str, Any]]:
     """A record per attack on one set of views of a subject: what unseen views are called under all that it found, and
-    their degrees from the one attacked view."""
+    their degrees from the nearest attacked view."""
     draws = generator(seed, subject.name, "unseen views", index)
     attacked = {
         views: recognised_scene(subject, classifier, light, views, stream_seed(seed, "attacked", views, index))
@@ -108,8 +112,9 @@ def unseen(
         for views, scene in attacked.items()
     }
     scenes = list(recognised_parts(subject, classifier, light, count, draws))
-    angles = [degrees_apart(views[0], attacked[1].cameras[0][0]) for scene in scenes for views in scene.cameras]
     for (kind, views), by_state in found.items():
+        near = [cameras[0] for cameras in attacked[views].cameras]
+        angles = [min(degrees_apart(seen[0], each) for each in near) for scene in scenes for seen in scene.cameras]
         problems = [ATTACKS[kind].problem(scene) for scene in scenes]
         said = {
             state: [
@@ -143,16 +148,37 @@ def cell(sets: Sequence[Sequence[str]], label: str) -> str:
     return f"{percent(list(chain(*fooled)))}; {min(shares):.0f} to {max(shares):.0f} %"
 
 
+def by_angle(
+    records: Sequence[Mapping[str, Any]], kind: str, views: int, low: float, high: float, label: str
+) -> list[bool]:
+    """Whether the strongest adversaries fool each unseen view at low to high degrees from the nearest attacked one."""
+    return [
+        answer != label
+        for record in records
+        if (record["kind"], record["attacked"]) == (kind, views)
+        for angle, answer in zip(record["angle"], record["answers"]["further"], strict=True)
+        if low < angle <= high or angle == low == 0
+    ]
+
+
 def far(records: Sequence[Mapping[str, Any]], label: str) -> str:
     """How the strongest adversaries of one view do near it and behind it."""
     parts = []
     for kind in ATTACKS:
-        seen = [
-            (angle <= FAR, answer != label)
-            for record in records
-            if (record["kind"], record["attacked"]) == (kind, 1)
-            for angle, answer in zip(record["angle"], record["answers"]["further"], strict=True)
-        ]
-        near, beyond = (percent([fooled for inside, fooled in seen if inside == side]) for side in (True, False))
+        near, beyond = (percent(by_angle(records, kind, 1, low, low + FAR, label)) for low in (0, FAR))
         parts.append(f"{near} within {FAR}° of the one attacked view and {beyond} beyond ({kind})")
     return "; ".join(parts)
+
+
+def draw(records: Sequence[Mapping[str, Any]], label: str, path: Path) -> None:
+    """A panel per kind of attack: success by angle, a line per number of attacked views."""
+    figure, panels = panels_beside(len(ATTACKS), (4.2, 3.2))
+    for panel, kind in zip(panels, ATTACKS, strict=True):
+        for views, color in zip(ATTACKED, ("#4269d0", "#ef7a34"), strict=True):
+            found = [by_angle(records, kind, views, low, high, label) for low, high in pairwise(BINS)]
+            places = [(low + high) / 2 for low, high in pairwise(BINS)]
+            draw_shares(panel, places, found, marker="o", color=color, label=f"{views} attacked")
+        panel.set(title=kind, xlabel="degrees to the nearest attacked view", xlim=(0, 180))
+    panels[0].set(ylabel="unseen views fooled, %", ylim=(-2, 102))
+    panels[-1].legend(frameon=False)
+    save(figure, path)
