@@ -2,6 +2,7 @@ import json
 import math
 from dataclasses import replace
 
+import PIL.Image
 import pytest
 import torch
 import trimesh
@@ -195,7 +196,7 @@ def test_each_unseen_view_has_an_answer_for_each_attack(short):
         ("unseen_views", ["section.sets=1", "section.views=2"], 4),
     ],
 )
-def test_a_section_has_data_and_text_without_folders(section, settings, lines, short, tmp_path, monkeypatch, reproduce):
+def test_a_section_has_data_figure_and_text_alone(section, settings, lines, short, tmp_path, monkeypatch, reproduce):
     monkeypatch.setattr(subjects, "VERTICES", 0)
     monkeypatch.setattr(transfer, "load_classifier", lambda name: by_brightness(name=name))
     export_mesh(SUBJECT.mesh, tmp_path / "ball.glb")
@@ -205,5 +206,7 @@ def test_a_section_has_data_and_text_without_folders(section, settings, lines, s
     data = (tmp_path / "paper" / f"{section}.jsonl").read_text()
     command = f"python scripts/reproduce_paper.py section={section} 'scene.meshes=[{{mesh:ball.glb,gain:1.5}}]'"
     assert command in page and str(tmp_path) not in page + data
+    with PIL.Image.open(tmp_path / "paper" / f"{section}.png") as figure:
+        assert figure.width > 400 and f"(paper/{section}.png)" in page
     assert len([json.loads(line) for line in data.splitlines()]) == lines
     assert "{" not in page.replace(command, "") and "nan" not in page.split("```")[0].lower().split()
