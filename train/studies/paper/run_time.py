@@ -68,7 +68,7 @@ def measure(study: Study, settings: Settings) -> Section:
     largest = by_pixels[:: len(FIELDS)]
     single = measured(plain, FIELDS[:1], settings.passes)
     at_once = [each for setup in (plain, textured) for each in measured(many(setup), FIELDS[:1], MANY_PASSES)]
-    training = training_step(study, settings.passes, settings.turns // 2)
+    training = training_step(study, settings.passes, max(1, settings.turns // 2))
     done = [each for subject in study.subjects for each in attacks(subject, study, settings)]
     values = {
         "mesh": first.name,
