@@ -18,7 +18,7 @@ from train.report.tables import markdown
 from train.studies.figures import panels_beside, pyplot, save
 from train.studies.paper.balls import LEVELS, SPACES, Outcome, attack_ball, joined, parts
 from train.studies.paper.section import Section, SectionSettings, Study
-from train.studies.paper.shares import interval
+from train.studies.paper.shares import draw_shares, interval
 from train.studies.paper.subjects import finer, recognised_scene
 
 TITLE = "Adversarial against random perturbations"
@@ -97,9 +97,7 @@ def draw_success(pooled: Sequence[Mapping[str, Any]], labels: Sequence[str], pat
         here = [each for each in pooled if each["space"] == name]
         for index, (method, label) in enumerate(zip(METHODS, labels, strict=True)):
             radii = [radius * 1.06 ** (index - 1) for radius in space.radii]  # beside each other
-            value, low, high = (np.array([each[method][key] for each in here]) for key in ("value", "low", "high"))
-            error = np.maximum([value - low, high - value], 0)  # below 0 by rounding alone
-            panel.errorbar(radii, value, error, label=label, capsize=3, **STYLES[method])
+            draw_shares(panel, radii, [each[method] for each in here], 1, label=label, capsize=3, **STYLES[method])
         for radius in space.paper:
             panel.axvline(radius, color="#bbbbbb", linestyle=(0, (4, 4)), linewidth=1, zorder=0)
         panel.set(xscale="log", title=space.title, xlabel=f"L∞ radius {space.axis}", ylim=(-0.03, 1.03))

@@ -16,7 +16,7 @@ from train.run_folder.classifier import load_classifier
 from train.studies.figures import panels_beside, save
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
-from train.studies.paper.shares import draw_shares, percent
+from train.studies.paper.shares import draw_shares, percent, share_of
 from train.studies.paper.subjects import answers, finer, greys_of, recognised_parts, scene_of
 
 TITLE = "Transfer to unseen networks"
@@ -122,9 +122,9 @@ def draw(records: Sequence[Mapping[str, Any]], names: Sequence[str], label: str,
     for panel, kind in zip(panels, ATTACKS, strict=True):
         here = [record for record in records if record["kind"] == kind]
         for index, (state, title) in enumerate(COLUMNS.items()):
-            found = [outcomes(here, name, state, names[0], label) for name in names]
+            shares = [share_of(outcomes(here, name, state, names[0], label)) for name in names]
             places = [place + 0.12 * (index - 1.5) for place in range(len(names))]
-            draw_shares(panel, places, found, label=title, **STYLES[state])
+            draw_shares(panel, places, shares, 100, label=title, capsize=2, **STYLES[state])
         ticks = [name.removeprefix("run:").replace("_", "\n").replace("/", "/\n") for name in names]
         panel.set_xticks(range(len(names)), ticks, fontsize=7)
         panel.set(title=kind, ylim=(-2, 102))

@@ -21,7 +21,7 @@ from train.report.tables import markdown
 from train.studies.figures import panels_beside, save
 from train.studies.paper.adversaries import ATTACKS, FURTHER, STEPS, with_random_signs
 from train.studies.paper.section import Section, SectionSettings, Study
-from train.studies.paper.shares import draw_shares, percent
+from train.studies.paper.shares import draw_shares, percent, share_of
 from train.studies.paper.subjects import answers, finer, recognised_parts, recognised_scene
 
 TITLE = "Unseen views"
@@ -175,9 +175,9 @@ def draw(records: Sequence[Mapping[str, Any]], label: str, path: Path) -> None:
     figure, panels = panels_beside(len(ATTACKS), (4.2, 3.2))
     for panel, kind in zip(panels, ATTACKS, strict=True):
         for views, color in zip(ATTACKED, ("#4269d0", "#ef7a34"), strict=True):
-            found = [by_angle(records, kind, views, low, high, label) for low, high in pairwise(BINS)]
+            shares = [share_of(by_angle(records, kind, views, low, high, label)) for low, high in pairwise(BINS)]
             places = [(low + high) / 2 for low, high in pairwise(BINS)]
-            draw_shares(panel, places, found, marker="o", color=color, label=f"{views} attacked")
+            draw_shares(panel, places, shares, 100, marker="o", color=color, label=f"{views} attacked", capsize=2)
         panel.set(title=kind, xlabel="degrees to the nearest attacked view", xlim=(0, 180))
     panels[0].set(ylabel="unseen views fooled, %", ylim=(-2, 102))
     panels[-1].legend(frameon=False)
