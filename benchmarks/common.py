@@ -1,0 +1,81 @@
+"""What the benchmarks share: timing in turns, errors, and result files.
+
+Run a benchmark as a module from the repository's root: python -m benchmarks.renderer
+"""
+
+import csv
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch.utils.benchmark import Timer
+
+Key = TypeVar("Key")
+BURST = 2e-3  # seconds: a shorter call is repeated for as long, since one call alone is within the clock's noise
+LIMIT = 20.0  # seconds of wall time, after which a comparison stops at the end of its third round
+
+
+def medians(calls: Mapping[Key, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[Key, float]:
+    """Median milliseconds of each call, on one thread.
+
+    All calls take turns in every round, so that noise hits all alike. On a CPU the clock is the process's own time,
+    which leaves out other processes on a shared machine; elsewhere it is wall time after synchronization.
+    """
+    clock = {"timer": time.process_time} if device == "cpu" else {}
+    timers = {key: Timer("call()", globals={"call": call}, **clock) for key, call in calls.items()}
+    repeats = {key: max(1, round(BURST / timer.timeit(1).median)) for key, timer in timers.items()}
+    times: dict[Key, list[float]] = {key: [] for key in calls}
+    start = time.perf_counter()
+    for past in range(rounds):
+        if past >= 3 and time.perf_counter() - start > LIMIT:
+            break
+        for key, timer in timers.items():
+            times[key].append(1e3 * timer.timeit(repeats[key]).median)  # warms up first
+    return {key: statistics.median(values) for key, values in times.items()}
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Processor time of one call, over all threads."""
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
+def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:
+    """Root mean square of the difference, over the root mean square of the reference."""
+    value, reference = (tensor.cpu().double() for tensor in (value, reference))
+    return float((value - reference).norm() / reference.norm())
+
+
+def machine(device: str = "cpu") -> str:
+    """One line: GPU, processor, threads, versions, and the load at the start."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
+    processor = next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.machine())
+    gpu = "" if device == "cpu" else f"{torch.cuda.get_device_name(device)}; "
+    versions = f"Python {platform.python_version()}, torch {torch.__version__}, NumPy {np.__version__}"
+    load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores at the start"
+    return f"{gpu}{processor}, {torch.get_num_threads()} thread(s); {versions}; {load}"
+
+
+def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """All rows, floats to four significant digits, nothing for None; the columns are those of all rows, in order."""
+    rows = [{name: f"{v:.4g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def append_json(path: Path, row: Mapping[str, Any]) -> None:
+    """One line of JSON at the end of a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
