@@ -76,7 +76,6 @@ WRONG = [
     (["publish", "run=[a]", "out=out"], "run: "),
     (["fit_skylight", "zenith_degree=many", "out=a.safetensors"], "zenith_degree: "),
     (["fit_skylight", "out=photo.png"], "out=photo.png: name a .safetensors file"),
-    (["check_accuracy", "degree=-1", "out=a.md"], "degree=-1 must be at least"),
     (["attack", f"scene.field_of_view={10**400}"], "scene.field_of_view: int too large to convert to float"),
     (["attack", "target={a: 1}"], "target: give a class, least_likely, or a list of classes, one per view"),
     (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
@@ -104,7 +103,7 @@ def test_a_setting_of_another_type_or_beyond_its_range_is_one_line(call, here, c
 @pytest.mark.parametrize(
     ("command", "out"),
     [(EXPORT, "/proc/none/out"), (EXPORT, "file/out"), (EXPORT, "x" * 300), (EVALUATE, "/dev/full/out"),
-     (["publish", "run=1.10"], "file/out"), (["fit_skylight"], "file/out"), (["check_accuracy"], "file/out"),
+     (["publish", "run=1.10"], "file/out"), (["fit_skylight"], "file/out"),
      (["check_interruptions"], "file/out"), (["benchmark_training"], "file/out"), (["benchmark_renderer"], "file/out"),
      (["reproduce_paper", "section=run_time", "scene.meshes=[a.glb]"], "file/out"), (["lab"], "file/out"),
      (["report", "a"], "x" * 300)],

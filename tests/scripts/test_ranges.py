@@ -11,7 +11,6 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from train.command_line.configuration import as_dict, composed, dotted, read_settings
 from train.laboratory.settings import LabSettings
-from train.studies.accuracy.study import AccuracySettings
 from train.studies.growth.study import GrowthSettings
 from train.studies.interruptions.study import InterruptionSettings
 from train.studies.load.study import LoadSettings
@@ -26,7 +25,6 @@ SETTINGS = {
     "benchmark_lights": CupSettings,
     "benchmark_renderer": RendererSpeedSettings,
     "benchmark_transport": CupSettings,
-    "check_accuracy": AccuracySettings,
     "check_interruptions": InterruptionSettings,
     "check_load": LoadSettings,
     "check_reliability": ReliabilitySettings,

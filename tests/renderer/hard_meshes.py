@@ -1,4 +1,4 @@
-"""Meshes that are hard to shade, each face of one colour, and a rasteriser that shows any face."""
+"""Meshes that are hard to shade, one color per face, and a rasteriser that shows any face."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ class Chart(Backend):
 
 
 def painted(vertices: ArrayLike, faces: Sequence[Sequence[int]] | np.ndarray) -> Mesh:
-    """A colour per face, in multiples of 1/64, which every number type holds exactly."""
+    """One color per face, in multiples of 1/64, which every number type holds exactly."""
     colors = np.random.default_rng(0).integers(16, 65, (len(faces), 1, 3)) / 64
     return replace(Mesh.plain(vertices, faces), corner_colors=colors.repeat(3, axis=1).astype(np.float32))
 

@@ -1,1 +1,0 @@
-"""The largest errors of the renderer, condition by condition."""
