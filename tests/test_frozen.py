@@ -14,19 +14,15 @@ or key is edited there.
 
 import hashlib
 import json
-import logging
 import math
 import os
 import platform
 import re
-import runpy
 import signal
-import sys
-import threading
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 
 import numpy as np
@@ -34,50 +30,22 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment import (
-    AttackSettings,
-    Classifier,
-    CompanionSettings,
-    LampsSettings,
-    LeastLikely,
-    ObjectSettings,
-    ProjectorSettings,
-    SkylightSettings,
-    StepSettings,
-    Targeted,
-    attack,
-    build_scene,
-)
+import augment
+import renderer
 from augment.attacks.observation import TransformationSettings
 from augment.scene import Conditions
-from renderer import (
-    Mesh,
-    OrthographicCamera,
-    PerspectiveCamera,
-    export_mesh,
-    load_light,
-    load_mesh,
-    operators,
-    render,
-    ring,
-    solid,
-    subdivide,
-)
 from renderer.lights import directional
 from renderer.skylight import coefficients as skylight
 
 RECORDS = Path(__file__).with_name("frozen.json")
-RECORDING = "RECORD_FROZEN"
 LIBRARIES = ("torch", "numpy", "scipy", "embreex", "pillow")
 SOFTWARE = {"visibility": "software"}  # the same on every machine; "compiled" has a case of its own
 SIZE = 24
 
-# ------------------------------------------------------------------------------------- renders
-
-ABOVE = OrthographicCamera(math.pi / 3, 0.4, 2.2)
-ASIDE = OrthographicCamera(1.4, 2.5, 2.6, 0.2, -0.1)
-NEAR = PerspectiveCamera(1.1, -0.7, 2.2, distance=4.0)
-RING = ring(3, 2.2, perspective=math.radians(40))
+ABOVE = renderer.OrthographicCamera(math.pi / 3, 0.4, 2.2)
+ASIDE = renderer.OrthographicCamera(1.4, 2.5, 2.6, 0.2, -0.1)
+NEAR = renderer.PerspectiveCamera(1.1, -0.7, 2.2, distance=4.0)
+RING = renderer.ring(3, 2.2, perspective=math.radians(40))
 
 # name: (mesh, cameras, light, keywords of `render`, differentiated arguments)
 RENDERS = {
@@ -89,7 +57,7 @@ RENDERS = {
     "sky": ("mushroom:3", RING, "skylight", {"gain": 0.7, "background": 0.1}, ()),
     "subdivided": ("table:0+2000", ABOVE, "lamp", {"normals": "flat", "samples": 3}, ()),
     "exported": ("bottle:1.glb", ASIDE, "grace", {"encoding": "srgb"}, ()),
-    "textured": ("checkered", NEAR, "grace", {"encoding": "srgb"}, ("light", "albedo")),
+    "textured": ("tent", NEAR, "grace", {"encoding": "srgb"}, ("light", "albedo")),
     "flat_gradients": ("sweet_pepper:0", ABOVE, "grace", {"normals": "flat"}, ("light", "vertices", "albedo")),
     "smooth_gradients": ("peach:0", NEAR, "eucalyptus", {"encoding": "srgb"}, ("light", "vertices", "albedo")),
     "bounces_gradients": ("lamp:0", ABOVE, "uniform", {"transport": "bounces:1"}, ("light", "vertices", "albedo")),
@@ -101,14 +69,12 @@ OPERATORS = {
     "shadows": ("plate:0", NEAR, {"transport": "shadows"}),
     "bounces": ("cup:1", ASIDE, {"transport": "bounces:2"}),
 }
-PROPS = [
-    CompanionSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0),
-    CompanionSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4),
-]
-AMONG_PROPS = ObjectSettings("solid:pear:0", "orange", gain=0.9, beside=PROPS)
-PROJECTOR = ProjectorSettings(pixels=6, polar=50.0, azimuth=20.0, power=2.0, pattern=0.5)
-LAMPS = LampsSettings(places=[[2.0, 1.0, 2.0], [-2.0, 0.5, 1.5]], power=8.0, start=3.0)
-DISCS = LampsSettings(places=[[2.0, 1.0, 2.0], [0.5, -2.0, 2.5]], power=8.0, radius=0.4, start=[[4, 3, 2], [1, 2, 3]])
+CUP = augment.CompanionSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0)
+LEMON = augment.CompanionSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4)
+AMONG_PROPS = augment.ObjectSettings("solid:pear:0", "orange", gain=0.9, beside=[CUP, LEMON])
+PROJECTOR = augment.ProjectorSettings(pixels=6, polar=50.0, azimuth=20.0, power=2.0, pattern=0.5)
+LAMPS = augment.LampsSettings([[2.0, 1.0, 2.0], [-2.0, 0.5, 1.5]], power=8.0, start=3.0)
+DISCS = augment.LampsSettings([[2.0, 1.0, 2.0], [0.5, -2.0, 2.5]], power=8.0, radius=0.4, start=[[4, 3, 2], [1, 2, 3]])
 # name: (meshes, views, keywords of `build_scene`)
 SCENES = {
     "grid": ([("solid:orange:0", "orange"), ("solid:apple:0", "apple")], 2, {"backgrounds": [0.2, 0.8]}),
@@ -118,90 +84,69 @@ SCENES = {
     "all_lights": ([AMONG_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "transport": "shadows"}),
 }
 
-# ------------------------------------------------------------------------------------- attacks
-
 CLASSES = ["orange", "apple", "pear", "bottle"]
 ORANGES = [("solid:orange:0", "orange"), ("solid:orange:1", "orange")]
 SCENE = {"samples": 2, "encoding": "linear", "normals": "flat", **SOFTWARE}
 SETTINGS = {"max_steps": 4, "margin": 0.5, "light": "physical"}
-# name: (steps by what is attacked, keywords of `build_scene`, other keywords of `AttackSettings`, criterion)
+Step, Sky = augment.StepSettings, augment.SkylightSettings
+BOTH = {"lighting": Step(step_size=0.2), "geometry": Step(radius=0.01, step="sign", step_size=0.005)}
+SHAPE, COLOR = {"geometry": Step("linf", 0.02, "sign", 0.01)}, {"albedo": Step("linf", 0.2, "sign", 0.03)}
+DRAWS = {"restarts": 2, "expectation": TransformationSettings(draws=2)}
+# name: (what is attacked, keywords of `build_scene`, other keywords of `AttackSettings`, criterion)
 ATTACKS = {
-    "lighting_l2": ({"lighting": {"norm": "l2", "radius": 0.8, "step_size": 0.3}}, {}, {"rounded": True}, None),
-    "lighting_signed": ({"lighting": {"step": "unit", "step_size": 0.3}}, {}, {"light": "signed", "margin": 0.0}, None),
-    "skylight": ({"skylight": {"zenith": 30.0, "step_size": 0.3}}, {"normals": "smooth"}, {}, None),
-    "projector": ({"projector": {"step_size": 1.0}}, {"projector": PROJECTOR, "encoding": "srgb"}, {}, None),
-    "lamps": ({"lamps": {"step_size": 2.0}}, {"lamps": LAMPS, "transport": "shadows"}, {}, None),
-    "places": ({"places": {"norm": "l2", "radius": 1.0, "step_size": 0.3}}, {"lamps": DISCS}, {}, None),
-    "geometry": (
-        {"geometry": {"radius": 0.02, "step": "sign", "step_size": 0.01}},
-        {"normals": "smooth", "transport": "shadows"},
-        {"shorten": True},
-        None,
-    ),
-    "albedo": (
-        {"albedo": {"radius": 0.2, "step": "sign", "step_size": 0.03}},
-        {"transport": "shadows", "ground": [0.5, 0.4, 0.3]},
-        {},
-        None,
-    ),
-    "pixels": ({"pixels": {"radius": 0.03, "step": "sign", "step_size": 0.01}}, {}, {}, LeastLikely()),
-    "shared_views": (
-        {"lighting": {"step_size": 0.2}, "geometry": {"radius": 0.01, "step": "sign", "step_size": 0.005}},
-        {"views": 3, "shared": True, "perspective": 35.0},
-        {"shorten": True},
-        None,
-    ),
-    "targeted": ({"lighting": {"step": "raw", "step_size": 0.5}}, {"views": 2}, {}, Targeted("pear")),
-    "expectation_and_restarts": (
-        {"lighting": {"norm": "linf", "radius": 0.1, "step": "sign", "step_size": 0.04}},
-        {"backgrounds": [0.1, 0.9]},
-        {"restarts": 2, "expectation": TransformationSettings(draws=2)},
-        None,
-    ),
+    "lighting_l2": ({"lighting": Step("l2", 0.8, step_size=0.3)}, {}, {"rounded": True}, None),
+    "lighting_signed": ({"lighting": Step(step_size=0.3)}, {}, {"light": "signed", "margin": 0.0}, None),
+    "skylight": ({"skylight": Sky(zenith=30.0, step_size=0.3)}, {"normals": "smooth"}, {}, None),
+    "projector": ({"projector": Step(step_size=1.0)}, {"projector": PROJECTOR, "encoding": "srgb"}, {}, None),
+    "lamps": ({"lamps": Step(step_size=2.0)}, {"lamps": LAMPS, "transport": "shadows"}, {}, None),
+    "places": ({"places": Step("l2", 1.0, step_size=0.3)}, {"lamps": DISCS}, {}, None),
+    "geometry": (SHAPE, {"normals": "smooth", "transport": "shadows"}, {"shorten": True}, None),
+    "albedo": (COLOR, {"transport": "shadows", "ground": [0.5, 0.4, 0.3]}, {}, None),
+    "pixels": ({"pixels": Step("linf", 0.03, "sign", 0.01)}, {}, {}, augment.LeastLikely()),
+    "shared_views": (BOTH, {"views": 3, "shared": True, "perspective": 35.0}, {"shorten": True}, None),
+    "targeted": ({"lighting": Step(step="raw", step_size=0.5)}, {"views": 2}, {}, augment.Targeted("pear")),
+    "expectation": ({"lighting": Step("linf", 0.1, "sign", 0.04)}, {"backgrounds": [0.1, 0.9]}, DRAWS, None),
 }
 
-# ------------------------------------------------------------------------------------- weights
-
-SMALL = [
-    "data=shapes", "data.train_per_class=10", "data.test_per_class=4", "data.size=16", "data.images=null",
-    "model.depth=10", "model.width=1", "train.epochs=2", "train.batch_size=16", "train.precision=float32",
-    "train.device=cpu", "train.threads=1", "renderer.visibility=software", "renderer.samples=2",
-    "scene.backgrounds=[0.2,0.8]",
-]  # fmt: skip
-DEMONSTRATION = ["experiment=demo", "augment.examples=4", "augment.attack.max_steps=3", "augment.attack.step_size=0.3"]
-BEST = [
-    "experiment=best", "augment.examples=null", "scene.views=1", "scene.meshes=['solid:orange',solid:orange:1]",
-    "train.images_per_epoch=60", "augment.every=30", "train.averaging=0.8", "train.distillation=1.0",
-    "augment.random.radius=1.0",
-]  # fmt: skip
-HARDEN = [
-    "experiment=harden", "augment=adversarial", "augment.examples=6", "scene.views=1", "train.distortion=augmix",
-    "scene.look_alikes=[{mesh: 'solid:ball:0', label: apple}]", "train.ranking=0.5", "train.label_smoothing=0.1",
-    "model.dropout=0.3", "train.epochs=3", "train.images_per_epoch=60", "augment.every=30", "train.averaging=0.8",
-    "train.flips=alternating", "augment.start=random", "augment.lights=continue", "augment.vary.place=0.1",
-    "augment.vary.exposure=[0.5,1.5]", "augment.vary.snapshot.noise=0.02",
-    "+attack@augment.attack=[lighting,albedo]", "augment.attack.max_steps=3",
-    "scene.meshes=[solid:orange:0,solid:orange:1]",
-]  # fmt: skip
-CHECKPOINTS, NEWEST, NETWORK = ("best.pt", "last.pt"), "last.pt", "model"
+SMALL = """
+data=shapes data.train_per_class=10 data.test_per_class=4 data.size=16 data.images=null model.depth=10 model.width=1
+train.epochs=2 train.batch_size=16 train.precision=float32 train.device=cpu train.threads=1 renderer.visibility=software
+renderer.samples=2 scene.backgrounds=[0.2,0.8]
+"""
+RUNS = {
+    "demonstration": "experiment=demo augment.examples=4 augment.attack.max_steps=3 augment.attack.step_size=0.3",
+    "best": """
+experiment=best augment.examples=null scene.views=1 scene.meshes=['solid:orange',solid:orange:1] augment.every=30
+train.images_per_epoch=60 train.averaging=0.8 train.distillation=1.0 augment.random.radius=1.0""",
+    "harden": """
+experiment=harden augment=adversarial augment.examples=6 augment.every=30 augment.start=random augment.lights=continue
++attack@augment.attack=[lighting,albedo] augment.attack.max_steps=3 augment.vary.place=0.1
+augment.vary.exposure=[0.5,1.5] augment.vary.snapshot.noise=0.02 model.dropout=0.3 train.epochs=3
+train.images_per_epoch=60 train.distortion=augmix train.ranking=0.5 train.label_smoothing=0.1 train.averaging=0.8
+train.flips=alternating scene.views=1 scene.meshes=[solid:orange:0,solid:orange:1]
+scene.look_alikes=[{mesh:'solid:ball:0',label:apple}]""",
+}
+FOLDERS: dict[str, Path] = {}  # of the runs that were made
 
 
 @pytest.mark.parametrize("name", RENDERS)
 def test_render(name, tmp_path, verify):
     shown, cameras, light, keywords, wanted = RENDERS[name]
     mesh, light = mesh_named(shown, tmp_path), light_named(light, tmp_path)
-    leaves = {"light": light, "vertices": torch.from_numpy(mesh.vertices).float(), "albedo": albedo_of(mesh)}
+    shape, draws = (mesh.textures or [mesh.faces])[0].shape, torch.Generator().manual_seed(2)
+    colors = 0.2 + 0.6 * torch.rand(shape, generator=draws)
+    leaves = {"light": light, "vertices": torch.from_numpy(mesh.vertices).float(), "albedo": colors}
     leaves = {argument: leaves[argument].requires_grad_() for argument in wanted}
-    images = render(mesh, cameras, **{"light": light, "size": SIZE, **SOFTWARE, **keywords, **leaves})
-    verify(images, *gradients(images, leaves.values()))
+    images = renderer.render(mesh, cameras, **{"light": light, "size": SIZE, **SOFTWARE, **keywords, **leaves})
+    verify(images, *gradients(images, list(leaves.values())))
 
 
 @pytest.mark.parametrize("name", OPERATORS)
 def test_render_by_operators(name, tmp_path, verify):
     shown, cameras, keywords = OPERATORS[name]
-    lights = torch.stack([light_named(light, tmp_path) for light in ("grace", "skylight", "environment")])
-    lights.requires_grad_()
-    found = operators(mesh_named(shown, tmp_path), cameras, SIZE, **SOFTWARE, **keywords)
+    named = ("grace", "skylight", "environment")
+    lights = torch.stack([light_named(light, tmp_path) for light in named]).requires_grad_()
+    found = renderer.operators(mesh_named(shown, tmp_path), cameras, SIZE, **SOFTWARE, **keywords)
     images = torch.stack([operator.image(lights, 0.3) for operator in found])
     verify(images, *gradients(images, [lights]), found[0].radiance(lights.detach()))
 
@@ -209,7 +154,7 @@ def test_render_by_operators(name, tmp_path, verify):
 @pytest.mark.parametrize("name", SCENES)
 def test_render_of_a_scene(name, verify):
     meshes, views, keywords = SCENES[name]
-    scene = build_scene(meshes, SIZE, views, **SCENE | keywords)
+    scene = augment.build_scene(meshes, SIZE, views, **SCENE | keywords)
     examples = torch.arange(len(scene))
     lights = scene.lights.clone().requires_grad_()
     relit = scene.render(Conditions(lights), examples)
@@ -221,46 +166,49 @@ def test_render_of_a_scene(name, verify):
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack(name, verify):
-    steps, shown, others, criterion = ATTACKS[name]
-    scene = build_scene(ORANGES, SIZE, **SCENE | shown)
-    kinds = {"skylight": SkylightSettings}
-    settings = {attacked: kinds.get(attacked, StepSettings)(**keywords) for attacked, keywords in steps.items()}
-    found = attack(classifier(), scene, criterion, AttackSettings(**settings, **SETTINGS | others), seed=5, force=True)
+    changed, shown, others, criterion = ATTACKS[name]
+    scene = augment.build_scene(ORANGES, SIZE, **SCENE | shown)
+    settings = augment.AttackSettings(**changed, **SETTINGS | others)
+    found = augment.attack(classifier(), scene, criterion, settings, seed=5, force=True)
     assert (found.images - found.images_before).abs().max() > 1e-3
     verify(found.images_before, found.images, found.logits, found.result.values, found.result.cost, found.steps)
 
 
-@pytest.mark.parametrize("arm", ["none", "adversarial"])
-def test_weights_of_a_demonstration(arm, trained, verify):
-    folder = trained("demonstration")
-    verify(*weights(folder / arm if arm == "none" else folder))
+@pytest.mark.parametrize("name", ["demonstration/none", "demonstration", "best", "harden"])
+def test_weights(name, trained, verify):
+    run, _, compared = name.partition("/")
+    verify(*weights(trained(run) / compared))
 
 
-@pytest.mark.parametrize("name", ["best", "harden"])
-def test_weights_of_a_fine_tuning(name, trained, verify):
-    verify(*weights(trained(name)))
+def test_weights_of_a_stopped_and_resumed_run(trained, call, monkeypatch, tmp_path, verify):
+    begun = f"train.init_from={trained('demonstration')}"
+    arguments = [*SMALL.split(), *RUNS["harden"].split(), begun, f"run={tmp_path}/run"]
+    with monkeypatch.context() as patch:
+
+        def save_and_stop(*arguments):
+            patch.undo()
+            torch.save(*arguments)
+            signal.raise_signal(signal.SIGTERM)
+
+        patch.setattr(torch, "save", save_and_stop)  # of the first checkpoint
+        assert call("train", *arguments) == 128 + signal.SIGTERM
+    stopped = digest(weights(tmp_path / "run"))
+    assert call("train", *arguments, "train.resume=true") == 0
+    assert digest(weights(tmp_path / "run")) != stopped
+    verify(*weights(tmp_path / "run"), case="test_weights[harden]")
 
 
-def test_weights_of_a_stopped_and_resumed_run(trained, tmp_path, verify):
-    arguments = [*SMALL, *HARDEN, f"train.init_from={trained('demonstration')}", f"run={tmp_path}/run"]
-    assert train(arguments, stop_after=tmp_path / "run" / NEWEST) == 128 + signal.SIGTERM
-    stopped = weights(tmp_path / "run")
-    assert train([*arguments, "train.resume=true"]) == 0
-    assert digest(weights(tmp_path / "run")) != digest(stopped)
-    verify(*weights(tmp_path / "run"), case="test_weights_of_a_fine_tuning[harden]")
+@pytest.fixture
+def trained(call, tmp_path_factory) -> Callable[[str], Path]:
+    """The folder of one of RUNS, which is made when a first test asks for it."""
 
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Callable[[str], Path]:
-    """The folder of a run by its name; a run is made when it is first asked for."""
-    folder = tmp_path_factory.mktemp("frozen")
-
-    @cache
     def run(name: str) -> Path:
-        chosen = {"demonstration": DEMONSTRATION, "best": BEST, "harden": HARDEN}[name]
-        begun = [] if name == "demonstration" else [f"train.init_from={run('demonstration')}"]
-        assert train([*SMALL, *chosen, *begun, f"run={folder / name}"]) == 0
-        return folder / name
+        if name not in FOLDERS:
+            folder = tmp_path_factory.mktemp("frozen") / name
+            begun = [] if name == "demonstration" else [f"train.init_from={run('demonstration')}"]
+            assert call("train", *SMALL.split(), *RUNS[name].split(), *begun, f"run={folder}") == 0
+            FOLDERS[name] = folder
+        return FOLDERS[name]
 
     return run
 
@@ -269,15 +217,14 @@ def trained(tmp_path_factory) -> Callable[[str], Path]:
 def verify(request) -> Callable[..., None]:
     """Compares a hash of tensors with the one recorded for a case, this test's unless it is named; or records it."""
     records = json.loads(RECORDS.read_text()) if RECORDS.exists() else {}
-    recording = bool(os.environ.get(RECORDING))
+    recording = os.environ.get("RECORD_FROZEN")
     if not recording and fingerprint() not in records:
-        pytest.skip(f"nothing is recorded for {fingerprint()}: {RECORDING}=1 python -m pytest tests/test_frozen.py")
+        pytest.skip(f"nothing is recorded for {fingerprint()}: RECORD_FROZEN=1 python -m pytest tests/test_frozen.py")
 
     def compare(*tensors: Tensor, case: str = request.node.name) -> None:
         assert all(tensor.isfinite().all() for tensor in tensors)
         if recording and case == request.node.name:
-            own = records.setdefault(fingerprint(), {})
-            own[case] = digest(tensors)
+            records.setdefault(fingerprint(), {})[case] = digest(tensors)
             RECORDS.write_text(json.dumps(records, indent=1, sort_keys=True) + "\n")
         assert digest(tensors) == records[fingerprint()].get(case)
 
@@ -287,19 +234,11 @@ def verify(request) -> Callable[..., None]:
 @cache
 def fingerprint() -> str:
     """What the last bits depend on."""
-    processor, file = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
-    if file.exists():
-        facts = dict(re.findall(r"^(model name|cpu family|model)\s*: (.*)$", file.read_text(), re.M))
-        processor = " ".join(facts.values()) or processor
-    versions = [f"{library} {installed(library)}" for library in LIBRARIES]
-    return ", ".join([processor, torch.backends.cpu.get_cpu_capability(), *versions])
-
-
-def installed(library: str) -> str:
-    try:
-        return version(library)
-    except PackageNotFoundError:
-        return "missing"
+    file = Path("/proc/cpuinfo")
+    facts = re.findall(r"^(model name|cpu family|model)\s*: (.*)$", file.read_text() if file.exists() else "", re.M)
+    processor = " ".join(dict(facts).values()) or platform.processor()
+    versions = {name: found.version for name in LIBRARIES for found in distributions(name=name)}
+    return ", ".join([processor, torch.backends.cpu.get_cpu_capability(), *map(" ".join, versions.items())])
 
 
 def digest(tensors: Iterable[Tensor]) -> str:
@@ -312,89 +251,42 @@ def digest(tensors: Iterable[Tensor]) -> str:
 
 def weights(folder: Path) -> list[Tensor]:
     """Those of a run's checkpoints, in order."""
-    states = [torch.load(folder / name, weights_only=True)[NETWORK] for name in CHECKPOINTS]
+    states = (torch.load(folder / name, weights_only=True)["model"] for name in ("best.pt", "last.pt"))
     return [tensor for state in states for tensor in state.values()]
 
 
-def train(arguments: list[str], stop_after: Path | None = None) -> int:
-    """`python -m train` within this process: its exit status. SIGTERM is sent once a file is there."""
-    ended = threading.Event()
-
-    def send() -> None:
-        while not ended.wait(0.002):
-            if stop_after.exists():
-                os.kill(os.getpid(), signal.SIGTERM)
-                return
-
-    watch = threading.Thread(target=send) if stop_after else None
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(RECORDS.parents[1])
-        patch.setattr(sys, "argv", ["train", *arguments])
-        handlers, before = logging.root.handlers[:], signal.signal(signal.SIGTERM, lambda *_: None)
-        try:
-            if watch:
-                watch.start()
-            runpy.run_module("train", run_name="__main__", alter_sys=True)
-        except SystemExit as stop:
-            return stop.code or 0
-        finally:
-            ended.set()
-            if watch:
-                watch.join()
-            signal.signal(signal.SIGTERM, before)
-            for handler in set(logging.root.handlers) - set(handlers):
-                handler.close()
-            logging.root.handlers[:] = handlers
-    return 0
-
-
-def gradients(images: Tensor, leaves: Iterable[Tensor]) -> list[Tensor]:
+def gradients(images: Tensor, leaves: list[Tensor]) -> list[Tensor]:
     """Those of a cost in which every value of the images has a weight of its own."""
-    leaves = list(leaves)
     weight = torch.linspace(-1, 1, images.numel()).view_as(images)
     return list(torch.autograd.grad((weight * images).sum(), leaves)) if leaves else []
 
 
-def classifier() -> Classifier:
+def classifier() -> augment.Classifier:
     """A network of random weights that takes everything for the first class, but not by far."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
-        network = nn.Sequential(
-            nn.Conv2d(3, 8, 3, stride=2), nn.ReLU(), nn.Conv2d(8, 16, 3, stride=2), nn.ReLU(), nn.Flatten(),
-            nn.Linear(400, len(CLASSES)),
-        )  # fmt: skip
+        convolutions = nn.Conv2d(3, 8, 3, stride=2), nn.ReLU(), nn.Conv2d(8, 16, 3, stride=2), nn.ReLU()
+        last = nn.Linear(400, len(CLASSES))
     with torch.no_grad():
-        network[-1].weight.mul_(60)
-        network[-1].bias[0] -= 0.8
-    return Classifier(network, SIZE, CLASSES)
+        last.weight.mul_(60)
+        last.bias[0] -= 0.8
+    return augment.Classifier(nn.Sequential(*convolutions, nn.Flatten(), last), SIZE, CLASSES)
 
 
-def mesh_named(name: str, folder: Path) -> Mesh:
-    """NAME:SEED is a solid, +N subdivides it, .glb writes it to a file and reads it; "checkered" has a texture."""
-    if name == "checkered":
-        return checkered()
+def mesh_named(name: str, folder: Path) -> renderer.Mesh:
+    """NAME:SEED is a solid, +N subdivides it, .glb writes it to a file and reads it; a textured tent has two sides."""
+    if name == "tent":
+        vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 0, 0.8], [-1, 0, 0.8], [1, 1, 0], [-1, 1, 0]])
+        plain = renderer.Mesh.plain(vertices, [[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
+        uvs = ((vertices[plain.faces][..., :2] + 1) / 2).astype(np.float32)
+        texture = np.random.default_rng(1).integers(0, 256, (8, 8, 3), dtype=np.uint8)
+        return replace(plain, corner_uvs=uvs, texture_ids=np.zeros(4, dtype=np.int32), textures=(texture,))
     kind, seed, more = re.fullmatch(r"(\w+):(\d+)(.*)", name).groups()
-    mesh = solid(kind, int(seed))
+    mesh = renderer.solid(kind, int(seed))
     if more == ".glb":
-        export_mesh(mesh, folder / "mesh.glb")
-        return load_mesh(folder / "mesh.glb")
-    return subdivide(mesh, int(more)) if more else mesh
-
-
-def checkered() -> Mesh:
-    """Two sides of a tent, with one texture."""
-    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 0, 0.8], [-1, 0, 0.8], [1, 1, 0], [-1, 1, 0]])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [3, 2, 4], [3, 4, 5]])
-    plain = Mesh.plain(vertices, faces)
-    uvs = ((vertices[faces][..., :2] + 1) / 2).astype(np.float32)
-    texture = np.random.default_rng(1).integers(0, 256, (8, 8, 3), dtype=np.uint8)
-    return replace(plain, corner_uvs=uvs, texture_ids=np.zeros(len(faces), dtype=np.int32), textures=(texture,))
-
-
-def albedo_of(mesh: Mesh) -> Tensor:
-    """Of each face, or a texture's."""
-    shape = mesh.textures[0].shape if mesh.textures else mesh.faces.shape
-    return 0.2 + 0.6 * torch.rand(shape, generator=torch.Generator().manual_seed(2))
+        renderer.export_mesh(mesh, folder / "mesh.glb")
+        return renderer.load_mesh(folder / "mesh.glb")
+    return renderer.subdivide(mesh, int(more)) if more else mesh
 
 
 def light_named(name: str, folder: Path) -> Tensor:
@@ -404,5 +296,5 @@ def light_named(name: str, folder: Path) -> Tensor:
         return directional(torch.tensor([0.48, 0.6, 0.64]), torch.tensor([1.0, 0.9, 0.7]))
     if name == "environment":
         np.save(folder / "map.npy", np.random.default_rng(4).gamma(0.3, size=(16, 32, 3)).astype(np.float32))
-        return load_light(str(folder / "map.npy"))
-    return load_light(name)
+        return renderer.load_light(str(folder / "map.npy"))
+    return renderer.load_light(name)
