@@ -7,7 +7,7 @@ from torch import Tensor
 from renderer.errors import require_range
 
 
-def anything_but(label: int) -> int:
+def complementary_label(label: int) -> int:
     """The label of what is of no class that the classifier knows, and in particular not of this one."""
     return -1 - label
 
@@ -46,10 +46,10 @@ def ranking_loss(logits: Tensor, labels: Tensor, label: int) -> Tensor:
     return (F.softplus(odds - odds[:, None]) * pairs).sum() / pairs.sum().clamp(min=1)
 
 
-def divergence(logits: Tensor, answers: Tensor) -> Tensor:
+def divergence(logits: Tensor, predictions: Tensor) -> Tensor:
     """(N,) Kullback–Leibler divergence Σ q log(q / p) of a network's probabilities p from another's q, by their logits
     (N, classes): what distillation lessens (Hinton et al. 2015, at temperature 1)."""
-    return F.kl_div(logits.log_softmax(1), answers.log_softmax(1), reduction="none", log_target=True).sum(1)
+    return F.kl_div(logits.log_softmax(1), predictions.log_softmax(1), reduction="none", log_target=True).sum(1)
 
 
 def is_right(predicted: Tensor, labels: Tensor) -> Tensor:

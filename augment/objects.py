@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from augment.progress import underway
+from augment.utils import underway
 from renderer.arguments import require_fields
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, concatenate, load_mesh, normalise
@@ -38,7 +38,7 @@ class MeshSettings:
 
 
 @dataclass
-class CompanionSettings(MeshSettings):
+class PropSettings(MeshSettings):
     """A mesh that stands beside another, on the same ground.
 
     at: (2,) x and y of its centroid, in world units. scale: its largest coordinate, where the other's is 1. azimuth:
@@ -52,21 +52,21 @@ class CompanionSettings(MeshSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.at) != 2:
-            raise InputError(f"beside: {self.mesh}: at={self.at} must be x and y")
+            raise InputError(f"props: {self.mesh}: at={self.at} must be x and y")
         for place in self.at:
-            require_range(f"beside: {self.mesh}: at", place, -FARTHEST, FARTHEST)
-        require_range(f"beside: {self.mesh}: scale", self.scale, 1 / FARTHEST, FARTHEST)
-        require_range(f"beside: {self.mesh}: azimuth", self.azimuth, -360, 360)
+            require_range(f"props: {self.mesh}: at", place, -FARTHEST, FARTHEST)
+        require_range(f"props: {self.mesh}: scale", self.scale, 1 / FARTHEST, FARTHEST)
+        require_range(f"props: {self.mesh}: azimuth", self.azimuth, -360, 360)
 
 
 @dataclass
 class ObjectSettings(MeshSettings):
     """One mesh of a scene, named as in `MeshSettings`. label: the name of its class. gain: multiplies the albedo.
-    beside: what is in the image, too, shadows it and is shadowed, and is no part of what is attacked."""
+    props: what is in the image, too, shadows it and is shadowed, and is no part of what is attacked."""
 
     label: str
     gain: float = 1.0
-    beside: list[CompanionSettings] = field(default_factory=list)
+    props: list[PropSettings] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,7 +78,7 @@ class SceneObject:
     """A mesh that spans [-1, 1], the name of its class, what multiplies its albedo, and its own name in messages.
 
     Company and table, whose albedo the gain multiplies, too, are in the mesh after the object's own faces.
-    own: the number of these, None where all are. company: meshes that stand on z = 0 beside the object. ground: the
+    own: the number of these, None where all are. props: meshes that stand on z = 0 beside the object. ground: the
     colour of its table, None where there is none.
     """
 
@@ -87,7 +87,7 @@ class SceneObject:
     gain: float = 1.0
     name: str = "the mesh"
     own: int | None = None
-    company: Sequence[Mesh] = ()
+    props: Sequence[Mesh] = ()
     ground: Sequence[float] | None = None
 
     @property
@@ -125,17 +125,17 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
     """
     with underway(f"preparing {item.mesh}"):
         mesh = normalise(subdivide(_load(item), vertices))
-    return in_company(SceneObject(item.label, mesh, item.gain, item.mesh), [_companion(each) for each in item.beside])
+    return with_props(SceneObject(item.label, mesh, item.gain, item.mesh), [_prop(each) for each in item.props])
 
 
-def in_company(item: SceneObject, company: Sequence[Mesh]) -> SceneObject:
+def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
     """The object among meshes that stand on z = 0, which are raised or lowered to where it stands."""
     height = np.array([0, 0, item.lowest])
     placed = []
-    for each in company:
+    for each in props:
         raised = (each.vertices + height).astype(np.float32)  # as `normalise` rounds
         placed.append(replace(each, vertices=raised.astype(np.float64)))
-    return replace(item.among(placed), company=company)
+    return replace(item.among(placed), props=props)
 
 
 def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
@@ -152,17 +152,17 @@ def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
     return replace(item.among([table]), ground=color)
 
 
-def another_individual(item: SceneObject, seed: int) -> SceneObject:
+def another_instance(item: SceneObject, seed: int) -> SceneObject:
     """Another of the same kind, in the same company and on the same table, where the object is a solid named without a
     seed, and otherwise the object itself."""
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item
     other = replace(item, mesh=normalise(solid(rest[0], seed)), own=None)
-    return on_ground(in_company(other, item.company), item.ground)
+    return on_ground(with_props(other, item.props), item.ground)
 
 
-def _companion(item: CompanionSettings) -> Mesh:
+def _prop(item: PropSettings) -> Mesh:
     """Where it stands, on z = 0."""
     mesh, angle = normalise(_load(item)), math.radians(item.azimuth)
     turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""Objects that move, are painted or stand under moved lamps, view by view: rasterised anew where vertices move."""
+"""Images of objects that move, are painted or stand under moved lamps, view by view."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -8,24 +8,124 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.held_transport import HeldTransport, HeldTransports
 from augment.objects import SceneObject
-from augment.placed_view import PlacedView
 from renderer.albedo import painted_albedo, surface_albedo
-from renderer.basis import Basis, Placed, parts_of
+from renderer.basis import Basis, Placed, Reach, parts_of
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
+from renderer.lamps import Lamps
 from renderer.mesh import Mesh
 from renderer.shading import radiance
+from renderer.transport.placed import lit, placed_radiance
+from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays
+from renderer.transport.surface import Surface
 from renderer.visibility import Backend
+
+NEAR = 0.001  # world units: shadows are found anew once a coordinate has moved by more since they were
+
+
+class FrozenTransport:
+    """What transport adds to the images of a mesh, per unit of each coefficient of light.
+
+    It stays where it is in the image, as the outline does for derivatives, and goes with the albedo of its pixel.
+    """
+
+    def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis):
+        self.mesh, self._settings = mesh, settings
+        self._transport = build_transport(mesh, settings, gain, basis)
+        self._views: dict[Camera, tuple[Tensor, Tensor] | None] = {}
+
+    def fits(self, vertices: np.ndarray) -> bool:
+        """Whether vertices (V, 3) are near the mesh's."""
+        return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
+
+    def knows(self, camera: Camera) -> bool:
+        return camera in self._views
+
+    def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
+        """A view of the mesh, and its albedo there (S, 3)."""
+        surface = Surface.of(self.mesh, fragments.to("cpu"), self._settings)
+        change = self._transport.change(surface, albedo.cpu().double()) if self._transport else None
+        if change is None:
+            self._views[camera] = None
+        else:
+            canvas = change.new_zeros(*change.shape[:2], fragments.size**2)
+            canvas[..., surface.fragments.pixels] = change
+            self._views[camera] = canvas.to(albedo), _by_pixel(fragments, albedo)
+
+    def radiance(self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
+        """(3, P) of a known view's fragments with albedo (S, 3) in a light (size, 3); differentiable in both."""
+        view = self._views[camera]
+        if view is None:
+            return light.new_zeros(3, len(fragments.pixels))
+        change, before = (each[..., fragments.pixels] for each in view)
+        added = torch.einsum("ckp,kc->cp", change.to(light), light)
+        now = _by_pixel(fragments, albedo)[:, fragments.pixels]
+        return added * torch.where(before > 0, now / before.masked_fill(before == 0, 1), 1).to(light)
+
+
+class FrozenTransports:
+    """The transport of a scene's objects in their own shapes, and of examples in the last that was not near these."""
+
+    def __init__(self, settings: ImageSettings, basis: Basis):
+        self._like = settings, basis
+        self._own: dict[int, FrozenTransport] = {}  # of objects
+        self._moved: dict[int, FrozenTransport] = {}  # of examples
+
+    def near(self, example: int, number: int, item: SceneObject, vertices: np.ndarray) -> FrozenTransport:
+        """That of a shape near the vertices (V, 3) of an example, which shows the object of a number."""
+        if number not in self._own:
+            self._own[number] = self._of(item, item.mesh)
+        if self._own[number].fits(vertices):
+            return self._own[number]
+        if example not in self._moved or not self._moved[example].fits(vertices):
+            self._moved[example] = self._of(item, replace(item.mesh, vertices=vertices))
+        return self._moved[example]
+
+    def _of(self, item: SceneObject, mesh: Mesh) -> FrozenTransport:
+        settings, basis = self._like
+        return FrozenTransport(mesh, settings, item.gain, basis)
+
+
+def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
+    """(3, size²) the sum of the samples' albedo (S, 3) over each pixel."""
+    pixel = fragments.pixels[fragments.pixel]
+    return albedo.new_zeros(3, fragments.size**2).index_add(1, pixel, albedo.T)
+
+
+class PlacedView:
+    """A view of one shape, computed on the CPU, which casts the rays: once for what stays in its place, and anew for
+    lamps at other places. Which lamps and which pixel of a pattern reach a sample is held in derivatives."""
+
+    def __init__(
+        self, rays: Rays, mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None
+    ):
+        """rays: among the shape's faces. vertices: the shape's (V, 3), where they are not the mesh's."""
+        vertices = None if vertices is None else vertices.cpu()
+        self._rays, self._surface = rays, Surface.of(mesh, fragments.to("cpu"), settings, vertices)
+        self._standing: dict[Placed, Reach] = {}
+
+    def radiance(self, basis: Placed, albedo: Tensor, light: Tensor, places: Tensor | None) -> Tensor:
+        """(3, P) of one basis with a light (size, 3), in its dtype and device, and albedo (S, 3) at the samples;
+        differentiable in both, in the vertices and in the places (L, 3) of lamps, None where they stand."""
+        reach = self._reach(basis, places)
+        return placed_radiance(self._surface.fragments, albedo.cpu().double(), reach, light.cpu().double()).to(light)
+
+    def _reach(self, basis: Placed, places: Tensor | None) -> Reach:
+        points, normals = self._surface.points, self._surface.normals
+        if isinstance(basis, Lamps) and places is not None:
+            return lit(self._rays, self._surface, basis.reach(points, normals, places.cpu().double()))
+        if basis not in self._standing:
+            self._standing[basis] = lit(self._rays, self._surface, basis.reach(points, normals))
+        return self._standing[basis]
 
 
 class Reshading:
     """What cameras see of objects, by their numbers; what they see of their own shapes is kept.
 
-    Shadows and bounces of distant light are those of a shape close by (`HeldTransport`), shadows of light from places
+    Shadows and bounces of distant light are those of a shape close by (`FrozenTransport`), shadows of light from places
     are a shape's own (`PlacedView`).
     """
 
@@ -35,7 +135,7 @@ class Reshading:
         """basis: what lights are coefficients of. like: of the dtype and on the device of the images."""
         self._objects, self._settings, self._backend, self._basis, self._like = objects, settings, backend, basis, like
         self._own: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
-        self._transports = HeldTransports(settings, basis)
+        self._transports = FrozenTransports(settings, basis)
         self._rays: dict[int, Rays] = {}
         self._placed_views: dict[tuple[int, Camera], PlacedView] = {}
 
@@ -97,19 +197,19 @@ class Reshading:
                 continue
             seen.append(radiance(fragments, vertices, own, albedo, smooth_faces))
             if self._settings.transport != "direct":
-                held = self._held(example, number, camera, positions)
-                seen.append(held.radiance(camera, fragments, albedo, own))
+                frozen = self._frozen(example, number, camera, positions)
+                seen.append(frozen.radiance(camera, fragments, albedo, own))
         return fragments, reduce(torch.add, seen)
 
     def _moved_view(self, mesh: Mesh, positions: np.ndarray, fragments: Fragments, vertices: Tensor) -> PlacedView:
         return PlacedView(Rays(replace(mesh, vertices=positions)), mesh, fragments, self._settings, vertices)
 
-    def _held(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> HeldTransport:
+    def _frozen(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """Of a shape near the vertices of an example, and with the camera's view of it."""
-        held = self._transports.near(example, number, self._objects[number], vertices)
-        if not held.knows(camera):
-            held.add(camera, *self._seen(number, camera, held.mesh.vertices))
-        return held
+        frozen = self._transports.near(example, number, self._objects[number], vertices)
+        if not frozen.knows(camera):
+            frozen.add(camera, *self._seen(number, camera, frozen.mesh.vertices))
+        return frozen
 
     def _seen(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
         """What a camera sees of an object's vertices, wherever they are, and the albedo there (S, 3)."""

@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from augment.layers import Layer, in_place
-from augment.memory import require_memory
 from augment.objects import SceneObject
-from augment.operator_stack import OperatorStack
-from augment.relighting import Relighting
+from augment.relighting import Layer, OperatorStack, Relighting, in_place
 from augment.reshading import Reshading
+from augment.utils import require_memory
 from renderer.arguments import checked, require_fields
 from renderer.basis import HARMONICS, Basis, parts_of
 from renderer.cache import OperatorCache
@@ -68,11 +66,10 @@ class Scene:
     """E examples of V views each, over backgrounds (B, 3 or 1, size, size) of values in [0, 1].
 
     Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
-    (`Relighting`). Where vertices move, their view is rasterised anew each time (`Reshading`).
-    lights: (E, size, 3), or (size, 3) for all, where attacks begin; their dtype and device are those of the images.
-    operators: where rendered views are kept. basis: what lights are coefficients of; 49 harmonics, unless another is
-    given. taken: what a camera makes of rendered images (A, V, 3, size, size) of examples (A,), differentiable; see
-    `Snapshot`.
+    (`Relighting`). Where vertices move, their view is rasterised anew each time (`Reshading`). lights: (E, size, 3), or
+    (size, 3) for all, where attacks begin; their dtype and device are those of the images. operators: where rendered
+    views are kept. basis: what lights are coefficients of; 49 harmonics, unless another is given. camera_effects: what
+    a camera makes of rendered images (A, V, 3, size, size) of examples (A,), differentiable; see `CameraEffects`.
     """
 
     objects: Sequence[SceneObject]
@@ -83,7 +80,7 @@ class Scene:
     backend: Backend
     operators: OperatorCache = field(default_factory=OperatorCache)
     basis: Basis = HARMONICS
-    taken: Callable[[Tensor, Tensor], Tensor] | None = None
+    camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
         require_fields(self)
@@ -198,7 +195,7 @@ class Scene:
         covered = [develop_composite(layer.composite, self.settings.encoding) for layer in layers]
         images = in_place(canvas, layers, covered)
         images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
-        images = images if self.taken is None else self.taken(images, examples)
+        images = images if self.camera_effects is None else self.camera_effects(images, examples)
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
 
     @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Rows drawn afresh: which individual is shown, from where, in which light, before what, and through which camera."""
+"""Rows drawn afresh: which instance is shown, from where, in which light, before what, and through which camera."""
 
 import math
 from collections.abc import Sequence
@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from augment.objects import another_individual
+from augment.camera_effects import CameraEffectSettings, draw_camera_effects
+from augment.objects import another_instance
 from augment.scene import Example, Scene
-from augment.snapshot import SnapshotSettings, draw_snapshot
 from renderer.arguments import require_fields
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
@@ -31,46 +31,51 @@ LAMP_REACH = 70.0  # degrees around the mesh and up or down, from the camera
 class VariationSettings:
     """What is drawn for each example in each round; by default nothing, which leaves the grid of the paper.
 
-    place: the mesh's middle is moved by at most this share of the frame's width, to either side and up and down.
-    scale, exposure: [least, most] that its size in the frame and the light are multiplied by, uniform in the
-    logarithm. backgrounds: a folder of images, each example before one of them. individuals: every solid that is
-    named without a seed is another of its kind in each of its views. turn: degrees that the camera goes around the
-    mesh, at most, to either side and up and down. lights: each example is in one of these, as `load_light` takes
-    them. lamps: the share of examples that stand in the parallel light of a lamp on the camera's side, up to 70°
-    off, over [least, most] `ambient` of their own. lit: a background is a wall that faces the camera in the
-    example's light. snapshot: what a camera makes of the images.
+    shift: the mesh's middle is moved by at most this share of the frame's width, to either side and up and down. scale,
+    exposure: [least, most] that its size in the frame and the light are multiplied by, uniform in the logarithm.
+    backgrounds: a folder of images, each example before one of them. instances: every solid that is named without a
+    seed is another of its kind in each of its views. azimuth: degrees that the camera goes around the mesh, at most, to
+    either side and up and down. environments: each example is in one of these, as `load_light` takes them.
+    directional_fraction: the fraction of examples that stand in the parallel light of a lamp on the camera's side, up
+    to 70° off, over [least, most] `fill_light` of their own. lit_background: a background is a wall that faces the
+    camera in the example's light. camera: what a camera makes of the images.
     """
 
-    place: float = 0.0
+    shift: float = 0.0
     scale: list[float] = field(default_factory=lambda: list(UNCHANGED))
     exposure: list[float] = field(default_factory=lambda: list(UNCHANGED))
     backgrounds: str | None = None
-    individuals: bool = False
-    turn: float = 0.0
-    lights: list[str] = field(default_factory=list)
-    lamps: float = 0.0
-    ambient: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    lit: bool = False
-    snapshot: SnapshotSettings = field(default_factory=SnapshotSettings)
+    instances: bool = False
+    azimuth: float = 0.0
+    environments: list[str] = field(default_factory=list)
+    directional_fraction: float = 0.0
+    fill_light: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    lit_background: bool = False
+    camera: CameraEffectSettings = field(default_factory=CameraEffectSettings)
 
     def __post_init__(self) -> None:
         require_fields(self)
-        for name, most in (("place", 1), ("turn", 180), ("lamps", 1)):
+        for name, most in (("shift", 1), ("azimuth", 180), ("directional_fraction", 1)):
             require_range(f"augment.vary.{name}", getattr(self, name), 0, most)
-        require_limits("augment.vary.ambient", self.ambient, 0, 1)
+        require_limits("augment.vary.fill_light", self.fill_light, 0, 1)
         for name in ("scale", "exposure"):
             require_limits(f"augment.vary.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
 
     @property
     def moves(self) -> bool:
         """Whether views change, which then are rasterised in every round."""
-        return self.place > 0 or tuple(self.scale) != UNCHANGED or self.turn > 0 or self.individuals
+        return self.shift > 0 or tuple(self.scale) != UNCHANGED or self.azimuth > 0 or self.instances
 
     @property
     def varies(self) -> bool:
         """Whether anything is drawn at all."""
-        of_light = tuple(self.exposure) != UNCHANGED or self.lights or self.lamps > 0 or self.lit
-        return bool(self.moves or of_light or self.backgrounds is not None or self.snapshot.changes)
+        of_light = (
+            tuple(self.exposure) != UNCHANGED
+            or self.environments
+            or self.directional_fraction > 0
+            or self.lit_background
+        )
+        return bool(self.moves or of_light or self.backgrounds is not None or self.camera.changes)
 
 
 def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, lights: int = 1) -> Scene:
@@ -87,9 +92,9 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, ligh
 
 def _moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
     """What is shown, where and before what."""
-    place = settings.place * (2 * torch.rand(len(scene), 2, generator=draws, dtype=torch.float64) - 1)
+    place = settings.shift * (2 * torch.rand(len(scene), 2, generator=draws, dtype=torch.float64) - 1)
     scale = _between(settings.scale, len(scene), draws)
-    angles = _angles(settings.turn, len(scene), draws)
+    angles = _angles(settings.azimuth, len(scene), draws)
     rows = [
         _moved(row, right, up, size, *angle)
         for row, (right, up), size, angle in zip(scene.examples, place.tolist(), scale, angles, strict=True)
@@ -98,11 +103,11 @@ def _moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generato
     if settings.backgrounds is not None:
         changed["backgrounds"] = _images(Path(settings.backgrounds), len(scene), scene.settings.size, draws)
         rows = [replace(row, background=index) for index, row in enumerate(rows)]
-    if settings.individuals:
+    if settings.instances:
         views = list(dict.fromkeys((row.object, row.cameras) for row in scene.examples))
         seeds = torch.randint(2**31, (len(views),), generator=draws).tolist()
         drawn = zip(views, seeds, strict=True)
-        changed["objects"] = [another_individual(scene.objects[index], seed) for (index, _), seed in drawn]
+        changed["objects"] = [another_instance(scene.objects[index], seed) for (index, _), seed in drawn]
         number = {view: index for index, view in enumerate(views)}
         which = [number[row.object, row.cameras] for row in scene.examples]
         rows = [replace(row, object=index) for row, index in zip(rows, which, strict=True)]
@@ -116,15 +121,17 @@ def _taken_anew(scene: Scene, settings: VariationSettings, draws: torch.Generato
     exposure = _between(settings.exposure, len(scene), draws)
     rows = [replace(row, exposure=row.exposure * each) for row, each in zip(scene.examples, exposure, strict=True)]
     changed: dict[str, Any] = {}
-    if settings.lights:
-        which = torch.randint(len(settings.lights), (len(rows),), generator=draws)
-        changed["lights"] = torch.stack([load_light(light) for light in settings.lights])[which].to(scene.lights)
-    if settings.lamps > 0:
+    if settings.environments:
+        which = torch.randint(len(settings.environments), (len(rows),), generator=draws)
+        changed["lights"] = torch.stack([load_light(light) for light in settings.environments])[which].to(scene.lights)
+    if settings.directional_fraction > 0:
         changed["lights"] = _in_lamplight(changed.get("lights", scene.lights), scene, settings, draws)
-    if settings.snapshot.changes:
-        changed["taken"] = draw_snapshot(settings.snapshot, len(rows), scene.settings, draws).to(scene.lights.device)
+    if settings.camera.changes:
+        changed["camera_effects"] = draw_camera_effects(settings.camera, len(rows), scene.settings, draws).to(
+            scene.lights.device
+        )
     varied = replace(scene, examples=rows, **changed)
-    return _with_lit_walls(varied) if settings.lit else varied
+    return _with_lit_walls(varied) if settings.lit_background else varied
 
 
 def _between(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
@@ -166,10 +173,10 @@ def _in_lamplight(lights: Tensor, scene: Scene, settings: VariationSettings, dra
 
     What stands on a table has no lamp below it: one that is drawn there is mirrored.
     """
-    low, high = settings.ambient
+    low, high = settings.fill_light
     shape = (len(scene), 1, 1)
     ambient = low + (high - low) * torch.rand(shape, generator=draws)
-    chosen = torch.rand(shape, generator=draws) < settings.lamps
+    chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
     lamps = []
     for row, angles in zip(scene.examples, _angles(LAMP_REACH, len(scene), draws), strict=True):
         towards = torch.from_numpy(_turned(row.cameras[0], *angles).axes()[2])

@@ -1,8 +1,9 @@
-"""Procedural solids: the embedded orange, the other things of the demo data set and look-alikes, from formulas alone.
+"""Procedural solids: the embedded orange, the other things of the demo data set and hard negatives, from formulas
+alone.
 
-Names are CIFAR-100 class names, so that a classifier's labels agree; look-alikes are what CIFAR-100 lacks. Every solid
-is closed, stands upright along z, has counter-clockwise faces outward and lies within about [−1, 1]³. Colours are RGB
-in [0, 1], sRGB-encoded.
+Names are CIFAR-100 class names, so that a classifier's labels agree; hard negatives are what CIFAR-100 lacks. Every
+solid is closed, stands upright along z, has counter-clockwise faces outward and lies within about [−1, 1]³. Colours are
+RGB in [0, 1], sRGB-encoded.
 """
 
 import colorsys
@@ -22,7 +23,7 @@ LEAF_GREEN = (0.25, 0.42, 0.12)
 
 @checked
 def solid(name: str, seed: int = 0) -> Mesh:
-    """The individual that `seed` picks of the solid `name`; InputError for a name that is in neither registry."""
+    """The instance that `seed` picks of the solid `name`; InputError for a name that is in neither registry."""
     require_range("seed", seed, 0, 2**63 - 1)
     known = SOLIDS | LOOK_ALIKES
     if name not in known:

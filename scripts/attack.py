@@ -7,11 +7,11 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 import train.command_line.entry_points as command
-from augment.attacks.adversary_folder import read_adversary
+from augment.attacks.adversary import read_adversary
+from augment.attacks.attack import logits_of
+from augment.attacks.evaluate import Sweep
 from augment.attacks.files import LINES
-from augment.attacks.run import logits_of
-from augment.attacks.sweep import Sweep
-from augment.parameters import KINDS
+from augment.attacks.parameters import PARAMETERS
 from renderer.errors import InputError
 from renderer.visibility import choose
 from train.attacks.curve import FIGURE, TABLE, curve, format_curve, write_curve
@@ -32,14 +32,14 @@ def main(config: DictConfig) -> None:
     settings = read_settings(AttackExperimentSettings, config)
     adversary = read_adversary(Path(settings.reload)) if settings.reload else None
     if adversary is None:
-        settings.attack.require_kinds()
+        settings.attack.require_parameters()
     device = choose_device(settings.device)
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
     if adversary is not None:
         images = adversary.render(choose(settings.renderer.visibility)).to(device)
-        logits = logits_of(settings.attack.judge(classifier), images[None], len(images))[0]
+        logits = logits_of(settings.attack.preprocessed_model(classifier), images[None], len(images))[0]
         print(format_reloaded(adversary, images, logits, classifier.classes))
-        if not settings.attack.kinds:
+        if not settings.attack.parameters:
             return
     others = load_others(settings, classifier, device)
     out = writable_folder(settings.out, "out")
@@ -52,8 +52,8 @@ def main(config: DictConfig) -> None:
                 print(f"{name} is not recognised in the scene as it is, but is with {overrides(scene, settings.scene)}")
             checks = attacked.check() if settings.attack.checks else None
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
-            verdicts = attacked.save(folder, checks, settings.attack.renderers)
-            print(format_attack(name, attacked, checks, verdicts))
+            rerender_checks = attacked.save(folder, checks, settings.attack.renderers)
+            print(format_attack(name, attacked, checks, rerender_checks))
             print(f"images, adversaries and numbers: {folder}\n")
             if others:
                 found = [*attacked.transfer(**others)]
@@ -63,7 +63,7 @@ def main(config: DictConfig) -> None:
                 sweeps[folder.name] = attacked.sweep(settings.attack.sweep)
                 print(f"{format_curve(sweeps[folder.name])}\n")
         if sweeps:
-            write_curve(curve(sweeps), {kind: each.norm for kind, each in settings.attack.kinds.items()}, out)
+            write_curve(curve(sweeps), {kind: each.norm for kind, each in settings.attack.parameters.items()}, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
         OmegaConf.save(config, out / "config.yaml")
 
@@ -75,8 +75,8 @@ def _several_kinds(argument: str) -> str:
     if key != "attack":
         return argument
     names = [name for name in re.split(r"[+,\s]+", kinds.strip("[]")) if name]
-    if unknown := [name for name in names if name not in KINDS]:
-        raise InputError(f"attack={unknown[0]} is not known: choose from {', '.join(KINDS)}, several joined by +")
+    if unknown := [name for name in names if name not in PARAMETERS]:
+        raise InputError(f"attack={unknown[0]} is not known: choose from {', '.join(PARAMETERS)}, several joined by +")
     return f"attack=[{','.join(names)}]"
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import train.command_line.entry_points as command
-from augment.progress import progress
+from augment.utils import progress
 from renderer.errors import InputError
 from train.report.comparison import format_comparison
 from train.report.summary import summarise

@@ -1,4 +1,4 @@
-"""Path-trace photographs of oranges and look-alikes under a projector: python scripts/lab.py out=lab"""
+"""Path-trace photographs of oranges and hard negatives under a projector: python scripts/lab.py out=lab"""
 
 from train.command_line.entry_points import script
 from train.laboratory.folder import write_laboratory

@@ -13,7 +13,7 @@ import torch
 
 import augment
 import renderer
-from augment.phases import Phases
+from augment.utils import Phases
 from renderer.arguments import checked
 from renderer.errors import InputError
 
@@ -25,7 +25,7 @@ MANY = [
     *(torch.tensor(1), torch.zeros(0), torch.full((49, 3), math.nan)),
     *(torch.zeros(49, 3, dtype=torch.int64), torch.zeros(49, 3, dtype=torch.complex64)),
 ]
-RESULTS = {"Attacked", "InputError", "Operator"}  # which nobody makes; their methods are below
+RESULTS = {"AttackResult", "InputError", "Operator"}  # which nobody makes; their methods are below
 SMALL = {"samples": 1, "encoding": "linear", "normals": "smooth", "transport": "direct", "visibility": "software"}
 OF_SCENE = {"views": 1, "shared": False, "backgrounds": [0.5], "light": "grace", "exposure": 1.0, "projector": None}
 OF_SCENE |= {"lamps": None, "ground": None, "polar": 60.0, "azimuth": 0.0, "field_of_view": 2.0, "perspective": None}
@@ -86,9 +86,9 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
         "attack": (augment.attack, {"classifier": classifier, "scene": scene, "settings": settings, "force": True}
                    | {"criterion": augment.Misclassification(), "seed": 0}),
         "Targeted": (augment.Targeted, {"classes": "b"}),
-        "Attacked.sweep": (attacked.sweep, {"scales": [1.0]}),
-        "Attacked.transfer": (attacked.transfer, {"classifiers": [], "azimuths": [], "objects": []}),
-        "Attacked.save": (attacked.save, {"folder": Path("saved"), "checks": None, "verify": ()}),
+        "AttackResult.sweep": (attacked.sweep, {"scales": [1.0]}),
+        "AttackResult.transfer": (attacked.transfer, {"classifiers": [], "azimuths": [], "objects": []}),
+        "AttackResult.save": (attacked.save, {"folder": Path("saved"), "checks": None, "verify": ()}),
         "AttackSettings": (augment.AttackSettings, fields(settings)),
         "SkylightSettings": (augment.SkylightSettings, {"zenith": 45.0, "azimuth": 0.0, "turbidity": 3.0}),
         "StepSettings": (augment.StepSettings, fields(augment.StepSettings())),
@@ -101,9 +101,9 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
         "AugmentationService.regenerate": (service.regenerate, {"model": network, "number": 0}),
         "LampsSettings": (built(augment.LampsSettings), fields(augment.LampsSettings())),
         "ProjectorSettings": (built(augment.ProjectorSettings), fields(augment.ProjectorSettings())),
-        "SnapshotSettings": (augment.SnapshotSettings, fields(augment.SnapshotSettings())),
+        "CameraEffectSettings": (augment.CameraEffectSettings, fields(augment.CameraEffectSettings())),
         "ObjectSettings": (augment.ObjectSettings, {"mesh": "solid:plate", "label": "a", "gain": 1.0, "color": None}),
-        "CompanionSettings": (augment.CompanionSettings, fields(augment.CompanionSettings("solid:plate", [1.0, 1.0]))),
+        "PropSettings": (augment.PropSettings, fields(augment.PropSettings("solid:plate", [1.0, 1.0]))),
     }  # fmt: skip
 
 

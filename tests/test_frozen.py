@@ -32,7 +32,7 @@ from torch import Tensor, nn
 
 import augment
 import renderer
-from augment.attacks.observation import TransformationSettings
+from augment.attacks.eot import EOTSettings
 from augment.scene import Conditions
 from renderer.lights import directional
 from renderer.skylight import coefficients as skylight
@@ -69,9 +69,9 @@ OPERATORS = {
     "shadows": ("plate:0", NEAR, {"transport": "shadows"}),
     "bounces": ("cup:1", ASIDE, {"transport": "bounces:2"}),
 }
-CUP = augment.CompanionSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0)
-LEMON = augment.CompanionSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4)
-AMONG_PROPS = augment.ObjectSettings("solid:pear:0", "orange", gain=0.9, beside=[CUP, LEMON])
+CUP = augment.PropSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0)
+LEMON = augment.PropSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4)
+AMONG_PROPS = augment.ObjectSettings("solid:pear:0", "orange", gain=0.9, props=[CUP, LEMON])
 PROJECTOR = augment.ProjectorSettings(pixels=6, polar=50.0, azimuth=20.0, power=2.0, pattern=0.5)
 LAMPS = augment.LampsSettings([[2.0, 1.0, 2.0], [-2.0, 0.5, 1.5]], power=8.0, start=3.0)
 DISCS = augment.LampsSettings([[2.0, 1.0, 2.0], [0.5, -2.0, 2.5]], power=8.0, radius=0.4, start=[[4, 3, 2], [1, 2, 3]])
@@ -87,15 +87,15 @@ SCENES = {
 CLASSES = ["orange", "apple", "pear", "bottle"]
 ORANGES = [("solid:orange:0", "orange"), ("solid:orange:1", "orange")]
 SCENE = {"samples": 2, "encoding": "linear", "normals": "flat", **SOFTWARE}
-SETTINGS = {"max_steps": 4, "margin": 0.5, "light": "physical"}
+SETTINGS = {"max_steps": 4, "margin": 0.5, "allow_negative": False}
 Step, Sky = augment.StepSettings, augment.SkylightSettings
 BOTH = {"lighting": Step(step_size=0.2), "geometry": Step(radius=0.01, step="sign", step_size=0.005)}
 SHAPE, COLOR = {"geometry": Step("linf", 0.02, "sign", 0.01)}, {"albedo": Step("linf", 0.2, "sign", 0.03)}
-DRAWS = {"restarts": 2, "expectation": TransformationSettings(draws=2)}
+DRAWS = {"restarts": 2, "eot": EOTSettings(draws=2)}
 # name: (what is attacked, keywords of `build_scene`, other keywords of `AttackSettings`, criterion)
 ATTACKS = {
     "lighting_l2": ({"lighting": Step("l2", 0.8, step_size=0.3)}, {}, {"rounded": True}, None),
-    "lighting_signed": ({"lighting": Step(step_size=0.3)}, {}, {"light": "signed", "margin": 0.0}, None),
+    "lighting_signed": ({"lighting": Step(step_size=0.3)}, {}, {"allow_negative": True, "margin": 0.0}, None),
     "skylight": ({"skylight": Sky(zenith=30.0, step_size=0.3)}, {"normals": "smooth"}, {}, None),
     "projector": ({"projector": Step(step_size=1.0)}, {"projector": PROJECTOR, "encoding": "srgb"}, {}, None),
     "lamps": ({"lamps": Step(step_size=2.0)}, {"lamps": LAMPS, "transport": "shadows"}, {}, None),
@@ -117,14 +117,14 @@ RUNS = {
     "demonstration": "experiment=demo augment.examples=4 augment.attack.max_steps=3 augment.attack.step_size=0.3",
     "best": """
 experiment=best augment.examples=null scene.views=1 scene.meshes=['solid:orange',solid:orange:1] augment.every=30
-train.images_per_epoch=60 train.averaging=0.8 train.distillation=1.0 augment.random.radius=1.0""",
+train.images_per_epoch=60 train.averaging=0.8 train.distillation=1.0 augment.random_light.radius=1.0""",
     "harden": """
-experiment=harden augment=adversarial augment.examples=6 augment.every=30 augment.start=random augment.lights=continue
-+attack@augment.attack=[lighting,albedo] augment.attack.max_steps=3 augment.vary.place=0.1
-augment.vary.exposure=[0.5,1.5] augment.vary.snapshot.noise=0.02 model.dropout=0.3 train.epochs=3
+experiment=harden augment=adversarial augment.examples=6 augment.every=30 augment.init=random augment.warm_start=true
++attack@augment.attack=[lighting,albedo] augment.attack.max_steps=3 augment.vary.shift=0.1
+augment.vary.exposure=[0.5,1.5] augment.vary.camera.noise=0.02 model.dropout=0.3 train.epochs=3
 train.images_per_epoch=60 train.distortion=augmix train.ranking=0.5 train.label_smoothing=0.1 train.averaging=0.8
 train.flips=alternating scene.views=1 scene.meshes=[solid:orange:0,solid:orange:1]
-scene.look_alikes=[{mesh:'solid:ball:0',label:apple}]""",
+scene.hard_negatives=[{mesh:'solid:ball:0',label:apple}]""",
 }
 FOLDERS: dict[str, Path] = {}  # of the runs that were made
 
@@ -171,7 +171,7 @@ def test_attack(name, verify):
     settings = augment.AttackSettings(**changed, **SETTINGS | others)
     found = augment.attack(classifier(), scene, criterion, settings, seed=5, force=True)
     assert (found.images - found.images_before).abs().max() > 1e-3
-    verify(found.images_before, found.images, found.logits, found.result.values, found.result.cost, found.steps)
+    verify(found.images_before, found.images, found.logits, found.descent.values, found.descent.cost, found.steps)
 
 
 @pytest.mark.parametrize("name", ["demonstration/none", "demonstration", "best", "harden"])

@@ -10,7 +10,7 @@ import trimesh
 from torch import nn
 from torch.utils.data import Dataset
 
-from augment.attacks import checks
+from augment.attacks import evaluate
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 HEADINGS = re.split(r"^#{2,3} (.*)$", README, flags=re.MULTILINE)
@@ -55,15 +55,15 @@ class Brightness(nn.Module):
 
 
 def test_attack_a_classifier(folder, capsys, monkeypatch):
-    monkeypatch.setattr(checks, "GROWTH", (1,))  # ten times as many steps take some 20 s
+    monkeypatch.setattr(evaluate, "GROWTH", (1,))  # ten times as many steps take some 20 s
     names = run("Attack a classifier", network=Brightness(), CLASSES=["orange", "plum"])
     attacked = names["attacked"]
     assert capsys.readouterr().out and names["after"].shape == names["before"].shape == (1, 3, 3, 224, 224)
     assert 0 < float((names["lights"] - attacked.problem.scene.lights).norm()) <= 1 + 1e-5
-    assert attacked.result.cost < attacked.result.cost_before
+    assert attacked.descent.cost < attacked.descent.cost_before
     (line,) = [json.loads(line) for line in (folder / "adversaries" / "attack.jsonl").read_text().splitlines()]
     assert (
-        line["fooled"] == bool(attacked.success) and (folder / "adversaries" / "example_000" / "light.json").is_file()
+        line["success"] == bool(attacked.success) and (folder / "adversaries" / "example_000" / "light.json").is_file()
     )
 
 

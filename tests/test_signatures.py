@@ -15,15 +15,13 @@ import torch
 from torch import Tensor, nn
 
 import renderer
+from augment.attacks.criteria import Goal, adversarial_cost
+from augment.attacks.descent import DescentResult, DescentSettings, descend
+from augment.attacks.parameters import AttackProblem, Lighting, StepSettings
 from augment.classifiers import Classifier
-from augment.descent import AttackResult, DescentSettings, descend
-from augment.goal import Goal, adversarial_cost
-from augment.kind import StepSettings
-from augment.parameters import Lighting
-from augment.perturbation import Perturbation
-from augment.phases import Phases
 from augment.scene import Scene
 from augment.service import AugmentationService, Renders
+from augment.utils import Phases
 from renderer import harmonics, image, normals, shading
 from renderer.camera import ring
 from renderer.transfer import Operator
@@ -126,7 +124,7 @@ def test_of_scenes_attacks_and_the_service():
     checked(adversarial_cost)(logits, renders.labels, 1 - renders.labels)
 
     scene = service.scene
-    problem, everything = Perturbation(scene, [Lighting(scene, StepSettings())]), torch.arange(2)
+    problem, everything = AttackProblem(scene, [Lighting(scene, StepSettings())]), torch.arange(2)
     conditions = checked(Scene.conditions)(scene, everything)
     check_fields(conditions)
     checked(Scene.render)(scene, conditions, everything)
@@ -134,7 +132,7 @@ def test_of_scenes_attacks_and_the_service():
     goal = Goal(renders.labels[:, None])
     check_fields(goal)
     result = descend(classifier, problem, goal, DescentSettings(max_steps=1), Phases())
-    assert isinstance(result, AttackResult)
+    assert isinstance(result, DescentResult)
     check_fields(result)
     checked(Goal.reached)(goal, result.predicted)
     checked(Goal.reached_in_views)(goal, result.predicted)

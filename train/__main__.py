@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import train.command_line.entry_points as command
-from augment import processes
+from augment import utils
 from train.command_line.overrides import quoted
 from train.data import DataSet
 from train.distributed import broadcast, first_process_first, process_group
@@ -35,7 +35,7 @@ NAMED_MODEL = re.compile(r"^model=(?!\{)")  # by its name alone
 def main(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     folder = Path(hydra_config.runtime.output_dir)
-    if processes.rank() == 0:
+    if utils.rank() == 0:
         broadcast(str(folder))
     config.run = str(folder)
     if hydra_config.mode == RunMode.MULTIRUN:
@@ -51,9 +51,9 @@ def run_arms(config: DictConfig, folder: Path) -> None:
     choices = {folder / str(arm): {"augment": {"arm": arm}} for arm in config.compare}
     arms = {path: cast(DictConfig, OmegaConf.merge(config, choice)) for path, choice in choices.items()}
     arms[folder] = config
-    with sole_writer("run", *arms) if processes.rank() == 0 else nullcontext():
+    with sole_writer("run", *arms) if utils.rank() == 0 else nullcontext():
         with first_process_first():
-            if processes.rank() == 0:
+            if utils.rank() == 0:
                 write_images(config, data.size)
         _train_arms(arms, data, folder)
 
@@ -67,18 +67,14 @@ def _train_arms(arms: Mapping[Path, DictConfig], data: DataSet, folder: Path) ->
         except Interrupted as stop:
             console.info("ended by %s; to go on: %s", stop.signal, resume_command(folder))
             raise
-    if processes.rank() == 0:
+    if utils.rank() == 0:
         console.info("\n%s", format_table([summarise(path) for path in arms]))
         console.info("%s", report_of([folder], folder))
 
 
 def resume_command(folder: Path) -> str:
     """The command that goes on with this run."""
-    start = (
-        f"torchrun --nproc_per_node={processes.world_size()} -m train"
-        if processes.world_size() > 1
-        else "python -m train"
-    )
+    start = f"torchrun --nproc_per_node={utils.world_size()} -m train" if utils.world_size() > 1 else "python -m train"
     overrides = [
         override for override in HydraConfig.get().overrides.task if not override.startswith(("run=", "train.resume="))
     ]
@@ -89,7 +85,7 @@ def start() -> None:
     """`main` in this process, or in each that torchrun starts; all take the first one's folder, and it alone writes."""
     command.one_sentence_errors(check_launcher)(sys.argv[1:])
     with process_group():
-        if processes.rank() > 0:
+        if utils.rank() > 0:
             console.setLevel("WARNING")
             sys.argv.append(f"run={quoted(broadcast())}")
         sys.argv[1:] = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from augment.classifiers.adapter import class_index
-from augment.seeding import generator
+from augment.utils import generator
 from renderer.errors import InputError
 from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
 from train.run_folder.logs import console

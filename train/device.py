@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from augment import processes
+from augment import utils
 from augment.labels import divergence, is_right, label_loss, ranking_loss
 from renderer.arguments import as_device
 from renderer.errors import InputError, require_choice
@@ -127,7 +127,7 @@ def compiles(choice: str, device: torch.device) -> bool:
         raise InputError("train.compile=always is for a GPU, whose graphs it replays: use auto or never")
     if choice != "auto":
         return choice == "always"
-    return device.type == "cuda" and processes.world_size() == 1 and compiler_works(device)
+    return device.type == "cuda" and utils.world_size() == 1 and compiler_works(device)
 
 
 @functools.cache

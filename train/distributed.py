@@ -10,7 +10,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from augment import processes
+from augment import utils
 
 
 @contextmanager
@@ -36,24 +36,24 @@ def is_process_lost(error: Exception) -> bool:
 @contextmanager
 def first_process_first() -> Iterator[None]:
     """Let the first process do alone what the others then find done, such as a download."""
-    if processes.rank() > 0:
+    if utils.rank() > 0:
         _wait()
     yield
-    if processes.rank() == 0:
+    if utils.rank() == 0:
         _wait()
 
 
 def broadcast(value: str = "") -> str:
     """The first process's value, which the others wait for."""
     values = [value]
-    if processes.world_size() > 1:
+    if utils.world_size() > 1:
         dist.broadcast_object_list(values, src=0)
     return values[0]
 
 
 def any_process(flag: bool) -> bool:
     """Whether the flag is set in any process."""
-    if processes.world_size() == 1:
+    if utils.world_size() == 1:
         return flag
     flags = torch.tensor([float(flag)])  # on the CPU, so that no device has to catch up
     dist.all_reduce(flags, dist.ReduceOp.MAX)
@@ -62,7 +62,7 @@ def any_process(flag: bool) -> bool:
 
 def summed(values: Tensor) -> Tensor:
     """The sum over all processes, in place."""
-    if processes.world_size() > 1:
+    if utils.world_size() > 1:
         dist.all_reduce(values)
     return values
 
@@ -73,7 +73,7 @@ def replicated(model: nn.Module) -> nn.Module:
     Batch normalisation takes its statistics over the global batch (`nn.SyncBatchNorm`), so that the result does not
     depend on the number of processes.
     """
-    if processes.world_size() == 1:
+    if utils.world_size() == 1:
         return model
     synchronise_norms(model)
     return DistributedDataParallel(model)
@@ -99,7 +99,7 @@ class SyncBatchNormCPU(nn.BatchNorm2d):
         mean = _average(values.mean((0, 2, 3)))
         centred = values - mean.view(1, -1, 1, 1)
         variance = _average(centred.square().mean((0, 2, 3)))
-        self._track(mean.detach(), variance.detach(), processes.world_size() * x.numel() // x.shape[1])
+        self._track(mean.detach(), variance.detach(), utils.world_size() * x.numel() // x.shape[1])
         scale = (variance + self.eps).rsqrt()
         if not self.affine:
             return (centred * scale.view(1, -1, 1, 1)).to(x.dtype)
@@ -128,7 +128,7 @@ class _Sum(torch.autograd.Function):
 
 
 def _average(values: Tensor) -> Tensor:
-    return _Sum.apply(values) / processes.world_size()
+    return _Sum.apply(values) / utils.world_size()
 
 
 def _converted(norm: nn.BatchNorm2d, kind: type[nn.Module], like: Tensor) -> nn.Module:
@@ -139,5 +139,5 @@ def _converted(norm: nn.BatchNorm2d, kind: type[nn.Module], like: Tensor) -> nn.
 
 
 def _wait() -> None:
-    if processes.world_size() > 1:
+    if utils.world_size() > 1:
         dist.barrier()

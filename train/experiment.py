@@ -9,9 +9,8 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from augment import processes
-from augment.phases import Phases
-from augment.seeding import stream_seed
+from augment import utils
+from augment.utils import Phases, stream_seed
 from renderer.cache import TensorCache, cache_folder
 from renderer.errors import InputError, require_choice
 from renderer.image import LARGEST_SIZE
@@ -96,9 +95,9 @@ def prepare(config: DictConfig, data: DataSet, folder: Path) -> Callable[[], Non
             device,
             trainer.learner.model.precision,
             torch.get_num_threads(),
-            processes.world_size(),
+            utils.world_size(),
         )
-        log = NoLog() if processes.rank() else RunLog(folder, trainer.history)
+        log = NoLog() if utils.rank() else RunLog(folder, trainer.history)
         trainer.fit(train.to(device), validation.to(device), log)
         log.scalars(_test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device))
 
@@ -150,7 +149,7 @@ def _open_folder(trainer: Trainer, config: DictConfig) -> None:
         console.info("resumed %s after epoch %d%s", folder, trainer.epoch, trainer.part_of_epoch)
     elif trainer.settings.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
-    if processes.rank() == 0:
+    if utils.rank() == 0:
         _write_config(config, folder)
 
 
@@ -184,7 +183,7 @@ def _photograph_scores(
 ) -> dict[str, float]:
     """The network's figures on each folder of photographs, as NAME/FIGURE; empty without one."""
     scores: dict[str, float | None] = {}
-    for name, photographs in settings.evaluate.folders.items() if processes.rank() == 0 else ():
+    for name, photographs in settings.evaluate.folders.items() if utils.rank() == 0 else ():
         summary = evaluate_photographs(
             trainer.learner.selected,
             data.classes,

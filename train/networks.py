@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from augment.classifiers.adapter import Normalised
 from augment.classifiers.imagenet import require_architecture
 from augment.classifiers.python_function import call_python
-from augment.model_state import eval_mode
+from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
 from train.wideresnet import WideResNet
 

@@ -1,7 +1,7 @@
 """A small labelled data set that the project renders itself, so that the experiment runs with nothing downloaded.
 
 Training and test images stand in soft, even light, as stock photographs do. The held-out images, written to a
-folder and scored like photographs, show other individuals in hard light from one side: every class under the same
+folder and scored like photographs, show other instances in hard light from one side: every class under the same
 lights before the same cameras, so that nothing but the thing itself tells one from another. They are renders.
 """
 
@@ -19,7 +19,7 @@ import augment
 from augment.backgrounds import load_backgrounds
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
-from augment.seeding import generator
+from augment.utils import generator
 from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings, to_bytes
@@ -32,7 +32,7 @@ from train.run_folder.logs import console
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)
-VIEWS, BACKGROUNDS = 5, 4  # images per individual: every view on every background, each in a light of its own
+VIEWS, BACKGROUNDS = 5, 4  # images per instance: every view on every background, each in a light of its own
 HELD_OUT, HELD_OUT_PER_CLASS = "held out", 60
 SOURCE = "rendered, hard light"
 CODE = RENDERER + source_key(Path(augment.__file__).parent, Path(__file__).parent)
@@ -41,7 +41,7 @@ Lights = Callable[[Tensor, torch.Generator], Tensor]
 
 
 def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
-    """That many training and test images of every class, in even light; whole individuals (20 images) each.
+    """That many training and test images of every class, in even light; whole instances (20 images) each.
 
     The cache keeps the images, not the operators: every one of those is used for four images and never again.
     """
@@ -101,14 +101,14 @@ def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Te
     """Images of every class, in order: uint8 (classes × per_class, 3, size, size). Held out, all classes have the same
     draws of light and camera."""
     backend = choose("software")
-    individuals = math.ceil(per_class / (VIEWS * BACKGROUNDS))
+    instances = math.ceil(per_class / (VIEWS * BACKGROUNDS))
     light = hard_light if part == HELD_OUT else even_light
     draws = seeds = generator(seed, part)
     images = []
     for name in CLASSES:
         if part == HELD_OUT:
             draws, seeds = generator(seed, part), generator(seed, part, name)
-        meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(individuals))
+        meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(instances))
         portraits = [_portraits(name, mesh, light, settings, backend, draws) for mesh in meshes]
         images.append(torch.cat(portraits)[:per_class])
     return torch.cat(images)
@@ -117,7 +117,7 @@ def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Te
 def _portraits(
     name: str, mesh: Mesh, light: Lights, settings: ImageSettings, backend: Backend, draws: torch.Generator
 ) -> Tensor:
-    """20 images of one individual: uint8 (20, 3, size, size)."""
+    """20 images of one instance: uint8 (20, 3, size, size)."""
     polar, azimuth, field = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
     cameras = [
         OrthographicCamera(math.radians(40 + 45 * p), 2 * math.pi * a, 2 + f)

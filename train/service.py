@@ -6,10 +6,10 @@ import torch
 
 from augment.build import build_scene
 from augment.classifiers.adapter import class_index
-from augment.labels import anything_but
-from augment.phases import Phases
+from augment.labels import complementary_label
 from augment.scene import Scene
 from augment.service import AugmentationService
+from augment.utils import Phases
 from renderer.cache import OperatorCache
 from renderer.harmonics import live_coefficients
 from renderer.transfer import COEFFICIENTS, DEGREE
@@ -27,9 +27,9 @@ def build_service(
         with phases("operators"), first_process_first():
             scene = _build_scene(settings, data, device)
         under_study = class_index(data.classes, settings.label, "label")
-        number = {OTHER: anything_but(under_study)} | {name: index for index, name in enumerate(data.classes)}
+        number = {OTHER: complementary_label(under_study)} | {name: index for index, name in enumerate(data.classes)}
         labels = torch.tensor([number[name] for name in scene.labels])
-        label = under_study if settings.scene.look_alikes else None
+        label = under_study if settings.scene.hard_negatives else None
     return AugmentationService(settings.augment, scene, labels.to(device), settings.seed, phases, label)
 
 

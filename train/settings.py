@@ -7,10 +7,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from augment.build import count_views
-from augment.objects import CompanionSettings, ObjectSettings
-from augment.placed_lights import LampsSettings, ProjectorSettings
-from augment.service_settings import AugmentationSettings
+from augment.build import LampsSettings, ProjectorSettings, count_views
+from augment.objects import ObjectSettings, PropSettings
+from augment.service import AugmentationSettings
 from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
@@ -21,7 +20,7 @@ from train.command_line.configuration import read_settings
 from train.fit.recipe import TrainSettings
 from train.networks import WIDERESNET
 
-OTHER = "other"  # in place of the class of a look-alike that the classifier has no class for
+OTHER = "other"  # in place of the class of a hard negative that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
 SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
@@ -86,14 +85,14 @@ class SceneSettings:
 
 @dataclass
 class TrainingSceneSettings(SceneSettings):
-    """look_alikes: like meshes, of what `label` is to be told from; of no class, unless a mapping names one."""
+    """hard_negatives: like meshes, of what `label` is to be told from; of no class, unless a mapping names one."""
 
-    look_alikes: list[Any] = field(default_factory=list)
+    hard_negatives: list[Any] = field(default_factory=list)
 
     @property
     def objects(self) -> int:
-        """How many; none where there is no mesh that look-alikes could be told from."""
-        return len(self.meshes) + len(self.look_alikes) if self.meshes else 0
+        """How many; none where there is no mesh that hard negatives could be told from."""
+        return len(self.meshes) + len(self.hard_negatives) if self.meshes else 0
 
 
 @dataclass
@@ -197,13 +196,13 @@ class ExperimentSettings:
 
     @property
     def objects(self) -> dict[str, ObjectSettings]:
-        """By their keys, the meshes of the scene, and its look-alikes, of the class OTHER where they name none."""
+        """By their keys, the meshes of the scene, and its hard negatives, of the class OTHER where they name none."""
         objects = {}
-        for key, label in (("meshes", self.label), ("look_alikes", OTHER)):
+        for key, label in (("meshes", self.label), ("hard_negatives", OTHER)):
             for index, item in enumerate(getattr(self.scene, key)):
                 objects[f"scene.{key}[{index}]"] = read_object(item, label, index, f"scene.{key}")
         for key, item in objects.items():
-            if key.startswith("scene.look_alikes") and item.label == self.label:
+            if key.startswith("scene.hard_negatives") and item.label == self.label:
                 raise InputError(f"{key} is of the class {self.label}: name it in scene.meshes, or leave it out")
         return objects
 
@@ -211,11 +210,11 @@ class ExperimentSettings:
 def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
     """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own."""
     own, keys = f"{key}[{index}]", dict(item) if isinstance(item, dict) else {"mesh": item}
-    beside: Any = keys.pop("beside", [])
-    if not (isinstance(beside, list) and all(isinstance(each, dict) for each in beside)):
-        raise InputError(f"{own}.beside: give a list of mappings, as in [{{mesh: solid:cup, at: [0.9, 0]}}]")
-    company = [
-        read_settings(CompanionSettings, OmegaConf.create(each), f"{own}.beside[{number}]")
-        for number, each in enumerate(beside)
+    props: Any = keys.pop("props", [])
+    if not (isinstance(props, list) and all(isinstance(each, dict) for each in props)):
+        raise InputError(f"{own}.props: give a list of mappings, as in [{{mesh: solid:cup, at: [0.9, 0]}}]")
+    props = [
+        read_settings(PropSettings, OmegaConf.create(each), f"{own}.props[{number}]")
+        for number, each in enumerate(props)
     ]
-    return replace(read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), own), beside=company)
+    return replace(read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), own), props=props)

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from augment import processes
+from augment import utils
 from renderer.errors import InputError
 
 DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything
@@ -110,17 +110,17 @@ class Dropout(nn.Dropout):
             return x
         if x.device.type == "cpu":
             return x * self._drawn_by_numpy(x)
-        if processes.world_size() == 1:
+        if utils.world_size() == 1:
             return super().forward(x)
-        everyone = torch.rand(processes.world_size(), *x.shape, device=x.device)
-        return x * (everyone[processes.rank()] >= self.p) / (1 - self.p)
+        everyone = torch.rand(utils.world_size(), *x.shape, device=x.device)
+        return x * (everyone[utils.rank()] >= self.p) / (1 - self.p)
 
     def _drawn_by_numpy(self, x: Tensor) -> Tensor:
         """0 or 1 / (1 - p) for each value, in x's memory layout: 16 bits each, from a generator that torch seeds."""
-        own, everyone = x.numel(), x.numel() * processes.world_size()
+        own, everyone = x.numel(), x.numel() * utils.world_size()
         generator = np.random.Generator(np.random.SFC64(int(torch.randint(2**63 - 1, (1,)))))
         words = generator.integers(0, 2**64 - 1, -(-everyone // 4), dtype=np.uint64, endpoint=True)
-        bits = torch.from_numpy(words.view(np.int16))[processes.rank() * own :][:own]
+        bits = torch.from_numpy(words.view(np.int16))[utils.rank() * own :][:own]
         dropped = round(self.p * LEVELS)
         kept = bits.ge_(dropped - LEVELS // 2)  # in place: as int16 it converts five times faster than as bool
         factors = torch.empty_like(x)  # dense, so that its storage can be filled in order

@@ -21,11 +21,11 @@ Column = tuple[str, Sequence[Tile]]  # a title, and a tile per view
 
 
 @dataclass(frozen=True)
-class Exhibit:
+class Panel:
     """What one side of an attack, initial or adversarial, shows in V views.
 
-    images: (V, 3, H, W) RGB in [0, 1]. captions: V times lines of text, as `answer_caption` gives them, the first in
-    ink and the others faint. spheres: (V, 3, S, S) in [0, 1], each view's light (`renderer.light_sphere`), or None.
+    images: (V, 3, H, W) RGB in [0, 1]. captions: V times lines of text, as `prediction_caption` gives them, the first
+    in ink and the others faint. spheres: (V, 3, S, S) in [0, 1], each view's light (`renderer.light_sphere`), or None.
     """
 
     images: Tensor
@@ -33,13 +33,13 @@ class Exhibit:
     spheres: Tensor | None = None
 
 
-def answer_caption(probabilities: Tensor, classes: Sequence[str], label: str) -> tuple[str, ...]:
+def prediction_caption(probabilities: Tensor, classes: Sequence[str], label: str) -> tuple[str, ...]:
     """A classifier's answer (C,) with its confidence and, where it is wrong, the true class with its own below it."""
     shown = dict.fromkeys([int(probabilities.argmax()), classes.index(label)])
     return tuple(f"{probabilities[index]:.1%} {classes[index]}" for index in shown)
 
 
-def save_figure(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
+def save_figure(initial: Panel, adversarial: Panel, path: Path) -> None:
     """Write the image, a row per view, as a .png, whose tiles `read_figure` returns.
 
     The differences are grey where there is none, and scaled alike so that the largest reaches black or white.
@@ -50,9 +50,9 @@ def save_figure(initial: Exhibit, adversarial: Exhibit, path: Path) -> None:
         ("adversarial", _tiles(adversarial.images, adversarial.captions)),
         ("difference", _difference_tiles(adversarial.images - initial.images)),
     ]
-    for title, exhibit in (("initial light", initial), ("adversarial light", adversarial)):
-        if exhibit.spheres is not None:
-            columns.append((title, _tiles(exhibit.spheres, [()] * len(exhibit.spheres))))
+    for title, panel in (("initial light", initial), ("adversarial light", adversarial)):
+        if panel.spheres is not None:
+            columns.append((title, _tiles(panel.spheres, [()] * len(panel.spheres))))
     columns = [(title, [*map(_enlarged, tiles)]) for title, tiles in columns]
     sheet, told = _draw(columns)
     info = PngInfo()

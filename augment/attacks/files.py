@@ -9,12 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment.attacks.adversary import Adversary
-from augment.attacks.adversary_folder import write_adversary
-from augment.attacks.checks import Checks
-from augment.attacks.figure import Exhibit, answer_caption, save_figure
-from augment.attacks.run import Attacked, answers
-from augment.attacks.verification import Verdict, require_renderers, verify
+from augment.attacks.adversary import Adversary, write_adversary
+from augment.attacks.attack import AttackResult, predictions
+from augment.attacks.evaluate import Checks, RerenderCheck, require_renderers, verify
+from augment.attacks.figure import Panel, prediction_caption, save_figure
 from augment.scene import Conditions
 from renderer.arguments import checked
 from renderer.basis import Basis
@@ -27,8 +25,8 @@ SPHERE = 192
 
 @checked
 def write_files(
-    attacked: Attacked, checks: Checks | None, folder: Path, renderers: Sequence[str] = ("reload",)
-) -> list[Verdict]:
+    attacked: AttackResult, checks: Checks | None, folder: Path, renderers: Sequence[str] = ("reload",)
+) -> list[RerenderCheck]:
     """Write a folder: attack.jsonl and, for each example, an image and the adversary as a folder of its own.
 
     renderers: what is to render the adversaries anew from these; see `verify`.
@@ -40,66 +38,66 @@ def write_files(
     stems = [folder / f"example_{example:03d}" for example in everything.tolist()]
     lines = []
     for example, stem in enumerate(stems):
-        save_figure(*exhibits(attacked, example), stem.with_suffix(".png"))
+        save_figure(*panels(attacked, example), stem.with_suffix(".png"))
         images = attacked.images_before[example], attacked.images[example]
         light = write_adversary(Adversary.of(attacked.problem.scene, example, after, *images), stem)
         lines.append({"example": example, **_numbers(attacked, example), **light, **_damage(attacked, after, example)})
-    verdicts = verify(attacked, stems, renderers)
+    rerender_checks = verify(attacked, stems, renderers)
     with open(folder / LINES, "w", encoding="utf-8") as file:
         for example, line in enumerate(lines):
-            survives = {each.version: each.of(example, attacked.classifier.classes) for each in verdicts}
+            survives = {each.version: each.of(example, attacked.classifier.classes) for each in rerender_checks}
             file.write(json.dumps({**line, "versions": survives}) + "\n")
         if checks is not None:
             file.write(json.dumps({"checks": asdict(checks), "warnings": checks.warnings}) + "\n")
-    return verdicts
+    return rerender_checks
 
 
-def exhibits(attacked: Attacked, example: int) -> tuple[Exhibit, Exhibit]:
+def panels(attacked: AttackResult, example: int) -> tuple[Panel, Panel]:
     """What an example shows before and after; its light only where the attack has changed it."""
     problem, classes = attacked.problem, attacked.classifier.classes
     one = problem.everything[example : example + 1]
-    sides = [problem.conditions(values[one], one) for values in (problem.start, attacked.result.values)]
+    sides = [problem.conditions(values[one], one) for values in (problem.start, attacked.descent.values)]
     lights = [(side.light[0], problem.scene.basis_under(side, 0)) for side in sides]
     changed = not torch.equal(lights[0][0], lights[1][0]) or lights[0][1] != lights[1][1]
-    labels = [classes[label] for label in attacked.goal.decrease[example].tolist()]
+    labels = [classes[label] for label in attacked.goal.source[example].tolist()]
 
-    def exhibit(images: Tensor, logits: Tensor, light: Tensor, basis: Basis) -> Exhibit:
+    def panel(images: Tensor, logits: Tensor, light: Tensor, basis: Basis) -> Panel:
         views = zip(logits[example].softmax(1), labels, strict=True)
-        captions = [answer_caption(probabilities, classes, label) for probabilities, label in views]
+        captions = [prediction_caption(probabilities, classes, label) for probabilities, label in views]
         cameras = problem.scene.cameras[example]
         spheres = torch.stack([light_sphere(light, SPHERE, each, basis) for each in cameras]) if changed else None
-        return Exhibit(images[example], captions, spheres)
+        return Panel(images[example], captions, spheres)
 
     return (
-        exhibit(attacked.images_before, attacked.logits_before, *lights[0]),
-        exhibit(attacked.images, attacked.logits, *lights[1]),
+        panel(attacked.images_before, attacked.logits_before, *lights[0]),
+        panel(attacked.images, attacked.logits, *lights[1]),
     )
 
 
-def _numbers(attacked: Attacked, example: int) -> dict[str, object]:
-    result, classes = attacked.result, attacked.classifier.classes
-    before = answers(attacked.logits_before[example], classes)
+def _numbers(attacked: AttackResult, example: int) -> dict[str, object]:
+    result, classes = attacked.descent, attacked.classifier.classes
+    before = predictions(attacked.logits_before[example], classes)
     one = slice(example, example + 1)
     ends = (attacked.problem.split(values[one]) for values in (result.values, attacked.problem.start))
     return {
-        "recognised": bool(attacked.recognised[example]),
-        "fooled_before": bool(result.fooled_before[example]),
-        "fooled": bool(attacked.success[example]),
-        "fooled_in_views": attacked.success_in_views[example].tolist(),
+        "clean_correct": bool(attacked.clean_correct[example]),
+        "success_before": bool(result.success_before[example]),
+        "success": bool(attacked.success[example]),
+        "success_in_views": attacked.success_in_views[example].tolist(),
         "steps": int(result.steps[example]),
         "cost_before": float(result.cost_before[example]),
         "cost": float(result.cost[example]),
-        "label": [classes[index] for index in attacked.goal.decrease[example].tolist()],
+        "label": [classes[index] for index in attacked.goal.source[example].tolist()],
         **{f"{key}_before": value for key, value in before.items()},
-        **answers(attacked.logits[example], classes),
+        **predictions(attacked.logits[example], classes),
         "largest_change": {
-            kind.name: float((part - start).abs().max())
-            for kind, part, start in zip(attacked.problem.kinds, *ends, strict=True)
+            parameter.name: float((part - start).abs().max())
+            for parameter, part, start in zip(attacked.problem.parameters, *ends, strict=True)
         },
     }
 
 
-def _damage(attacked: Attacked, after: Conditions, example: int) -> dict[str, dict[str, Any]]:
+def _damage(attacked: AttackResult, after: Conditions, example: int) -> dict[str, dict[str, Any]]:
     """What became of the shape, where it was attacked."""
     mesh = attacked.problem.scene.mesh(example)
     if after.vertices is None:

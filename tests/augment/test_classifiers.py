@@ -461,8 +461,8 @@ def oranges() -> Callable[[int], torch.Tensor]:
 
 @torch.no_grad()
 def share_called_orange(classifier: Classifier, images: torch.Tensor) -> float:
-    answers = torch.cat([classifier(batch).argmax(1) for batch in images.split(16)])
-    return float((answers == classifier.label("orange")).float().mean())
+    predictions = torch.cat([classifier(batch).argmax(1) for batch in images.split(16)])
+    return float((predictions == classifier.label("orange")).float().mean())
 
 
 @pytest.mark.realdata

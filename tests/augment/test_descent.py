@@ -6,16 +6,16 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.descent import AttackResult, DescentSettings, descend, descend_repeatedly
-from augment.goal import Goal
-from augment.kind import STEPS, direction
-from augment.norm_ball import NormBall
-from augment.phases import Phases
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentResult, DescentSettings, descend, descend_repeatedly
+from augment.attacks.norm_ball import NormBall
+from augment.attacks.parameters import STEPS, direction
+from augment.utils import Phases
 from renderer.errors import InputError
 
 EPS = torch.finfo(torch.float64).eps
 PIXELS, DIMENSIONS = (3, 2, 2), 5
-FIELDS = [each.name for each in fields(AttackResult)]
+FIELDS = [each.name for each in fields(DescentResult)]
 
 
 def random(*shape: int, seed: int) -> Tensor:
@@ -66,7 +66,7 @@ class LinearScene:
         return self.ball.project(values, self.centre[examples])
 
 
-def attack(model: nn.Module, problem, classes: Tensor, steps: int = 30, **settings) -> AttackResult:
+def attack(model: nn.Module, problem, classes: Tensor, steps: int = 30, **settings) -> DescentResult:
     """Without a target."""
     goal = Goal(classes if classes.ndim == 2 else classes[:, None])
     return descend(model, problem, goal, DescentSettings(steps, **settings), Phases())
@@ -103,13 +103,13 @@ def test_on_a_linear_classifier_every_step_is_as_in_closed_form(step, size):
         displacement, steps, after = closed_form(step, size, 6, slope, before)
         taken.add(steps)
         assert int(result.steps[row]) == steps
-        assert bool(result.fooled_before[row]) == (before < 0) and bool(result.fooled[row]) == (after < 0)
+        assert bool(result.success_before[row]) == (before < 0) and bool(result.success[row]) == (after < 0)
         # Six steps of a few roundings each, in sums of 12 terms.
         torch.testing.assert_close(result.values[row] - start[row], displacement, rtol=0, atol=64 * EPS)
         for cost, margin in ((result.cost_before, before), (result.cost, after)):
             assert float(cost[row]) == pytest.approx(-math.log1p(math.exp(-margin)), rel=128 * EPS)
     assert {0, 6} < taken  # examples that were fooled at once, on the way, and never
-    assert torch.equal(result.predicted[:, 0] != classes, result.fooled)
+    assert torch.equal(result.predicted[:, 0] != classes, result.success)
     images = problem.render(result.values, torch.arange(16))
     torch.testing.assert_close(result.images, images, rtol=0, atol=16 * EPS)
     assert not result.zero_gradient.any()
@@ -135,22 +135,22 @@ def test_fooled_examples_stay_and_are_not_looked_at_again():
     result = attack(model, problem, classes, steps=6)
     assert torch.equal(problem.rendered, result.steps + 1)
     assert model.seen == int(problem.rendered.sum())
-    at_once = result.fooled_before
+    at_once = result.success_before
     assert at_once.any() and not result.steps[at_once].any()
     assert torch.equal(result.values[at_once], start[at_once])
     logits = model(result.images.flatten(0, 1))
-    assert torch.equal(logits.argmax(1) != classes, result.fooled)
+    assert torch.equal(logits.argmax(1) != classes, result.success)
 
 
 def test_without_steps_nothing_moves_and_the_costs_are_told():
     start, classes = random(16, DIMENSIONS, seed=2), torch.arange(16) % 2
     result = attack(Linear(WEIGHT), LinearScene(start), classes, steps=0)
     assert torch.equal(result.values, start) and torch.equal(result.cost, result.cost_before)
-    assert not result.steps.any() and torch.equal(result.fooled, result.fooled_before)
+    assert not result.steps.any() and torch.equal(result.success, result.success_before)
 
 
 @pytest.mark.parametrize(
-    ("decrease", "increase", "predicted", "fooled"),
+    ("source", "target", "predicted", "success"),
     [
         ([[0, 1]], None, [[2, 2]], True),  # any error, in every view
         ([[0, 1]], None, [[1, 0]], True),
@@ -161,11 +161,11 @@ def test_without_steps_nothing_moves_and_the_costs_are_told():
         ([[0], [1], [2]], [[1], [1], [1]], [[1], [2], [0]], [True, False, False]),
     ],
 )
-def test_a_goal_is_reached_when_every_view_is_given_what_was_asked(decrease, increase, predicted, fooled):
-    goal = Goal(torch.tensor(decrease), None if increase is None else torch.tensor(increase))
+def test_a_goal_is_reached_when_every_view_is_given_what_was_asked(source, target, predicted, success):
+    goal = Goal(torch.tensor(source), None if target is None else torch.tensor(target))
     reached = goal.reached(torch.tensor(predicted))
-    assert reached.tolist() == torch.tensor(fooled).flatten().tolist()
-    last = torch.tensor([len(decrease) - 1])
+    assert reached.tolist() == torch.tensor(success).flatten().tolist()
+    last = torch.tensor([len(source) - 1])
     assert goal.of(last).reached(torch.tensor(predicted)[last]).tolist() == [reached.tolist()[-1]]
 
 
@@ -202,7 +202,7 @@ class Axis:
         return values
 
 
-def on_the_axis(steps: int, shorten: bool) -> AttackResult:
+def on_the_axis(steps: int, shorten: bool) -> DescentResult:
     start = torch.tensor([[1.0], [0.125], [0.75]], dtype=torch.float64)
     goal = Goal(torch.zeros(3, 1, dtype=torch.int64), torch.ones(3, 1, dtype=torch.int64))
     return descend(Bowl(), Axis(start), goal, DescentSettings(steps, shorten), Phases())
@@ -233,7 +233,7 @@ def test_a_step_that_fools_is_kept_whatever_its_cost():
     """With three classes the true one may gain while another overtakes it."""
     start = torch.ones(1, 1, dtype=torch.float64)
     result = attack(Detour(), Axis(start), torch.zeros(1, dtype=torch.int64), steps=5, shorten=True)
-    assert result.fooled.tolist() == [True] and result.steps.tolist() == [1] and result.values.tolist() == [[-0.5]]
+    assert result.success.tolist() == [True] and result.steps.tolist() == [1] and result.values.tolist() == [[-0.5]]
     assert float(result.cost_before) == pytest.approx(math.log(0.4)) and float(result.cost) == pytest.approx(
         math.log(0.45)
     )
@@ -257,14 +257,14 @@ def test_with_shortened_steps_towards_the_least_likely_class_the_cost_never_rise
     ]
     rejected = 0
     for before, after in itertools.pairwise(runs):
-        assert (after.cost[~after.fooled] <= before.cost[~after.fooled]).all()
-        back = (after.cost == before.cost) & ~before.fooled
+        assert (after.cost[~after.success] <= before.cost[~after.success]).all()
+        back = (after.cost == before.cost) & ~before.success
         rejected += int(back.sum())
         assert torch.equal(after.steps[back], before.steps[back] + 1)
         for name in set(FIELDS) - {"steps"}:
             assert torch.equal(getattr(after, name)[back], getattr(before, name)[back])
-    assert rejected > 9 and runs[-1].fooled.any() and not runs[-1].fooled.all()
-    assert torch.equal(runs[-1].fooled[:, None], runs[-1].predicted == goal.increase)
+    assert rejected > 9 and runs[-1].success.any() and not runs[-1].success.all()
+    assert torch.equal(runs[-1].success[:, None], runs[-1].predicted == goal.target)
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -279,7 +279,7 @@ def test_a_zero_gradient_leaves_the_values_and_is_told(step):
     problem, classes = Clamped(start, step, 0.01), torch.zeros(2, dtype=torch.int64)
     result = attack(Linear(WEIGHT, bias=20.0), problem, classes, steps=4)
     assert result.zero_gradient.tolist() == [False, True]
-    assert result.steps.tolist() == [4, 4] and not result.fooled.any()
+    assert result.steps.tolist() == [4, 4] and not result.success.any()
     assert (result.values[0] != start[0]).all() and torch.equal(result.values[1], start[1])
 
 
@@ -293,7 +293,7 @@ def small_network() -> nn.Sequential:
 
 def small_attack(
     views: int, batch_size: int = 128, shorten: bool = False, margin: float = 0.0
-) -> tuple[LinearScene, AttackResult]:
+) -> tuple[LinearScene, DescentResult]:
     """Nine examples, of which some are fooled at once, on the way and never."""
     problem = LinearScene(3 * random(9, DIMENSIONS, seed=3), size=0.3, views=views)
     classes = (torch.arange(9) % 4)[:, None].expand(9, views)
@@ -346,28 +346,28 @@ def test_restarts_go_on_with_those_that_are_left_and_keep_what_fools():
     problems = [LinearScene(start, "sign", 0.1, ball, centre=centre) for start in (centre, *starts)]
     single = [descend(network, each, goal, settings, Phases()) for each in problems]
     assert torch.isclose((single[1].values - centre).abs(), torch.tensor(0.5).double()).any()  # the ball holds some
-    rounds = torch.stack([each.fooled for each in single]).long().argmax(0)
-    assert set(rounds.tolist()) == {0, 1, 2} and not result.fooled.all()
-    assert torch.equal(result.fooled, torch.stack([each.fooled for each in single]).any(0))
+    rounds = torch.stack([each.success for each in single]).long().argmax(0)
+    assert set(rounds.tolist()) == {0, 1, 2} and not result.success.all()
+    assert torch.equal(result.success, torch.stack([each.success for each in single]).any(0))
     for row, chosen in enumerate(rounds.tolist()):
-        last = chosen if result.fooled[row] else 2
+        last = chosen if result.success[row] else 2
         assert int(result.steps[row]) == sum(int(each.steps[row]) for each in single[: last + 1])
         assert int(counted[row]) == int(result.steps[row]) + last + 1
-        assert not result.fooled[row] or result.fooled_at[row] == result.steps[row]
+        assert not result.success[row] or result.success_at[row] == result.steps[row]
         for name in ("values", "images", "cost", "predicted"):
             torch.testing.assert_close(
                 getattr(result, name)[row], getattr(single[chosen], name)[row], rtol=0, atol=64 * EPS
             )
-        for name in ("cost_before", "fooled_before", "zero_gradient"):
+        for name in ("cost_before", "success_before", "zero_gradient"):
             assert torch.equal(getattr(result, name)[row], getattr(single[0], name)[row])
 
 
 @pytest.mark.parametrize("shorten", [False, True])
 def test_a_margin_does_not_change_when_an_example_is_first_fooled(shorten):
     (_, border), (_, beyond) = small_attack(2, shorten=shorten), small_attack(2, shorten=shorten, margin=0.5)
-    assert torch.equal(beyond.fooled, border.fooled) and (beyond.steps > border.steps)[border.fooled].any()
+    assert torch.equal(beyond.success, border.success) and (beyond.steps > border.steps)[border.success].any()
     for result in (border, beyond):
-        assert torch.equal(result.fooled_at[border.fooled], border.steps[border.fooled])
+        assert torch.equal(result.success_at[border.success], border.steps[border.success])
 
 
 class Watched(nn.Module):

@@ -3,12 +3,12 @@ import pytest
 import torch
 from scipy.special import log_softmax, logit, rel_entr, softmax
 
-from augment.labels import anything_but, divergence, is_right, label_loss, log_odds, ranking_loss
+from augment.labels import complementary_label, divergence, is_right, label_loss, log_odds, ranking_loss
 
 EPS = torch.finfo(torch.float64).eps
 LOGITS = 3 * torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 CLASSES = torch.tensor([0, 1, 2, 3, 4, 0])
-EXCLUDED = torch.tensor([anything_but(label) for label in CLASSES.tolist()])
+EXCLUDED = torch.tensor([complementary_label(label) for label in CLASSES.tolist()])
 
 
 def test_anything_but_a_class_costs_minus_the_logarithm_of_all_others_probability():
@@ -27,7 +27,7 @@ def test_a_class_costs_the_cross_entropy_beside_one_that_is_excluded():
 def test_the_gradient_is_exact_and_finite_where_the_excluded_class_is_certain():
     assert torch.autograd.gradcheck(lambda logits: label_loss(logits, EXCLUDED), LOGITS.clone().requires_grad_(True))
     certain = torch.tensor([[100.0, 0.0, 0.0]], requires_grad=True)
-    label_loss(certain, torch.tensor([anything_but(0)])).sum().backward()
+    label_loss(certain, torch.tensor([complementary_label(0)])).sum().backward()
     torch.testing.assert_close(certain.grad, torch.tensor([[1.0, -0.5, -0.5]]))
 
 
@@ -42,13 +42,15 @@ def test_log_odds_are_the_probability_s_logit():
 
 
 def test_divergence_is_the_relative_entropy_of_the_answers():
-    answers = LOGITS.flip(0) / 2
-    expected = rel_entr(softmax(answers.numpy(), axis=1), softmax(LOGITS.numpy(), axis=1)).sum(1)
-    torch.testing.assert_close(divergence(LOGITS, answers), torch.from_numpy(expected), rtol=64 * EPS, atol=64 * EPS)
+    predictions = LOGITS.flip(0) / 2
+    expected = rel_entr(softmax(predictions.numpy(), axis=1), softmax(LOGITS.numpy(), axis=1)).sum(1)
+    torch.testing.assert_close(
+        divergence(LOGITS, predictions), torch.from_numpy(expected), rtol=64 * EPS, atol=64 * EPS
+    )
 
 
 def test_ranking_is_the_mean_logistic_loss_of_all_pairs_of_the_class_and_another():
-    labels = torch.tensor([2, 0, anything_but(2), 2, anything_but(2), 4])
+    labels = torch.tensor([2, 0, complementary_label(2), 2, complementary_label(2), 4])
     odds = log_odds(LOGITS, 2).numpy()
     pairs = [np.log1p(np.exp(odds[other] - odds[own])) for own in (0, 3) for other in (1, 2, 4, 5)]
     torch.testing.assert_close(
@@ -58,7 +60,7 @@ def test_ranking_is_the_mean_logistic_loss_of_all_pairs_of_the_class_and_another
 
 def test_ranking_costs_nothing_and_pulls_nowhere_without_a_pair():
     logits = LOGITS.clone().requires_grad_(True)
-    for labels in (torch.full((6,), 2), torch.full((6,), anything_but(2))):
+    for labels in (torch.full((6,), 2), torch.full((6,), complementary_label(2))):
         loss = ranking_loss(logits, labels, 2)
         loss.backward()
         assert loss == 0 and not logits.grad.any()
@@ -66,6 +68,6 @@ def test_ranking_costs_nothing_and_pulls_nowhere_without_a_pair():
 
 def test_ranking_compares_images_and_has_no_threshold():
     """Where every image's log-odds rise alike."""
-    labels = torch.tensor([2, 0, anything_but(2), 2, anything_but(2), 4])
+    labels = torch.tensor([2, 0, complementary_label(2), 2, complementary_label(2), 4])
     shifted = LOGITS + 3 * (torch.arange(5) == 2)
     torch.testing.assert_close(ranking_loss(shifted, labels, 2), ranking_loss(LOGITS, labels, 2))

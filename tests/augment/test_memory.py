@@ -5,12 +5,11 @@ import pytest
 import torch
 from torch import nn
 
-from augment import memory
+from augment import utils
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentResult, DescentSettings, descend, descend_in_parts
 from augment.build import build_scene
-from augment.descent import AttackResult, DescentSettings, descend, descend_in_parts
-from augment.goal import Goal
-from augment.memory import BatchSize, require_memory
-from augment.phases import Phases
+from augment.utils import BatchSize, Phases, require_memory
 from renderer.errors import InputError
 
 CPU = torch.device("cpu")
@@ -53,14 +52,14 @@ def attack(model: nn.Module, batch_size: int):
 
 @pytest.fixture(autouse=True)
 def unsaid():
-    memory._say.cache_clear()
+    utils._say.cache_clear()
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 def test_an_attack_that_does_not_fit_goes_on_in_smaller_batches_with_the_same_result(caplog, error):
     roomy, small = Small(10, error), Small(3, error)
     expected, found = attack(roomy, batch_size=2), attack(small, batch_size=8)
-    for name in ("values", "images", "steps", "cost", "predicted", "fooled"):
+    for name in ("values", "images", "steps", "cost", "predicted", "success"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
     assert small.sizes[:3] == [8, 4, 2] and max(small.sizes[3:]) == 2  # not tried again in every step
     attack(small, batch_size=8)
@@ -88,14 +87,14 @@ def test_an_attack_in_parts_is_the_attack(at_once):
         return descend_in_parts(Small(99, ERRORS[0]), Shades(), goal, settings, Phases(), starts, most)
 
     expected, found = whole(10), whole(at_once)
-    assert 0 < expected.fooled.sum() < 10 or expected.steps.unique().numel() > 1
-    for item in fields(AttackResult):
+    assert 0 < expected.success.sum() < 10 or expected.steps.unique().numel() > 1
+    for item in fields(DescentResult):
         assert torch.equal(getattr(found, item.name), getattr(expected, item.name)), item.name
 
 
 def test_what_is_too_large_for_the_memory_is_refused_before_it_is_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(memory, "MEMORY", tmp_path / "meminfo")
-    monkeypatch.setattr(memory, "GROUP", tmp_path)
+    monkeypatch.setattr(utils, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(utils, "GROUP", tmp_path)
     require_memory("renders", 2**60, CPU)  # a system that does not say
     (tmp_path / "meminfo").write_text("MemTotal: 8388608 kB\nMemAvailable: 4194304 kB\n")
     (tmp_path / "memory.max").write_text("max\n")
@@ -109,12 +108,12 @@ def test_what_is_too_large_for_the_memory_is_refused_before_it_is_made(tmp_path,
 
 
 def test_a_million_renders_need_their_memory_before_any_is_made(monkeypatch):
-    monkeypatch.setattr(memory, "_free", lambda device: 2**30)
+    monkeypatch.setattr(utils, "_free", lambda device: 2**30)
     with pytest.raises(InputError, match=r"^100000 renders of 64 pixels per side .* need 9\.2 GB"):
         build_scene(
             [("solid:orange", "orange")], 64, 20_000, backgrounds=(0, 0.25, 0.5, 0.75, 1), visibility="software"
         )
     scene = build_scene([("solid:orange", "orange")], 128, 500, visibility="software", samples=1)
-    monkeypatch.setattr(memory, "_free", lambda device: 10**8)
+    monkeypatch.setattr(utils, "_free", lambda device: 10**8)
     with pytest.raises(InputError, match=r"^500 views of 128 pixels per side .* need "):
         _ = scene.stacks

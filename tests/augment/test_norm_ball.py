@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
 from torch import Tensor
 
-from augment.norm_ball import NORMS, NormBall
+from augment.attacks.norm_ball import NORMS, NormBall
 from renderer.convex import nearest_in_box
 from renderer.errors import InputError
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from augment.objects import CompanionSettings, ObjectSettings, another_individual, load_object, on_ground
+from augment.objects import ObjectSettings, PropSettings, another_instance, load_object, on_ground
 from renderer.errors import InputError
 from renderer.mesh import load_mesh, normalise
 from renderer.shapes import solid
@@ -55,15 +55,15 @@ def test_what_is_no_colour_is_refused(plain, color):
 def test_another_individual_stands_on_the_same_table():
     color = [0.2, 0.3, 0.4]
     item = on_ground(load_object(ObjectSettings("solid:apple", "apple")), color)
-    other = another_individual(item, 5)
+    other = another_instance(item, 5)
     expected = on_ground(load_object(ObjectSettings("solid:apple:5", "apple")), color)
     np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
     np.testing.assert_array_equal(other.mesh.corner_colors, expected.mesh.corner_colors)
 
 
 def test_company_stands_on_the_objects_ground_where_it_is_put_and_turned():
-    beside = [CompanionSettings("solid:cup:1", [0.9, -0.2], scale=0.5, azimuth=90)]
-    item = load_object(ObjectSettings("solid:apple", "apple", beside=beside))
+    props = [PropSettings("solid:cup:1", [0.9, -0.2], scale=0.5, azimuth=90)]
+    item = load_object(ObjectSettings("solid:apple", "apple", props=props))
     apple, cup = normalise(solid("apple")), normalise(solid("cup", 1))
     np.testing.assert_array_equal(item.mesh.faces[item.own_faces], apple.faces)
     np.testing.assert_array_equal(item.mesh.vertices[item.own_vertices], apple.vertices)
@@ -75,10 +75,10 @@ def test_company_stands_on_the_objects_ground_where_it_is_put_and_turned():
 
 
 def test_another_individual_has_the_same_company():
-    beside, color = [CompanionSettings("solid:cup", [1.0, 0.0], 0.5)], [0.2, 0.3, 0.4]
-    kinds = [ObjectSettings(name, "apple", beside=beside) for name in ("solid:apple", "solid:apple:5")]
+    props, color = [PropSettings("solid:cup", [1.0, 0.0], 0.5)], [0.2, 0.3, 0.4]
+    kinds = [ObjectSettings(name, "apple", props=props) for name in ("solid:apple", "solid:apple:5")]
     item, expected = (on_ground(load_object(kind), color) for kind in kinds)
-    other = another_individual(item, 5)
+    other = another_instance(item, 5)
     np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
     np.testing.assert_array_equal(other.own_faces, expected.own_faces)
     assert not np.array_equal(other.mesh.vertices[other.own_vertices], item.mesh.vertices[item.own_vertices])

@@ -11,13 +11,24 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from augment import reshading
-from augment.descent import DescentSettings, descend
-from augment.goal import Goal
-from augment.kind import STEPS, Kind, StepSettings, direction
-from augment.parameters import KINDS, Albedo, Geometry, Lighting, Pixels, Skylight, SkylightSettings
-from augment.perturbation import Perturbation
-from augment.phases import Phases
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentSettings, descend
+from augment.attacks.parameters import (
+    PARAMETERS,
+    STEPS,
+    Albedo,
+    AttackProblem,
+    Geometry,
+    Lighting,
+    Parameter,
+    Pixels,
+    Skylight,
+    SkylightSettings,
+    StepSettings,
+    direction,
+)
 from augment.scene import Conditions, Scene
+from augment.utils import Phases
 from renderer.environment import read_map, to_map, write_map
 from renderer.errors import InputError
 from renderer.harmonics import project
@@ -38,14 +49,14 @@ def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
     return SkylightSettings(zenith=math.degrees(zenith), azimuth=math.degrees(azimuth), turbidity=turbidity, **steps)
 
 
-MAKERS: dict[str, Callable[[Scene], Kind]] = {"skylight": partial(Skylight, settings=sky_at(SKY))} | {
+MAKERS: dict[str, Callable[[Scene], Parameter]] = {"skylight": partial(Skylight, settings=sky_at(SKY))} | {
     kind.name: partial(kind, settings=FREE) for kind in (Lighting, Geometry, Albedo, Pixels)
 }
 SIZES = {"lighting": 49 * 3, "skylight": 3, "geometry": 12 * 3, "albedo": 20 * 3, "pixels": 2 * 3 * 6 * 6}
 
 
 def test_every_kind_has_a_name_of_its_own():
-    assert KINDS.keys() - {"projector", "lamps", "places"} == MAKERS.keys() == SIZES.keys()
+    assert PARAMETERS.keys() - {"projector", "lamps", "places"} == MAKERS.keys() == SIZES.keys()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -105,7 +116,7 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
     kinds'. The differences leave a fourth power of h = 2e-4, times fifth derivatives, and rounding over h."""
     scene, draws = make_scene(encoding=encoding), torch.Generator().manual_seed(2)
     scene.render(replace(scene.conditions(EVERY), albedo=scene.lights.new_zeros(3, 20, 3)), EVERY)  # is what is seen
-    problem = Perturbation(scene, [MAKERS[name](scene) for name in names])
+    problem = AttackProblem(scene, [MAKERS[name](scene) for name in names])
     at = problem.start[1] + 0.02 * torch.randn(problem.start.shape[1], generator=draws)
     weights = torch.randn(2, 3, 6, 6, generator=draws, dtype=torch.float64)
     directions = torch.eye(len(at)) if len(names) == 1 else torch.randn(8, len(at), generator=draws)
@@ -141,7 +152,7 @@ def test_vertices_that_move_along_the_view_have_the_gradient_of_the_image_render
         torch.testing.assert_close(directions @ gradient[0], expected, rtol=0, atol=1e-9)
 
 
-def attack(model: torch.nn.Module, problem: Perturbation, goal: Goal, steps: int) -> tuple[Tensor, Tensor]:
+def attack(model: torch.nn.Module, problem: AttackProblem, goal: Goal, steps: int) -> tuple[Tensor, Tensor]:
     """(values, images) that a descent of so many steps ends with."""
     result = descend(model, problem, goal, DescentSettings(steps, batch_size=4), Phases())
     return result.values, result.images
@@ -155,7 +166,7 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     logits = model(before.flatten(0, 1)).detach()
     truth = logits.argmax(1)
     slopes = (logits.softmax(1) - torch.nn.functional.one_hot(truth, 4)) @ model[1].weight.detach()
-    problem = Perturbation(scene, [Pixels(scene, StepSettings("linf", epsilon, "sign", epsilon))])
+    problem = AttackProblem(scene, [Pixels(scene, StepSettings("linf", epsilon, "sign", epsilon))])
     _, images = attack(model, problem, Goal(truth.view(3, 2)), steps=1)
     expected = (before + epsilon * slopes.sign().view_as(before)).clamp(0, 1)
     assert torch.equal(images, expected)
@@ -166,7 +177,7 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
 def test_iterated_steps_on_pixels_stop_at_the_radius(make_scene, make_linear, steps, reach):
     scene = make_scene(backgrounds=torch.ones(3, 3, 6, 6))
     model, before = make_linear(2, bias=50.0), scene.render(scene.conditions(EVERY), EVERY)
-    problem = Perturbation(scene, [Pixels(scene, StepSettings("linf", 0.03, "sign", 0.01))])
+    problem = AttackProblem(scene, [Pixels(scene, StepSettings("linf", 0.03, "sign", 0.01))])
     classes = torch.zeros(3, 2, dtype=torch.int64)
     _, images = attack(model, problem, Goal(classes, classes + 1), steps)
     downhill = (model[1].weight[1] - model[1].weight[0]).detach().sign().view(3, 6, 6)
@@ -176,7 +187,7 @@ def test_iterated_steps_on_pixels_stop_at_the_radius(make_scene, make_linear, st
 def test_a_random_start_makes_it_projected_gradient_descent_within_the_same_ball(make_scene, make_linear):
     """Every restart ends in the corner that lies downhill of the middle, not of where it began."""
     scene = make_scene()
-    problem = Perturbation(scene, [Pixels(scene, StepSettings("linf", 0.03, "sign", 0.01))])
+    problem = AttackProblem(scene, [Pixels(scene, StepSettings("linf", 0.03, "sign", 0.01))])
     problem.start = problem.sample(torch.Generator().manual_seed(0))
     assert problem.start.abs().max() <= 0.03 and problem.start.std() > 0.01
     model, classes = make_linear(2, bias=50.0), torch.zeros(3, 2, dtype=torch.int64)
@@ -185,7 +196,7 @@ def test_a_random_start_makes_it_projected_gradient_descent_within_the_same_ball
     assert torch.equal(values, (0.03 * downhill).expand(3, 2, -1).flatten(1))
 
 
-class Exposure(Kind):
+class Exposure(Parameter):
     """A kind that the package does not have: the logarithm of a factor on the light."""
 
     name = "exposure"
@@ -201,7 +212,7 @@ def test_a_new_kind_is_one_class_and_goes_with_the_others(make_scene, make_linea
     """It ends at the end of its interval that lies downhill, on top of the light that is attacked beside it."""
     scene, model, classes = make_scene(), make_linear(2, bias=50.0), torch.zeros(3, 2, dtype=torch.int64)
     kinds = [kind(scene, StepSettings("linf", 0.1, "sign", 0.05)) for kind in (Lighting, Exposure)]
-    problem = Perturbation(scene, kinds)
+    problem = AttackProblem(scene, kinds)
     values, images = attack(model, problem, Goal(classes, classes + 1), steps=4)
     light, exposure = problem.split(values)
     assert exposure.abs().eq(0.1).all() and (light - problem.split(problem.start)[0]).abs().max() <= 0.1 + EPS
@@ -242,7 +253,7 @@ def test_physical_light_is_the_nearest_within_the_ball_that_something_emits(make
 def test_a_descent_in_physical_light_ends_in_light_that_an_environment_map_holds(make_scene, make_linear, tmp_path):
     """And begins with the nearest to the scene's: RGBE, which has no negative numbers, gives the images back."""
     scene, classes = ringing(make_scene()), torch.zeros(3, 2, dtype=torch.int64)
-    problem = Perturbation(scene, [Lighting(scene, StepSettings(step_size=0.5), physical=True)])
+    problem = AttackProblem(scene, [Lighting(scene, StepSettings(step_size=0.5), physical=True)])
     values, images = attack(make_linear(2, bias=50.0), problem, Goal(classes, classes + 1), steps=6)
     assert (values - problem.start).norm(dim=1).min() > 1
     written = []
@@ -271,7 +282,7 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
     @settings(max_examples=80, deadline=None)
     def check(start: tuple, values: tuple, radius: float | None):
         sky = Skylight(scene, sky_at(start, norm=norm, radius=radius))
-        problem = Perturbation(scene, [sky])
+        problem = AttackProblem(scene, [sky])
         centre, ends = sky.start[0], torch.tensor([[ZENITH[0], -99, 0.5], [ZENITH[1], 99, 2.5]], dtype=dtype)
         torch.testing.assert_close(centre * torch.tensor([1, 1, 4], dtype=dtype), torch.tensor(start, dtype=dtype))
         anywhere = torch.tensor(values, dtype=dtype).expand(3, 3)
@@ -295,7 +306,7 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
 def test_a_free_descent_over_the_sky_slides_along_the_end_of_its_domain(make_scene, make_linear):
     """With steps far beyond it, up to the horizon and to the haziest or clearest air."""
     scene, classes = make_scene(), torch.zeros(3, 2, dtype=torch.int64)
-    problem = Perturbation(scene, [Skylight(scene, sky_at(SKY, step="sign", step_size=0.8))])
+    problem = AttackProblem(scene, [Skylight(scene, sky_at(SKY, step="sign", step_size=0.8))])
     values, _ = attack(make_linear(2, bias=50.0), problem, Goal(classes, classes + 1), steps=6)
     ends = torch.tensor([[0, math.pi / 2], [0.5, 2.5]], dtype=torch.float64)
     reached = (values[:, [0, 2], None] == ends).any(2)

@@ -2,8 +2,8 @@ import colorsys
 
 import torch
 
-from augment.patterns import draw_patterns
-from augment.seeding import generator
+from augment.camera_effects import draw_patterns
+from augment.utils import generator
 from renderer.image import encode
 
 PATTERNS = draw_patterns(200, 24, generator(0))

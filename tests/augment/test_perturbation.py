@@ -5,13 +5,20 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from augment.descent import AttackResult, DescentSettings, descend
-from augment.goal import Goal
-from augment.kind import StepSettings
-from augment.parameters import Albedo, Geometry, Lighting, Pixels, Skylight, SkylightSettings
-from augment.perturbation import Perturbation
-from augment.phases import Phases
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentResult, DescentSettings, descend
+from augment.attacks.parameters import (
+    Albedo,
+    AttackProblem,
+    Geometry,
+    Lighting,
+    Pixels,
+    Skylight,
+    SkylightSettings,
+    StepSettings,
+)
 from augment.scene import Scene
+from augment.utils import Phases
 from renderer.camera import ring
 from renderer.harmonics import live_coefficients
 from renderer.transfer import build_operators
@@ -22,14 +29,14 @@ DEAD = torch.ones(49, dtype=torch.bool).index_fill(0, live_coefficients(6), Fals
 FRONT, SIDE, BACK = ring(3, 2.2)
 
 
-def attack(model: nn.Module, problem: Perturbation, goal: Goal, steps: int, **settings) -> AttackResult:
+def attack(model: nn.Module, problem: AttackProblem, goal: Goal, steps: int, **settings) -> DescentResult:
     return descend(model, problem, goal, DescentSettings(steps, **settings), Phases())
 
 
-def towards(problem: Perturbation, increase: int | None = 1) -> Goal:
+def towards(problem: AttackProblem, target: int | None = 1) -> Goal:
     """Every image's class 0 falls and another, or none in particular, rises."""
     classes = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
-    return Goal(classes, None if increase is None else classes + increase)
+    return Goal(classes, None if target is None else classes + target)
 
 
 def light_slope(scene: Scene, weight: Tensor) -> Tensor:
@@ -67,11 +74,11 @@ def test_the_light_that_fools_a_linear_classifier_most_is_reached(
 ):
     """Where no pixel clamps, the margin is s · U + const, summed over the views that share the light. The ball's lowest
     point is its corner U₀ - r sign(s), to the bit, or U₀ - r s/|s|, to rounding; dead coefficients stay."""
-    radius, (cameras, classes, bias, increase) = 0.01, CASES[case]
+    radius, (cameras, classes, bias, target) = 0.01, CASES[case]
     scene, model = make_scene(cameras=cameras, dtype=dtype), make_linear(classes, bias, dtype=dtype)
-    problem = Perturbation(scene, [Lighting(scene, StepSettings(norm, radius, step, step_size))])
-    result = attack(model, problem, towards(problem, increase=increase), steps)
-    assert not result.fooled.any() and result.steps.eq(steps).all()
+    problem = AttackProblem(scene, [Lighting(scene, StepSettings(norm, radius, step, step_size))])
+    result = attack(model, problem, towards(problem, target=target), steps)
+    assert not result.success.any() and result.steps.eq(steps).all()
     assert result.images.min() > 0 and result.images.max() < 1
 
     weight, eps = (model[1].weight[0] - model[1].weight[1]).detach().double(), torch.finfo(dtype).eps
@@ -88,7 +95,7 @@ def test_the_light_that_fools_a_linear_classifier_most_is_reached(
         reach = slope.flatten(1).norm(dim=1)
         surface = start - radius * slope / reach[:, None, None]
         torch.testing.assert_close(lights.double(), surface, rtol=0, atol=16 * eps)
-    if increase is not None:  # then the cost is the margin itself
+    if target is not None:  # then the cost is the margin itself
         lowest = result.cost_before.double() - radius * reach
         torch.testing.assert_close(result.cost.double(), lowest, rtol=0, atol=4 * 50 * eps)
 
@@ -106,7 +113,7 @@ def test_views_that_share_what_is_attacked_add_their_gradients(make_scene, make_
             "geometry": lambda: Geometry(scene, settings),
             "albedo": lambda: Albedo(scene, settings),
         }[name]()
-        problem = Perturbation(scene, [kind])
+        problem = AttackProblem(scene, [kind])
         result = attack(make_linear(5, bias=50.0), problem, towards(problem), steps=1)
         return result.values - problem.start
 
@@ -118,7 +125,7 @@ def test_views_that_share_what_is_attacked_add_their_gradients(make_scene, make_
 def test_pixels_of_one_view_do_not_change_those_of_another(make_scene, make_linear):
     """Views share the values' example and nothing else: a raw step is either view's own."""
     scene = make_scene(cameras=[[FRONT, SIDE]], backgrounds=torch.full((1, 3, 6, 6), 0.5))
-    problem = Perturbation(scene, [Pixels(scene, StepSettings(step="raw", step_size=0.1))])
+    problem = AttackProblem(scene, [Pixels(scene, StepSettings(step="raw", step_size=0.1))])
     model = make_linear(5, bias=50.0)
     result = attack(model, problem, towards(problem), steps=1)
     downhill = (model[1].weight[1] - model[1].weight[0]).detach()
@@ -130,19 +137,19 @@ def test_a_deep_optical_illusion_shows_each_view_another_class(make_scene, make_
     targets = torch.tensor([[1, 2], [2, 1], [1, 1]])
     scene = make_scene(cameras=[[FRONT, SIDE]] * 3, backgrounds=torch.full((3, 3, 6, 6), 0.5))
     model, goal = make_linear(3, seed=6), Goal(torch.zeros_like(targets), targets)
-    problem = Perturbation(scene, [Lighting(scene, StepSettings())])
+    problem = AttackProblem(scene, [Lighting(scene, StepSettings())])
     result = attack(model, problem, goal, steps=30)
-    assert result.fooled.all() and not result.fooled_before.any()
+    assert result.success.all() and not result.success_before.any()
     assert torch.equal(model(result.images.flatten(0, 1)).argmax(1).view(3, 2), targets)
     assert torch.equal(result.predicted, targets)
     last = result.steps.argmax()
     before = attack(model, problem, goal, steps=int(result.steps[last]) - 1)
-    assert not before.fooled[last] and (before.predicted[last] == targets[last]).sum() < 2
+    assert not before.success[last] and (before.predicted[last] == targets[last]).sum() < 2
 
 
-def mixed(scene: Scene, **settings) -> Perturbation:
+def mixed(scene: Scene, **settings) -> AttackProblem:
     """Light, shape, paint and pixels at once, with balls of their own."""
-    return Perturbation(
+    return AttackProblem(
         scene,
         [
             Lighting(scene, StepSettings("linf", 0.02, **settings)),
@@ -153,9 +160,9 @@ def mixed(scene: Scene, **settings) -> Perturbation:
     )
 
 
-def reaches(problem: Perturbation, values: Tensor) -> list[Tensor]:
+def reaches(problem: AttackProblem, values: Tensor) -> list[Tensor]:
     """How far each kind has gone, as a share of its radius."""
-    parts = zip(problem.kinds, problem.split(values - problem.start), strict=True)
+    parts = zip(problem.parameters, problem.split(values - problem.start), strict=True)
     return [
         (part.norm(dim=1) if kind.settings.norm == "l2" else part.abs().amax(1)) / kind.settings.radius
         for kind, part in parts
@@ -175,13 +182,13 @@ def test_several_kinds_at_once_each_go_to_the_end_of_their_own_ball(make_scene, 
 def test_each_kind_steps_and_is_projected_as_if_it_were_alone(make_scene):
     """A unit step is one of each kind, by the size that it has. Examples may have starts of their own."""
     problem, draws = mixed(make_scene()), torch.Generator().manual_seed(0)
-    for size, kind in enumerate(problem.kinds, start=1):
+    for size, kind in enumerate(problem.parameters, start=1):
         kind.settings, kind.start = replace(kind.settings, step_size=size), kind.start + torch.arange(3)[:, None]
     values = problem.start + 0.1 * torch.randn(problem.start.shape, generator=draws)
     parts, steps = problem.split(values), problem.split(problem.step(values))
     chosen = torch.tensor([2, 0])
     projected = problem.split(problem.project(values[chosen], chosen))
-    for kind, part, step, nearest in zip(problem.kinds, parts, steps, projected, strict=True):
+    for kind, part, step, nearest in zip(problem.parameters, parts, steps, projected, strict=True):
         unit = part / part.norm(dim=1, keepdim=True)
         torch.testing.assert_close(step, kind.settings.step_size * unit, rtol=0, atol=16 * EPS)
         assert torch.equal(nearest, kind.settings.project(part[chosen], kind.start[chosen]))
@@ -206,7 +213,7 @@ def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
         Geometry(scene, StepSettings()),
         Albedo(scene, StepSettings("l2", 0.1)),
     ]
-    problem = Perturbation(scene, kinds)
+    problem = AttackProblem(scene, kinds)
     values = problem.start + torch.randn(problem.start.shape, generator=draws) * torch.tensor([[0.1], [0.0], [0.3]])
     drawn = problem.sample_as_far(values, torch.Generator().manual_seed(1))
     free = zip(problem.split(values - problem.start), problem.split(drawn - problem.start), strict=True)
@@ -221,31 +228,31 @@ def test_an_attack_on_light_rasterises_a_camera_once_and_one_on_shape_every_view
 ):
     model = make_linear(3, bias=50.0)
     scene = make_scene(cameras=TWO_VIEWS)
-    problem = Perturbation(scene, [Lighting(scene, StepSettings()), Pixels(scene, StepSettings())])
+    problem = AttackProblem(scene, [Lighting(scene, StepSettings()), Pixels(scene, StepSettings())])
     attack(model, problem, towards(problem), steps=9)
     assert rasterised == [3]
-    problem = Perturbation(scene, [Lighting(scene, StepSettings()), Albedo(scene, StepSettings())])
+    problem = AttackProblem(scene, [Lighting(scene, StepSettings()), Albedo(scene, StepSettings())])
     attack(model, problem, towards(problem), steps=9)
     assert rasterised == [3] + [1] * 3
-    problem = Perturbation(scene, [Lighting(scene, StepSettings()), Geometry(scene, StepSettings())])
+    problem = AttackProblem(scene, [Lighting(scene, StepSettings()), Geometry(scene, StepSettings())])
     result = attack(model, problem, towards(problem), steps=4)
     assert result.steps.tolist() == [4, 4, 4] and rasterised == [3] + [1] * (3 + 5 * 6)
 
 
 def test_shapes_are_rasterised_only_while_they_are_attacked(make_scene, make_linear, rasterised):
     scene, model = make_scene(cameras=ONE_VIEW), make_linear(2, seed=7)
-    problem = Perturbation(scene, [Geometry(scene, StepSettings(step_size=0.3))])
+    problem = AttackProblem(scene, [Geometry(scene, StepSettings(step_size=0.3))])
     truth = model(problem.render(problem.start, EVERY).flatten(0, 1)).argmax(1)[:, None]
     rasterised.clear()
     result = attack(model, problem, Goal(truth), steps=6)
-    assert result.fooled.any() and not result.fooled.all()
+    assert result.success.any() and not result.success.all()
     assert rasterised == [1] * int((result.steps + 1).sum())
 
 
 def test_with_shortened_steps_no_shape_is_worse_than_the_one_before_when_rendered_anew(make_scene, make_linear):
     """Steps of half the mesh's size; without shortening some raise the cost."""
     scene, model = make_scene(), make_linear(3, bias=50.0)
-    problem = Perturbation(scene, [Geometry(scene, StepSettings(step_size=0.5))])
+    problem = AttackProblem(scene, [Geometry(scene, StepSettings(step_size=0.5))])
     costs = {}
     for shorten in (False, True):
         results = [attack(model, problem, towards(problem), steps, shorten=shorten) for steps in range(7)]
@@ -261,7 +268,7 @@ def test_hundreds_of_examples_are_attacked_in_one_batch_and_the_same_each_time(m
     """300 images of ten cameras, from random lights of a seed; whether fooled at once, on the way or never."""
     cameras = [[camera] for _ in range(30) for camera in ring(10, 2.2)]
     scene, model = make_scene(cameras=cameras, dtype=dtype), make_linear(6, dtype=dtype, seed=2)
-    problem = Perturbation(scene, [Lighting(scene, StepSettings("l2", 0.4, step_size=0.1))])
+    problem = AttackProblem(scene, [Lighting(scene, StepSettings("l2", 0.4, step_size=0.1))])
     classes = model(problem.render(problem.start, torch.arange(300)).flatten(0, 1)).argmax(1)[:, None]
     results = []
     for _ in range(2):
@@ -269,5 +276,5 @@ def test_hundreds_of_examples_are_attacked_in_one_batch_and_the_same_each_time(m
         results.append(attack(model, problem, Goal(classes), steps=5, batch_size=64))
     first, again = results
     assert all(torch.equal(getattr(first, name), getattr(again, name)) for name in vars(first))
-    assert {0, 1, 5} <= set(first.steps.tolist()) and 0.1 < first.fooled.double().mean() < 1
-    assert torch.equal(model(first.images.flatten(0, 1)).argmax(1) != classes[:, 0], first.fooled)
+    assert {0, 1, 5} <= set(first.steps.tolist()) and 0.1 < first.success.double().mean() < 1
+    assert torch.equal(model(first.images.flatten(0, 1)).argmax(1) != classes[:, 0], first.success)

@@ -1,13 +1,13 @@
 import pytest
 
-from augment.phases import Phases
+from augment.utils import Phases
 
 
 @pytest.fixture
 def wait(monkeypatch):
     """A clock that only this moves."""
     now = [100.0]
-    monkeypatch.setattr("augment.phases.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("augment.utils.time.perf_counter", lambda: now[0])
 
     def advance(seconds: float) -> None:
         now[0] += seconds

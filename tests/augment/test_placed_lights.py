@@ -6,14 +6,11 @@ import torch
 from PIL import Image
 
 import augment
-from augment.attacks.adversary import Adversary
-from augment.attacks.adversary_folder import read_adversary, write_adversary
-from augment.kind import StepSettings
-from augment.parameters import LampPlaces, LampPowers, Lighting, ProjectorPattern
-from augment.perturbation import Perturbation
-from augment.placed_lights import LampsSettings, ProjectorSettings
+from augment.attacks.adversary import Adversary, read_adversary, write_adversary
+from augment.attacks.parameters import AttackProblem, LampPlaces, LampPowers, Lighting, ProjectorPattern, StepSettings
+from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
-from augment.service_settings import TrainingAttackSettings
+from augment.service import TrainingAttackSettings
 from renderer import sparse
 from renderer.basis import parts_of
 from renderer.cache import OperatorCache
@@ -46,7 +43,7 @@ def test_the_image_under_several_lights_is_the_sum_of_those_under_each():
 @pytest.mark.parametrize("kind", [Lighting, ProjectorPattern, LampPowers])
 def test_each_light_is_attacked_alone_and_by_the_gradient_of_its_image(kind):
     shown = scene(exposure=0.3)
-    problem = Perturbation(shown, [kind(shown, StepSettings())])
+    problem = AttackProblem(shown, [kind(shown, StepSettings())])
     draws = torch.Generator().manual_seed(0)
     values = problem.start.clone().requires_grad_(True)
     images = problem.render(values, EVERY)
@@ -90,7 +87,7 @@ def test_an_adversary_with_lights_in_the_scene_is_read_back_and_seen_by_mitsuba(
     torch.testing.assert_close(pattern, written.light[49:85], rtol=0, atol=thrown.power / 255)
 
     pytest.importorskip("mitsuba")
-    from augment.attacks.verification import rendered
+    from augment.attacks.evaluate import rendered
 
     seen = rendered(tmp_path, ["mitsuba"], choose("software"))["mitsuba"]
     assert (seen - done.images[0]).abs().median() < 2 / 255
@@ -190,7 +187,7 @@ def test_the_gradient_by_places_is_that_of_the_image_where_views_share_lamps():
         [("solid:orange", "orange")], SIZE, 2, shared=True, visibility="software", light="st_peters", exposure=0.3,
         lamps=LAMPS, samples=4,
     )  # fmt: skip
-    problem = Perturbation(shown, [LampPlaces(shown, StepSettings())])
+    problem = AttackProblem(shown, [LampPlaces(shown, StepSettings())])
     draws = torch.Generator().manual_seed(0)
     values = problem.start.clone().requires_grad_(True)
     images = problem.render(values, torch.arange(1))

@@ -6,12 +6,9 @@ import pytest
 import torch
 
 import augment
-from augment.attacks.adversary import Adversary
-from augment.attacks.adversary_folder import read_adversary, write_adversary
-from augment.kind import StepSettings
-from augment.parameters import Skylight
-from augment.perturbation import Perturbation
-from augment.placed_lights import LampsSettings, ProjectorSettings
+from augment.attacks.adversary import Adversary, read_adversary, write_adversary
+from augment.attacks.parameters import AttackProblem, Skylight, StepSettings
+from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from renderer.visibility import choose
 
@@ -79,7 +76,7 @@ def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_the_same_image(kinds
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
     settings = augment.AttackSettings(**steps, max_steps=3, shorten=True)
     done = augment.attack(classifier, scene(), settings=settings, force=True)
-    assert (done.result.cost < done.result.cost_before).all()
+    assert (done.descent.cost < done.descent.cost_before).all()
     assert (done.images - done.images_before).abs().max() > 0.02
     for example in range(2):
         images = done.images_before[example], done.images[example]
@@ -90,6 +87,6 @@ def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_the_same_image(kinds
 
 def test_a_sky_is_attacked_beside_a_projector():
     shown = scene(lamps=None)
-    problem = Perturbation(shown, [Skylight(shown, STEPS["skylight"])])
+    problem = AttackProblem(shown, [Skylight(shown, STEPS["skylight"])])
     light = problem.conditions(problem.start, EVERY).light
     assert torch.equal(light[:, 49:], shown.lights[:, 49:]) and not torch.equal(light[:, :49], shown.lights[:, :49])

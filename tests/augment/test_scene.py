@@ -8,19 +8,16 @@ import trimesh
 
 import renderer
 from augment import relighting
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentSettings, descend
+from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting, StepSettings
 from augment.backgrounds import load_backgrounds
 from augment.build import build_scene, count_views
-from augment.descent import DescentSettings, descend
-from augment.goal import Goal
-from augment.held_transport import NEAR
-from augment.kind import StepSettings
-from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object
-from augment.parameters import Albedo, Geometry, Lighting
-from augment.perturbation import Perturbation
-from augment.phases import Phases
+from augment.objects import ObjectSettings, PropSettings, SceneObject, load_object
+from augment.reshading import NEAR
 from augment.scene import Conditions, Example, Scene
-from augment.service import AugmentationService
-from augment.service_settings import AugmentationSettings, TrainingAttackSettings
+from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
+from augment.utils import Phases
 from renderer.basis import Distant
 from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera, ring
@@ -422,7 +419,7 @@ def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its
     torch.testing.assert_close(image, expected, rtol=0, atol=8 * torch.finfo(torch.float64).eps)
 
     light = Lighting(scene, StepSettings("linf", 0.45, "sign", 0.15))
-    problem, goal = Perturbation(scene, [light]), Goal(torch.zeros(1, 1, dtype=torch.int64))
+    problem, goal = AttackProblem(scene, [light]), Goal(torch.zeros(1, 1, dtype=torch.int64))
     dark = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 2)).double()
     torch.nn.init.constant_(dark[1].weight, 0)
     with torch.no_grad():
@@ -540,8 +537,8 @@ def test_a_scene_of_nothing_is_refused(nothing):
 
 def with_apple(*at: float, **more: float) -> torch.Tensor:
     """From +x, the image of an orange, and of an apple beside it if places are given."""
-    beside = [CompanionSettings("solid:apple", list(at), 0.5)] if at else []
-    orange, seen = ObjectSettings("solid:orange", "orange", beside=beside), {"polar": 90.0, "field_of_view": 5.0}
+    beside = [PropSettings("solid:apple", list(at), 0.5)] if at else []
+    orange, seen = ObjectSettings("solid:orange", "orange", props=beside), {"polar": 90.0, "field_of_view": 5.0}
     scene = build_scene([orange], 16, samples=1, visibility=BACKEND, **seen | more)
     return scene.render(scene.conditions(torch.arange(1)), torch.arange(1))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from augment.seeding import generator, stream_seed
+from augment.utils import generator, stream_seed
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,7 +35,7 @@ def test_streams_of_neighbouring_epochs_are_uncorrelated():
 
 def test_another_process_draws_the_same():
     """Whatever its hash seed, since a resumed run is another process."""
-    script = "from augment.seeding import stream_seed; print(stream_seed(1, 2, 'lights'))"
+    script = "from augment.utils import stream_seed; print(stream_seed(1, 2, 'lights'))"
     environment = os.environ | {"PYTHONHASHSEED": "1", "PYTHONPATH": str(ROOT)}
     output = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     assert int(output.stdout) == stream_seed(1, 2, "lights")

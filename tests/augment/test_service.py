@@ -6,14 +6,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
+from augment.attacks.parameters import StepSettings
 from augment.backgrounds import load_backgrounds
-from augment.kind import StepSettings
-from augment.labels import anything_but
+from augment.labels import complementary_label
 from augment.objects import ObjectSettings, load_object
-from augment.phases import Phases
 from augment.scene import Conditions, Scene
-from augment.service import AugmentationService
-from augment.service_settings import AugmentationSettings, RandomLights, TrainingAttackSettings
+from augment.service import AugmentationService, AugmentationSettings, RandomLightSettings, TrainingAttackSettings
+from augment.utils import Phases
 from augment.variation import VariationSettings
 from renderer.camera import ring
 from renderer.errors import InputError
@@ -26,7 +25,7 @@ EPS32 = torch.finfo(torch.float32).eps
 LIGHT = probe("grace")
 CLASSES = {"plate": 0, "table": 2}
 SHORT = TrainingAttackSettings(max_steps=5)
-SHARES = {"fooled_before", "fooled", "used_all_steps", "zero_gradient", "clamped"}
+SHARES = {"attack_success_before", "attack_success", "used_all_steps", "zero_gradient", "clamped"}
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +106,7 @@ def test_100_images_come_with_their_labels_and_plain_diagnostics(serve, model, s
     assert phases.take().keys() == {"attack_classifier"}
 
 
-@pytest.mark.parametrize("settings", [{"arm": "random"}, {"arm": "adversarial", "start": "random"}])
+@pytest.mark.parametrize("settings", [{"arm": "random"}, {"arm": "adversarial", "init": "random"}])
 def test_the_seed_and_the_epoch_decide_the_draw(serve, model, settings):
     images = serve(seed=1, **settings).regenerate(model, 3).images
     resumed = serve(seed=1, **settings)
@@ -124,7 +123,7 @@ def test_random_diagnostics_are_those_of_the_images(serve, model):
     with torch.no_grad():
         logits = model(renders.images)
     model.train()
-    assert renders.diagnostics["fooled"] == pytest.approx((logits.argmax(1) != renders.labels).double().mean())
+    assert renders.diagnostics["attack_success"] == pytest.approx((logits.argmax(1) != renders.labels).double().mean())
     loss = nn.functional.cross_entropy(logits.double(), renders.labels)
     assert renders.diagnostics["loss"] == pytest.approx(float(loss), rel=100 * EPS32)
     # ±0.5 on 147 coefficients: a norm of 3.5, with a standard deviation of 0.13 that 100 examples bring to 0.013.
@@ -132,7 +131,7 @@ def test_random_diagnostics_are_those_of_the_images(serve, model):
 
 
 def test_random_lights_of_a_radius_have_that_norm(serve, model):
-    renders = serve(arm="random", random=RandomLights(radius=1.5)).regenerate(model, 0)
+    renders = serve(arm="random", random_light=RandomLightSettings(radius=1.5)).regenerate(model, 0)
     assert renders.diagnostics["light_change"] == pytest.approx(1.5, rel=8 * EPS32)
 
 
@@ -141,7 +140,7 @@ def test_of_the_candidates_each_render_is_the_one_of_the_highest_loss(serve, mod
     still = copy.deepcopy(model).eval()  # without dropout
     still.register_forward_hook(lambda _, images, logits: shown.append(images[0]))
     varied = VariationSettings(exposure=[0.2, 5.0])
-    renders = serve(arm="random", vary=varied, random=RandomLights(candidates=3)).regenerate(still, 0)
+    renders = serve(arm="random", vary=varied, random_light=RandomLightSettings(candidates=3)).regenerate(still, 0)
     candidates = torch.cat(shown)[:300].unflatten(0, (3, 100))
     with torch.no_grad():
         logits = still(candidates.flatten(0, 1))
@@ -170,17 +169,17 @@ def attacked_by_hand(model: nn.Module, scene: Scene, labels: Tensor, step: str, 
         lights.requires_grad_(True)
         images = render(scene, lights)
         logits = model(images)
-        losses, fooled = nn.functional.cross_entropy(logits, labels, reduction="none"), logits.argmax(1) != labels
+        losses, success = nn.functional.cross_entropy(logits, labels, reduction="none"), logits.argmax(1) != labels
         if index == 0:
-            before = {"fooled_before": fooled, "loss_before": losses.detach()}
+            before = {"attack_success_before": success, "loss_before": losses.detach()}
         if index == steps:
             break
         (uphill,) = torch.autograd.grad(losses.sum(), lights)
         move = uphill.sign() if step == "sign" else uphill / uphill.flatten(1).norm(dim=1)[:, None, None]
-        lights = torch.where(fooled[:, None, None], lights, lights + 0.05 * move).detach()
-        taken += ~fooled
+        lights = torch.where(success[:, None, None], lights, lights + 0.05 * move).detach()
+        taken += ~success
     model.train(was_training)
-    after = {"fooled": fooled, "loss": losses.detach(), "steps": taken, "used_all_steps": taken == steps}
+    after = {"attack_success": success, "loss": losses.detach(), "steps": taken, "used_all_steps": taken == steps}
     return (
         before | after | {"images": images.detach(), "light_change": (lights - LIGHT).detach().flatten(1).norm(dim=1)}
     )
@@ -194,41 +193,41 @@ def test_adversarial_images_are_those_of_the_papers_loop(serve, model, scene, la
     torch.testing.assert_close(renders.images, expected.pop("images"), rtol=0, atol=10 * 64 * EPS32)
     for name, values in expected.items():
         assert renders.diagnostics[name] == pytest.approx(float(values.double().mean()), rel=1e-4), name
-    assert 0 < renders.diagnostics["fooled"] < 1 and renders.diagnostics["zero_gradient"] == 0
+    assert 0 < renders.diagnostics["attack_success"] < 1 and renders.diagnostics["zero_gradient"] == 0
 
 
 def test_the_attack_raises_the_loss_within_its_budget(serve, model):
     diagnostics = serve(attack=TrainingAttackSettings(max_steps=10)).regenerate(model, 0).diagnostics
-    assert diagnostics["fooled_before"] < 0.2 < diagnostics["fooled"]
+    assert diagnostics["attack_success_before"] < 0.2 < diagnostics["attack_success"]
     assert diagnostics["loss"] > 2 * diagnostics["loss_before"]
     assert 0 < diagnostics["light_change"] <= 0.05 * diagnostics["steps"] + 1e-6 <= 0.5 + 1e-6
 
 
 def test_lights_that_restart_begin_at_the_light_each_epoch(serve, model):
-    service = serve(lights="restart")
+    service = serve(warm_start=False)
     first, second = (service.regenerate(model, epoch) for epoch in range(2))
     torch.testing.assert_close(second.images, first.images, rtol=0, atol=0)
     assert service.state_dict() == {}
 
 
-@pytest.mark.parametrize("start", ["light", "random"])
+@pytest.mark.parametrize("start", ["scene", "random"])
 def test_lights_that_continue_begin_where_they_ended_also_after_a_resume(serve, model, start):
-    service = serve(lights="continue", start=start)
+    service = serve(warm_start=True, init=start)
     first = service.regenerate(model, 0)
     state = {name: value.clone() for name, value in service.state_dict().items()}
     second = service.regenerate(model, 1)
     assert second.diagnostics["loss_before"] == pytest.approx(first.diagnostics["loss"], rel=8 * EPS32)
-    assert second.diagnostics["fooled_before"] == first.diagnostics["fooled"]
+    assert second.diagnostics["attack_success_before"] == first.diagnostics["attack_success"]
     assert second.diagnostics["loss"] > first.diagnostics["loss"]
 
-    resumed = serve(lights="continue", start=start)
+    resumed = serve(warm_start=True, init=start)
     resumed.load_state_dict(state)
     torch.testing.assert_close(resumed.regenerate(model, 1).images, second.images, rtol=0, atol=0)
 
 
 def test_a_random_start_is_the_random_arms_light(serve, model):
     still = TrainingAttackSettings(max_steps=0)
-    started = serve(start="random", attack=still).regenerate(model, 5)
+    started = serve(init="random", attack=still).regenerate(model, 5)
     random = serve(arm="random").regenerate(model, 5)
     torch.testing.assert_close(started.images, random.images, rtol=0, atol=0)
     assert started.diagnostics["light_change"] == random.diagnostics["light_change"] > 0
@@ -236,12 +235,12 @@ def test_a_random_start_is_the_random_arms_light(serve, model):
 
 def test_continued_lights_of_another_number_of_examples_are_refused(serve):
     with pytest.raises(InputError, match=r"augment\.examples: the checkpoint continues 3 examples and the scene has"):
-        serve(lights="continue").load_state_dict({"values": torch.zeros(3, 147)})
+        serve(warm_start=True).load_state_dict({"values": torch.zeros(3, 147)})
 
 
 def test_lights_that_an_older_version_continued_are_refused(serve):
     with pytest.raises(InputError, match="as an older version kept them"):
-        serve(lights="continue").load_state_dict({"lights": torch.zeros(4, 49, 3)})
+        serve(warm_start=True).load_state_dict({"lights": torch.zeros(4, 49, 3)})
 
 
 @pytest.mark.parametrize("arm", ["random", "adversarial"])
@@ -256,9 +255,8 @@ def test_a_label_beyond_the_classes_of_the_network_is_refused(model, arm):
     ("make", "message"),
     [
         (lambda: AugmentationSettings(arm="both"), r"augment\.arm=both: choose one of none, random, adversarial"),
-        (lambda: RandomLights(candidates=0), r"augment\.random\.candidates=0"),
-        (lambda: AugmentationSettings(start="dark"), r"augment\.start=dark: choose one of light, random"),
-        (lambda: AugmentationSettings(lights="stay"), r"augment\.lights=stay: choose one of restart, continue"),
+        (lambda: RandomLightSettings(candidates=0), r"augment\.random_light\.candidates=0"),
+        (lambda: AugmentationSettings(init="dark"), r"augment\.init=dark: choose one of scene, random"),
         (lambda: AugmentationSettings(examples=-1), r"augment\.examples=-1"),
         (lambda: TrainingAttackSettings(step="newton"), r"attack: step=newton: choose one of unit, raw, sign"),
         (lambda: TrainingAttackSettings(step_size=0.0), r"attack: step_size=0\.0 must be at least"),
@@ -269,9 +267,9 @@ def test_a_label_beyond_the_classes_of_the_network_is_refused(model, arm):
             lambda: AugmentationSettings(arm="random", attack=TrainingAttackSettings(geometry=StepSettings())),
             r"augment\.attack\.geometry\.radius=null has no random draw: set a radius",
         ),
-        (lambda: RandomLights(amplitude=0.0), r"augment\.random\.amplitude=0\.0"),
-        (lambda: RandomLights(amplitude=math.nan), r"augment\.random\.amplitude=nan"),
-        (lambda: RandomLights(radius=0.0), r"augment\.random\.radius=0\.0"),
+        (lambda: RandomLightSettings(amplitude=0.0), r"augment\.random_light\.amplitude=0\.0"),
+        (lambda: RandomLightSettings(amplitude=math.nan), r"augment\.random_light\.amplitude=nan"),
+        (lambda: RandomLightSettings(radius=0.0), r"augment\.random_light\.radius=0\.0"),
     ],
 )
 def test_settings_out_of_range_are_refused(make, message):
@@ -327,7 +325,7 @@ def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, mon
     monkeypatch.chdir(tmp_path)
     meshes = [("solid:plate", 0), (solid("table"), 2)]
     attack = TrainingAttackSettings(max_steps=2)
-    settings = AugmentationSettings(lights="continue", attack=attack)
+    settings = AugmentationSettings(warm_start=True, attack=attack)
     choices = dict(views=2, backgrounds=[0.25, 0.75], samples=2, visibility="software")
     service = AugmentationService.from_meshes(meshes, 8, settings, **choices)
     renders = service.regenerate(model, 0)
@@ -351,7 +349,7 @@ def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, mon
 
 def test_look_alikes_are_lit_towards_the_label_and_the_label_away_from_it(serve, scene, model, labels):
     """Tables are `other`, anything but a plate: there every step raises the plate's probability."""
-    other = torch.where(labels == 0, labels, anything_but(0))
+    other = torch.where(labels == 0, labels, complementary_label(0))
     service = AugmentationService(AugmentationSettings(attack=SHORT), scene, other, 0, Phases(), label=0)
     renders = service.regenerate(model, 0)
     model.eval()
@@ -372,13 +370,13 @@ def test_a_look_alike_of_a_class_of_its_own_is_fooled_only_as_the_label(scene, l
     with torch.no_grad():
         predicted = model(result.images).argmax(1)
     model.train()
-    fooled = torch.where(labels == 0, predicted != 0, predicted == 0)
-    assert result.diagnostics["fooled"] == pytest.approx(fooled.double().mean())
+    success = torch.where(labels == 0, predicted != 0, predicted == 0)
+    assert result.diagnostics["attack_success"] == pytest.approx(success.double().mean())
 
 
 def test_lights_that_continue_keep_their_shapes():
-    with pytest.raises(InputError, match=r"augment\.lights=continue goes on with the last shapes"):
-        AugmentationSettings(lights="continue", vary=VariationSettings(individuals=True))
+    with pytest.raises(InputError, match=r"augment\.warm_start=true goes on with the last shapes"):
+        AugmentationSettings(warm_start=True, vary=VariationSettings(instances=True))
 
 
 def test_specimens_are_of_examples_that_the_attack_turned_and_show_both_sides(scene, labels, model):
@@ -386,16 +384,18 @@ def test_specimens_are_of_examples_that_the_attack_turned_and_show_both_sides(sc
         AugmentationSettings(attack=TrainingAttackSettings(max_steps=30, step_size=0.5)), scene, labels, 0, Phases()
     )
     renders = service.regenerate(model, 0)
-    found = renders.specimens
-    assert renders.diagnostics["fooled"] > renders.diagnostics["fooled_before"] and 0 < len(found) <= 4
-    assert (found.answers_before.argmax(1) == found.labels).all() and (found.answers.argmax(1) != found.labels).all()
+    found = renders.attack_examples
+    assert renders.diagnostics["attack_success"] > renders.diagnostics["attack_success_before"] and 0 < len(found) <= 4
+    assert (found.predictions_before.argmax(1) == found.labels).all() and (
+        found.predictions.argmax(1) != found.labels
+    ).all()
     assert torch.equal(found.lights_before, LIGHT.expand(len(found), -1, -1))
-    for images, lights, answers in [
-        (found.images_before, found.lights_before, found.answers_before),
-        (found.images, found.lights, found.answers),
+    for images, lights, predictions in [
+        (found.images_before, found.lights_before, found.predictions_before),
+        (found.images, found.lights, found.predictions),
     ]:
         everything = [render(scene, light.expand(len(scene), -1, -1)) for light in lights]
         gaps = [(image - shown).flatten(1).abs().amax(1).min() for image, shown in zip(images, everything, strict=True)]
         assert max(gaps) < 100 * EPS32
         with torch.no_grad():
-            torch.testing.assert_close(answers, model.eval()(images).softmax(1))
+            torch.testing.assert_close(predictions, model.eval()(images).softmax(1))

@@ -2,8 +2,8 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from augment.seeding import generator
-from augment.snapshot import Snapshot, SnapshotSettings, draw_snapshot
+from augment.camera_effects import CameraEffects, CameraEffectSettings, draw_camera_effects
+from augment.utils import generator
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode, encode
 
@@ -14,20 +14,20 @@ EVERY = torch.arange(COUNT)
 
 def taken(images=IMAGES, examples=EVERY, encoding="srgb", **settings) -> torch.Tensor:
     image = ImageSettings(SIZE, encoding=encoding)
-    return draw_snapshot(SnapshotSettings(**settings), COUNT, image, generator(1))(images, examples)
+    return draw_camera_effects(CameraEffectSettings(**settings), COUNT, image, generator(1))(images, examples)
 
 
 def test_a_camera_that_changes_nothing_gives_the_render():
     torch.testing.assert_close(taken(), IMAGES, rtol=0, atol=1e-6)  # the draws are single precision
-    assert not SnapshotSettings().changes and SnapshotSettings(noise=0.1).changes
+    assert not CameraEffectSettings().changes and CameraEffectSettings(noise=0.1).changes
 
 
 def test_a_pattern_multiplies_the_light_of_object_and_background_alike():
     """Beneath it, a share of the scene's own light is left."""
-    ratio = decode(taken(patterns=1.0, ambient=[0.2, 0.2]), "srgb") / decode(IMAGES, "srgb")
+    ratio = decode(taken(pattern_fraction=1.0, pattern_fill=[0.2, 0.2]), "srgb") / decode(IMAGES, "srgb")
     torch.testing.assert_close(ratio[:, 0], ratio[:, 1], rtol=1e-5, atol=0)
     assert 0.2 - 1e-5 <= ratio.min() < 0.25 and 0.99 < ratio.max() <= 1 + 1e-5
-    untouched = (taken(patterns=0.5) == taken()).flatten(1).all(1).double().mean()
+    untouched = (taken(pattern_fraction=0.5) == taken()).flatten(1).all(1).double().mean()
     assert 0.3 < untouched < 0.7
 
 
@@ -40,7 +40,7 @@ def test_white_balance_is_a_gain_of_each_channel_in_stops():
 
 def test_a_blur_is_scipys_gaussian_of_the_linear_light():
     blur = torch.linspace(0.3, 1.2, COUNT)
-    camera = Snapshot(torch.ones(COUNT, 3, 1, 1), blur, torch.zeros(COUNT, 3, SIZE, SIZE), "srgb")
+    camera = CameraEffects(torch.ones(COUNT, 3, 1, 1), blur, torch.zeros(COUNT, 3, SIZE, SIZE), "srgb")
     light = decode(camera(IMAGES, EVERY), "srgb")
     for index in range(0, COUNT, 13):
         sharp, sigma = decode(IMAGES[index], "srgb").numpy(), (0, 0, float(blur[index]), float(blur[index]))
@@ -55,13 +55,13 @@ def test_noise_has_the_deviation_that_was_drawn_for_the_image():
 
 
 def test_examples_keep_their_own_draws_in_any_order():
-    settings = {"patterns": 1.0, "white_balance": 0.5, "blur": 1.0, "noise": 0.05}
+    settings = {"pattern_fraction": 1.0, "white_balance": 0.5, "blur": 1.0, "noise": 0.05}
     some = torch.tensor([7, 3])
     torch.testing.assert_close(taken(IMAGES[some], some, **settings), taken(**settings)[some], rtol=0, atol=1e-12)
 
 
 def test_images_are_differentiable_in_the_render():
-    camera = Snapshot(torch.full((1, 3, 1, 1), 0.5), torch.tensor([0.8]), torch.zeros(1, 3, 4, 4), "srgb")
+    camera = CameraEffects(torch.full((1, 3, 1, 1), 0.5), torch.tensor([0.8]), torch.zeros(1, 3, 4, 4), "srgb")
     images = 0.2 + 0.5 * IMAGES[:1, :1, :, :4, :4]
     assert torch.autograd.gradcheck(lambda values: camera(values, torch.tensor([0])), images.requires_grad_(True))
 
@@ -69,15 +69,15 @@ def test_images_are_differentiable_in_the_render():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"patterns": 1.5}, r"augment\.vary\.snapshot\.patterns"),
-        ({"blur": -1.0}, r"augment\.vary\.snapshot\.blur"),
-        ({"noise": float("nan")}, r"augment\.vary\.snapshot\.noise"),
+        ({"pattern_fraction": 1.5}, r"augment\.vary\.camera\.pattern_fraction"),
+        ({"blur": -1.0}, r"augment\.vary\.camera\.blur"),
+        ({"noise": float("nan")}, r"augment\.vary\.camera\.noise"),
         (
-            {"ambient": [0.5, 0.2]},
-            r"augment\.vary\.snapshot\.ambient=\[0\.5, 0\.2\]: give \[least, most\], both from 0 to 1",
+            {"pattern_fill": [0.5, 0.2]},
+            r"augment\.vary\.camera\.pattern_fill=\[0\.5, 0\.2\]: give \[least, most\], both from 0 to 1",
         ),
     ],
 )
 def test_settings_beyond_their_range_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
-        SnapshotSettings(**settings)
+        CameraEffectSettings(**settings)

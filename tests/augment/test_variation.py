@@ -11,13 +11,11 @@ from torch import Tensor, nn
 
 import augment
 from augment.backgrounds import load_background, load_backgrounds
+from augment.camera_effects import CameraEffectSettings
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
-from augment.phases import Phases
 from augment.scene import Scene
-from augment.seeding import generator
-from augment.service import AugmentationService
-from augment.service_settings import AugmentationSettings
-from augment.snapshot import SnapshotSettings
+from augment.service import AugmentationService, AugmentationSettings
+from augment.utils import Phases, generator
 from augment.variation import VariationSettings, vary
 from renderer.camera import ring
 from renderer.errors import InputError
@@ -63,7 +61,7 @@ def test_where_nothing_varies_the_scene_is_its_own(scene):
 
 
 def test_a_place_moves_the_mesh_at_most_so_far_and_keeps_its_size(scene):
-    (middles, extents), (before, extents_before) = outlines(drawn(scene, place=0.3)), outlines(scene)
+    (middles, extents), (before, extents_before) = outlines(drawn(scene, shift=0.3)), outlines(scene)
     offsets = (middles - before).abs()
     assert (offsets <= 0.3 + 1 / SIZE).all() and (offsets.amax(0) > 0.2).all()
     torch.testing.assert_close(extents, extents_before, rtol=0, atol=2 / SIZE)
@@ -78,7 +76,7 @@ def test_a_scale_magnifies_about_the_middle(scene):
 
 def test_in_perspective_rows_are_zoomed_and_aside_and_turned_from_where_their_camera_stands():
     scene = augment.build_scene([("solid:orange", "orange")], 16, 6, visibility="software", perspective=40.0)
-    rows = drawn(scene, place=0.3, scale=[0.5, 1.5], turn=20.0)
+    rows = drawn(scene, shift=0.3, scale=[0.5, 1.5], azimuth=20.0)
     (before,), cameras = {view.distance for (view,) in scene.cameras}, [view for (view,) in rows.cameras]
     origins = np.concatenate([camera.project(np.zeros((1, 3))) for camera in cameras])[:, :2]
     assert {camera.distance for camera in cameras} == {before} and len({camera.angle for camera in cameras}) == 6
@@ -111,7 +109,7 @@ def test_a_turn_moves_the_camera_at_most_so_far_around_the_mesh(scene):
     def angles(of: Scene) -> Tensor:
         return torch.tensor([[row.cameras[0].polar, row.cameras[0].azimuth] for row in of.examples])
 
-    offsets = torch.rad2deg(angles(drawn(scene, turn=40.0)) - angles(scene)).abs()
+    offsets = torch.rad2deg(angles(drawn(scene, azimuth=40.0)) - angles(scene)).abs()
     assert (offsets <= 40).all() and (offsets.amax(0) > 25).all()
 
 
@@ -121,7 +119,7 @@ def test_individuals_are_drawn_of_solids_without_a_seed_alone(scene):
     settings, row = ImageSettings(SIZE, samples=2), scene.examples[0]
     rows = [replace(row, object=index) for index in range(3)]
     mixed = Scene(objects, rows, load_backgrounds([0.0], SIZE), LIGHT, settings, choose("software"))
-    first, second = (drawn(mixed, seed, individuals=True).objects for seed in (0, 1))
+    first, second = (drawn(mixed, seed, instances=True).objects for seed in (0, 1))
     assert first[1] is objects[1] and [item.label for item in first] == kinds
     for index in (0, 2):
         colors = [each[index].mesh.corner_colors for each in (objects, first, second)]
@@ -133,14 +131,14 @@ def test_each_view_shows_an_individual_of_its_own_before_all_backgrounds():
     apple, settings = load_object(ObjectSettings("solid:apple", "apple")), ImageSettings(SIZE, samples=2)
     backgrounds = load_backgrounds([0.0, 1.0], SIZE)
     grid = Scene.grid([apple, apple], ring(3, 3.0), backgrounds, LIGHT, settings, choose("software"))
-    varied = drawn(grid, individuals=True, lamps=0.5)
+    varied = drawn(grid, instances=True, directional_fraction=0.5)
     assert [row.object for row in varied.examples] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
     assert [row.background for row in varied.examples] == [row.background for row in grid.examples]
     assert len({item.mesh.corner_colors.tobytes() for item in varied.objects}) == 6
 
 
 def test_rows_repeat_under_several_lights_with_all_but_the_light_as_it_was(scene):
-    varying = {"place": 0.2, "turn": 30.0, "individuals": True, "exposure": [0.5, 2.0], "lamps": 0.5}
+    varying = {"shift": 0.2, "azimuth": 30.0, "instances": True, "exposure": [0.5, 2.0], "directional_fraction": 0.5}
     varied = vary(scene, VariationSettings(**varying), generator(0), lights=3)
     parts = [varied.examples[first : first + len(scene)] for first in range(0, 3 * len(scene), len(scene))]
     assert [(row.object, row.cameras, row.background) for part in parts for row in part] == 3 * [
@@ -150,7 +148,7 @@ def test_rows_repeat_under_several_lights_with_all_but_the_light_as_it_was(scene
 
 
 def test_lights_are_shared_out_among_the_examples(scene):
-    varied = drawn(scene, lights=["eucalyptus", "st_peters"])
+    varied = drawn(scene, environments=["eucalyptus", "st_peters"])
     choices = torch.stack([probe("eucalyptus"), probe("st_peters")])
     counts = (varied.lights[:, None] == choices).flatten(2).all(2).sum(0)
     assert counts.sum() == 12 and (counts > 0).all()
@@ -158,7 +156,7 @@ def test_lights_are_shared_out_among_the_examples(scene):
 
 def test_a_lamp_is_white_parallel_light_from_the_cameras_side_over_some_of_the_own_light(scene):
     """Its harmonics of degree 1 point to where it comes from; its mean is a quarter of what it gives."""
-    lit = drawn(scene, lamps=1.0, ambient=[0.5, 0.5])
+    lit = drawn(scene, directional_fraction=1.0, fill_light=[0.5, 0.5])
     lamps = (lit.lights - 0.5 * scene.lights)[:, :, 0].double()
     towards = lamps[:, [3, 1, 2]] / lamps[:, 1:4].norm(dim=1, keepdim=True)  # Y₁₁ ∝ x, Y₁₋₁ ∝ y, Y₁₀ ∝ z
     for example, direction in zip(scene.examples, towards, strict=True):
@@ -179,14 +177,14 @@ def test_what_stands_on_a_table_has_no_lamp_below_it(scene):
     height = {}
     for ground in (None, [0.5, 0.5, 0.5]):
         objects = [item if ground is None else on_ground(item, ground) for item in scene.objects]
-        lights = drawn(replace(scene, objects=objects), lamps=1.0).lights
+        lights = drawn(replace(scene, objects=objects), directional_fraction=1.0).lights
         height[ground is None] = lights[:, 2, 0]
     assert (height[True] < 0).any()
     assert torch.equal(height[False], height[True].abs())
 
 
 def test_a_share_of_the_examples_stands_in_lamplight_and_the_rest_in_their_own_light(scene):
-    lit = drawn(scene, lamps=0.5)
+    lit = drawn(scene, directional_fraction=0.5)
     own = (lit.lights == scene.lights).all((1, 2))
     assert 0 < own.sum() < len(scene)
     assert (lit.lights[~own, 0] > 0).all()
@@ -199,7 +197,7 @@ def test_a_lit_background_is_a_wall_that_faces_the_camera():
     white = SceneObject("ball", Mesh.plain(ball.vertices, ball.faces, (1.0, 1.0, 1.0)))
     behind = load_backgrounds([1.0, 0.5], SIZE)
     balls = Scene.grid([white], ring(3, 2.5), behind, probe("grace"), settings, choose("software"))
-    seen = decode(images(drawn(balls, lit=True, exposure=[0.3, 0.6])), "srgb")
+    seen = decode(images(drawn(balls, lit_background=True, exposure=[0.3, 0.6])), "srgb")
     middle, corner = seen[:, :, SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1], seen[:, :, 0, 0]
     middle = middle.mean((2, 3))
     white, grey = corner[::2], corner[1::2] / decode(torch.tensor(0.5), "srgb")
@@ -208,13 +206,13 @@ def test_a_lit_background_is_a_wall_that_faces_the_camera():
 
 
 def test_a_camera_takes_what_the_scene_renders(scene):
-    darker = images(drawn(scene, snapshot=SnapshotSettings(white_balance=1.0))) / images(scene)
+    darker = images(drawn(scene, camera=CameraEffectSettings(white_balance=1.0))) / images(scene)
     gains = darker.flatten(2).nanmean(2)
     assert 0.5 <= gains.min() < 0.7 and 1.4 < gains.max() <= 2.001
 
 
 def test_each_epoch_draws_its_own_rows_and_repeats_them(scene):
-    vary_all = VariationSettings(place=0.1, scale=[0.8, 1.2], exposure=[0.5, 2.0])
+    vary_all = VariationSettings(shift=0.1, scale=[0.8, 1.2], exposure=[0.5, 2.0])
     settings = AugmentationSettings(arm="random", examples=12, vary=vary_all)
     model = nn.Sequential(nn.Flatten(), nn.Linear(3 * SIZE**2, 2))
     service = AugmentationService(settings, scene, torch.zeros(12, dtype=torch.int64), 0, Phases())
@@ -225,13 +223,13 @@ def test_each_epoch_draws_its_own_rows_and_repeats_them(scene):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"place": -0.1}, r"augment\.vary\.place=-0\.1 must be at least 0"),
-        ({"place": math.nan}, r"augment\.vary\.place=nan"),
+        ({"shift": -0.1}, r"augment\.vary\.shift=-0\.1 must be at least 0"),
+        ({"shift": math.nan}, r"augment\.vary\.shift=nan"),
         ({"scale": [1.0]}, r"augment\.vary\.scale=\[1\.0\]: give \[least, most\]"),
         ({"scale": [2.0, 1.0]}, r"augment\.vary\.scale"),
         ({"exposure": [0.0, 1.0]}, r"augment\.vary\.exposure=\[0\.0, 1\.0\]: give \[least, most\], both from 1e-05 to"),
         ({"exposure": [1.0, math.inf]}, r"augment\.vary\.exposure"),
-        ({"turn": 200.0}, r"augment\.vary\.turn"),
+        ({"azimuth": 200.0}, r"augment\.vary\.azimuth"),
     ],
 )
 def test_variations_that_are_none_are_refused(settings, message):

@@ -16,7 +16,7 @@ from train.command_line.entry_points import USER_ERROR
 ROOT = Path(__file__).parents[2]
 SMALL = [
     f"classifier=run:{ROOT / 'pretrained' / 'none'}", "attack.force=true", "attack.max_steps=2", "device=cpu",
-    "renderer.visibility=software", "renderer.cache=null", "attack.light=signed",
+    "renderer.visibility=software", "renderer.cache=null", "attack.allow_negative=true",
 ]  # fmt: skip
 
 
@@ -79,12 +79,12 @@ def test_an_adversary_is_rendered_again_and_gone_on_from(run, tmp_path, capsys):
     assert run(f"reload={first / 'example_000'}", "out=none") == 0
     lines = capsys.readouterr().out.splitlines()
     assert not (tmp_path / "none").exists() and len(lines) == 2
-    for view, (told, answer, confidence) in enumerate(zip(lines, line["answer"], line["confidence"], strict=True)):
+    for view, (told, answer, confidence) in enumerate(zip(lines, line["predicted"], line["confidence"], strict=True)):
         assert told.startswith(f"view {view}: orange is taken for {answer} ({confidence:.1%}); values differ ")
         assert float(told.rpartition("by ")[2].partition("/255")[0]) <= 1
     assert run(f"reload={first / 'example_000'}", "attack=lighting", "attack.checks=false", "out=again") == 0
     again = json.loads((tmp_path / "again" / "0_solid_orange_0" / "attack.jsonl").read_text())
-    assert again["answer_before"] == line["answer"]
+    assert again["predicted_before"] == line["predicted"]
     assert again["cost_before"] == pytest.approx(line["cost"], abs=0.05)
 
 
@@ -115,11 +115,11 @@ def test_what_fools_is_shown_to_other_networks_from_other_sides_and_on_other_mes
     folder = tmp_path / "out" / "0_solid_orange_0"
     lines = [json.loads(line) for line in (folder / "transfer.jsonl").read_text().splitlines()]
     attacked = [json.loads(line) for line in (folder / "attack.jsonl").read_text().splitlines()]
-    adversaries = [line for line in attacked if line["recognised"] and line["fooled"]]
+    adversaries = [line for line in attacked if line["clean_correct"] and line["success"]]
     own, other, turned, still, same, apple = lines
     assert other["network"].endswith("best") and turned["azimuth"] == "-20°" and apple["mesh"] == "solid:apple:0"
     for line in (own, still, same):  # where nothing is another
-        assert line["answer"] == [each["answer"] for each in adversaries]
+        assert line["predicted"] == [each["predicted"] for each in adversaries]
         assert line["hits"] == line["n"] == len(adversaries) > 0
     assert "| network run:" in capsys.readouterr().out
 

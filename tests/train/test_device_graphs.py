@@ -4,7 +4,7 @@ import torch.nn.functional as F
 from torch._dynamo.exc import BackendCompilerFailed
 
 from augment.labels import ranking_loss
-from augment.model_state import eval_mode
+from augment.utils import eval_mode
 from train import device as compute
 from train.device import RECOMPILE_LIMIT, SIZES, FixedSizes, compiler_works, compiles, training_pass
 from train.wideresnet import WideResNet

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from omegaconf import OmegaConf
 from PIL import Image
 
-from augment import processes
+from augment import utils
 from train.distributed import SyncBatchNormCPU, any_process, process_group, replicated, summed, synchronise_norms
 from train.experiment import load_data, run
 from train.fit import trainer
@@ -59,22 +59,22 @@ def train_two_steps(folder: Path) -> None:
     """Writes the losses, the gradients of the second step, and the buffers, and what the processes agree on."""
     model = network()
     replica, losses = replicated(model), []
-    share = torch.arange(12).view(processes.world_size(), -1)[processes.rank()]
+    share = torch.arange(12).view(utils.world_size(), -1)[utils.rank()]
     for step in range(2):
         torch.manual_seed(step)
         loss = F.cross_entropy(replica(BATCH[share]), LABELS[share])
         model.zero_grad()
         loss.backward()
-        losses.append(float(summed(loss.detach().clone())) / processes.world_size())
+        losses.append(float(summed(loss.detach().clone())) / utils.world_size())
     state = {
         "losses": losses,
         "gradients": {name: parameter.grad for name, parameter in model.named_parameters()},
         "buffers": dict(model.named_buffers()),
-        "any": [any_process(processes.rank() == 1), any_process(False)],
-        "merged": processes.merged(processes.share(5) * 10, processes.share(5), 5),
-        "few": processes.merged(processes.share(1) + 7, processes.share(1), 1),
+        "any": [any_process(utils.rank() == 1), any_process(False)],
+        "merged": utils.merged(utils.shard(5) * 10, utils.shard(5), 5),
+        "few": utils.merged(utils.shard(1) + 7, utils.shard(1), 1),
     }
-    torch.save(state, folder / f"{processes.rank()}_of_{processes.world_size()}.pt")
+    torch.save(state, folder / f"{utils.rank()}_of_{utils.world_size()}.pt")
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def interrupted_at(epoch: int, step: int, process: int) -> Iterator[None]:
 
     def signalled(images, labels, batch_size, seed, now, *rest, **more):
         for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
-            if (now.epoch, count, processes.rank()) == (epoch, step, process):
+            if (now.epoch, count, utils.rank()) == (epoch, step, process):
                 signal.raise_signal(signal.SIGTERM)
             yield batch
 

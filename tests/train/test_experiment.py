@@ -16,7 +16,7 @@ import torch
 import trimesh
 from omegaconf import OmegaConf
 
-from augment.labels import anything_but
+from augment.labels import complementary_label
 from augment.variation import VariationSettings
 from renderer.errors import InputError
 from train.command_line.configuration import composed, read_settings
@@ -79,7 +79,11 @@ def test_an_interrupted_and_resumed_run_ends_as_an_uninterrupted_one(
 ):
     """Bit for bit, with adversaries whose lights continue from epoch to epoch, and dropout."""
     settings = OmegaConf.load(finished / "config.yaml")
-    assert (settings.augment.arm, settings.augment.lights, settings.model.dropout) == ("adversarial", "continue", 0.3)
+    assert (settings.augment.arm, settings.augment.warm_start, settings.model.dropout) == (
+        "adversarial",
+        "continue",
+        0.3,
+    )
     assert all(line["augment/light_change"] > 0 for line in read_metrics(finished)[:-1])
     with monkeypatch.context() as patch:
         interrupt(patch)
@@ -453,12 +457,12 @@ def test_look_alikes_follow_the_meshes_and_are_anything_but_the_label_unless_the
     trained = []
     put_last = trainer.put_last
     monkeypatch.setattr(trainer, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
-    look_alikes = "scene.look_alikes=['solid:fruit', {mesh: 'solid:pear', label: pear}]"
-    config = tiny("train.epochs=1", "scene.meshes=['solid:orange']", look_alikes, "augment.examples=6")
+    hard_negatives = "scene.hard_negatives=['solid:fruit', {mesh: 'solid:pear', label: pear}]"
+    config = tiny("train.epochs=1", "scene.meshes=['solid:orange']", hard_negatives, "augment.examples=6")
     run(config, load_data(config), tmp_path)
     (renders,) = trained
     orange = 1
-    assert renders.labels.tolist() == [orange] * 2 + [anything_but(orange)] * 2 + [2] * 2
+    assert renders.labels.tolist() == [orange] * 2 + [complementary_label(orange)] * 2 + [2] * 2
     assert np.isfinite(read_metrics(tmp_path)[0]["train/loss"])
 
 
@@ -486,8 +490,8 @@ def test_metrics_have_each_epochs_losses_attack_and_seconds_and_the_final_scores
     for line in epochs:
         assert {
             "train/loss", "train/accuracy", "train/learning_rate", "validation/loss", "validation/accuracy",
-            "augment/fooled_before", "augment/fooled", "augment/steps", "augment/loss_before", "augment/loss",
-            "augment/light_change", "augment/clamped",
+            "augment/attack_success_before", "augment/attack_success", "augment/steps", "augment/loss_before",
+            "augment/loss", "augment/light_change", "augment/clamped",
             "seconds/attack", "seconds/training", "seconds/evaluation", "seconds/input_output",
         } <= line.keys()  # fmt: skip
         assert all(isinstance(value, int | float) for value in line.values())
@@ -633,7 +637,7 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["+train.epoch=3"], "train.epoch: Key 'epoch' not in"),
         (["augment.attack.step_size=abc"], "augment.attack.step_size: Value 'abc'"),
         (["augment.arm=adverserial"], "augment.arm=adverserial: choose one of"),
-        (["augment.random=3"], "RandomLights"),
+        (["augment.random_light=3"], "RandomLightSettings"),
         (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12"),
         (["augment.examples=5"], "augment.examples=5 is not a multiple of 2 meshes × 2 backgrounds"),
         (["scene.meshes=solid:orange"], "scene.meshes"),
@@ -641,15 +645,15 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
         (["scene.meshes=[{label: orange}]", "augment.examples=2"], r"mesh"),
         (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
         (
-            ["scene.look_alikes=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
-            r"scene.look_alikes\[0\] is of the class orange: name it in scene.meshes",
+            ["scene.hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
+            r"scene.hard_negatives\[0\] is of the class orange: name it in scene.meshes",
         ),
         (["scene.exposure=0"], "scene.exposure=0.0 must be at least"),
         (["scene.exposure=1e30"], r"scene.exposure=1e\+30 must be at least 1e-05 and at most 100000"),
         (["scene.views=1000000000000"], "scene.views=1000000000000 must be at least 1 and at most 100000"),
         (["train.threads=100000"], "train.threads=100000 must be at least 1 and at most 1024"),
         (["augment.examples=1000000000000"], "augment.examples=1000000000000 must be at least 0"),
-        (["augment.random.amplitude=1e30"], r"augment.random.amplitude=1e\+30 must be"),
+        (["augment.random_light.amplitude=1e30"], r"augment.random_light.amplitude=1e\+30 must be"),
         (["augment.attack.step_size=nan"], "attack: step_size=nan must be"),
         (["renderer.samples=65"], "renderer.samples=65 must be at least 1 and at most 64"),
         (["renderer=x"], "renderer: Merge error: str is not a subclass of RendererSettings"),
@@ -701,15 +705,15 @@ def test_every_experiment_is_a_configuration_that_runs_on_other_data_too(tiny_np
 
 def test_the_papers_renders_are_as_they_are_and_have_no_look_alikes():
     settings = read_settings(ExperimentSettings, composed("train", ["experiment=paper", "run=here"]))
-    assert settings.augment.vary == VariationSettings() and settings.scene.look_alikes == []
+    assert settings.augment.vary == VariationSettings() and settings.scene.hard_negatives == []
 
 
 def test_another_class_takes_a_label_meshes_and_look_alikes_alone(tiny, tmp_path, monkeypatch):
     trained = []
     put_last = trainer.put_last
     monkeypatch.setattr(trainer, "put_last", lambda split, renders: trained.append(renders) or put_last(split, renders))
-    meshes = ["label=pear", "scene.meshes=['solid:pear']", "scene.look_alikes=[{mesh: 'solid:apple', label: apple}]"]
-    small = ["augment.examples=null", "scene.views=2", "augment.every=30", "augment.lights=restart", "train.epochs=1"]
+    meshes = ["label=pear", "scene.meshes=['solid:pear']", "scene.hard_negatives=[{mesh: 'solid:apple', label: apple}]"]
+    small = ["augment.examples=null", "scene.views=2", "augment.every=30", "augment.warm_start=false", "train.epochs=1"]
     config = tiny("experiment=best", "train.init_from=null", "train.soup=false", *meshes, *small)
     run(config, load_data(config), tmp_path)
     first, second = trained
@@ -728,7 +732,7 @@ def test_training_takes_the_attacks_of_scripts_attack_and_the_papers_where_none_
 
     def kinds(*overrides: str) -> dict:
         settings = read_settings(ExperimentSettings, composed("train", ["run=here", *overrides]))
-        return {name: asdict(each) for name, each in settings.augment.attack.kinds.items()}
+        return {name: asdict(each) for name, each in settings.augment.attack.parameters.items()}
 
     paper = {"norm": "linf", "radius": None, "step": "unit", "step_size": 0.05}
     assert kinds() == kinds("experiment=paper") == {"lighting": paper}

@@ -26,7 +26,7 @@ def coarse(monkeypatch):
 
 
 @pytest.fixture
-def individuals(monkeypatch) -> list[tuple[str, int]]:
+def instances(monkeypatch) -> list[tuple[str, int]]:
     """The solids made, in order, as (name, seed)."""
     made = []
     solid = rendered_shapes.solid
@@ -43,20 +43,20 @@ def test_the_classes_are_ten_solids_the_orange_among_them():
     assert len(set(CLASSES)) == len(CLASSES) == 10 and "orange" in CLASSES
 
 
-def test_every_class_has_the_images_asked_for_of_as_many_individuals_as_that_takes(individuals):
+def test_every_class_has_the_images_asked_for_of_as_many_individuals_as_that_takes(instances):
     data = load_shapes(train=21, test=2, size=SIZE, seed=0)
     assert data.classes == FEW
     assert data.train.images.shape == (63, 3, SIZE, SIZE) and data.train.images.dtype == torch.uint8
     assert data.train.labels.tolist() == [label for label in range(3) for _ in range(21)]
     assert data.test.labels.tolist() == [label for label in range(3) for _ in range(2)]
-    assert [name for name, _ in individuals] == [name for name in FEW for _ in range(2)] + list(FEW)
+    assert [name for name, _ in instances] == [name for name in FEW for _ in range(2)] + list(FEW)
     assert len(data.train.images.unique(dim=0)) == 63
 
 
-def test_no_individual_is_in_two_of_training_test_and_held_out_images(individuals, tmp_path):
+def test_no_individual_is_in_two_of_training_test_and_held_out_images(instances, tmp_path):
     load_shapes(train=1, test=1, size=SIZE, seed=0)
     write_held_out(tmp_path, SIZE, seed=0)
-    assert len(individuals) == len(set(individuals)) == 9
+    assert len(instances) == len(set(instances)) == 9
 
 
 def test_images_are_a_function_of_the_seed():
@@ -67,12 +67,12 @@ def test_images_are_a_function_of_the_seed():
         assert not torch.equal(getattr(first, part).images, getattr(other, part).images)
 
 
-def test_images_that_are_on_disk_are_not_rendered_again(tmp_path, individuals):
+def test_images_that_are_on_disk_are_not_rendered_again(tmp_path, instances):
     cache = TensorCache(tmp_path / "kept")
     for folder, made in (("first", 9), ("second", 9)):
         data = load_shapes(1, 2, SIZE, 0, cache)
         write_held_out(tmp_path / folder, SIZE, 0, cache)
-        assert len(individuals) == made
+        assert len(instances) == made
     fresh = load_shapes(1, 2, SIZE, 0)
     for part in ("train", "test"):
         assert torch.equal(getattr(data, part).images, getattr(fresh, part).images)
@@ -85,15 +85,15 @@ def test_images_that_are_on_disk_are_not_rendered_again(tmp_path, individuals):
     ("change", "splits"),
     [({"train": 2}, 1), ({"test": 3}, 1), ({"size": 9}, 2), ({"seed": 1}, 2), ({"code": "other"}, 2), ({}, 0)],
 )
-def test_images_of_other_settings_or_other_code_are_rendered(change, splits, tmp_path, individuals, monkeypatch):
+def test_images_of_other_settings_or_other_code_are_rendered(change, splits, tmp_path, instances, monkeypatch):
     def load(code=rendered_shapes.CODE, **settings):
         monkeypatch.setattr(rendered_shapes, "CODE", code)
         load_shapes(**{"train": 1, "test": 2, "size": SIZE, "seed": 0} | settings, cache=TensorCache(tmp_path))
 
     load()
-    individuals.clear()
+    instances.clear()
     load(**change)
-    assert len(individuals) == 3 * splits
+    assert len(instances) == 3 * splits
 
 
 def test_held_out_images_are_a_folder_of_photographs_that_says_they_are_rendered(tmp_path):

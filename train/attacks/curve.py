@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from augment.attacks.sweep import Sweep
+from augment.attacks.evaluate import Sweep
 from train.photographs.shares import counted, share
 from train.report.plots import COLOURS, LINES, MARKERS
 from train.report.tables import aligned
@@ -25,10 +25,10 @@ def curve(found: Mapping[str, Sweep]) -> list[dict[str, Any]]:
         pooled = (torch.cat([getattr(each, method) for each in found.values()], dim=1) for method in METHODS)
         together[ALL] = Sweep(next(iter(found.values())).radii, *pooled)
     return [
-        {"mesh": mesh, "method": method, **radii, **share(int(fooled.sum()), len(fooled))}
+        {"mesh": mesh, "method": method, **radii, **share(int(success.sum()), len(success))}
         for mesh, sweep in {**found, **together}.items()
         for method in METHODS
-        for radii, fooled in zip(sweep.radii, getattr(sweep, method), strict=True)
+        for radii, success in zip(sweep.radii, getattr(sweep, method), strict=True)
     ]
 
 

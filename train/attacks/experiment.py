@@ -6,8 +6,8 @@ from dataclasses import replace
 import torch
 
 from augment.attacks.adversary import Adversary
+from augment.attacks.attack import AttackResult, attack
 from augment.attacks.criteria import Criterion, LeastLikely, Misclassification, Targeted
-from augment.attacks.run import Attacked, attack
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
 from renderer.errors import InputError
@@ -21,7 +21,7 @@ LEAST_LIKELY = "least_likely"
 
 def attacks(
     settings: AttackExperimentSettings, classifier: Classifier, device: torch.device, adversary: Adversary | None = None
-) -> Iterator[tuple[str, AttackSceneSettings, Attacked]]:
+) -> Iterator[tuple[str, AttackSceneSettings, AttackResult]]:
     """(name, the scene that was attacked, what came of it) for an adversary to go on from or, without one, for each
     mesh, in a scene that was searched for where `scene.search` says so."""
     if adversary is not None:
@@ -36,7 +36,7 @@ def attacks(
 
 def attack_mesh(
     item: ObjectSettings, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
-) -> Attacked:
+) -> AttackResult:
     """Attack one mesh under the settings, on the classifier's device.
 
     InputError also where the classifier does not recognise it to begin with.
@@ -48,7 +48,7 @@ def attack_mesh(
 
 def attack_adversary(
     adversary: Adversary, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
-) -> Attacked:
+) -> AttackResult:
     """Go on from an adversary that was read back; norm-balls are around where it is."""
     if adversary.pixels is not None:
         raise InputError(

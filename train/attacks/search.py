@@ -9,12 +9,12 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from augment.attacks.run import logits_of
+from augment.attacks.attack import logits_of
 from augment.build import build_scene
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
 from augment.scene import Scene
-from augment.seeding import generator
+from augment.utils import generator
 from renderer.lights import PROBES, UNIFORM, load_light
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 
@@ -91,7 +91,7 @@ def _confidence(scene: Scene, settings: AttackExperimentSettings, classifier: Cl
     where an image is taken for something else."""
     problem = settings.attack.problem(scene)
     images = problem.images(problem.start)
-    shares = logits_of(settings.attack.judge(classifier), images, settings.attack.batch_size).softmax(2)
+    shares = logits_of(settings.attack.preprocessed_model(classifier), images, settings.attack.batch_size).softmax(2)
     labels = torch.tensor([classifier.label(label) for label in scene.labels], device=shares.device)[:, None]
     right = shares.gather(2, labels[..., None].expand(-1, scene.views, 1))[..., 0] * (shares.argmax(2) == labels)
     return right.view(groups, -1).amin(1)

@@ -3,10 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from augment.attacks.settings import AttackSettings
-from augment.attacks.transfer import require_transferable
-from augment.attacks.verification import require_renderers
-from augment.placed_lights import LampsSettings, ProjectorSettings
+from augment.attacks.attack import AttackSettings
+from augment.attacks.evaluate import require_renderers, require_transferable
+from augment.build import LampsSettings, ProjectorSettings
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
 from train.settings import LARGEST_SEED, RendererSettings, SceneSettings
@@ -19,7 +18,7 @@ LIT = 2.0  # power of the default lamps whose places alone are attacked
 class AttackCommandSettings(AttackSettings):
     """shared: the views share what is attacked. force: go on where nothing is recognised. checks: see `Checks`.
 
-    sweep: radii to draw success against; see `augment.attacks.sweep`.
+    sweep: radii to draw success against; see `augment.attacks.evaluate`.
     verify: what renders the adversaries anew from their files, "reload" or "mitsuba" or both joined by +; or None.
     """
 
@@ -99,7 +98,7 @@ class AttackExperimentSettings:
         names = self.target if isinstance(self.target, list) else [self.target]
         if any(isinstance(name, dict | list) for name in names):
             raise InputError("target: give a class, least_likely, or a list of classes, one per view")
-        require_transferable(self.attack.kinds, self.transfer.azimuths, self.transfer.meshes)
+        require_transferable(self.attack.parameters, self.transfer.azimuths, self.transfer.meshes)
         if self.attack.projector is not None and self.scene.projector is None:
             self.scene.projector = ProjectorSettings()
         if self.attack.lamps is not None and self.scene.lamps is None:

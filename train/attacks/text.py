@@ -5,17 +5,18 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from augment.attacks.adversary import Adversary
-from augment.attacks.checks import Checks
-from augment.attacks.run import Attacked
-from augment.attacks.verification import Verdict
+from augment.attacks.attack import AttackResult
+from augment.attacks.evaluate import Checks, RerenderCheck
 from train.photographs.shares import share
 
 
-def format_attack(mesh: str, attacked: Attacked, checks: Checks | None, verdicts: Sequence[Verdict] = ()) -> str:
+def format_attack(
+    mesh: str, attacked: AttackResult, checks: Checks | None, rerender_checks: Sequence[RerenderCheck] = ()
+) -> str:
     """A paragraph on one mesh's attack, without a newline at the end."""
-    result = attacked.result
-    kinds = "+".join(kind.name for kind in attacked.problem.kinds)
-    steps = result.steps[result.fooled & ~result.fooled_before].double()
+    result = attacked.descent
+    kinds = "+".join(kind.name for kind in attacked.problem.parameters)
+    steps = result.steps[result.success & ~result.success_before].double()
     lines = [
         f"{mesh}: {kinds} against {attacked.classifier.name}: {_success(attacked)}"
         + (f"; median of {steps.median():.0f} steps" if len(steps) else "")
@@ -29,31 +30,31 @@ def format_attack(mesh: str, attacked: Attacked, checks: Checks | None, verdicts
             f"fooled by as many random draws: {checks.random_search:.0%}; by longer attacks: {by_steps} steps",
             *(f"warning: {warning}" for warning in checks.warnings),
         ]
-    fooled = attacked.success & attacked.recognised
-    lines += [_survival(verdict, fooled) for verdict in verdicts if fooled.any()]
+    success = attacked.success & attacked.clean_correct
+    lines += [_survival(rerender_check, success) for rerender_check in rerender_checks if success.any()]
     return "\n".join(lines)
 
 
-def _survival(verdict: Verdict, fooled: Tensor) -> str:
+def _survival(rerender_check: RerenderCheck, success: Tensor) -> str:
     """How many of the adversaries fool in another version, and how far its values are from theirs, of 255."""
-    largest, mean = 255 * verdict.largest[fooled].max(), 255 * verdict.mean[fooled].mean()
+    largest, mean = 255 * rerender_check.largest[success].max(), 255 * rerender_check.mean[success].mean()
     return (
-        f"{verdict.version}: {int(verdict.fooled[fooled].sum())} of {int(fooled.sum())} still fool; "
+        f"{rerender_check.version}: {int(rerender_check.success[success].sum())} of {int(success.sum())} still fool; "
         f"values differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
     )
 
 
-def _success(attacked: Attacked) -> str:
+def _success(attacked: AttackResult) -> str:
     """Among what was recognised before the attack, in examples and in views, with the 95 % Wilson interval."""
-    recognised = attacked.recognised
-    found = share(int(attacked.success[recognised].sum()), int(recognised.sum()))
+    clean_correct = attacked.clean_correct
+    found = share(int(attacked.success[clean_correct].sum()), int(clean_correct.sum()))
     if not found["n"]:
-        return f"none of {len(recognised)} examples was recognised before: there is nothing to count"
+        return f"none of {len(clean_correct)} examples was recognised before: there is nothing to count"
     text = "{hits} of {n} examples fooled [{low:.0%}, {high:.0%}]".format(**found)
     if attacked.success_in_views.shape[1] > 1:
-        views = attacked.success_in_views[recognised]
+        views = attacked.success_in_views[clean_correct]
         text += f", {int(views.sum())} of {views.numel()} views"
-    wrong = int((~recognised).sum())
+    wrong = int((~clean_correct).sum())
     return text + (f"; {wrong} not recognised before, which do not count" if wrong else "")
 
 

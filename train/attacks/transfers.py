@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment.attacks.transfer import Transfer
+from augment.attacks.evaluate import Transfer
 from augment.classifiers import Classifier
 from augment.objects import load_object, on_ground
 from renderer.errors import InputError
@@ -22,8 +22,8 @@ FILE = "transfer.jsonl"
 
 
 def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:
-    """The arguments of `Attacked.transfer`; none where nothing is asked for. InputError: as the loaders, and where a
-    classifier lacks a class."""
+    """The arguments of `AttackResult.transfer`; none where nothing is asked for. InputError: as the loaders, and where
+    a classifier lacks a class."""
     asked, scene = settings.transfer, settings.scene
     named = [item if isinstance(item, dict) else {"classifier": item} for item in asked.classifiers]
     if unknown := next((key for item in named for key in item if key not in ("classifier", "weights")), None):
@@ -45,8 +45,8 @@ def write_transfers(found: Sequence[Transfer], folder: Path) -> None:
         {
             each.kind: each.name,
             **_share(each),
-            "recognised": each.recognised.tolist(),
-            "fooled": each.fooled.tolist(),
+            "clean_correct": each.clean_correct.tolist(),
+            "success": each.success.tolist(),
             **{f"{name}_before": answer for name, answer in _answers(each.before, each.classes).items()},
             **_answers(each.after, each.classes),
         }
@@ -60,17 +60,19 @@ def format_transfers(found: Sequence[Transfer]) -> str:
     rows = []
     for each in found:
         found_here = _share(each)
-        rows.append([f"{each.kind} {each.name}", f"{found_here['n']} of {len(each.recognised)}", counted(found_here)])
-    return aligned(["what fools, shown to", "recognised before", "fooled"], rows)
+        rows.append(
+            [f"{each.kind} {each.name}", f"{found_here['n']} of {len(each.clean_correct)}", counted(found_here)]
+        )
+    return aligned(["what fools, shown to", "recognised before", "success"], rows)
 
 
 def _share(found: Transfer) -> dict[str, Any]:
-    return share(int(found.fooled[found.recognised].sum()), int(found.recognised.sum()))
+    return share(int(found.success[found.clean_correct].sum()), int(found.clean_correct.sum()))
 
 
 def _answers(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
     best = logits.softmax(2).max(2)
     return {
-        "answer": [[classes[index] for index in views] for views in best.indices.tolist()],
+        "predicted": [[classes[index] for index in views] for views in best.indices.tolist()],
         "confidence": best.values.tolist(),
     }

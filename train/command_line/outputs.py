@@ -6,7 +6,7 @@ from pathlib import Path
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from augment import processes
+from augment import utils
 from renderer.errors import InputError
 from train.command_line.entry_points import one_sentence_errors
 
@@ -54,7 +54,7 @@ class Folders(Callback):
 
     @one_sentence_errors
     def on_run_start(self, config: DictConfig, **_: object) -> None:
-        if processes.rank() == 0:
+        if utils.rank() == 0:
             _try_setting(config.hydra.run.dir, "run")
             writable_file(Path(config.hydra.run.dir) / LOG, "run")
 

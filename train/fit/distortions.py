@@ -6,9 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from augment import processes
-from augment.model_state import as_found
-from augment.seeding import generator, stream_seed
+from augment import utils
+from augment.utils import as_found, generator, stream_seed
 from renderer.image import to_bytes, to_unit
 
 Distort = Callable[[Tensor, Tensor, int], Tensor]  # uint8 images (B, 3, H, W), labels (B,) and the step to images
@@ -27,7 +26,7 @@ def distortion(name: str, model: nn.Module, seed: int) -> Distort:
     if name == "none":
         return lambda images, labels, step: images
     if name == "pgd":
-        return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", processes.rank()))
+        return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", utils.rank()))
     transform = torchvision_transform(name)
     return lambda images, labels, step: _each(transform, images, seed, step)
 
@@ -62,7 +61,7 @@ def pgd(model: nn.Module, images: Tensor, labels: Tensor, draws: torch.Generator
 
 def _each(transform: nn.Module, images: Tensor, seed: int, step: int) -> Tensor:
     """torchvision's transforms draw once for a whole batch, and from the global generator."""
-    first = processes.rank() * len(images)
+    first = utils.rank() * len(images)
     changed = []
     with torch.random.fork_rng(devices=[]):
         for place, image in enumerate(images, first):

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment import processes
-from augment.seeding import generator
+from augment import utils
 from augment.service import Renders
+from augment.utils import generator
 from renderer.image import to_bytes, to_unit
 from train.data import Split
 from train.distributed import summed
@@ -57,8 +57,8 @@ def training_batches(
     order = _order(now.rows, batch_size, generator(seed, now.number, "batches"))
     shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, now.number, "shifts"))
     flipped = _flipped(order, len(images), seed, now, flips)
-    share = batch_size // processes.world_size()
-    mine = slice(processes.rank() * share, (processes.rank() + 1) * share)
+    share = batch_size // utils.world_size()
+    mine = slice(utils.rank() * share, (utils.rank() + 1) * share)
     order, shifts, flipped = (draws[..., first:, mine].to(images.device) for draws in (order, shifts, flipped))
     batches_at_once = max(1, CHUNK_BYTES // (share * images[0].numel()))
     for begin in range(0, len(order), batches_at_once):
@@ -178,5 +178,5 @@ class EpochUnderWay:
     def from_state_dict(cls, state: Mapping[str, Any], device: torch.device) -> "EpochUnderWay":
         history = state["history"]
         renders = Renders(to_unit(state["images"]).to(device), state["labels"].to(device), history[-1])
-        sums = state["sums"] if processes.rank() == 0 else torch.zeros(2)
+        sums = state["sums"] if utils.rank() == 0 else torch.zeros(2)
         return cls(renders, sums.to(device), history, state["step"])

@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from augment import processes
-from augment.model_state import eval_mode
+from augment import utils
+from augment.utils import eval_mode
 from renderer.image import to_unit
 from train.data import Split
 from train.distributed import summed
@@ -19,7 +19,7 @@ def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
 
     Every process of a run scores its share of the images; all get the result.
     """
-    share = slice(processes.rank(), None, processes.world_size())
+    share = slice(utils.rank(), None, utils.world_size())
     loss_sum, correct = totals = torch.zeros(2, device=split.images.device)
     with eval_mode(model):
         for images, labels in zip(split.images[share].split(BATCH), split.labels[share].split(BATCH), strict=True):

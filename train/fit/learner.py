@@ -20,9 +20,11 @@ class Learner:
 
     def __init__(self, settings: TrainSettings, model: MixedPrecision, seed: int, label: int | None = None):
         """model: as the run begins, which a distillation holds to and each epoch of a soup begins with. label: the
-        class that is ranked above look-alikes; InputError for a ranking without them."""
+        class that is ranked above hard negatives; InputError for a ranking without them."""
         if settings.ranking and label is None:
-            raise InputError(f"train.ranking={settings.ranking} ranks look-alikes: name some in scene.look_alikes")
+            raise InputError(
+                f"train.ranking={settings.ranking} ranks hard negatives: name some in scene.hard_negatives"
+            )
         self.settings = settings
         self.model = model
         self.device = next(model.parameters()).device

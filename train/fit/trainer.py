@@ -7,11 +7,9 @@ from typing import Any
 
 import torch
 
-from augment import processes
-from augment.phases import Phases
-from augment.progress import progress
-from augment.seeding import stream_seed
+from augment import utils
 from augment.service import AugmentationService, Renders
+from augment.utils import Phases, progress, stream_seed
 from renderer.errors import InputError
 from train.data import Split
 from train.device import MixedPrecision
@@ -43,9 +41,9 @@ class Trainer:
 
         InputError where the run's processes cannot share a batch equally.
         """
-        if settings.batch_size % processes.world_size():
+        if settings.batch_size % utils.world_size():
             raise InputError(
-                f"train.batch_size={settings.batch_size} is not a multiple of the {processes.world_size()} processes"
+                f"train.batch_size={settings.batch_size} is not a multiple of the {utils.world_size()} processes"
             )
         self.settings = settings
         self.learner = Learner(settings, model, seed, service.label)
@@ -121,9 +119,9 @@ class Trainer:
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
             renders = self.service.regenerate(self.learner.attacked, now.number)
-        if renders.specimens:
+        if renders.attack_examples:
             with self.phases("input_output"):  # now, since a run that goes on within the epoch makes no others
-                log.specimens(renders.specimens, self.architecture["classes"], self.epoch + 1)
+                log.attack_examples(renders.attack_examples, self.architecture["classes"], self.epoch + 1)
         return renders
 
     def _train(
@@ -200,7 +198,7 @@ class Trainer:
     def _save(self) -> None:
         """Write last.pt, keeping the one before, and best.pt where there is a better network, by the first process."""
         state, best, self._best = self.state_dict(), self._best, None
-        if processes.rank() > 0:
+        if utils.rank() > 0:
             return
         if best:
             checkpoint.save(self.folder / checkpoint.BEST, best)
@@ -219,7 +217,7 @@ class Trainer:
         }
         self.history.append({"epoch": self.epoch, **scalars})
         log.scalars(scalars, self.epoch)
-        fooled = diagnostics.get("fooled")
+        success = diagnostics.get("attack_success")
         console.info(
             "epoch %d/%d  train loss %.3f accuracy %.3f  validation accuracy %.3f%s  %.0f s (attack %.1f s)",
             self.epoch,
@@ -227,7 +225,7 @@ class Trainer:
             trained["loss"],
             trained["accuracy"],
             validated["accuracy"],
-            "" if fooled is None else f"  renders fooled {fooled:.2f}",
+            "" if success is None else f"  renders fooled {success:.2f}",
             sum(seconds.get(name, 0.0) for name in PHASES),
             seconds.get("attack", 0.0),
         )

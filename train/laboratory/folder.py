@@ -14,8 +14,7 @@ import torch
 from PIL import Image
 
 from augment.objects import load_object
-from augment.progress import progress
-from augment.seeding import stream_seed
+from augment.utils import progress, stream_seed
 from renderer.environment import read_panorama
 from renderer.errors import InputError
 from renderer.image import encode
@@ -84,7 +83,7 @@ def _write(sittings: Iterator[tuple[int, Shot, Subject]], settings: LabSettings,
 
 
 def read_subject(item: str | dict[str, Any], index: int) -> Subject:
-    """An entry of `meshes`. Without a label, a solid has its own name, with `other_` before that of a look-alike.
+    """An entry of `meshes`. Without a label, a solid has its own name, with `other_` before that of a hard negative.
 
     InputError: as `load_object`; a file without a label.
     """

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 import torch
 
-from augment.seeding import stream_seed
+from augment.utils import stream_seed
 from renderer.harmonics import equirectangular
 from train.laboratory.patterns import draw_colour, draw_pattern
 

@@ -11,8 +11,7 @@ from pathlib import Path, PurePath, PurePosixPath
 import torch
 
 from augment.labels import log_odds
-from augment.model_state import eval_mode
-from augment.progress import progress
+from augment.utils import eval_mode, progress
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.photographs.folder import SEPARATOR, Photograph, split_sources

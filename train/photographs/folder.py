@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from augment.classifiers.adapter import class_index, nearest
-from augment.memory import require_memory
-from augment.progress import progress
+from augment.utils import progress, require_memory
 from renderer.errors import InputError, require_file
 from renderer.files.image_files import read_square
 from train.run_folder.logs import console

@@ -58,12 +58,12 @@ def _difference(runs: Arms, name: str) -> str:
 
 
 def of_attacks(attacks: Sequence[Attack]) -> str:
-    fooled, total = sum(attack.fooled for attack in attacks), sum(len(attack.examples) for attack in attacks)
-    before = sum(attack.fooled_before for attack in attacks)
+    success, total = sum(attack.success for attack in attacks), sum(len(attack.examples) for attack in attacks)
+    before = sum(attack.success_before for attack in attacks)
     wrong = f", {before} more being wrong before any step" if before else ""
     draws = [share for attack in attacks if isinstance(share := attack.checks.get("random_search"), int | float)]
     random = f"; random search with as many tries fools {sum(draws) / len(draws):.0%}" if draws else ""
     return (
         f"Asked: can a change of the scene fool the classifier in {total} examples? "
-        f"Answered: it does in {fooled} of {total}{wrong}{random}."
+        f"Answered: it does in {success} of {total}{wrong}{random}."
     )

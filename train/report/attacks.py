@@ -34,15 +34,15 @@ class Example:
     label: str
     before: str | None
     after: str
-    fooled: bool
-    fooled_before: bool
+    success: bool
+    success_before: bool
     steps: int
 
     @property
     def outcome(self) -> str:
-        if self.fooled_before:
+        if self.success_before:
             return "wrong before any step"
-        return f"{'fooled' if self.fooled else 'not fooled'} in {self.steps} steps"
+        return f"{'fooled' if self.success else 'not fooled'} in {self.steps} steps"
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class Attack:
     checks: dict[str, Any]
 
     @property
-    def fooled(self) -> int:
+    def success(self) -> int:
         """How many examples, without those that were wrong before any step."""
-        return sum(each.fooled and not each.fooled_before for each in self.examples)
+        return sum(each.success and not each.success_before for each in self.examples)
 
     @property
-    def fooled_before(self) -> int:
-        return sum(each.fooled_before for each in self.examples)
+    def success_before(self) -> int:
+        return sum(each.success_before for each in self.examples)
 
 
 def read_attack(folder: Path) -> Attack:
@@ -80,14 +80,14 @@ def read_attack(folder: Path) -> Attack:
 
 
 def _read_example(line: dict[str, Any]) -> Example:
-    before = _answers(line["answer_before"], line["confidence_before"]) if "answer_before" in line else None
+    before = _answers(line["predicted_before"], line["confidence_before"]) if "predicted_before" in line else None
     return Example(
         number=int(line["example"]),
         label=", ".join(dict.fromkeys(map(str, line["label"]))),
         before=before,
-        after=_answers(line["answer"], line["confidence"]),
-        fooled=bool(line["fooled"]),
-        fooled_before=bool(line.get("fooled_before")),
+        after=_answers(line["predicted"], line["confidence"]),
+        success=bool(line["success"]),
+        success_before=bool(line.get("success_before")),
         steps=int(line["steps"]),
     )
 
@@ -101,7 +101,7 @@ def sections(attacks: Sequence[Attack]) -> Iterator[Section]:
     for attack in attacks[:MOST_ATTACKS]:
         yield Section(f"Attack {attack.folder.parent.name}/{attack.folder.name}", [*_blocks(attack)])
     if others := attacks[MOST_ATTACKS:]:
-        told = "\n".join(f"{each.folder}: {each.fooled} of {len(each.examples)} fooled" for each in others)
+        told = "\n".join(f"{each.folder}: {each.success} of {len(each.examples)} fooled" for each in others)
         yield Section("Further attacks", [Code(f"{len(others)} more", told)])
 
 

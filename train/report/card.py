@@ -77,14 +77,14 @@ def _renders(config: DictConfig) -> str:
     often = f"every {config.augment.every} training images" if config.augment.get("every") else "each epoch"
     if config.augment.arm == "none":
         return f"renders {often}: none"
-    meshes, look_alikes = config.scene.meshes, config.scene.get("look_alikes") or []
-    each = len(meshes) + len(look_alikes), config.scene.views, len(config.scene.backgrounds)
-    beside = f" beside {_counted(look_alikes)}" if look_alikes else ""
+    meshes, hard_negatives = config.scene.meshes, config.scene.get("hard_negatives") or []
+    each = len(meshes) + len(hard_negatives), config.scene.views, len(config.scene.backgrounds)
+    beside = f" beside {_counted(hard_negatives)}" if hard_negatives else ""
     count = config.augment.examples or math.prod(each)
     return f"renders {often}: {count} renders of {_counted(meshes)}{beside}"
 
 
 def _counted(meshes: Sequence[Any]) -> str:
-    """Names of scene.meshes or scene.look_alikes, each with how often it is there."""
+    """Names of scene.meshes or scene.hard_negatives, each with how often it is there."""
     counts = Counter(Path(mesh if isinstance(mesh, str) else mesh.mesh).name for mesh in meshes)
     return ", ".join(f"{count} × {name}" if count > 1 else name for name, count in counts.items())

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from augment.parameters import KINDS
+from augment.attacks.parameters import PARAMETERS
 from train.command_line.configuration import as_dict, composed, dotted, is_within
 from train.command_line.overrides import quoted
 
@@ -27,7 +27,7 @@ def attack_command(config: DictConfig) -> str:
 
 def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapping[str, Any]) -> str:
     """Also of a run from another version, whose keys this one may lack; they are left out."""
-    kinds = [kind for kind in KINDS if kind in attack]
+    kinds = [kind for kind in PARAMETERS if kind in attack]
     chosen = [f"{group}=[{','.join(kinds)}]"] if kinds else []
     if config.get("data", {}).get("name") in DATA:
         chosen.append(f"data={config.data.name}")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from augment.attacks.files import LINES
-from augment.service_settings import ARMS
+from augment.service import ARMS
 from renderer.errors import InputError
 from train.report.attacks import Attack, read_attack
 from train.report.summary import RunSummary, is_finished, summarise

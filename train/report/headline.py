@@ -10,7 +10,7 @@ from train.report.blocks import Illustration
 from train.report.images import turned
 from train.report.photographs import scored, scored_on, scores_of
 from train.report.plots import COLOURS
-from train.run_folder.specimens import Side
+from train.run_folder.attack_examples import Side
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ from renderer.files.image_files import read_square
 from train.photographs.answers import Answer, outcomes
 from train.photographs.contact_sheet import caption, evenly
 from train.report.blocks import Gallery, Illustration
-from train.run_folder.specimens import SUFFIX, Side, read_specimens
+from train.run_folder.attack_examples import SUFFIX, Side, read_attack_examples
 
 TILE = 96  # pixels
 TILES = 8  # photographs of each kind
@@ -58,20 +58,22 @@ def renders(folder: Path, arm: str) -> Gallery:
 
 
 def _specimens(folder: Path) -> Iterator[tuple[int, list[tuple[str, Side, Side]]]]:
-    """Those of a run's first, middle and last epoch with specimens: the epoch, and label, before and after of each."""
+    """Those of a run's first, middle and last epoch with attack_examples: the epoch, and label, before and after of
+    each."""
     for epoch, path in first_middle_last([*(folder / "renders").glob(f"epoch_*{SUFFIX}")]):
         with suppress(InputError):
-            yield epoch, read_specimens(path)
+            yield epoch, read_attack_examples(path)
 
 
-def specimens(folder: Path, arm: str) -> Iterator[Gallery]:
+def attack_examples(folder: Path, arm: str) -> Iterator[Gallery]:
     """What fooled in a run: renders and lights, before and after."""
     for epoch, rows in _specimens(folder):
         yield Gallery(f"{arm}, epoch {epoch}", [image for label, *sides in rows for image in _sides(label, sides)])
 
 
 def turned(folder: Path, count: int) -> list[tuple[Side, Side]]:
-    """Before and after, of the newest of a run's specimens that were called by their label before, and not after."""
+    """Before and after, of the newest of a run's attack examples that were called by their label before, and not
+    after."""
     for _, rows in reversed([*_specimens(folder)]):
         if found := [(before, after) for label, before, after in rows if before.answer == label != after.answer]:
             return found[:count]

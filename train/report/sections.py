@@ -66,7 +66,7 @@ def _training(arms: Arms, unfinished: Sequence[UnfinishedRun]) -> Section:
         plots.curves(_series(lines, "train/accuracy"), "accuracy, training", "epoch"),
         plots.curves(_series(lines, "validation/accuracy"), "accuracy, validation", "epoch"),
         plots.curves(_recall(lines), "recall of renders before training on them", "epoch"),
-        plots.curves(_series(lines, "augment/fooled"), "share of renders fooled", "epoch"),
+        plots.curves(_series(lines, "augment/attack_success"), "share of renders fooled", "epoch"),
         plots.curves(_series(lines, "augment/steps"), "steps of the attack", "epoch", None),
     ]
     seconds = [
@@ -93,12 +93,12 @@ def _line(run: Run, name: str) -> tuple[list[float], list[float]]:
 
 def _recall(lines: Lines) -> plots.Series:
     """The share of an epoch's renders that the network got right as they were made."""
-    fooled = _series(lines, "augment/fooled")
-    return {arm: [(x, [1 - share for share in y]) for x, y in group] for arm, group in fooled.items()}
+    success = _series(lines, "augment/attack_success")
+    return {arm: [(x, [1 - share for share in y]) for x, y in group] for arm, group in success.items()}
 
 
 def _fooled(arms: Arms) -> Section:
-    blocks = [gallery for arm, group in arms.items() for gallery in images.specimens(group[0].folder, arm)]
+    blocks = [gallery for arm, group in arms.items() for gallery in images.attack_examples(group[0].folder, arm)]
     return Section("Light that fooled", blocks)
 
 

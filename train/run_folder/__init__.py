@@ -1,1 +1,1 @@
-"""What a run has on disk: configuration and metrics, checkpoints, specimens, and its network as a classifier."""
+"""What a run has on disk: configuration and metrics, checkpoints, attack examples, and its network as a classifier."""

@@ -21,7 +21,14 @@ CIRCUMSTANCES = (
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = "inputs"  # in a run's config.yaml
-KEYS = ("data.path", "scene.meshes", "scene.look_alikes", "scene.backgrounds", "scene.light", "augment.vary.lights")
+KEYS = (
+    "data.path",
+    "scene.meshes",
+    "scene.hard_negatives",
+    "scene.backgrounds",
+    "scene.light",
+    "augment.vary.environments",
+)
 
 
 def decisive_settings(config: DictConfig) -> dict[str, object]:

@@ -12,10 +12,10 @@ from pathlib import Path
 from PIL import Image
 from torch import Tensor
 
-from augment.specimens import Specimens
+from augment.service import AttackExamples
 from renderer.image import to_bytes
+from train.run_folder.attack_examples import SUFFIX, write_attack_examples
 from train.run_folder.files import read_numbers
-from train.run_folder.specimens import SUFFIX, write_specimens
 
 METRICS = "metrics.jsonl"
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; others are parts of these, or once a run
@@ -72,10 +72,10 @@ class RunLog:
         image = Summary.Image(height=height, width=width, colorspace=channels, encoded_image_string=png.getvalue())
         self._show(epoch, summary=Summary(value=[Summary.Value(tag="renders", image=image)]))
 
-    def specimens(self, specimens: Specimens, classes: Sequence[str], epoch: int) -> None:
+    def attack_examples(self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int) -> None:
         """A few of the epoch's renders that fool, with what they were before, in renders/."""
         self._renders.mkdir(exist_ok=True)
-        write_specimens(self._renders / f"epoch_{epoch:03d}{SUFFIX}", specimens, classes)
+        write_attack_examples(self._renders / f"epoch_{epoch:03d}{SUFFIX}", attack_examples, classes)
 
     def _show(self, step: int, **content: object) -> None:
         """Write an event for TensorBoard, at once; torch's SummaryWriter has a thread, whose errors nobody catches."""
@@ -92,7 +92,7 @@ class NoLog:
     def _nothing(self, *_: object, **__: object) -> None:
         pass
 
-    scalars = renders = specimens = _nothing
+    scalars = renders = attack_examples = _nothing
 
 
 Log = RunLog | NoLog

@@ -10,10 +10,9 @@ import pytest
 import torch
 
 import augment
-from augment.attacks.adversary import Adversary
-from augment.attacks.adversary_folder import DESCRIPTION, read_adversary, write_adversary
-from augment.objects import SceneObject, in_company, on_ground
-from augment.parameters import KINDS
+from augment.attacks.adversary import DESCRIPTION, Adversary, read_adversary, write_adversary
+from augment.attacks.parameters import PARAMETERS
+from augment.objects import SceneObject, on_ground, with_props
 from augment.scene import Example, Scene
 from renderer.errors import InputError
 from renderer.mesh import Mesh, normalise
@@ -25,12 +24,12 @@ CLASSES = ("orange", "lime", "sky")
 SOFTWARE = choose("software")
 
 
-def attacked(kinds: set[str], scene: Scene) -> augment.Attacked:
+def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), scene.settings.size, CLASSES)
     radii = {"albedo": 0.2, "geometry": 0.01, "pixels": 0.05, "lighting": 0.3}
     settings = {name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name]) for name in kinds}
     return augment.attack(
-        classifier, scene, settings=augment.AttackSettings(**settings, light="signed", max_steps=3), force=True
+        classifier, scene, settings=augment.AttackSettings(**settings, allow_negative=True, max_steps=3), force=True
     )
 
 
@@ -47,14 +46,14 @@ def textured() -> Mesh:
     )
 
 
-def adversary_of(done: augment.Attacked) -> Adversary:
+def adversary_of(done: augment.AttackResult) -> Adversary:
     return Adversary.of(done.problem.scene, 0, done.conditions, done.images_before[0], done.images[0])
 
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 @pytest.mark.parametrize(
     "kinds",
-    [{"lighting"}, {"geometry"}, {"albedo"}, {"pixels"}, set(KINDS) - OTHER_LIGHTS],
+    [{"lighting"}, {"geometry"}, {"albedo"}, {"pixels"}, set(PARAMETERS) - OTHER_LIGHTS],
     ids=lambda kinds: "+".join(sorted(kinds)),
 )
 def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, kinds, encoding):
@@ -74,7 +73,7 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
 def test_company_and_table_are_never_attacked_not_after_they_are_read_back_either(tmp_path):
     """With textures of their own: the faces of a file are ordered by texture, and its vertices by place."""
     beside = replace(textured(), vertices=0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3]))
-    item = on_ground(in_company(SceneObject("orange", normalise(textured())), [beside]), (0.4, 0.3, 0.2))
+    item = on_ground(with_props(SceneObject("orange", normalise(textured())), [beside]), (0.4, 0.3, 0.2))
     scene = augment.build_scene([("solid:apple", "orange")], 24, visibility="software", field_of_view=3.0)
     scene = replace(scene, objects=[item])
     painted = attacked({"albedo"}, scene).conditions.albedo[0]

@@ -7,7 +7,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
-from augment.attacks.figure import SIDE, Exhibit, answer_caption, read_figure, save_figure
+from augment.attacks.figure import SIDE, Panel, prediction_caption, read_figure, save_figure
 from renderer.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 
 PAPER = 255
@@ -19,12 +19,12 @@ def random_images(views: int, size: int, seed: int) -> torch.Tensor:
     return torch.randint(0, 250, (views, 3, size, size), generator=draws).float() / 255
 
 
-def exhibit(views: int = 2, size: int = 32, seed: int = 0, caption: tuple[str, ...] = ("orange",), **more) -> Exhibit:
-    return Exhibit(random_images(views, size, seed), [caption] * views, **more)
+def panel(views: int = 2, size: int = 32, seed: int = 0, caption: tuple[str, ...] = ("orange",), **more) -> Panel:
+    return Panel(random_images(views, size, seed), [caption] * views, **more)
 
 
-def draw(path: Path, *exhibits: Exhibit) -> np.ndarray:
-    save_figure(*exhibits, path)
+def draw(path: Path, *panels: Panel) -> np.ndarray:
+    save_figure(*panels, path)
     with Image.open(path) as sheet:
         return np.asarray(sheet)
 
@@ -41,7 +41,7 @@ def place(sheet: np.ndarray, image: torch.Tensor) -> list[tuple[int, int]]:
 
 @pytest.mark.parametrize(("views", "size"), [(1, 32), (3, 32), (2, 200), (2, 224)])
 def test_each_view_has_a_row_and_each_side_a_column_in_which_pixels_stay_as_they_are(tmp_path, views, size):
-    before, after = exhibit(views, size, 0), exhibit(views, size, 1)
+    before, after = panel(views, size, 0), panel(views, size, 1)
     sheet = draw(tmp_path / "report.png", before, after)
     side = -(-SIDE // size) * size
     row_height = side + 2 + 2 * LINE_HEIGHT + GAP  # the captions of the differences have two lines
@@ -58,7 +58,7 @@ def test_the_difference_is_grey_where_there_is_none_and_reaches_white_or_black(t
     after[0, 0, 1, 2] += 0.2
     after[1, :, 3, 0] -= 0.1
     after[:, 1, 0, 0] += 0.05
-    sheet = draw(tmp_path / "report.png", *(Exhibit(images, [()] * 2) for images in (before, after)))
+    sheet = draw(tmp_path / "report.png", *(Panel(images, [()] * 2) for images in (before, after)))
     expected = torch.full((2, 3, 4, 4), 128.0)
     expected[0, 0, 1, 2] = 255
     expected[1, :, 3, 0] = 64
@@ -69,21 +69,21 @@ def test_the_difference_is_grey_where_there_is_none_and_reaches_white_or_black(t
 
 
 def test_without_a_difference_all_of_it_is_grey(tmp_path):
-    shown = exhibit(1)
+    shown = panel(1)
     sheet = draw(tmp_path / "report.png", shown, shown)
     assert len(place(sheet, torch.full((3, 32, 32), 128 / 255))) == 1
 
 
 def test_the_light_of_either_side_is_shown_where_it_is_given(tmp_path):
     spheres = [random_images(2, 48, seed) for seed in (2, 3)]
-    both = draw(tmp_path / "both.png", exhibit(seed=0, spheres=spheres[0]), exhibit(seed=1, spheres=spheres[1]))
+    both = draw(tmp_path / "both.png", panel(seed=0, spheres=spheres[0]), panel(seed=1, spheres=spheres[1]))
     column = SIDE + GAP
     for number, sphere in enumerate(spheres, start=3):
         for image in sphere:
             [(_, left)] = place(both, image)
             assert left == MARGIN + number * column
-    one = draw(tmp_path / "one.png", exhibit(seed=0), exhibit(seed=1, spheres=spheres[1]))
-    none = draw(tmp_path / "none.png", exhibit(seed=0), exhibit(seed=1))
+    one = draw(tmp_path / "one.png", panel(seed=0), panel(seed=1, spheres=spheres[1]))
+    none = draw(tmp_path / "none.png", panel(seed=0), panel(seed=1))
     assert both.shape[1] - one.shape[1] == one.shape[1] - none.shape[1] == column
 
 
@@ -103,7 +103,7 @@ def contains(sheet: np.ndarray, part: np.ndarray) -> bool:
 
 def test_captions_stand_below_their_images_uncut_however_long(tmp_path):
     long = "97.0% a jumpy quagga, grazing beside a long paddock's edge"
-    sheet = draw(tmp_path / "report.png", exhibit(1, caption=("orange", "by jug")), exhibit(1, seed=1, caption=(long,)))
+    sheet = draw(tmp_path / "report.png", panel(1, caption=("orange", "by jug")), panel(1, seed=1, caption=(long,)))
     below = sheet[MARGIN + TITLE_HEIGHT + SIDE :]
     for text, color in (("orange", INK), ("by jug", FAINT), (long, INK)):
         assert contains(below, written(text, color))
@@ -113,7 +113,7 @@ def test_captions_stand_below_their_images_uncut_however_long(tmp_path):
 
 def test_the_largest_differences_are_told_in_numbers(tmp_path):
     before = torch.full((1, 3, 4, 4), 0.5)
-    sheet = draw(tmp_path / "report.png", *(Exhibit(shown, [()]) for shown in (before, before + 0.125)))
+    sheet = draw(tmp_path / "report.png", *(Panel(shown, [()]) for shown in (before, before + 0.125)))
     assert contains(sheet[-3 * MARGIN :], written("largest 0.125", INK))
     assert contains(sheet[-3 * MARGIN :], written("shown 8 times", FAINT))
 
@@ -121,7 +121,7 @@ def test_the_largest_differences_are_told_in_numbers(tmp_path):
 def test_what_is_read_back_is_what_was_shown(tmp_path):
     """Of two views of two sizes: the light's spheres are larger than the images."""
     said = ("87% plum", "<pear>")
-    sides = [exhibit(seed=seed, caption=said, spheres=random_images(2, 300, seed + 2)) for seed in (0, 1)]
+    sides = [panel(seed=seed, caption=said, spheres=random_images(2, 300, seed + 2)) for seed in (0, 1)]
     save_figure(*sides, tmp_path / "report.png")
     columns = dict(read_figure(tmp_path / "report.png"))
     assert list(columns) == ["initial", "adversarial", "difference", "initial light", "adversarial light"]
@@ -168,10 +168,10 @@ def test_an_image_that_tells_of_no_tiles_is_refused(tmp_path, text):
     ],
 )
 def test_an_answer_is_told_with_its_confidence_and_the_true_classs_where_it_is_wrong(probabilities, label, caption):
-    assert answer_caption(torch.tensor(probabilities), ["fig", "pear", "plum", "fig"], label) == caption
+    assert prediction_caption(torch.tensor(probabilities), ["fig", "pear", "plum", "fig"], label) == caption
 
 
 def test_views_without_a_caption_of_their_own_are_refused(tmp_path):
     with pytest.raises(ValueError):
-        save_figure(Exhibit(random_images(2, 8, 0), [()]), exhibit(2, 8), tmp_path / "report.png")
+        save_figure(Panel(random_images(2, 8, 0), [()]), panel(2, 8), tmp_path / "report.png")
     assert not list(tmp_path.iterdir())

@@ -9,9 +9,9 @@ from PIL import Image
 from torch import Tensor, nn
 
 import augment
-from augment.attacks import observation
-from augment.attacks.observation import Expected, Rounded, TransformationSettings, as_jpeg
-from augment.seeding import generator
+from augment.attacks import eot
+from augment.attacks.eot import EOTSettings, ExpectationOverTransformations, Rounded, as_jpeg
+from augment.utils import generator
 from renderer.errors import InputError
 
 CLASSES = ("orange", "lime", "sky")
@@ -33,10 +33,10 @@ def noise(*shape: int) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0))
 
 
-def expected(**settings) -> tuple[Expected, Means]:
+def expected(**settings) -> tuple[ExpectationOverTransformations, Means]:
     nothing = {"draws": 1, "jitter": 0.0, "exposure": 0.0, "noise": 0.0, "jpeg": 100}
     means = Means()
-    return Expected(means, TransformationSettings(**nothing | settings), generator(0)), means
+    return ExpectationOverTransformations(means, EOTSettings(**nothing | settings), generator(0)), means
 
 
 def test_a_model_is_given_bytes_and_its_derivative_passes_them_by():
@@ -60,7 +60,7 @@ def test_the_mean_is_of_log_probabilities_over_the_image_and_its_changes():
 
 
 def test_each_change_does_what_it_says(monkeypatch):
-    monkeypatch.setattr(observation, "as_jpeg", lambda images, quality: images)
+    monkeypatch.setattr(eot, "as_jpeg", lambda images, quality: images)
     images = 0.25 + 0.5 * noise(8, 3, 32, 32)
     model, means = expected(exposure=0.5)
     model(images)
@@ -96,8 +96,8 @@ def test_jpeg_is_pillows():
     ("key", "value"), [("draws", -1), ("jitter", 2.0), ("noise", float("nan")), ("exposure", 99.0), ("jpeg", 0)]
 )
 def test_settings_out_of_range_are_refused(key, value):
-    with pytest.raises(InputError, match=f"attack.expectation.{key}={value} must be at least"):
-        TransformationSettings(**{key: value})
+    with pytest.raises(InputError, match=f"attack.eot.{key}={value} must be at least"):
+        EOTSettings(**{key: value})
 
 
 @pytest.mark.parametrize("rounded", [False, True])
@@ -107,7 +107,11 @@ def test_adversaries_exceed_the_margin_and_without_one_stop_at_the_border(rounde
     scene = augment.build_scene([("solid:orange", "orange")], 8, views=2, shared=True, visibility="software")
     for margin in (0.0, 2.0):
         settings = augment.AttackSettings(
-            lighting=augment.StepSettings(step_size=0.02), light="signed", max_steps=100, margin=margin, rounded=rounded
+            lighting=augment.StepSettings(step_size=0.02),
+            allow_negative=True,
+            max_steps=100,
+            margin=margin,
+            rounded=rounded,
         )
         done = augment.attack(classifier, scene, settings=settings)
         images = (done.images * 255).round() / 255 if rounded else done.images
@@ -123,12 +127,12 @@ def test_what_fools_is_kept_where_the_margin_is_out_of_reach():
     scene = augment.build_scene([("solid:orange", "orange")], 8, visibility="software")
     light = augment.StepSettings(step_size=0.05)
     first = augment.attack(
-        classifier, scene, settings=augment.AttackSettings(lighting=light, light="signed", max_steps=60)
+        classifier, scene, settings=augment.AttackSettings(lighting=light, allow_negative=True, max_steps=60)
     )
-    further = augment.AttackSettings(lighting=light, light="signed", max_steps=60, margin=1e4)
+    further = augment.AttackSettings(lighting=light, allow_negative=True, max_steps=60, margin=1e4)
     done = augment.attack(classifier, scene, settings=further)
     assert done.success.all() and done.steps.item() == 60
-    assert done.result.cost < first.result.cost
+    assert done.descent.cost < first.descent.cost
 
 
 def test_expected_adversaries_survive_changes_that_others_do_not():
@@ -137,11 +141,11 @@ def test_expected_adversaries_survive_changes_that_others_do_not():
     scene = augment.build_scene([("solid:orange", "orange")], 8, visibility="software")
     survived = []
     for draws in (0, 8):
-        changes = TransformationSettings(draws=draws, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)
+        changes = EOTSettings(draws=draws, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)
         light = augment.StepSettings(step_size=0.02)
-        settings = augment.AttackSettings(lighting=light, light="signed", max_steps=100, expectation=changes)
+        settings = augment.AttackSettings(lighting=light, allow_negative=True, max_steps=100, eot=changes)
         done = augment.attack(classifier, scene, settings=settings)
-        others, means = Expected(Means(), TransformationSettings(200, 0.2, 0.5, 0.1, 60), generator(1)), []
+        others, means = ExpectationOverTransformations(Means(), EOTSettings(200, 0.2, 0.5, 0.1, 60), generator(1)), []
         others(done.images[:, 0])
         means = torch.cat([each.mean((2, 3)) for each in others.model.seen[1:]])
         survived.append((means.argmax(1) != 0).double().mean().item())

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.checks import Checks
-from augment.parameters import KINDS
+from augment.attacks.evaluate import Checks
+from augment.attacks.parameters import PARAMETERS
 from renderer.errors import InputError
 from renderer.mesh import Mesh, load_mesh
 from renderer.nonnegative import nearest_nonnegative
@@ -14,7 +14,7 @@ from renderer.shapes import solid
 
 OTHER_LIGHTS = {"skylight", "projector", "lamps", "places"}
 CLASSES = ("orange", "lime", "sky", "night")
-SIGNED = augment.AttackSettings(lighting=augment.StepSettings(), light="signed")
+SIGNED = augment.AttackSettings(lighting=augment.StepSettings(), allow_negative=True)
 SMALL = {"visibility": "software", "field_of_view": 2.4}
 
 
@@ -33,9 +33,9 @@ def test_several_meshes_and_classes_are_attacked_in_one_scene_each_away_from_its
     lime = Mesh.plain(solid("orange").vertices, solid("orange").faces, (0.1, 0.9, 0.1))
     scene = augment.build_scene([("solid:orange", "orange"), (lime, "lime")], 8, views=2, **SMALL)
     attacked = augment.attack(classifier, scene, settings=SIGNED)
-    assert attacked.goal.decrease.tolist() == [[0], [0], [1], [1]]
+    assert attacked.goal.source.tolist() == [[0], [0], [1], [1]]
     assert attacked.success.all() and (attacked.steps > 0).all()
-    assert torch.equal(attacked.logits.argmax(2) != attacked.goal.decrease, attacked.success[:, None])
+    assert torch.equal(attacked.logits.argmax(2) != attacked.goal.source, attacked.success[:, None])
     assert attacked.images.shape == attacked.images_before.shape == (4, 1, 3, 8, 8)
 
 
@@ -45,7 +45,7 @@ def test_shared_views_may_each_have_a_target(classifier, target):
     attacked = augment.attack(classifier, scene, augment.Targeted(target), SIGNED)
     assert attacked.conditions.light.shape == (1, 49, 3) and attacked.images.shape == (1, 2, 3, 8, 8)
     names = [target] * 2 if isinstance(target, str) else target
-    assert attacked.goal.increase.tolist() == [[CLASSES.index(name) for name in names]]
+    assert attacked.goal.target.tolist() == [[CLASSES.index(name) for name in names]]
 
 
 @pytest.mark.parametrize("transport", ["shadows", pytest.param("bounces:1", marks=pytest.mark.slow)])
@@ -54,17 +54,19 @@ def test_what_is_judged_has_the_shadows_of_the_shape_and_the_colours_that_leave(
     moved = {name: augment.StepSettings("linf", 0.05, "sign", 0.03) for name in ("geometry", "albedo")}
     settings = augment.AttackSettings(**moved, max_steps=2)
     attacked = augment.attack(classifier, scene, settings=settings, force=True)
-    held = attacked.problem.images(attacked.result.values)
-    verdicts = {each.version: each for each in attacked.save(tmp_path)}
+    held = attacked.problem.images(attacked.descent.values)
+    rerender_checks = {each.version: each for each in attacked.save(tmp_path)}
     assert (held - attacked.images).abs().max() > 0.5 / 255
-    assert verdicts["reload"].largest.max() < 0.1 / 255
+    assert rerender_checks["reload"].largest.max() < 0.1 / 255
 
 
 def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifier, tmp_path):
-    kinds = {name: augment.StepSettings("linf", 0.01, "sign", 0.004) for name in KINDS.keys() - OTHER_LIGHTS}
+    kinds = {name: augment.StepSettings("linf", 0.01, "sign", 0.004) for name in PARAMETERS.keys() - OTHER_LIGHTS}
     scene = augment.build_scene([("solid:orange", "orange")], 8, **SMALL)
-    attacked = augment.attack(classifier, scene, settings=augment.AttackSettings(**kinds, max_steps=4, light="signed"))
-    moved = (attacked.result.values - attacked.problem.start).abs()
+    attacked = augment.attack(
+        classifier, scene, settings=augment.AttackSettings(**kinds, max_steps=4, allow_negative=True)
+    )
+    moved = (attacked.descent.values - attacked.problem.start).abs()
     assert 0.009 < moved.max() <= 0.01 + 1e-6
     checks = attacked.check()
     assert isinstance(checks, Checks) and checks.cost < checks.cost_before
@@ -75,19 +77,19 @@ def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifi
     assert len(shape.faces) == len(scene.mesh(0).faces)
 
 
-@pytest.mark.parametrize(("light", "physical"), [("physical", True), ("signed", False)])
+@pytest.mark.parametrize(("allow_negative", "physical"), [(False, True), (True, False)])
 @pytest.mark.parametrize("kind", ["geometry", "albedo"])
 def test_whatever_is_attacked_the_light_is_one_that_something_can_emit_unless_any_will_do(
-    classifier, kind, light, physical, tmp_path
+    classifier, kind, allow_negative, physical, tmp_path
 ):
     """So that the files, whose maps hold no negative radiance, show the same."""
     scene = augment.build_scene([("solid:orange", "orange")], 8, **SMALL)
-    settings = augment.AttackSettings(**{kind: augment.StepSettings()}, light=light, max_steps=2)
+    settings = augment.AttackSettings(**{kind: augment.StepSettings()}, allow_negative=allow_negative, max_steps=2)
     attacked = augment.attack(classifier, scene, settings=settings)
     lights = attacked.conditions.light
     assert torch.equal(lights, nearest_nonnegative(scene.lights)) == physical
     assert torch.equal(lights, scene.lights) != physical
-    images = [attacked.problem.images(values) for values in (attacked.problem.start, attacked.result.values)]
+    images = [attacked.problem.images(values) for values in (attacked.problem.start, attacked.descent.values)]
     assert torch.equal(images[0], attacked.images_before) and torch.equal(images[1], attacked.images)
     attacked.save(tmp_path)
     assert (tmp_path / "example_000" / "light.exr").is_file() == physical
@@ -97,7 +99,7 @@ def test_what_is_not_recognised_or_no_class_is_refused_in_one_sentence(classifie
     scene = augment.build_scene([("solid:orange", "lime")], 8, **SMALL)
     with pytest.raises(InputError, match="1 of 1 images of solid:orange are not recognised as 'lime'"):
         augment.attack(classifier, scene)
-    assert augment.attack(classifier, scene, force=True).result.fooled_before.all()
+    assert augment.attack(classifier, scene, force=True).descent.success_before.all()
     with pytest.raises(InputError, match="'mango' is not a class of the model"):
         augment.attack(classifier, augment.build_scene([("solid:orange", "mango")], 8, **SMALL))
     with pytest.raises(InputError, match="names 2 classes for 1 views"):

@@ -4,16 +4,15 @@ import pytest
 import torch
 
 import augment
-from augment.attacks.run import Attacked
-from augment.attacks.settings import AttackSettings
-from augment.attacks.sweep import sweep
-from augment.kind import StepSettings
+from augment.attacks.attack import AttackResult, AttackSettings
+from augment.attacks.evaluate import sweep
+from augment.attacks.parameters import StepSettings
 
 SCALES = [0.3, 0.05, 1.0, 0.1]
 
 
 @pytest.fixture
-def attacked(make_scene, make_linear) -> Attacked:
+def attacked(make_scene, make_linear) -> AttackResult:
     """Three examples of pixels, whose logits are linear in what is added: class 0 against 1, far from any clamp."""
     classifier = augment.Classifier(make_linear(2, bias=3.0), 6, ("stone", "other"))
     shown = make_scene()

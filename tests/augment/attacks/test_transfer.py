@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import augment
-from augment.attacks.run import Attacked
-from augment.kind import StepSettings
+from augment.attacks.attack import AttackResult
+from augment.attacks.parameters import StepSettings
 from renderer.errors import InputError
 
 CLASSES, SIZE = ("orange", "lime", "sky"), 12
@@ -19,12 +19,12 @@ def network(classes: tuple[str, ...] = CLASSES, size: int = SIZE) -> augment.Cla
     return augment.Classifier(lambda images: 30 * images.mean((2, 3))[:, order], size, classes, f"{classes[0]}{size}")
 
 
-def attacked(criterion=None, **kinds: StepSettings) -> Attacked:
+def attacked(criterion=None, **kinds: StepSettings) -> AttackResult:
     """Of two views, each an example, before grey."""
     scene = augment.build_scene(
         [("solid:orange", "orange")], SIZE, 2, backgrounds=[0.4], light="st_peters", exposure=0.5
     )
-    settings = augment.AttackSettings(**kinds, light="signed", max_steps=20)
+    settings = augment.AttackSettings(**kinds, allow_negative=True, max_steps=20)
     found = augment.attack(network(), scene, criterion, settings)
     assert found.success.all()
     return found
@@ -44,13 +44,13 @@ def test_where_nothing_is_another_the_answers_are_the_same(kinds):
     (found,) = done.transfer([network()])
     torch.testing.assert_close(found.before, done.logits_before, rtol=0, atol=1e-4)
     torch.testing.assert_close(found.after, done.logits, rtol=0, atol=1e-4)
-    assert found.recognised.all() and found.fooled.all() and found.kind == "network"
+    assert found.clean_correct.all() and found.success.all() and found.kind == "network"
 
 
 def test_another_network_sees_a_render_at_its_size_and_has_its_own_order_of_classes():
     done = attacked(criterion=augment.Targeted("sky"), lighting=LIGHT)
     (found,) = done.transfer([network(("sky", "orange", "lime"), size=3 * SIZE)])
-    assert (found.after.argmax(2) == 0).all() and found.recognised.all() and found.fooled.all()
+    assert (found.after.argmax(2) == 0).all() and found.clean_correct.all() and found.success.all()
     finer = augment.build_scene([("solid:orange", "orange")], 3 * SIZE, 2, backgrounds=[0.4])
     images = finer.render(done.conditions, torch.arange(2))
     torch.testing.assert_close(found.after, network(found.classes, 3 * SIZE)(images[:, 0])[:, None], rtol=0, atol=1e-4)
@@ -69,7 +69,7 @@ def test_other_sides_and_other_meshes_are_those_of_a_scene_with_them():
     for found, shown in ((turned, replace(scene, examples=rows)), (other, apple)):
         logits = network()(shown.render(done.conditions, torch.arange(2))[:, 0])[:, None]
         torch.testing.assert_close(found.after, logits, rtol=0, atol=1e-4)
-    assert not other.recognised.any()  # a lime by its label, and none by its colour
+    assert not other.clean_correct.any()  # a lime by its label, and none by its colour
 
 
 def test_only_what_was_recognised_and_then_fooled_is_shown():
@@ -79,4 +79,4 @@ def test_only_what_was_recognised_and_then_fooled_is_shown():
     (found,) = replace(done, logits_before=before).transfer([network()])
     torch.testing.assert_close(found.after, done.logits[1:], rtol=0, atol=1e-4)
     (none,) = replace(done, logits_before=-done.logits_before).transfer([network()])
-    assert none.after.shape == (0, 1, 3) and not len(none.fooled)
+    assert none.after.shape == (0, 1, 3) and not len(none.success)

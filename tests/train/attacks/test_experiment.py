@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from augment.attacks import run
-from augment.attacks.checks import Checks
-from augment.attacks.run import Attacked
+from augment.attacks import attack
+from augment.attacks.attack import AttackResult
+from augment.attacks.criteria import adversarial_cost
+from augment.attacks.descent import descend_in_parts
+from augment.attacks.evaluate import Checks
+from augment.attacks.parameters import PARAMETERS
 from augment.classifiers import Classifier
-from augment.descent import descend_in_parts
-from augment.goal import adversarial_cost
-from augment.parameters import KINDS
 from renderer.camera import ring
 from renderer.errors import InputError
 from renderer.lights import probe
@@ -59,7 +59,7 @@ def standing(kinds: str) -> list[str]:
     return [STANDING[kind] for kind in kinds.split(",") if kind in STANDING]
 
 
-def attacked(*overrides: str, classifier: Classifier | None = None, device: torch.device = CPU) -> Attacked:
+def attacked(*overrides: str, classifier: Classifier | None = None, device: torch.device = CPU) -> AttackResult:
     settings = configured(*overrides)
     (mesh,) = settings.scene.meshes
     return attack_mesh(read_object(mesh, settings.label, 0), settings, classifier or by_colour(), device)
@@ -68,40 +68,40 @@ def attacked(*overrides: str, classifier: Classifier | None = None, device: torc
 # ---------------------------------------------------------------------------------------- what is attacked
 
 
-@pytest.mark.parametrize("kinds", [*KINDS, "lighting,geometry,pixels"])
+@pytest.mark.parametrize("kinds", [*PARAMETERS, "lighting,geometry,pixels"])
 def test_every_kind_alone_and_with_others_lowers_the_cost_of_its_own_images(kinds):
     """The numbers are those of the images: the cost and the answers follow from the logits."""
     more = ["attack.max_steps=3", "scene.backgrounds=[0.4,0.5]", "renderer.transport=direct", *standing(kinds)]
     done = attacked(f"attack=[{kinds}]", *more)
-    assert [kind.name for kind in done.problem.kinds] == kinds.split(",")
+    assert [kind.name for kind in done.problem.parameters] == kinds.split(",")
     assert done.images.shape == (2, 1, 3, SIZE, SIZE)
-    assert (done.result.cost < done.result.cost_before).all() and (done.result.steps > 0).all()
+    assert (done.descent.cost < done.descent.cost_before).all() and (done.descent.steps > 0).all()
     for images, logits, cost in [
-        (done.images_before, done.logits_before, done.result.cost_before),
-        (done.images, done.logits, done.result.cost),
+        (done.images_before, done.logits_before, done.descent.cost_before),
+        (done.images, done.logits, done.descent.cost),
     ]:
         assert torch.equal(logits[:, 0], mean_colour(images[:, 0]))
         # Sums of 64 pixels in another order differ by rounding.
-        torch.testing.assert_close(cost, adversarial_cost(logits[:, 0], done.goal.decrease[:, 0]), rtol=0, atol=1e-4)
-    assert torch.equal(done.logits.argmax(2) != 0, done.result.fooled[:, None])
+        torch.testing.assert_close(cost, adversarial_cost(logits[:, 0], done.goal.source[:, 0]), rtol=0, atol=1e-4)
+    assert torch.equal(done.logits.argmax(2) != 0, done.descent.success[:, None])
     everything = torch.arange(2)
-    again = done.problem.render(done.result.values, everything)
+    again = done.problem.render(done.descent.values, everything)
     torch.testing.assert_close(again.detach(), done.images, rtol=0, atol=1e-6)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize("kinds", [*KINDS, "lighting,geometry,albedo,pixels"])
+@pytest.mark.parametrize("kinds", [*PARAMETERS, "lighting,geometry,albedo,pixels"])
 def test_a_gpu_attacks_as_a_cpu_does_to_rounding(kinds):
     """After one step; a gradient's sign may differ where it is nearly zero, hence not every pixel is compared."""
     overrides = (f"attack=[{kinds}]", "attack.max_steps=1", "scene.views=2", *standing(kinds))
-    expected, found = (attacked(*overrides, device=device).result for device in (CPU, torch.device("cuda")))
+    expected, found = (attacked(*overrides, device=device).descent for device in (CPU, torch.device("cuda")))
     torch.testing.assert_close(found.cost_before.cpu(), expected.cost_before, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(found.cost.cpu(), expected.cost, rtol=1e-2, atol=1e-2)
-    assert torch.equal(found.fooled.cpu(), expected.fooled)
+    assert torch.equal(found.success.cpu(), expected.success)
 
 
 def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
-    overrides = "scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "attack.light=signed"
+    overrides = "scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "attack.allow_negative=true"
     done = attacked(*overrides, "attack.max_steps=0")
     cameras = ring(3, 2.0, math.pi / 2)
     assert done.problem.scene.cameras == [(camera,) for camera in cameras for _ in range(2)]
@@ -112,9 +112,9 @@ def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
 def test_shared_views_are_one_example_with_one_light():
     done = attacked("scene.views=3", "attack.shared=true")
     assert (len(done.problem.scene), done.problem.scene.views) == (1, 3)
-    assert done.result.values.shape == (1, 147)
-    each = adversarial_cost(done.logits_before[0], done.goal.decrease[0])
-    assert done.result.cost_before.item() == pytest.approx(each.sum().item(), abs=1e-4)
+    assert done.descent.values.shape == (1, 147)
+    each = adversarial_cost(done.logits_before[0], done.goal.source[0])
+    assert done.descent.cost_before.item() == pytest.approx(each.sum().item(), abs=1e-4)
 
 
 def test_exposure_multiplies_the_light_and_gain_the_surface():
@@ -136,9 +136,9 @@ def test_the_same_seed_gives_the_same_result(kinds):
     """Nothing reaches `sky`, so that a restart is drawn."""
     overrides = [f"attack=[{kinds}]", "target=sky", "attack.restarts=1", f"attack.{kinds}.radius=0.02"]
     first, second = (attacked(*overrides, "attack.max_steps=2") for _ in range(2))
-    for name, value in vars(first.result).items():
-        assert torch.equal(value, getattr(second.result, name)), name
-    assert first.result.steps.item() == 4 and not first.result.fooled.any()
+    for name, value in vars(first.descent).items():
+        assert torch.equal(value, getattr(second.descent, name)), name
+    assert first.descent.steps.item() == 4 and not first.descent.success.any()
 
 
 def test_restarts_are_within_the_ball_and_follow_from_the_seed(monkeypatch):
@@ -150,7 +150,7 @@ def test_restarts_are_within_the_ball_and_follow_from_the_seed(monkeypatch):
             drawn.extend(each)
             return descend_in_parts(*rest, drawn, at_once)
 
-        monkeypatch.setattr(run, "descend_in_parts", recorded)
+        monkeypatch.setattr(attack, "descend_in_parts", recorded)
         done = attacked(f"seed={seed}", "attack.restarts=2", "attack.lighting.radius=0.02", "attack.max_steps=0")
         return torch.stack(drawn) - done.problem.start
 
@@ -165,7 +165,7 @@ def test_restarts_are_within_the_ball_and_follow_from_the_seed(monkeypatch):
 
 def test_least_likely_is_each_views_own_least_confidence():
     done = attacked("target=least_likely", "scene.views=2", "attack.shared=true")
-    assert torch.equal(done.goal.increase, done.logits_before.argmin(2))
+    assert torch.equal(done.goal.target, done.logits_before.argmin(2))
 
 
 @pytest.mark.parametrize(
@@ -175,19 +175,19 @@ def test_targets_are_one_for_all_views_or_one_each(target, wanted):
     done = attacked(
         f"target={target}", "scene.views=2", "attack.shared=true", "attack.max_steps=1", "scene.backgrounds=[0.4,0.5]"
     )
-    found = done.goal.increase
+    found = done.goal.target
     assert found is None if wanted is None else found.tolist() == [wanted] * 2
-    assert done.goal.decrease.tolist() == [[0, 0]] * 2
+    assert done.goal.source.tolist() == [[0, 0]] * 2
 
 
 def test_a_target_is_reached():
     done = attacked("target=lime", "attack.max_steps=30")
-    assert done.result.fooled.all() and done.logits.argmax(2).item() == CLASSES.index("lime")
+    assert done.descent.success.all() and done.logits.argmax(2).item() == CLASSES.index("lime")
 
 
 def test_a_class_whose_name_is_a_number_is_a_target():
     done = attacked("target=7", "attack.max_steps=1", classifier=by_colour(("orange", "7", "8", "9")))
-    assert done.goal.increase.tolist() == [[1]]
+    assert done.goal.target.tolist() == [[1]]
 
 
 # ---------------------------------------------------------------------------------------- bad input
@@ -236,7 +236,7 @@ def test_bad_input_is_refused_in_one_sentence(overrides, message):
 
 def test_an_attack_on_nothing_is_refused():
     with pytest.raises(InputError, match="attack: name what to change, such as attack=lighting; there are lighting, "):
-        configured("attack=[]").attack.require_kinds()
+        configured("attack=[]").attack.require_parameters()
 
 
 def test_a_mesh_may_name_its_own_class():
@@ -252,21 +252,21 @@ def test_a_mesh_that_is_none_is_refused_by_its_place(item):
 
 
 BESIDE = [
-    ([{"mesh": "solid:cup"}], r"scene.meshes\[3\].beside\[0\].at is not set: give scene.meshes\[3\].beside\[0\].at="),
-    ([{"mesh": "solid:cup", "at": [1]}], r"beside: solid:cup: at=\[1.0\] must be x and y"),
-    ([{"mesh": "solid:cup", "at": [0, float("nan")]}], "beside: solid:cup: at=nan must be at least -10"),
-    ([{"mesh": "solid:cup", "at": [0, 1], "scale": 0}], "beside: solid:cup: scale=0.0 must be at least 0.1"),
-    ([{"mesh": "solid:cup", "at": [0, 1], "gain": 2}], r"meshes\[3\].beside\[0\].gain: Key 'gain' not in"),
-    (["solid:cup"], r"meshes\[3\].beside: give a list of mappings"),
-    ("solid:cup", r"meshes\[3\].beside: give a list of mappings"),
-    (None, r"meshes\[3\].beside: give a list of mappings"),
+    ([{"mesh": "solid:cup"}], r"scene.meshes\[3\].props\[0\].at is not set: give scene.meshes\[3\].props\[0\].at="),
+    ([{"mesh": "solid:cup", "at": [1]}], r"props: solid:cup: at=\[1.0\] must be x and y"),
+    ([{"mesh": "solid:cup", "at": [0, float("nan")]}], "props: solid:cup: at=nan must be at least -10"),
+    ([{"mesh": "solid:cup", "at": [0, 1], "scale": 0}], "props: solid:cup: scale=0.0 must be at least 0.1"),
+    ([{"mesh": "solid:cup", "at": [0, 1], "gain": 2}], r"meshes\[3\].props\[0\].gain: Key 'gain' not in"),
+    (["solid:cup"], r"meshes\[3\].props: give a list of mappings"),
+    ("solid:cup", r"meshes\[3\].props: give a list of mappings"),
+    (None, r"meshes\[3\].props: give a list of mappings"),
 ]
 
 
-@pytest.mark.parametrize(("beside", "message"), BESIDE)
-def test_what_cannot_stand_beside_a_mesh_is_refused(beside, message):
+@pytest.mark.parametrize(("props", "message"), BESIDE)
+def test_what_cannot_stand_beside_a_mesh_is_refused(props, message):
     with pytest.raises(InputError, match=message):
-        read_object({"mesh": "solid:apple", "beside": beside}, "orange", 3)
+        read_object({"mesh": "solid:apple", "props": props}, "orange", 3)
 
 
 def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_forced():
@@ -282,8 +282,8 @@ def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_f
         "change the scene, or set attack.force=true"
     )
     done = attacked("scene.views=2", "attack.force=true", "attack.max_steps=1", classifier=deaf)
-    assert done.result.fooled_before.all() and not done.result.steps.any()
-    assert done.result.zero_gradient.all()
+    assert done.descent.success_before.all() and not done.descent.steps.any()
+    assert done.descent.zero_gradient.all()
     assert format_attack("mesh", done, None).startswith("mesh: lighting against callable: none of 2 examples was")
     found = done.check()
     assert (found.success, found.random_search, set(found.success_by_steps.values())) == (0, 0, {0})
@@ -293,7 +293,7 @@ def test_success_is_counted_among_what_was_recognised_before():
     """Before the dark background the image is not recognised; wrong as it is, it is nothing that the attack did."""
     dark = Classifier(sky_in_the_dark, SIZE, CLASSES[:3])
     done = attacked("scene.backgrounds=[0.5,0.0]", "attack.force=true", "attack.max_steps=30", classifier=dark)
-    assert done.recognised.tolist() == [True, False] and done.success.tolist() == [True, True]
+    assert done.clean_correct.tolist() == [True, False] and done.success.tolist() == [True, True]
     assert "1 of 1 examples fooled [21%, 100%]; 1 not recognised before, which do not count" in format_attack(
         "mesh", done, None
     )
@@ -326,8 +326,8 @@ def test_what_is_attacked_stands_in_the_scene_without_being_named(kind):
 def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
     done = attacked("attack.max_steps=3", "scene.backgrounds=[0.3,0.5,0.7]", "attack.lighting.step_size=0.1")
     found = done.check()
-    assert found.cost_before == pytest.approx(float(done.result.cost_before.mean()))
-    assert found.cost == pytest.approx(float(done.result.cost.mean())) and found.cost < found.cost_before
+    assert found.cost_before == pytest.approx(float(done.descent.cost_before.mean()))
+    assert found.cost == pytest.approx(float(done.descent.cost.mean())) and found.cost < found.cost_before
     assert found.cost_fell == 1 and found.zero_gradient == 0 and 0 <= found.random_search <= 1
     shares = list(found.success_by_steps.values())
     assert list(found.success_by_steps) == [3, 9, 30]
@@ -337,7 +337,9 @@ def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
 
 
 def test_checks_count_what_fools_within_the_steps_also_where_a_margin_sends_it_on():
-    done = attacked("attack.max_steps=3", "attack.margin=100", "attack.light=signed", "attack.lighting.step_size=0.2")
+    done = attacked(
+        "attack.max_steps=3", "attack.margin=100", "attack.allow_negative=true", "attack.lighting.step_size=0.2"
+    )
     found = done.check()
     assert found.success == 1 and found.success_by_steps == {3: 1, 9: 1, 30: 1}
 
@@ -353,7 +355,7 @@ def test_random_search_that_does_as_well_is_a_warning():
     network = Classifier(narrow, SIZE, CLASSES[:2])
     done = attacked("attack.lighting.radius=0.1", "attack.max_steps=8", classifier=network)
     found = done.check()
-    assert not done.result.fooled_before.any() and found.success == found.random_search == 1
+    assert not done.descent.success_before.any() and found.success == found.random_search == 1
     assert found.warnings == ["random search does as well or better"]
 
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 import trimesh
 
-from augment.attacks.adversary_folder import MAP_HEIGHT
+from augment.attacks.adversary import MAP_HEIGHT
+from augment.attacks.attack import AttackResult
 from augment.attacks.figure import read_figure
 from augment.attacks.files import LINES, write_files
-from augment.attacks.run import Attacked
 from augment.classifiers import Classifier
 from renderer.environment import read_map, to_map
 from renderer.files.mesh_damage import mesh_damage
@@ -25,20 +25,20 @@ from train.settings import read_object
 CLASSES = ("orange", "lime", "sky")
 
 
-def attacked(*overrides: str) -> Attacked:
+def attacked(*overrides: str) -> AttackResult:
     small = [
         "renderer.visibility=software",
         "renderer.cache=null",
         "attack.max_steps=2",
         "attack.force=true",
-        "attack.light=signed",
+        "attack.allow_negative=true",
     ]
     settings = read_settings(AttackExperimentSettings, composed("attack", [*small, *overrides]))
     by_colour = Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES, "by_colour")
     return attack_mesh(read_object("solid:orange:0", "orange", 0), settings, by_colour, torch.device("cpu"))
 
 
-def written(done: Attacked, folder: Path) -> list[dict]:
+def written(done: AttackResult, folder: Path) -> list[dict]:
     """The lines."""
     write_files(done, None, folder)
     return [json.loads(line) for line in (folder / LINES).read_text().splitlines()]
@@ -54,16 +54,16 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(tmp_path):
     assert [line["example"] for line in lines] == [0, 1]
     shares = done.logits.softmax(2)
     for example, line in enumerate(lines):
-        for name in ("fooled", "fooled_before", "steps", "cost", "cost_before"):
-            assert line[name] == getattr(done.result, name)[example].item()
+        for name in ("success", "success_before", "steps", "cost", "cost_before"):
+            assert line[name] == getattr(done.descent, name)[example].item()
         assert line["label"] == ["orange"]
-        assert line["answer"] == [CLASSES[done.logits[example, 0].argmax()]]
+        assert line["predicted"] == [CLASSES[done.logits[example, 0].argmax()]]
         assert line["confidence"] == [pytest.approx(shares[example].max().item())]
         before = done.logits_before[example].softmax(1)
-        assert line["answer_before"] == [CLASSES[before.argmax()]]
+        assert line["predicted_before"] == [CLASSES[before.argmax()]]
         assert line["confidence_before"] == [pytest.approx(before.max().item())]
-        assert line["recognised"] is (before.argmax().item() == 0)
-        change = (done.result.values[example] - done.problem.start[example]).abs().max().item()
+        assert line["clean_correct"] is (before.argmax().item() == 0)
+        change = (done.descent.values[example] - done.problem.start[example]).abs().max().item()
         assert line["largest_change"] == {"lighting": change} and change > 0
 
 
@@ -85,7 +85,7 @@ def test_the_light_is_read_back_to_the_bit_and_as_a_map_only_where_it_is_physica
     for light, physical in [("st_peters", True), ("grace", False)]:
         done = attacked(f"scene.light={light}", "attack.lighting.radius=0.001", "scene.exposure=2")
         (line,) = written(done, tmp_path / light)
-        folder, values = tmp_path / light / "example_000", done.result.values[0].unflatten(0, (49, 3))
+        folder, values = tmp_path / light / "example_000", done.descent.values[0].unflatten(0, (49, 3))
         assert torch.equal(load_light(str(folder / "light.json")), values)
         expected = to_map(values, MAP_HEIGHT).float()
         assert (line["negative_light"] < 1e-6) == physical == (expected.min() >= 0).item()
@@ -102,7 +102,7 @@ def test_the_shape_is_read_back_where_the_attack_left_it(tmp_path):
     done = attacked("attack=[geometry]")
     (line,) = written(done, tmp_path)
     mesh = done.problem.scene.mesh(0)
-    moved = done.problem.scene.vertices[0] + done.result.values[0].unflatten(0, (-1, 3))
+    moved = done.problem.scene.vertices[0] + done.descent.values[0].unflatten(0, (-1, 3))
     found = load_mesh(tmp_path / "example_000" / "mesh.glb")
     np.testing.assert_array_equal(found.vertices[found.faces], moved.double().numpy()[mesh.faces])
     damage = mesh_damage(mesh.vertices, moved.double().numpy(), mesh.faces)
@@ -136,8 +136,8 @@ def test_every_line_has_each_versions_answer(tmp_path):
         answer = CLASSES[rounded.mean((0, 2, 3)).argmax()]
         off = (rounded - done.images[example]).abs()
         assert line["versions"]["8 bits"] == {
-            "fooled": answer != "orange",
-            "answer": [answer],
+            "success": answer != "orange",
+            "predicted": [answer],
             "confidence": [pytest.approx((30 * rounded.mean((2, 3))).softmax(1).max().item(), abs=1e-5)],
             "largest_difference": pytest.approx(off.max().item(), abs=1e-7),
             "mean_difference": pytest.approx(off.mean().item(), abs=1e-7),

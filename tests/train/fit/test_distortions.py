@@ -4,7 +4,7 @@ import torch.nn.functional as F
 from torch import nn
 from torchvision.transforms import v2
 
-from augment import processes
+from augment import utils
 from renderer.image import to_unit
 from train.fit.distortions import DISTORTIONS, RADIUS, TRANSFORMS, distortion, torchvision_transform
 from train.wideresnet import WideResNet
@@ -46,7 +46,7 @@ def test_every_image_is_distorted_by_draws_of_its_own_whatever_the_number_of_pro
     same = images[:1].expand(6, -1, -1, -1)
     whole = distortion(name, model, 0)(same, LABELS, 1)
     assert len(whole.unique(dim=0)) > 1
-    monkeypatch.setattr(processes, "rank", lambda: 1)
+    monkeypatch.setattr(utils, "rank", lambda: 1)
     assert torch.equal(distortion(name, model, 0)(same[3:], LABELS[3:], 1), whole[3:])
 
 

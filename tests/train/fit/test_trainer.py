@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from augment.phases import Phases
 from augment.service import Renders
+from augment.utils import Phases
 from renderer.errors import InputError
 from train.data import Split
 from train.device import MixedPrecision
@@ -66,7 +66,9 @@ def fit_noise(trainer: Trainer) -> list[dict]:
 
 
 def test_a_ranking_without_look_alikes_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"train\.ranking=1\.0 ranks look-alikes: name some in scene\.look_alikes"):
+    with pytest.raises(
+        InputError, match=r"train\.ranking=1\.0 ranks hard negatives: name some in scene\.hard_negatives"
+    ):
         make_trainer(tmp_path, ranking=1.0)
 
 

@@ -43,7 +43,7 @@ def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_ma
 def test_a_card_counts_the_renders_that_the_scene_makes_and_names_the_look_alikes(finished, tmp_path, read_markdown):
     run = copytree(finished, tmp_path / "run")
     config = OmegaConf.load(run / "config.yaml")
-    config.scene.look_alikes = ["solid:fruit", {"mesh": "solid:apple", "label": "apple"}, "solid:fruit"]
+    config.scene.hard_negatives = ["solid:fruit", {"mesh": "solid:apple", "label": "apple"}, "solid:fruit"]
     config.scene.views, config.scene.backgrounds, config.augment.examples = 3, [0.2, 0.4], None
     OmegaConf.save(config, run / "config.yaml")
     publish_run(run, tmp_path / "published")

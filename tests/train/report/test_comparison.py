@@ -203,8 +203,8 @@ def test_an_arm_does_not_differ_from_itself(scored_run, read_markdown):
 
 
 def test_groups_of_an_arm_are_named_by_the_settings_in_which_they_differ(scored_run, read_markdown):
-    radii = [["augment.random.radius=1.5"], []]
+    radii = [["augment.random_light.radius=1.5"], []]
     folders = [scored_run("none", STUDIO_AND_WEB), *(scored_run("random", STUDIO_AND_WEB, *radius) for radius in radii)]
     titles = list(compare(read_markdown, folders))
-    assert "random, augment.random.radius=1.5 minus none, one seed" in titles
-    assert "random, augment.random.radius=None minus none, one seed" in titles
+    assert "random, augment.random_light.radius=1.5 minus none, one seed" in titles
+    assert "random, augment.random_light.radius=None minus none, one seed" in titles

@@ -6,11 +6,11 @@ import pytest
 import torch
 from PIL import Image
 
-from augment.specimens import Specimens
+from augment.service import AttackExamples
 from train.photographs.shares import share
 from train.report.headline import headline
 from train.report.summary import RunSummary, summarise
-from train.run_folder.specimens import write_specimens
+from train.run_folder.attack_examples import write_attack_examples
 
 AUC = {"value": 0.9, "low": 0.8, "high": 1.0}
 
@@ -20,8 +20,8 @@ def keep_specimens(folder: Path, epoch: int, before: list[float], after: list[fl
     images, lights = torch.full((2, 2, 3, 8, 8), 0.5), torch.zeros(2, 2, 49, 3)
     answers = torch.tensor([before, after])[:, None].expand(2, 2, 2)
     (folder / "renders").mkdir(exist_ok=True)
-    specimens = Specimens(*images, *lights, *answers, torch.ones(2, dtype=torch.int64))
-    write_specimens(folder / "renders" / f"epoch_{epoch:03d}.safetensors", specimens, ["apple", "orange"])
+    attack_examples = AttackExamples(*images, *lights, *answers, torch.ones(2, dtype=torch.int64))
+    write_attack_examples(folder / "renders" / f"epoch_{epoch:03d}.safetensors", attack_examples, ["apple", "orange"])
 
 
 @pytest.fixture

@@ -56,8 +56,8 @@ def page(finished, made_up_run, tmp_path_factory) -> Path:
     (folder / "failed" / "failed.txt").write_text(HOSTILE)
     attack = folder / "attacks" / HOSTILE.replace("/", "_")
     attack.mkdir(parents=True)
-    line = {"example": 0, "label": [HOSTILE], "answer": ["b"], "confidence": [0.5], "fooled": True, "steps": 3}
-    lines = [line, line | {"example": 1, "steps": 0, "fooled_before": True}]
+    line = {"example": 0, "label": [HOSTILE], "predicted": ["b"], "confidence": [0.5], "success": True, "steps": 3}
+    lines = [line, line | {"example": 1, "steps": 0, "success_before": True}]
     (attack / "attack.jsonl").write_text("".join(json.dumps(each) + "\n" for each in lines))
     with locked(folder / "begun"):
         return write_report([folder], folder / "out")

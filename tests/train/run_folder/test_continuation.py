@@ -19,11 +19,11 @@ def test_a_run_knows_its_inputs_by_content(tiny, tiny_npz, finished):
     "override",
     [
         "scene.meshes=[{}]",
-        "scene.look_alikes=[{{mesh: {}, label: apple}}]",
-        "scene.meshes=[{{mesh: solid:orange, beside: [{{mesh: {}}}]}}]",
+        "scene.hard_negatives=[{{mesh: {}, label: apple}}]",
+        "scene.meshes=[{{mesh: solid:orange, props: [{{mesh: {}}}]}}]",
         "scene.light={}",
         "scene.backgrounds=[0.5,{}]",
-        "augment.vary.lights=[{}]",
+        "augment.vary.environments=[{}]",
         "data.path={}",
     ],
 )

@@ -4,7 +4,7 @@ import pytest
 import torch
 import trimesh
 
-from augment import held_transport
+from augment import reshading
 from renderer.errors import InputError
 from renderer.files.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.image import ImageSettings
@@ -60,11 +60,11 @@ def test_shadows_found_anew_at_each_step_are_right_and_those_held_are_not(monkey
     monkeypatch.setattr(held, "EXAMPLES", 2)
     monkeypatch.setattr(held, "STEPS", 4)
     monkeypatch.setattr(held, "EVERY", (1, math.inf))
-    near, network = held_transport.NEAR, load_classifier("run:pretrained/none", None)
+    near, network = reshading.NEAR, load_classifier("run:pretrained/none", None)
     anew, still = cells(held.table(normalise(solid("cup", 0)), network))
     assert anew[0] == "one step" and anew[2:4] == ["0.00%", "0.0%"]
     assert still[0] == "the whole attack" and 0 < float(still[2].rstrip("%")) < 5
-    assert near == held_transport.NEAR
+    assert near == reshading.NEAR
 
 
 def test_mitsubas_image_is_in_the_place_of_ours(monkeypatch):

@@ -13,9 +13,8 @@ import torch
 from torch.multiprocessing.spawn import start_processes
 
 from augment.build import build_scene
-from augment.phases import Phases
-from augment.service import AugmentationService
-from augment.service_settings import AugmentationSettings, TrainingAttackSettings
+from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
+from augment.utils import Phases
 from train.distributed import process_group
 from train.wideresnet import WideResNet
 

@@ -21,7 +21,7 @@ DOOR = Door(
 )
 CHANGED = (
     *("train.resume=true", "train.learning_rate=0.02", "model.dropout=0.3", "augment.examples=4"),
-    *("augment.lights=continue", "augment.attack.max_steps=3", "augment.attack.step_size=0.3"),
+    *("augment.warm_start=true", "augment.attack.max_steps=3", "augment.attack.step_size=0.3"),
     *("scene.backgrounds=[0.2,0.8]", "renderer.samples=2"),
 )
 

@@ -6,14 +6,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentSettings, Part, Problem, descend
+from augment.attacks.parameters import AttackProblem, Geometry, Lighting, Parameter, StepSettings
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings, Part, Problem, descend
-from augment.goal import Goal
-from augment.kind import Kind, StepSettings
-from augment.parameters import Geometry, Lighting
-from augment.perturbation import Perturbation
-from augment.phases import Phases
 from augment.scene import Scene
+from augment.utils import Phases
 
 STEPS = 30  # the paper's appendix C
 FURTHER = 10  # steps that an adversary goes on for
@@ -23,7 +21,7 @@ class Unreachable(Goal):
     """An error is wanted, and is never enough: the descent takes all of its steps."""
 
     def of(self, examples: Tensor) -> "Unreachable":
-        return Unreachable(self.decrease[examples])
+        return Unreachable(self.source[examples])
 
     def reached(self, predicted: Tensor) -> Tensor:
         return torch.zeros(len(predicted), dtype=torch.bool)
@@ -33,12 +31,12 @@ class Unreachable(Goal):
 class Attack:
     """What changes, by which steps, and for how long."""
 
-    kind: Callable[[Scene, StepSettings], Kind]
+    kind: Callable[[Scene, StepSettings], Parameter]
     step: StepSettings
     descent: DescentSettings
 
-    def problem(self, scene: Scene) -> Perturbation:
-        return Perturbation(scene, [self.kind(scene, self.step)])
+    def problem(self, scene: Scene) -> AttackProblem:
+        return AttackProblem(scene, [self.kind(scene, self.step)])
 
     def adversaries(self, problem: Problem, classifier: Classifier, label: str, views: int) -> tuple[Tensor, Tensor]:
         """(E, D) values where the descent first fools or ends, and (E, D) those `FURTHER` steps later.
@@ -49,7 +47,7 @@ class Attack:
         first = descend(classifier, problem, goal, self.descent, Phases())
         onwards = Part(problem, torch.arange(len(first.values)), first.values)
         longer = replace(self.descent, max_steps=FURTHER)
-        last = descend(classifier, onwards, Unreachable(goal.decrease), longer, Phases())
+        last = descend(classifier, onwards, Unreachable(goal.source), longer, Phases())
         return first.values, last.values
 
 

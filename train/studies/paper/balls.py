@@ -6,15 +6,13 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from augment.attacks.run import logits_of
+from augment.attacks.attack import logits_of
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentSettings, descend
+from augment.attacks.parameters import PARAMETERS, AttackProblem, StepSettings
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings, descend
-from augment.goal import Goal
-from augment.kind import StepSettings
-from augment.parameters import KINDS
-from augment.perturbation import Perturbation
-from augment.phases import Phases
 from augment.scene import Scene
+from augment.utils import Phases
 from train.studies.paper.subjects import PART, part_of
 
 
@@ -67,11 +65,11 @@ def attack_ball(
 ) -> Outcome:
     """Descend and draw in one ball of a space."""
     space = SPACES[name]
-    problem = Perturbation(scene, [KINDS[name](scene, StepSettings("linf", radius, "sign", radius * space.step))])
+    problem = AttackProblem(scene, [PARAMETERS[name](scene, StepSettings("linf", radius, "sign", radius * space.step))])
     goal = Goal(torch.full((len(scene), 1), classifier.label(label)))
     everything = torch.arange(len(scene))
 
-    def fooled(values: Tensor, examples: Tensor) -> Tensor:
+    def success(values: Tensor, examples: Tensor) -> Tensor:
         images = problem.render(values, examples)
         return goal.of(examples).reached(logits_of(classifier, images, PART).argmax(2))
 
@@ -79,13 +77,13 @@ def attack_ball(
     # The gradient of geometry holds visibility fixed, so that whole steps may raise the cost.
     descent = DescentSettings(steps, shorten=name == "geometry", batch_size=PART)
     result = descend(classifier, problem, goal, descent, Phases(problem.start.device))
-    random = fooled(problem.sample(draws), everything)
+    random = success(problem.sample(draws), everything)
     search = random.clone()
     for _ in range(steps - 1):
         left = torch.nonzero(~search).squeeze(1)
         if len(left):
-            search[left] = fooled(problem.sample(draws)[left], left)
-    return Outcome(result.fooled, random, search, before[:, 0], result.images[:, 0], result.predicted[:, 0])
+            search[left] = success(problem.sample(draws)[left], left)
+    return Outcome(result.success, random, search, before[:, 0], result.images[:, 0], result.predicted[:, 0])
 
 
 def parts(scene: Scene) -> Iterator[Scene]:

@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from augment.attacks.attack import AttackResult
 from augment.attacks.figure import save_figure
-from augment.attacks.files import exhibits
-from augment.attacks.run import Attacked
+from augment.attacks.files import panels
 from augment.objects import ObjectSettings
 from renderer.errors import InputError
 from train.attacks.experiment import attack_mesh
@@ -32,7 +32,7 @@ class Settings(SectionSettings):
 
 
 LIKE_THE_PAPER = [  # any light, an end where the classifier is fooled, no shadows
-    "attack.light=signed",
+    "attack.allow_negative=true",
     "attack.margin=0",
     "attack.rounded=false",
     "renderer.transport=direct",
@@ -99,21 +99,21 @@ def measure(study: Study, settings: Settings) -> Section:
     return Section(values, records, figures)
 
 
-def record(case: Case, attacked: Attacked) -> dict[str, Any]:
+def record(case: Case, attacked: AttackResult) -> dict[str, Any]:
     return {
         "case": case.name,
         "title": case.title,
         "parameters": attacked.problem.start.shape[1],
         "views": attacked.images.shape[1],
         "target": case.target,
-        "fooled": bool(attacked.success[0]),
+        "success": bool(attacked.success[0]),
         "steps": int(attacked.steps[0]),
         "before": answers(attacked.logits_before, attacked),
         "after": answers(attacked.logits, attacked),
     }
 
 
-def answers(logits: Tensor, attacked: Attacked) -> list[str]:
+def answers(logits: Tensor, attacked: AttackResult) -> list[str]:
     """The answer of each view of the first example."""
     best = logits[0].softmax(1).max(1)
     pairs = zip(best.indices.tolist(), best.values.tolist(), strict=True)
@@ -121,14 +121,14 @@ def answers(logits: Tensor, attacked: Attacked) -> list[str]:
 
 
 def row(found: dict[str, Any]) -> list[str]:
-    steps = str(found["steps"]) if found["fooled"] else f"{found['steps']}, not fooled"
+    steps = str(found["steps"]) if found["success"] else f"{found['steps']}, not fooled"
     said = (", ".join(found[key]) for key in ("before", "after"))
     return [found["title"], f"{found['parameters']:,}", str(found["views"]), steps, *said]
 
 
-def save_small(attacked: Attacked, path: Path) -> None:
+def save_small(attacked: AttackResult, path: Path) -> None:
     """The image of an attack, in 256 colours where it would be large."""
-    save_figure(*exhibits(attacked, 0), path)
+    save_figure(*panels(attacked, 0), path)
     if path.stat().st_size > LIMIT:
         with Image.open(path) as image:
             reduced = image.quantize(256)

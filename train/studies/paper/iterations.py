@@ -13,15 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from augment.attacks.criteria import Goal, adversarial_cost
+from augment.attacks.descent import DescentSettings, descend
 from augment.backgrounds import load_backgrounds
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings, descend
-from augment.goal import Goal, adversarial_cost
 from augment.objects import SceneObject
-from augment.phases import Phases
 from augment.scene import Scene
-from augment.service import AugmentationService
-from augment.service_settings import AugmentationSettings, TrainingAttackSettings
+from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
+from augment.utils import Phases
 from renderer.camera import ring
 from renderer.image import ImageSettings
 from renderer.lights import load_light

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
-from augment.seeding import generator
+from augment.utils import generator
 from train.photographs.shares import share
 from train.report.tables import markdown
 from train.studies.figures import panels_beside, pyplot, save

@@ -6,14 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment.attacks.run import logits_of
-from augment.descent import DescentSettings, descend
-from augment.goal import Goal
-from augment.kind import StepSettings
-from augment.parameters import Lighting
-from augment.perturbation import Perturbation
-from augment.phases import Phases
+from augment.attacks.attack import logits_of
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentSettings, descend
+from augment.attacks.parameters import AttackProblem, Lighting, StepSettings
 from augment.scene import Scene
+from augment.utils import Phases
 from renderer.harmonics import basis, project
 from renderer.transfer import DEGREE
 from train.photographs.shares import share
@@ -45,15 +43,17 @@ def measure(study: Study, settings: Settings) -> Section:
     ]
     records = []
     for radius in RADII:
-        fooled = torch.cat([outcome(scene, study, radius, settings.steps) for scene in scenes], dim=1)
-        records.append(record(radius, fooled))
+        success = torch.cat([outcome(scene, study, radius, settings.steps) for scene in scenes], dim=1)
+        records.append(record(radius, success))
     cells = ([each["radius"] or "none", *map(interval, list(each.values())[1:])] for each in records)
-    return Section({"count": fooled.shape[1], "table": markdown(HEADER, cells)}, records)
+    return Section({"count": success.shape[1], "table": markdown(HEADER, cells)}, records)
 
 
-def record(radius: float | None, fooled: Tensor) -> dict[str, Any]:
+def record(radius: float | None, success: Tensor) -> dict[str, Any]:
     names = ("signed", "clipped", "physical")
-    return {"radius": radius} | {name: share(int(row.sum()), len(row)) for name, row in zip(names, fooled, strict=True)}
+    return {"radius": radius} | {
+        name: share(int(row.sum()), len(row)) for name, row in zip(names, success, strict=True)
+    }
 
 
 def outcome(scene: Scene, study: Study, radius: float | None, steps: int) -> Tensor:
@@ -62,14 +62,14 @@ def outcome(scene: Scene, study: Study, radius: float | None, steps: int) -> Ten
     label = study.classifier.label(study.label)
     goal = Goal(torch.full((len(scene), 1), label))
     step = StepSettings("linf", radius, *(("unit", 0.05) if radius is None else ("sign", radius / 4)))
-    problems = [Perturbation(scene, [Lighting(scene, step, physical)]) for physical in (False, True)]
+    problems = [AttackProblem(scene, [Lighting(scene, step, physical)]) for physical in (False, True)]
     descent = DescentSettings(steps, batch_size=PART)
     signed, physical = (descend(study.classifier, problem, goal, descent, Phases()) for problem in problems)
     clipped = torch.stack([without_negative(light) for light in signed.values.unflatten(1, (-1, 3))])
     images = problems[0].render(clipped.flatten(1), problems[0].everything)
     predicted = logits_of(study.classifier, images, PART).argmax(2)
-    fooled = torch.stack([signed.fooled, goal.reached(predicted), physical.fooled])
-    return fooled[:, ~(signed.fooled_before | physical.fooled_before)]
+    success = torch.stack([signed.success, goal.reached(predicted), physical.success])
+    return success[:, ~(signed.success_before | physical.success_before)]
 
 
 def without_negative(light: Tensor) -> Tensor:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from augment.attacks.run import logits_of
+from augment.attacks.attack import logits_of
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
-from augment.seeding import generator
+from augment.utils import generator
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from train.report.tables import markdown

@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 import torch
 
-from augment.descent import DescentSettings, descend
-from augment.goal import Goal
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentSettings, descend
 from augment.objects import ObjectSettings, SceneObject
 from train.photographs.shares import share
 from train.report.tables import markdown
@@ -103,7 +103,7 @@ class Attack:
     """One image's attack. seconds: also of what is rendered once."""
 
     mesh: str
-    fooled: bool
+    success: bool
     steps: int
     seconds: float
 
@@ -122,19 +122,19 @@ def attacks(subject: SceneObject, study: Study, settings: Settings) -> Iterator[
         start = time.process_time()
         result = descend(classifier, problem, goal, DescentSettings(settings.max_steps), Stopwatch())
         spent = time.process_time() - start
-        yield Attack(subject.name, bool(result.fooled), int(result.steps), prepared + spent)
+        yield Attack(subject.name, bool(result.success), int(result.steps), prepared + spent)
 
 
 def distribution(done: Sequence[Attack]) -> Iterator[list[str]]:
     """Steps and seconds of the attacks that succeed."""
     for name, digits in (("steps", 0), ("seconds", 2)):
-        values = [getattr(each, name) for each in done if each.fooled]
+        values = [getattr(each, name) for each in done if each.success]
         yield [name, *(f"{np.quantile(values, q):.{digits}f}" if values else "-" for q in QUANTILES.values())]
 
 
 def finding(done: Sequence[Attack]) -> str:
     """Whether "fewer than 10 iterations, a few seconds" holds, failures counted as attacks that never end."""
-    steps = [each.steps if each.fooled else np.inf for each in done]
+    steps = [each.steps if each.success else np.inf for each in done]
     few = share(sum(value < FEWER for value in steps), len(steps))
     median, spent = np.median(steps), np.median([each.seconds for each in done])
     return (

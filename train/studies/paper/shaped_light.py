@@ -9,9 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment.attacks.run import attack
-from augment.attacks.settings import AttackSettings
-from augment.kind import StepSettings
+from augment.attacks.attack import AttackSettings, attack
+from augment.attacks.parameters import StepSettings
 from augment.objects import SceneObject
 from augment.scene import Scene
 from renderer.camera import Camera
@@ -117,8 +116,8 @@ def results(records: Sequence[Mapping[str, Any]]) -> str:
             here = [each for each in records if each["transport"] == transport]
             here = [each for each in here if (each["kept"] > SELF_SHADED) == concave]
             both = [each for each in here if each["here"][0] == each["traced"][0] == each["label"]]
-            fooled = [each for each in both if each["here"][1] != each["label"]]
+            success = [each for each in both if each["here"][1] != each["label"]]
             found = percent([each["here"][1] != each["label"] for each in both])
-            traced = percent([each["traced"][1] != each["label"] for each in fooled])
+            traced = percent([each["traced"][1] != each["label"] for each in success])
             rows.append(["concave" if concave else "convex", transport, found, traced])
     return markdown(["meshes", "found with", "fools here", "and, of these, path-traced"], rows)

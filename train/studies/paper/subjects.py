@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from augment.attacks.run import logits_of
+from augment.attacks.attack import logits_of
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.scene import Example, Scene
-from augment.seeding import generator
+from augment.utils import generator
 from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import InputError
 from renderer.image import ImageSettings

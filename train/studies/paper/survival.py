@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from hydra.errors import HydraException
 
-from augment.attacks.run import NotRecognisedError
-from augment.attacks.verification import RENDERERS
+from augment.attacks.attack import NotCleanCorrectError
+from augment.attacks.evaluate import RENDERERS
 from augment.objects import ObjectSettings
 from renderer.errors import InputError
 from renderer.files.mitsuba_scene import SAMPLES
@@ -61,7 +61,7 @@ def measure(study: Study, settings: Settings) -> Section:
         "rounding": "8 bits" if told.attack.rounded else "floats",
         "samples": SAMPLES,
         "table": markdown(
-            ["attack", "fooled", *versions],
+            ["attack", "success", *versions],
             ([name, *shares(recognised, kinds, versions)] for name, kinds in rows.items()),
         ),
         "lost": lost(recognised, RENDERERS[-1]),
@@ -80,18 +80,18 @@ def outcomes(item: ObjectSettings, study: Study, settings: Settings) -> Iterator
             record = {"mesh": short_name(item), "attack": name, "example": example}
             try:
                 ((_, scene, done),) = attacks(told, study.classifier, torch.device("cpu"))
-            except NotRecognisedError:
+            except NotCleanCorrectError:
                 yield {**record, "recognised": False}
                 continue
             with TemporaryDirectory() as folder:
-                verdicts = done.save(Path(folder), verify=RENDERERS)
+                rerender_checks = done.save(Path(folder), verify=RENDERERS)
             yield {
                 **record,
                 "recognised": True,
                 "scene": overrides(scene, told.scene) or None,
                 "steps": int(done.steps[0]),
-                "fooled": bool(done.success[0]),
-                "versions": {each.version: each.of(0, done.classifier.classes) for each in verdicts},
+                "success": bool(done.success[0]),
+                "versions": {each.version: each.of(0, done.classifier.classes) for each in rerender_checks},
             }
 
 
@@ -110,14 +110,14 @@ def command(
 def shares(recognised: Sequence[dict[str, Any]], kinds: Sequence[str], versions: Sequence[str]) -> list[str]:
     """Of some attacks: those that fooled, and of these, those that still do in each version."""
     here = [record for record in recognised if record["attack"] in kinds]
-    fooled = [record for record in here if record["fooled"]]
-    kept = [percent([record["versions"][version]["fooled"] for record in fooled]) for version in versions]
-    return [percent([record["fooled"] for record in here]), *kept]
+    success = [record for record in here if record["success"]]
+    kept = [percent([record["versions"][version]["success"] for record in success]) for version in versions]
+    return [percent([record["success"] for record in here]), *kept]
 
 
 def lost(recognised: Sequence[dict[str, Any]], version: str) -> str:
     """The meshes of adversaries that fool no longer in a version, with their number."""
     found = Counter(
-        record["mesh"] for record in recognised if record["fooled"] and not record["versions"][version]["fooled"]
+        record["mesh"] for record in recognised if record["success"] and not record["versions"][version]["success"]
     )
     return ", ".join(f"{count} of {mesh}" for mesh, count in found.items()) or "none"

@@ -10,7 +10,7 @@ import torch
 
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
-from augment.seeding import generator
+from augment.utils import generator
 from train.report.tables import markdown
 from train.run_folder.classifier import load_classifier
 from train.studies.figures import panels_beside, save

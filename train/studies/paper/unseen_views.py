@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from augment.attacks.parameters import AttackProblem
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
-from augment.perturbation import Perturbation
 from augment.scene import Scene
-from augment.seeding import generator, stream_seed
+from augment.utils import generator, stream_seed
 from renderer.camera import Camera
 from train.report.tables import markdown
 from train.studies.figures import panels_beside, save
@@ -69,7 +69,7 @@ def measure(study: Study, settings: Settings) -> Section:
 class Together:
     """All examples of a problem, of one view each, as the views of a single one: one light or shape for all of them."""
 
-    problem: Perturbation
+    problem: AttackProblem
 
     @property
     def start(self) -> Tensor:
@@ -143,9 +143,9 @@ def results(records: Sequence[Mapping[str, Any]], label: str) -> str:
 
 def cell(sets: Sequence[Sequence[str]], label: str) -> str:
     """The share of all views fooled, and the lowest and highest of the sets."""
-    fooled = [[answer != label for answer in answers] for answers in sets]
-    shares = [100 * sum(some) / len(some) for some in fooled]
-    return f"{percent(list(chain(*fooled)))}; {min(shares):.0f} to {max(shares):.0f} %"
+    success = [[answer != label for answer in answers] for answers in sets]
+    shares = [100 * sum(some) / len(some) for some in success]
+    return f"{percent(list(chain(*success)))}; {min(shares):.0f} to {max(shares):.0f} %"
 
 
 def by_angle(

@@ -170,7 +170,7 @@ REFUSED: dict[str, dict[str, Edit]] = {
     "photos.csv": {
         "no header": content("a,b\n"),
         "no such photograph": content("path,source_tag\nnowhere.png,web\n"),
-        "no such look-alikes": content("path,source_tag,look_alikes\norange/0.png,web,nowhere\n"),
+        "no such hard negatives": content("path,source_tag,hard_negatives\norange/0.png,web,nowhere\n"),
         "Latin-1": content(b"path,source_tag\norange/0.png,\xe4\n"),
     },
 }

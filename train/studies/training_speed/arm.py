@@ -5,7 +5,7 @@ from typing import cast
 
 import torch
 
-from augment.phases import Phases
+from augment.utils import Phases
 from train.data import DataSet, Split
 from train.experiment import build_trainer
 from train.run_folder.logs import RunLog

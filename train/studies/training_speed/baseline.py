@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 from torchvision import transforms
 
-from augment.phases import Phases
+from augment.utils import Phases
 from train.data import Split
 from train.fit.epoch import PADDING
 from train.fit.recipe import TrainSettings

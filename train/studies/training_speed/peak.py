@@ -4,8 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from augment.model_state import eval_mode
-from augment.phases import Phases
+from augment.utils import Phases, eval_mode
 
 SIZES = {"cpu": (512, 1024, 2048, 3072), "cuda": (2048, 4096, 8192, 16384)}
 PRECISIONS = {"bfloat16": torch.bfloat16, "float32": torch.float32}

@@ -13,7 +13,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from augment.objects import CompanionSettings, ObjectSettings, SceneObject, load_object, on_ground
+from augment.objects import ObjectSettings, PropSettings, SceneObject, load_object, on_ground
 from renderer.camera import OrthographicCamera
 from renderer.environment import write_map
 from renderer.files.mitsuba_scene import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mitsuba_map, write_mitsuba_scene
@@ -40,7 +40,7 @@ def meshes() -> dict[str, Mesh]:
     plate = Mesh.plain([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
     box = trimesh.creation.box((0.8, 0.8, 0.02))
     ring, cup = trimesh.creation.torus(0.45, 0.45), normalise(solid("cup", 0))
-    apples = [CompanionSettings("solid:apple", place, 0.5) for place in ([0.2, 0.7], [0.4, -0.8])]
+    apples = [PropSettings("solid:apple", place, 0.5) for place in ([0.2, 0.7], [0.4, -0.8])]
     return {
         "convex: a ball": ball,
         "concave: solid:cup": cup,
@@ -54,7 +54,7 @@ def meshes() -> dict[str, Mesh]:
         ),
         "scene.ground: solid:cup on a table": on_ground(SceneObject("", cup), (0.9, 0.3, 0.2)).mesh,
         "scene.meshes: solid:pear beside two apples, on a table": on_ground(
-            load_object(ObjectSettings("solid:pear", "pear", beside=apples)), (0.3, 0.3, 0.9)
+            load_object(ObjectSettings("solid:pear", "pear", props=apples)), (0.3, 0.3, 0.9)
         ).mesh,
     }
 

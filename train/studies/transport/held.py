@@ -7,14 +7,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from augment import held_transport
-from augment.attacks.run import attack
-from augment.attacks.settings import AttackSettings
+from augment import reshading
+from augment.attacks.attack import AttackSettings, attack
+from augment.attacks.criteria import Goal, adversarial_cost
+from augment.attacks.parameters import AttackProblem, StepSettings
 from augment.classifiers import Classifier
-from augment.goal import Goal, adversarial_cost
-from augment.kind import StepSettings
 from augment.objects import SceneObject
-from augment.perturbation import Perturbation
 from renderer.mesh import Mesh
 from train.report.tables import markdown
 from train.studies.paper.subjects import recognised_scene
@@ -26,36 +24,36 @@ STEPS, EXAMPLES = 20, 16
 
 def table(mesh: Mesh, classifier: Classifier) -> str:
     """By how many steps shadows are held for; the mesh is a cup."""
-    chosen, rows = held_transport.NEAR, []
+    chosen, rows = reshading.NEAR, []
     cup = SceneObject("cup", mesh, name="solid:cup")
     drawn = recognised_scene(cup, classifier, "grace", EXAMPLES, 0)
     settings = AttackSettings(geometry=STEP, max_steps=STEPS, margin=2.0)
     try:
         for every in EVERY:
-            held_transport.NEAR = (every - 0.5) * STEP.step_size
+            reshading.NEAR = (every - 0.5) * STEP.step_size
             image = replace(drawn.settings, transport="shadows")
             scene = replace(drawn, settings=image)
             start = time.process_time()
             attacked = attack(classifier, scene, settings=settings, force=True)
             taken = (time.process_time() - start) / int(attacked.steps.sum() + EXAMPLES)
-            images, slope = images_and_gradient(attacked.problem, classifier, attacked.goal, attacked.result.values)
-            held_transport.NEAR = -1.0  # no shape is near
-            exact, true = images_and_gradient(attacked.problem, classifier, attacked.goal, attacked.result.values)
-            fooled, still = (each & attacked.recognised for each in (attacked.result.fooled, attacked.success))
+            images, slope = images_and_gradient(attacked.problem, classifier, attacked.goal, attacked.descent.values)
+            reshading.NEAR = -1.0  # no shape is near
+            exact, true = images_and_gradient(attacked.problem, classifier, attacked.goal, attacked.descent.values)
+            success, still = (each & attacked.clean_correct for each in (attacked.descent.success, attacked.success))
             rows.append(
                 [
                     held_for(every),
                     f"{1e3 * taken:.0f}",
                     f"{(images - exact).square().mean().sqrt() / exact.max():.2%}",
                     f"{((slope - true).norm(dim=1) / true.norm(dim=1)).mean():.1%}",
-                    f"{int(fooled.sum())} of {int(attacked.recognised.sum())}",
-                    f"{int((fooled & still).sum())}",
+                    f"{int(success.sum())} of {int(attacked.clean_correct.sum())}",
+                    f"{int((success & still).sum())}",
                 ]
             )
     finally:
-        held_transport.NEAR = chosen
+        reshading.NEAR = chosen
     return markdown(
-        ["held for", "ms per step", "image's error", "gradient's error", "fooled", "with shadows anew"], rows
+        ["held for", "ms per step", "image's error", "gradient's error", "success", "with shadows anew"], rows
     )
 
 
@@ -66,10 +64,10 @@ def held_for(every: float) -> str:
 
 
 def images_and_gradient(
-    problem: Perturbation, classifier: Classifier, goal: Goal, values: Tensor
+    problem: AttackProblem, classifier: Classifier, goal: Goal, values: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Of all examples of one view, and of the cost by the values (E, D)."""
     values = values.detach().requires_grad_()
     images = problem.render(values, problem.everything)
-    cost = adversarial_cost(classifier(images[:, 0]), goal.decrease[:, 0]).sum()
+    cost = adversarial_cost(classifier(images[:, 0]), goal.source[:, 0]).sum()
     return images.detach(), torch.autograd.grad(cost, values)[0]

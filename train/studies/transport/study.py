@@ -2,7 +2,7 @@
 
 import torch
 
-from augment.held_transport import NEAR
+from augment.reshading import NEAR
 from renderer.files.mitsuba_scene import DIFFERENTIABLE, mitsuba
 from renderer.mesh import normalise
 from renderer.shapes import solid
@@ -53,6 +53,6 @@ def run(settings: CupSettings) -> None:
         fine=beside_mitsuba.CONVERGED,
         samples=beside_mitsuba.SAMPLES,
         patches=PATCHES,
-        beside=beside_mitsuba.table(),
+        props=beside_mitsuba.table(),
     )
     write(out, joined([wrapped(text)]))

@@ -14,7 +14,7 @@ from torch import nn
 from augment.attacks import files
 from augment.classifiers import Classifier
 from augment.objects import SceneObject
-from augment.seeding import generator
+from augment.utils import generator
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.mesh import Mesh
@@ -151,11 +151,11 @@ def test_the_stopwatch_counts_only_the_classifier():
 
 
 def test_failures_count_as_attacks_without_end():
-    fooled, failed = Attack("ball", True, 3, 0.2), Attack("ball", False, 30, 2.0)
-    assert "67% [" in run_time.finding([fooled, fooled, failed]) and ": met" in run_time.finding(
-        [fooled, fooled, failed]
+    success, failed = Attack("ball", True, 3, 0.2), Attack("ball", False, 30, 2.0)
+    assert "67% [" in run_time.finding([success, success, failed]) and ": met" in run_time.finding(
+        [success, success, failed]
     )
-    assert "not met" in run_time.finding([fooled, failed, failed])
+    assert "not met" in run_time.finding([success, failed, failed])
 
 
 def test_the_distribution_is_over_attacks_that_succeed():
@@ -170,7 +170,7 @@ def test_each_image_is_attacked_until_it_is_fooled(subject):
     done = list(run_time.attacks(subject, Study(bright(0.35), [], "grace", "orange", seed=0), settings))
     assert len(done) == settings.examples
     assert all(each.seconds > 0 for each in done)
-    assert all(each.fooled or each.steps == settings.max_steps for each in done)
+    assert all(each.success or each.steps == settings.max_steps for each in done)
 
 
 # ---------------------------------------------------------------------------------------- gallery

@@ -56,10 +56,10 @@ def test_the_table_counts_what_still_fools_of_what_fooled(tmp_path, reproduce, m
     assert all(set(record["versions"]) == {"float", "8 bits", "JPEG 90", "reload", "mitsuba"} for record in records)
     for name in ("light", "albedo"):
         here = [record for record in records if record["attack"] == name]
-        fooled = [record for record in here if record["fooled"]]
+        success = [record for record in here if record["success"]]
         (row,) = [line for line in page.splitlines() if line.startswith(f"| {name} |")]
         counts = [cell.rpartition("of ")[2] for cell in row.strip(" |").split(" | ")[1:]]
-        assert counts == [str(len(here))] + [str(len(fooled))] * 5
+        assert counts == [str(len(here))] + [str(len(success))] * 5
     same = sum(record["versions"]["reload"]["largest_difference"] <= 1 / 255 for record in records)
     assert f"same image within 1/255: {same} of {len(records)}" in " ".join(page.split())
     assert same == len(records)

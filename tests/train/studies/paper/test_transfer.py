@@ -7,12 +7,11 @@ import pytest
 import torch
 import trimesh
 
+from augment.attacks.descent import DescentSettings
+from augment.attacks.parameters import Lighting, StepSettings
 from augment.classifiers import Classifier
-from augment.descent import DescentSettings
-from augment.kind import StepSettings
 from augment.objects import SceneObject
-from augment.parameters import Lighting
-from augment.seeding import generator
+from augment.utils import generator
 from renderer.camera import OrthographicCamera, ring
 from renderer.errors import InputError
 from renderer.files.mesh_export import export_mesh

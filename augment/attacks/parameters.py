@@ -1,24 +1,103 @@
-"""What an attack may change: light, sky, a projector's pattern, lamps, shape, colours, pixels; any of them at once."""
+"""What an attack may change: light, sky, a projector's pattern, lamps, shape, colors, pixels; any at once."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from augment.kind import Kind, StepSettings
+from augment.attacks.norm_ball import NormBall, anywhere
 from augment.scene import Conditions, Scene
+from renderer.arguments import require_fields
 from renderer.basis import Distant, Placed, parts_of
 from renderer.convex import Ball, nearest_in_box
-from renderer.errors import InputError
+from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
 from renderer.lamps import Lamps
 from renderer.lights import mean_luminance
 from renderer.projector import Projector
 from renderer.skylight import TURBIDITY, ZENITH, coefficients
+
+STEPS = ("unit", "raw", "sign")
+
+
+@dataclass
+class StepSettings(NormBall):
+    """A norm-ball, and how far values go in it at once.
+
+    step: the gradient at unit L2 norm, as it is, or its sign. step_size: times that.
+    """
+
+    step: str = "unit"
+    step_size: float = 0.05
+
+    def __post_init__(self) -> None:
+        require_fields(self)
+        super().__post_init__()
+        require_choice("attack: step", self.step, STEPS)
+        require_range("attack: step_size", self.step_size, 1 / LARGEST, FACTOR)
+
+
+def direction(gradient: Tensor, step: str) -> Tensor:
+    """The gradient (A, D) as a step: unit L2 norm per example (a zero gradient stays zero), raw, or its sign."""
+    if step == "raw":
+        return gradient
+    if step == "sign":
+        return gradient.sign()
+    # Scaling by the largest entry first keeps tiny gradients from underflowing when squared.
+    tiny = torch.finfo(gradient.dtype).tiny
+    return F.normalize(gradient / gradient.abs().amax(1, keepdim=True).clamp(min=tiny), eps=tiny)
+
+
+class Parameter(ABC):
+    """One kind of parameter of a scene's E examples. `start` (E, D) is where attacks begin and its balls' centre.
+
+    used: (E, D) bool, where examples differ in how many values they use: the others stay as they are. None: all.
+    """
+
+    name: str
+
+    def __init__(self, scene: Scene, start: Tensor, settings: StepSettings, used: Tensor | None = None):
+        self.scene, self.start, self.settings, self.used = scene, start, settings, used
+
+    @abstractmethod
+    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        """The conditions of examples (A,) with this part of them set to values (A, D)."""
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        """The nearest values (A, D) of the examples (A,) within the norm-ball and what is physically possible."""
+        return self.settings.project(values, self.start[examples], self.within_domain)
+
+    def sample(self, generator: torch.Generator, examples: Tensor) -> Tensor:
+        """Uniform draws (A, D) from the balls of the examples (A,), within the domain."""
+        used = None if self.used is None else self.used[examples]
+        return self.project(self.settings.sample(self.start[examples], generator, used), examples)
+
+    def sample_as_far(self, values: Tensor, generator: torch.Generator, examples: Tensor) -> Tensor:
+        """`sample` where there is a radius; else a random direction at the L2 distance of values (A, D) from the
+        start, within the domain."""
+        if self.settings.radius is not None:
+            return self.sample(generator, examples)
+        start = self.start[examples].to(values)
+        offset = torch.randn(values.shape, generator=generator).to(values)
+        if self.used is not None:
+            offset = offset * self.used[examples]
+        reach = (values - start).norm(dim=1, keepdim=True)
+        return self.within_domain(start + offset * reach / offset.norm(dim=1, keepdim=True))
+
+    def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+        """See `augment.attacks.norm_ball.Domain`; by default there is no bound."""
+        return anywhere(values, within)
+
+    def step(self, gradient: Tensor) -> Tensor:
+        """How far to go down a gradient (A, D)."""
+        return self.settings.step_size * direction(gradient, self.settings.step)
+
 
 TURBIDITY_UNIT = 4.0  # its domain spans 2 of them, as the zenith's and the azimuth's span about 1.6 and 6
 
@@ -32,7 +111,7 @@ class SkylightSettings(StepSettings):
     turbidity: float = 3.0
 
 
-class OfMesh(Kind):
+class OfMesh(Parameter):
     """Three values for each of the items, vertices or faces, that a mesh has; the first of them in a smaller mesh, and
     used where they are the object's own."""
 
@@ -49,7 +128,7 @@ class OfMesh(Kind):
         return used.unflatten(1, (-1, 3))
 
 
-class OfLight(Kind):
+class OfLight(Parameter):
     """Every coefficient of one of the bases that a scene's light is of. The start is the examples' own; or, where light
     is to be physical, what is nearest to it that something can emit, and so is every light from there on."""
 
@@ -113,7 +192,7 @@ class LampPowers(OfPlace):
     name = Lamps.name
 
 
-class LampPlaces(Kind):
+class LampPlaces(Parameter):
     """Where each lamp is, three coordinates in world units. Shadows are cast anew in each image, and are held in its
     derivative. InputError where the scene has no lamps."""
 
@@ -128,7 +207,7 @@ class LampPlaces(Kind):
         return replace(conditions, places=values.unflatten(1, (-1, 3)))
 
 
-class Skylight(Kind):
+class Skylight(Parameter):
     """Three values: zenith, azimuth, turbidity / 4. The sky is scaled to the mean luminance of the example's own light
     where the attack starts, and by the same factor elsewhere. Lights in the scene stay as they are."""
 
@@ -180,7 +259,7 @@ class Albedo(OfMesh):
         return replace(conditions, albedo=self.by_item(values, examples))
 
 
-class Pixels(Kind):
+class Pixels(Parameter):
     """What is added to each image's values, background included; the sum is clamped to [0, 1].
 
     One step of the radius along the sign is FGSM (Goodfellow et al. 2014); several smaller ones are the iterated
@@ -198,6 +277,60 @@ class Pixels(Kind):
         return replace(conditions, pixels=values.unflatten(1, (self.scene.views, 3, size, size)))
 
 
-KINDS: dict[str, Callable[..., Kind]] = {
-    kind.name: kind for kind in (Lighting, Skylight, ProjectorPattern, LampPowers, LampPlaces, Geometry, Albedo, Pixels)
+PARAMETERS: dict[str, Callable[..., Parameter]] = {
+    parameter.name: parameter
+    for parameter in (Lighting, Skylight, ProjectorPattern, LampPowers, LampPlaces, Geometry, Albedo, Pixels)
 }
+
+
+class AttackProblem:
+    """Kinds side by side: values (E, D) are theirs, one after the other. See `augment.attacks.descent.Problem`."""
+
+    def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
+        self.scene, self.parameters = scene, parameters
+        self.start = torch.cat([parameter.start.to(scene.lights) for parameter in parameters], dim=1)
+        self.everything = torch.arange(len(scene), device=self.start.device)
+        self._sizes = [parameter.start.shape[1] for parameter in parameters]
+
+    def conditions(self, values: Tensor, examples: Tensor) -> Conditions:
+        """What values (A, D) make of the scene of examples (A,)."""
+        conditions = self.scene.conditions(examples)
+        for parameter, part in zip(self.parameters, self.split(values), strict=True):
+            conditions = parameter.apply(part, conditions, examples)
+        return conditions
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        return self.scene.render(self.conditions(values, examples), examples)
+
+    @torch.no_grad()
+    def images(self, values: Tensor) -> Tensor:
+        """(E, V, 3, size, size) of values (E, D), rendered by parts, so that little memory beside theirs is used."""
+        size = self.scene.settings.size
+        images = values.new_empty(len(values), self.scene.views, 3, size, size)
+        for part in self.everything.split(self.scene.at_once):
+            images[part] = self.render(values[part], part)
+        return images
+
+    def step(self, gradient: Tensor) -> Tensor:
+        parts = zip(self.parameters, self.split(gradient), strict=True)
+        return torch.cat([parameter.step(part) for parameter, part in parts], dim=1)
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        parts = zip(self.parameters, self.split(values), strict=True)
+        return torch.cat([parameter.project(part, examples) for parameter, part in parts], dim=1)
+
+    def sample(self, generator: torch.Generator) -> Tensor:
+        """Uniform draws (E, D) from every kind's ball around its start, within its domain."""
+        drawn = [parameter.sample(generator, self.everything).to(self.start) for parameter in self.parameters]
+        return torch.cat(drawn, dim=1)
+
+    def sample_as_far(self, values: Tensor, generator: torch.Generator) -> Tensor:
+        """Draws (E, D) as far as values went: uniform in a kind's ball where it has a radius, else in a random
+        direction at the values' own L2 distance from the start."""
+        parts = zip(self.parameters, self.split(values), strict=True)
+        drawn = [parameter.sample_as_far(part, generator, self.everything).to(self.start) for parameter, part in parts]
+        return torch.cat(drawn, dim=1)
+
+    def split(self, values: Tensor) -> tuple[Tensor, ...]:
+        """Each kind's part (A, D_k) of values (A, D)."""
+        return values.split(self._sizes, dim=1)

@@ -1,4 +1,4 @@
-"""A regeneration's specimens as a file of at most half a megabyte beside the epoch's grid of renders."""
+"""A regeneration's attack examples as a file of at most half a megabyte beside the epoch's grid of renders."""
 
 import json
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from augment.specimens import MOST, Specimens
+from augment.service import MOST, AttackExamples
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
 from renderer.light_sphere import light_sphere
@@ -26,7 +26,8 @@ SPHERE = 64  # pixels
 
 @dataclass(frozen=True)
 class Side:
-    """A specimen, before or after: its image and a white ball in its light, (3, H, W) uint8, and the model's answer."""
+    """An attack example, before or after: its image and a white ball in its light, (3, H, W) uint8, and the model's
+    answer."""
 
     image: Tensor
     sphere: Tensor
@@ -34,15 +35,18 @@ class Side:
     confidence: float
 
 
-def write_specimens(path: Path, specimens: Specimens, classes: Sequence[str]) -> None:
+def write_attack_examples(path: Path, attack_examples: AttackExamples, classes: Sequence[str]) -> None:
     """Images as bytes, in the safetensors format; labels and answers in its metadata."""
-    tensors, answers = {}, {"label": [classes[index] if index >= 0 else OTHER for index in specimens.labels.tolist()]}
+    tensors, answers = (
+        {},
+        {"label": [classes[index] if index >= 0 else OTHER for index in attack_examples.labels.tolist()]},
+    )
     for name, images, lights, probabilities in [
-        ("before", specimens.images_before, specimens.lights_before, specimens.answers_before),
-        ("after", specimens.images, specimens.lights, specimens.answers),
+        ("before", attack_examples.images_before, attack_examples.lights_before, attack_examples.predictions_before),
+        ("after", attack_examples.images, attack_examples.lights, attack_examples.predictions),
     ]:
         tensors[f"images_{name}"] = to_bytes(_reduced(images.detach().cpu())).contiguous()
-        spheres = [to_bytes(light_sphere(light, SPHERE, basis=specimens.basis)) for light in lights]
+        spheres = [to_bytes(light_sphere(light, SPHERE, basis=attack_examples.basis)) for light in lights]
         tensors[f"spheres_{name}"] = torch.stack(spheres)
         best = probabilities.max(1)
         answers[name] = [classes[index] for index in best.indices.tolist()]
@@ -50,8 +54,8 @@ def write_specimens(path: Path, specimens: Specimens, classes: Sequence[str]) ->
     path.write_bytes(save(tensors, {"answers": json.dumps(answers)}))  # an error of which names the file
 
 
-def read_specimens(path: Path) -> list[tuple[str, Side, Side]]:
-    """The label, before and after of each; InputError naming a file that is none of `write_specimens`."""
+def read_attack_examples(path: Path) -> list[tuple[str, Side, Side]]:
+    """The label, before and after of each; InputError naming a file that is none of `write_attack_examples`."""
     try:
         if not path.is_file():
             raise ValueError("there is no such file")

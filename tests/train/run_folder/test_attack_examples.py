@@ -3,30 +3,30 @@ import json
 import pytest
 import torch
 
-from augment.specimens import MOST, Specimens
+from augment.service import MOST, AttackExamples
 from renderer.basis import HARMONICS, Sum
 from renderer.errors import InputError
 from renderer.image import to_bytes
 from renderer.light_sphere import light_sphere
 from renderer.projector import Projector
-from train.run_folder.specimens import LARGEST_SIDE, SPHERE, read_specimens, write_specimens
+from train.run_folder.attack_examples import LARGEST_SIDE, SPHERE, read_attack_examples, write_attack_examples
 
 CLASSES = ["apple", "orange"]
 BASIS = Sum((HARMONICS, Projector(pixels=2)))
 
 
-def specimens(side: int, count: int = 2) -> Specimens:
+def attack_examples(side: int, count: int = 2) -> AttackExamples:
     draws = torch.Generator().manual_seed(0)
     images, lights = (torch.rand(2, count, 3, *rest, generator=draws) for rest in ((side, side), (1,)))
     lights = lights.expand(2, count, 3, BASIS.size).transpose(2, 3)
     answers = torch.tensor([[0.25, 0.75], [0.875, 0.125]])[:, None].expand(2, count, 2)
-    return Specimens(*images, *lights, *answers, torch.ones(count, dtype=torch.int64), BASIS)
+    return AttackExamples(*images, *lights, *answers, torch.ones(count, dtype=torch.int64), BASIS)
 
 
 def test_specimens_are_read_as_they_were_written(tmp_path):
-    written = specimens(8)
-    write_specimens(tmp_path / "a", written, CLASSES)
-    read = read_specimens(tmp_path / "a")
+    written = attack_examples(8)
+    write_attack_examples(tmp_path / "a", written, CLASSES)
+    read = read_attack_examples(tmp_path / "a")
     assert len(read) == 2
     for row, (label, before, after) in enumerate(read):
         assert label == "orange"
@@ -40,15 +40,15 @@ def test_specimens_are_read_as_they_were_written(tmp_path):
 
 
 def test_a_file_stays_small_whatever_the_images_size(tmp_path):
-    write_specimens(tmp_path / "a", specimens(2 * LARGEST_SIDE, MOST), CLASSES)
+    write_attack_examples(tmp_path / "a", attack_examples(2 * LARGEST_SIDE, MOST), CLASSES)
     assert (tmp_path / "a").stat().st_size < 2**19
-    _, before, _ = read_specimens(tmp_path / "a")[0]
+    _, before, _ = read_attack_examples(tmp_path / "a")[0]
     assert before.image.shape == (3, LARGEST_SIDE, LARGEST_SIDE)
 
 
 @pytest.mark.parametrize("name, value", [("label", ["orange"]), ("confidence_after", [1.0, None]), ("before", 3)])
 def test_a_file_whose_parts_do_not_fit_is_refused_by_name(tmp_path, name, value):
-    write_specimens(tmp_path / "a", specimens(8), CLASSES)
+    write_attack_examples(tmp_path / "a", attack_examples(8), CLASSES)
     whole = (tmp_path / "a").read_bytes()
     start = whole.index(b'"answers":"') + len(b'"answers":"')
     end = whole.index(b'}"', start) + 1
@@ -58,4 +58,4 @@ def test_a_file_whose_parts_do_not_fit_is_refused_by_name(tmp_path, name, value)
     header = int.from_bytes(whole[:8], "little") + len(told) - (end - start)
     (tmp_path / "a").write_bytes(header.to_bytes(8, "little") + whole[8:start] + told + whole[end:])
     with pytest.raises(InputError, match=str(tmp_path / "a")):
-        read_specimens(tmp_path / "a")
+        read_attack_examples(tmp_path / "a")

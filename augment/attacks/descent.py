@@ -9,12 +9,9 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor, nn
 
-from augment import processes
-from augment.goal import Goal, adversarial_cost, logit_gap
-from augment.memory import BatchSize
-from augment.model_state import as_found
-from augment.phases import Phases
-from augment.progress import progress
+from augment import utils
+from augment.attacks.criteria import Goal, adversarial_cost, logit_gap
+from augment.utils import BatchSize, Phases, as_found, progress
 from renderer.errors import FACTOR, require_range
 
 if TYPE_CHECKING:
@@ -60,7 +57,7 @@ class Problem(Protocol):
 
 
 @dataclass(frozen=True)
-class AttackResult:
+class DescentResult:
     """What an attack did, per example; all tensors lie on the values' device.
 
     values, images: where the descent ended, or of those that fool the one of the lowest cost. steps: taken. fooled_at:
@@ -72,18 +69,18 @@ class AttackResult:
     values: Float[Tensor, "E D"]
     images: Float[Tensor, "E V 3 H W"]
     steps: Int[Tensor, " E"]
-    fooled_before: Bool[Tensor, " E"]
-    fooled: Bool[Tensor, " E"]
-    fooled_at: Int[Tensor, " E"]
+    success_before: Bool[Tensor, " E"]
+    success: Bool[Tensor, " E"]
+    success_at: Int[Tensor, " E"]
     cost_before: Float[Tensor, " E"]
     cost: Float[Tensor, " E"]
     predicted: Int[Tensor, "E V"]
     zero_gradient: Bool[Tensor, " E"]
 
-    def merged(self, examples: Tensor, total: int) -> AttackResult:
+    def merged(self, examples: Tensor, total: int) -> DescentResult:
         """The result of all `total` examples, where this one is of the process's own (A,); see `processes.merged`."""
-        rows = {item.name: processes.merged(getattr(self, item.name), examples, total) for item in fields(self)}
-        return AttackResult(**rows)
+        rows = {item.name: utils.merged(getattr(self, item.name), examples, total) for item in fields(self)}
+        return DescentResult(**rows)
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,7 @@ def descend_in_parts(
     phases: Phases,
     starts: Iterable[Tensor],
     at_once: int,
-) -> AttackResult:
+) -> DescentResult:
     """`descend_repeatedly`, of so many examples at a time, so that memory holds no more than these and the result."""
     parts = torch.arange(len(problem.start), device=problem.start.device).split(at_once)
     if len(parts) <= 1:
@@ -136,32 +133,32 @@ def descend_in_parts(
         for item in fields(result):
             found = getattr(result, item.name)
             whole.setdefault(item.name, found.new_empty(len(problem.start), *found.shape[1:]))[rows] = found
-    return AttackResult(**whole)
+    return DescentResult(**whole)
 
 
 def descend_repeatedly(
     model: nn.Module, problem: Problem, goal: Goal, settings: DescentSettings, phases: Phases, starts: Iterable[Tensor]
-) -> AttackResult:
+) -> DescentResult:
     """`descend`, and again from other starts (E, D) for the examples that no descent has fooled yet.
 
     What a later descent reaches counts where it fools; steps add up.
     """
     best = descend(model, problem, goal, settings, phases)
     for start in starts:
-        left = torch.nonzero(~best.fooled).squeeze(1)
+        left = torch.nonzero(~best.success).squeeze(1)
         if not len(left):
             break
         again = descend(model, Part(problem, left, start[left]), goal.of(left), settings, phases)
-        better = left[again.fooled]
-        best.fooled_at[better] = (best.steps[left] + again.fooled_at)[again.fooled]
+        better = left[again.success]
+        best.success_at[better] = (best.steps[left] + again.success_at)[again.success]
         best.steps[left] += again.steps
-        for name in ("values", "images", "fooled", "cost", "predicted"):
-            getattr(best, name)[better] = getattr(again, name)[again.fooled]
+        for name in ("values", "images", "success", "cost", "predicted"):
+            getattr(best, name)[better] = getattr(again, name)[again.success]
     return best
 
 
 @torch.enable_grad()
-def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSettings, phases: Phases) -> AttackResult:
+def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSettings, phases: Phases) -> DescentResult:
     """Step each example's values down the cost, summed over its views, until the goal is reached.
 
     model: (N, 3, H, W) in [0, 1] → logits; used in eval mode and left as it was found. The forward pass that yields the
@@ -169,10 +166,10 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
     """
     values = problem.start.detach().clone()
     active = torch.arange(len(values), device=values.device)
-    steps, fooled_at, fooled = torch.zeros_like(active), torch.zeros_like(active), torch.zeros_like(active).bool()
+    steps, success_at, success = torch.zeros_like(active), torch.zeros_like(active), torch.zeros_like(active).bool()
     cost, length = values.new_full((len(values),), torch.inf), values.new_ones(len(values), 1)
     candidate, place, slope = values.clone(), values.clone(), torch.zeros_like(values)
-    predicted, batch_size = torch.zeros_like(goal.decrease), BatchSize(settings.batch_size)
+    predicted, batch_size = torch.zeros_like(goal.source), BatchSize(settings.batch_size)
     with as_found(model):
         for step in range(settings.max_steps + 1):
             chosen = candidate[active].requires_grad_(True)
@@ -183,17 +180,17 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
             (gradient,) = torch.autograd.grad(rendered, chosen, seen.gradient)
             reached = aim.reached(seen.predicted)
             if step == 0:
-                images, cost_before, fooled_before = rendered.detach().clone(), seen.cost, reached
+                images, cost_before, success_before = rendered.detach().clone(), seen.cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
             done = reached & (seen.gap >= settings.margin)
-            fooled_at[active[reached & ~fooled[active]]] = step
+            success_at[active[reached & ~success[active]]] = step
             fell = seen.cost < cost[active]
             taken = done | fell if settings.shorten else torch.ones_like(done)
-            best = done | torch.where(fooled[active], reached & fell, reached | taken)
+            best = done | torch.where(success[active], reached & fell, reached | taken)
             rows = torch.nonzero(best).squeeze(1)
             kept = active[rows]
             values[kept], images[kept] = candidate[kept], rendered.detach()[rows]
-            cost[kept], predicted[kept], fooled[kept] = seen.cost[rows], seen.predicted[rows], reached[rows]
+            cost[kept], predicted[kept], success[kept] = seen.cost[rows], seen.predicted[rows], reached[rows]
             place[active[taken]], slope[active[taken]] = candidate[active[taken]], gradient[taken]
             length[active[~taken]] /= 2
             active = active[~done]
@@ -202,26 +199,26 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
             moved = place[active] - length[active] * problem.step(slope[active])
             candidate[active] = problem.project(moved, active)
             steps[active] += 1
-    return AttackResult(
-        values, images, steps, fooled_before, fooled, fooled_at, cost_before, cost, predicted, zero_gradient
+    return DescentResult(
+        values, images, steps, success_before, success, success_at, cost_before, cost, predicted, zero_gradient
     )
 
 
 def _classifier_pass(model: nn.Module, images: Tensor, goal: Goal, batch_size: BatchSize) -> _Pass:
     views, flat = images.shape[1], images.flatten(0, 1)
-    decrease, increase = goal.decrease.flatten(), None if goal.increase is None else goal.increase.flatten()
+    source, target = goal.source.flatten(), None if goal.target is None else goal.target.flatten()
     gradient = torch.empty_like(flat)
 
-    def judge(part: slice) -> tuple[Tensor, Tensor, Tensor]:
+    def preprocessed_model(part: slice) -> tuple[Tensor, Tensor, Tensor]:
         batch = flat[part].detach().requires_grad_(True)
         logits = model(batch)
-        aim = decrease[part], None if increase is None else increase[part]
+        aim = source[part], None if target is None else target[part]
         cost = adversarial_cost(logits, *aim)
         (by_image,) = torch.autograd.grad(cost.sum(), batch)
         gradient[part] = by_image  # laid out as the images are, not as the network's channels
         return cost.detach(), logits.detach().argmax(1), logit_gap(logits.detach(), *aim)
 
-    costs, predicted, gaps = zip(*batch_size.map(judge, len(flat)), strict=True)
+    costs, predicted, gaps = zip(*batch_size.map(preprocessed_model, len(flat)), strict=True)
     return _Pass(
         torch.cat(costs).unflatten(0, (-1, views)).sum(1),
         torch.cat(predicted).unflatten(0, (-1, views)),

@@ -15,7 +15,7 @@ from renderer.image import clamp, to_bytes, to_unit
 
 
 @dataclass
-class TransformationSettings:
+class EOTSettings:
     """Random changes of an image over which an attack takes the expectation (Athalye et al. 2018, EOT).
 
     draws: of each image at each step, beside the image as it is; none by default. jitter: of the camera, up to this
@@ -30,10 +30,10 @@ class TransformationSettings:
     jpeg: int = 75
 
     def __post_init__(self) -> None:
-        require_range("attack.expectation.draws", self.draws, 0, 1000)
+        require_range("attack.eot.draws", self.draws, 0, 1000)
         for name, most in (("jitter", 0.5), ("exposure", 5), ("noise", 1)):
-            require_range(f"attack.expectation.{name}", getattr(self, name), 0, most)
-        require_range("attack.expectation.jpeg", self.jpeg, 1, 100)
+            require_range(f"attack.eot.{name}", getattr(self, name), 0, most)
+        require_range("attack.eot.jpeg", self.jpeg, 1, 100)
 
 
 class Rounded(nn.Module):
@@ -47,11 +47,11 @@ class Rounded(nn.Module):
         return self.model(straight_through(images, lambda each: to_unit(to_bytes(each)).to(each)))
 
 
-class Expected(nn.Module):
+class ExpectationOverTransformations(nn.Module):
     """A model's mean log-probabilities over images and random changes of them, drawn anew each time; the derivative
     passes straight through their compression."""
 
-    def __init__(self, model: nn.Module, settings: TransformationSettings, draws: torch.Generator):
+    def __init__(self, model: nn.Module, settings: EOTSettings, draws: torch.Generator):
         super().__init__()
         self.model, self.settings, self._draws = model, settings, draws
 

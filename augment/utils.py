@@ -1,0 +1,200 @@
+"""Random draws by name, memory, progress, seconds by phase, a model's state, processes that train together."""
+
+import logging
+import math
+import sys
+import time
+import zlib
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from renderer.errors import InputError, is_out_of_memory, require_range
+
+
+def stream_seed(*key: int | str) -> int:
+    """A 63-bit seed from a key such as (run seed, epoch, "order"); different keys give independent streams."""
+    for part in key:
+        require_range("seed", None if isinstance(part, str) else part, 0, math.inf)
+    words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
+    return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> 1)
+
+
+def generator(*key: int | str) -> torch.Generator:
+    """A CPU generator for the stream of this key."""
+    return torch.Generator().manual_seed(stream_seed(*key))
+
+
+MEMORY, GROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")  # Linux's, and a container's share of it (cgroup v2)
+Result = TypeVar("Result")
+
+
+@dataclass
+class BatchSize:
+    """Images per pass through a classifier; halved, for good, each time that memory runs out."""
+
+    images: int
+
+    def map(self, compute: Callable[[slice], Result], total: int) -> Iterator[Result]:
+        """What comes of consecutive parts that are `total` long together. A part may be computed anew, in halves.
+
+        Whatever `compute` raises, also where memory runs out on a single image.
+        """
+        begin = 0
+        while begin < total:
+            part = slice(begin, begin + self.images)
+            try:
+                result = compute(part)
+            except (RuntimeError, MemoryError) as error:
+                if self.images == 1 or not is_out_of_memory(error):
+                    raise
+                self.images //= 2
+                _say(self.images)
+            else:
+                yield result
+                begin = part.stop
+                continue
+            if torch.cuda.is_available():
+                torch.cuda.empty_cache()  # here, where the error no longer holds what was computed
+
+
+@cache  # once, not in each epoch
+def _say(images: int) -> None:
+    logging.getLogger(__name__).warning("memory ran out: the attack goes on with %d images per pass", images)
+
+
+def require_memory(name: str, needed: int, device: torch.device) -> None:
+    """InputError naming what needs more bytes than are free, rather than an end by the system half an hour later."""
+    free = _free(device)
+    if free is not None and needed > free:
+        raise InputError(
+            f"{name} need {needed / 2**30:.1f} GB of memory and {free / 2**30:.1f} GB are free: ask for fewer or "
+            "smaller ones"
+        )
+
+
+def _free(device: torch.device) -> int | None:
+    """Bytes on a GPU, or in the machine or the container; None where the system does not say."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    try:
+        free = 1024 * int(dict(line.split(":") for line in MEMORY.read_text().splitlines())["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return None
+    try:
+        most, used = (int((GROUP / file).read_text()) for file in ("memory.max", "memory.current"))
+    except (OSError, ValueError):  # no such file, or "max"
+        return free
+    return min(free, most - used)
+
+
+PATIENCE = 5  # seconds without one
+Item = TypeVar("Item")
+
+
+def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterable[Item]:
+    """The items, with a bar on a terminal once they have taken some seconds; nothing elsewhere.
+
+    total: how many there are, where they have no length. done: before these.
+    """
+    hidden = not sys.stderr.isatty()
+    return tqdm(items, description, total, delay=PATIENCE, leave=False, disable=hidden, initial=done)
+
+
+@contextmanager
+def underway(description: str) -> Iterator[None]:
+    """A bar at 0 % on a terminal, at once, for as long as what has no parts to count takes; nothing elsewhere."""
+    with tqdm(total=1, desc=description, leave=False, disable=not sys.stderr.isatty()):
+        yield
+
+
+class Phases:
+    """Adds up wall-clock seconds per named phase: `with phases("attack"): ...`. Phases may nest."""
+
+    def __init__(self, device: torch.device | str = "cpu"):
+        self._device = torch.device(device)
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        start = self._now()
+        try:
+            yield
+        finally:
+            self._seconds[name] += self._now() - start
+
+    def take(self) -> dict[str, float]:
+        """The seconds since the last call, by phase; starts again from zero."""
+        seconds, self._seconds = dict(self._seconds), defaultdict(float)
+        return seconds
+
+    def _now(self) -> float:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return time.perf_counter()
+
+
+@contextmanager
+def eval_mode(model: nn.Module) -> Iterator[None]:
+    """Eval mode inside; each module's own mode restored after, since a frozen layer may differ from the whole."""
+    training = [module for module in model.modules() if module.training]
+    if training:  # setting the mode of a large network takes as long as rendering an image
+        model.eval()
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
+
+
+@contextmanager
+def as_found(model: nn.Module) -> Iterator[None]:
+    """Eval mode and no gradients for parameters inside; mode, requires_grad and random state restored after."""
+    parameters = list(model.parameters())
+    trainable = [parameter for parameter in parameters if parameter.requires_grad]
+    devices = {parameter.device for parameter in parameters if parameter.is_cuda}
+    for parameter in trainable:
+        parameter.requires_grad_(False)
+    try:
+        with eval_mode(model), torch.random.fork_rng(devices=sorted(devices, key=str)):
+            yield
+    finally:
+        for parameter in trainable:
+            parameter.requires_grad_(True)
+
+
+def world_size() -> int:
+    """How many there are; 1 for a run by itself."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def rank() -> int:
+    """This one's number, from 0."""
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def shard(total: int) -> Tensor:
+    """Ascending indices of this process's examples: every `world_size()`-th, at least one, also if others have it."""
+    return torch.arange(rank() % total, total, world_size())
+
+
+def merged(part: Tensor, examples: Tensor, total: int) -> Tensor:
+    """All `total` rows, of which every process has those of its examples; the same in every process."""
+    if world_size() == 1:
+        return part
+    parts = [(part, examples)] * world_size()  # to be overwritten
+    dist.all_gather_object(parts, (part.cpu(), examples.cpu()))
+    whole = part.new_empty(total, *part.shape[1:])
+    for rows, places in parts:
+        whole[places.to(whole.device)] = rows.to(whole.device)
+    return whole
