@@ -104,7 +104,7 @@ def test_a_setting_of_another_type_or_beyond_its_range_is_one_line(call, here, c
     ("command", "out"),
     [(EXPORT, "/proc/none/out"), (EXPORT, "file/out"), (EXPORT, "x" * 300), (EVALUATE, "/dev/full/out"),
      (["publish", "run=1.10"], "file/out"), (["fit_skylight"], "file/out"),
-     (["check_interruptions"], "file/out"), (["benchmark_training"], "file/out"), (["benchmark_renderer"], "file/out"),
+     (["check_interruptions"], "file/out"), (["benchmark_training"], "file/out"),
      (["reproduce_paper", "section=run_time", "scene.meshes=[a.glb]"], "file/out"), (["lab"], "file/out"),
      (["report", "a"], "x" * 300)],
 )  # fmt: skip

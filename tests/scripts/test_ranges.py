@@ -16,15 +16,10 @@ from train.studies.interruptions.study import InterruptionSettings
 from train.studies.load.study import LoadSettings
 from train.studies.paper.study import SECTIONS, PaperSettings
 from train.studies.reliability.study import ReliabilitySettings
-from train.studies.renderer_speed.study import RendererSpeedSettings
-from train.studies.transport.cost import CupSettings
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 SETTINGS = {
     "benchmark_growth": GrowthSettings,
-    "benchmark_lights": CupSettings,
-    "benchmark_renderer": RendererSpeedSettings,
-    "benchmark_transport": CupSettings,
     "check_interruptions": InterruptionSettings,
     "check_load": LoadSettings,
     "check_reliability": ReliabilitySettings,

@@ -368,7 +368,7 @@ def test_an_error_of_the_users_input_is_not_followed_by_suggestions(monkeypatch,
             ["data.path=./c d.npz", "train.device=cuda:0"],
             "attack.py 'data.path=c d.npz' train.device=cuda:0",
         ),
-        ("scripts/benchmark_renderer.py", [], "benchmark_renderer.py"),
+        ("scripts/report.py", [], "report.py"),
     ],
 )
 def test_a_page_shows_its_command_as_it_can_be_typed_without_the_machines_folders(

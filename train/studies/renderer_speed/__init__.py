@@ -1,1 +1,1 @@
-"""The renderer's time against its error: scenes and reference, clocks, panels, Mitsuba, targets, page."""
+"""A timer that other studies use."""

@@ -1,1 +1,0 @@
-"""What shadows and bounces cost, and how right they are: beside direct light, beside more rays, and beside Mitsuba."""
