@@ -81,7 +81,7 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
     for name, value in {"BASES": bases, "RAYS": (64, 512), "VIEWS": 1, "STEPS_AWAY": (0, 20), "REFERENCE": 16}.items():
         monkeypatch.setattr(lights, name, value)
     monkeypatch.setattr(lights, "CONVERGED", (2**11, 2**6, 2**6))
-    monkeypatch.setattr(lights, "SAMPLES", (2, 8))
+    monkeypatch.setattr(lights, "SAMPLES", (8,))
     monkeypatch.setattr(radiosity, "PATCHES", 64)
     monkeypatch.setattr(sparse, "SMALL", 0)
     path = tmp_path / "lights.jsonl"
