@@ -1,0 +1,161 @@
+"""What the paper's benchmarks share: options, networks, meshes, views that a network recognizes, and JSON lines.
+
+Run from the root of the clone: python -m benchmarks.paper.norm_balls --help. A mesh is a file, solid:NAME:SEED, or a
+YAML mapping such as '{mesh: banana.glb, label: banana, gain: 2}'.
+"""
+
+import argparse
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from augment import AttackSettings, Classifier, Scene, StepSettings
+from augment.attacks.run import logits_of
+from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.scene import Example
+from benchmarks.common import append_json as append
+from benchmarks.common import machine
+from renderer import ImageSettings, InputError, OrthographicCamera, load_light
+from renderer.visibility import choose
+from train.run_folder.classifier import load_classifier
+
+VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
+FIELDS_OF_VIEW = (2.0, 3.0)  # width of the image in world units (the paper's appendix on rendering quality)
+GREYS = (0.0, 0.25, 0.5, 0.75, 1.0)
+BATCH = 10  # examples that are rendered or attacked at once: a shape's gradient keeps all samples of its images
+LEAST_RECOGNIZED = 0.02  # a fraction; below it the search for recognized views is given up
+
+View = tuple[OrthographicCamera, float]  # and the grey of the background
+
+
+def parser(study: str | None, description: str | None) -> argparse.ArgumentParser:
+    """The options of every benchmark. study: the name of its table, None where it is an option."""
+    options = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if study is not None:
+        options.set_defaults(study=study)
+    options.add_argument("--out", type=Path, required=True, help="JSON lines are appended to this file")
+    options.add_argument("--meshes", nargs="+", required=True, help="files, solid:NAME:SEED or {mesh, label, gain}")
+    options.add_argument("--label", default="orange", help="class that meshes without a label show")
+    options.add_argument("--classifier", default="efficientnet_lite0", help="the attacked network, also run:FOLDER")
+    options.add_argument("--weights", help="its file of weights, where it brings none")
+    options.add_argument("--light", default="grace", help="where attacks begin")
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--threads", type=int, default=1, help="of the CPU")
+    return options
+
+
+def prepare(
+    options: argparse.ArgumentParser, argv: Sequence[str] | None, vertices: int = 0
+) -> tuple[argparse.Namespace, Classifier, list[SceneObject]]:
+    """Parse the arguments, load network and meshes, and begin a run in the file of JSON lines.
+
+    vertices: subdivide meshes until they have more.
+    """
+    arguments = options.parse_args(argv)
+    torch.set_num_threads(arguments.threads)
+    try:
+        classifier = load_classifier(arguments.classifier, arguments.weights)
+        items = [read_item(mesh, arguments.label) for mesh in arguments.meshes]
+        subjects = [replace(load_object(item, vertices), name=Path(item.mesh).stem) for item in items]
+    except (InputError, TypeError, yaml.YAMLError) as error:
+        options.exit(2, f"error: {' '.join(str(error).split())}\n")
+    begin(arguments)
+    return arguments, classifier, subjects
+
+
+def read_item(mesh: str, label: str) -> ObjectSettings:
+    """A value of --meshes."""
+    given = yaml.safe_load(mesh)
+    return ObjectSettings(**({"label": label} | (given if isinstance(given, dict) else {"mesh": mesh})))
+
+
+def begin(arguments: argparse.Namespace) -> None:
+    """Append the line that begins a run: its settings, and the machine."""
+    settings = {name: value for name, value in vars(arguments).items() if name != "out"}
+    append(arguments.out, {"run": settings | {"machine": machine()}})
+
+
+def last_run(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """(settings, records) of the last run in a file of JSON lines."""
+    settings: dict[str, Any] = {}
+    records: list[dict[str, Any]] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        record = json.loads(line)
+        if "run" in record:
+            settings, records = record["run"], []
+        else:
+            records.append(record)
+    return settings, records
+
+
+def attack_settings(kind: str, max_steps: int = 30, **more: Any) -> AttackSettings:
+    """The paper's attack on light or shape (its appendix C): any light, an end where the network errs."""
+    steps = {
+        "lighting": StepSettings("linf", None, "unit", 0.05),
+        "geometry": StepSettings("linf", 0.002, "sign", 0.0005),
+    }
+    shorten = kind == "geometry"  # its gradient holds visibility fixed, so that whole steps may raise the cost
+    return AttackSettings(**{kind: steps[kind]}, light="signed", shorten=shorten, max_steps=max_steps, **more)
+
+
+def scene_of(subject: SceneObject, size: int, light: str, views: Sequence[View]) -> Scene:
+    """An example per view."""
+    return Scene(
+        [subject],
+        [Example(0, (camera,), index) for index, (camera, _) in enumerate(views)],
+        torch.tensor([grey for _, grey in views]).view(-1, 1, 1, 1).expand(-1, 3, size, size),
+        load_light(light),
+        ImageSettings(size, samples=2, normals="smooth"),
+        choose(),
+    )
+
+
+def random_views(count: int, draws: torch.Generator) -> list[View]:
+    """Views from π/3 off the zenith (the paper's) and any azimuth, with a field of view of 2 or 3, on a grey."""
+    azimuths = (2 * math.pi * torch.rand(count, generator=draws)).tolist()
+    widths = torch.randint(len(FIELDS_OF_VIEW), (count,), generator=draws).tolist()
+    greys = torch.randint(len(GREYS), (count,), generator=draws).tolist()
+    return [
+        (OrthographicCamera(math.pi / 3, azimuth, FIELDS_OF_VIEW[width]), GREYS[grey])
+        for azimuth, width, grey in zip(azimuths, widths, greys, strict=True)
+    ]
+
+
+def recognized_views(
+    subject: SceneObject, classifier: Classifier, light: str, count: int, draws: torch.Generator
+) -> list[View]:
+    """As many random views that the classifier recognizes. InputError: hardly any is."""
+    found: list[View] = []
+    drawn = 0
+    while len(found) < count:
+        views = random_views(BATCH, draws)
+        answers = answers_of(classifier, images_of(scene_of(subject, classifier.size, light, views)))
+        found += [view for view, answer in zip(views, answers, strict=True) if answer == subject.label]
+        drawn += len(views)
+        if len(found) < LEAST_RECOGNIZED * drawn - BATCH:
+            raise InputError(f"{classifier.name} recognizes only {len(found)} of {drawn} images of {subject.name}")
+    return found[:count]
+
+
+def batches(views: Sequence[View]) -> Iterator[Sequence[View]]:
+    for first in range(0, len(views), BATCH):
+        yield views[first : first + BATCH]
+
+
+@torch.no_grad()
+def images_of(scene: Scene) -> Tensor:
+    """(E, 1, 3, size, size) of all examples under the scene's own light."""
+    examples = torch.arange(len(scene))
+    return scene.render(scene.conditions(examples), examples)
+
+
+def answers_of(classifier: Classifier, images: Tensor) -> list[str]:
+    """The class that a classifier gives to the one view of each of E examples (E, 1, 3, size, size)."""
+    return [classifier.classes[index] for index in logits_of(classifier, images, BATCH)[:, 0].argmax(1).tolist()]

@@ -1,0 +1,111 @@
+"""Adversarial against random perturbations in norm-balls (the paper's Section 4.1 and appendix A).
+
+python -m benchmarks.paper.norm_balls --out norm_balls.jsonl --examples 50 --meshes orange_studio.glb \\
+    '{mesh: orange_sketchfab.glb, gain: 3}'
+python -m benchmarks.paper.table norm_balls.jsonl --figure norm_balls.png
+
+Every ball is searched by a descent and by as many uniform draws. The space "physical" is light whose radiance is
+nowhere negative, which the paper's light may be; "clipped" counts adversaries of any light, without its negative
+radiance.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from augment import AttackSettings, StepSettings, attack
+from augment.attacks.run import Attacked, logits_of
+from augment.seeding import generator
+from benchmarks.paper import common
+from renderer.harmonics import basis, project
+from renderer.transfer import DEGREE
+
+LIGHT_RADII = (0.02, 0.05, 0.1, 0.3, 1.0, None)
+RADII: dict[str, tuple[float | None, ...]] = {  # L∞; the paper's are 0.1, 0.002, and on pixels 0.12, 0.53, 0.82
+    "lighting": LIGHT_RADII,  # per coefficient
+    "physical": LIGHT_RADII,
+    "geometry": (0.0001, 0.0005, 0.002, 0.01, 0.03),  # per vertex and axis
+    "pixels": (0.01, 0.12, 0.53, 0.82),
+}
+
+
+def settings_of(space: str, radius: float | None, steps: int) -> AttackSettings:
+    """Signed steps of a quarter of the radius; on pixels, of all of it: the fast gradient sign method, repeated."""
+    step = StepSettings("linf", None, "unit", 0.05)
+    if radius is not None:
+        step = StepSettings("linf", radius, "sign", radius if space == "pixels" else radius / 4)
+    return AttackSettings(
+        **{"lighting" if space == "physical" else space: step},
+        light="physical" if space == "physical" else "signed",
+        max_steps=steps,
+        shorten=space == "geometry",
+        batch_size=common.BATCH,
+    )
+
+
+def ball(attacked: Attacked, space: str, radius: float | None, draws: torch.Generator) -> dict[str, Tensor]:
+    """What a ball holds for each of the examples (E,) that are recognized before."""
+    change = (attacked.images - attacked.images_before)[:, 0].abs().amax(1)
+    reach = change.flatten(1).amax(1)
+    found = {
+        "adversarial": attacked.success,
+        "reach": reach,
+        "changed_pixels": (change > reach.view(-1, 1, 1) / 2).float().mean((1, 2)),
+    }
+    if radius is not None:  # without one there is no uniform draw
+        tries = [successes(attacked, attacked.problem.sample(draws)) for _ in range(attacked.settings.max_steps)]
+        found |= {"random": tries[0], "search": torch.stack(tries).any(0)}
+    if space == "lighting":
+        lights = torch.stack([without_negative(light) for light in attacked.conditions.light])
+        found["clipped"] = successes(attacked, lights.flatten(1))
+    return {name: values[attacked.recognised] for name, values in found.items()}
+
+
+def successes(attacked: Attacked, values: Tensor) -> Tensor:
+    """(E,) bool: whether the classifier errs under values (E, D)."""
+    return attacked.goal.reached(logits_of(attacked.judge, attacked.problem.images(values), common.BATCH).argmax(2))
+
+
+def without_negative(light: Tensor) -> Tensor:
+    """A light (49, 3) as an environment map holds it, from which negative radiance is left out."""
+
+    def radiance(directions: Tensor) -> Tensor:
+        return (basis(directions, DEGREE) @ light.to(directions)).clamp(min=0)
+
+    return project(radiance, DEGREE).to(light)
+
+
+def record(mesh: str, space: str, radius: float | None, parts: Sequence[dict[str, Tensor]]) -> dict[str, object]:
+    """Counts, and means over all examples of reach and changed pixels."""
+    whole = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    numbers = {
+        name: int(values.sum()) if values.dtype == torch.bool else float(values.mean())
+        for name, values in whole.items()
+    }
+    return {"mesh": mesh, "space": space, "radius": radius, "n": len(whole["reach"]), **numbers}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    options = common.parser("norm_balls", __doc__)
+    options.add_argument("--spaces", nargs="+", choices=RADII, default=list(RADII))
+    options.add_argument("--examples", type=int, default=20, help="of each mesh")
+    options.add_argument("--steps", type=int, default=10, help="of a descent at most, and draws of a search")
+    args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
+    for subject in subjects:
+        views = common.recognized_views(
+            subject, classifier, args.light, args.examples, generator(args.seed, subject.name)
+        )
+        scenes = [common.scene_of(subject, classifier.size, args.light, part) for part in common.batches(views)]
+        for space in args.spaces:
+            draws = generator(args.seed, subject.name, space)
+            for radius in RADII[space]:
+                parts = []
+                for scene in scenes:
+                    attacked = attack(classifier, scene, settings=settings_of(space, radius, args.steps), force=True)
+                    parts.append(ball(attacked, space, radius, draws))
+                common.append(args.out, record(subject.name, space, radius, parts))
+
+
+if __name__ == "__main__":
+    main()

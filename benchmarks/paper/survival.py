@@ -1,0 +1,65 @@
+"""Do adversaries still fool in 8 bits, as JPEG, read back from their files, and in Mitsuba?
+
+python -m benchmarks.paper.survival --out survival.jsonl --meshes orange_studio.glb \\
+    '{mesh: banana.glb, label: banana}' '{mesh: "solid:cup:3", label: coffee mug}'
+python -m benchmarks.paper.table survival.jsonl
+
+Each is found and rendered anew by scripts/attack.py; --overrides are its own, such as renderer.transport=direct to
+count how many lights that were found without shadows fool where Mitsuba casts them.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchmarks.paper import common
+
+ATTACKS = ("lighting", "projector", "lamps", "geometry", "albedo", "lighting+geometry+albedo", "projector+geometry")
+ROOT = Path(__file__).parents[2]
+
+
+def run_attack(overrides: Sequence[str], threads: int) -> dict[str, Any]:
+    """The numbers of one example that scripts/attack.py attacks, {"refusal": its sentence} where it ended in one."""
+    with TemporaryDirectory() as folder:
+        command = [sys.executable, "scripts/attack.py", f"out={folder}/out", "attack.checks=false", *overrides]
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(threads)}
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+        if done.returncode == 2:
+            return {"refusal": done.stderr.strip().splitlines()[-1]}
+        if done.returncode:
+            raise RuntimeError(f"{command} ended with {done.returncode}: {done.stderr}")
+        (lines,) = Path(folder).glob("out/*/attack.jsonl")
+        numbers: dict[str, Any] = json.loads(lines.read_text(encoding="utf-8").splitlines()[0])
+        return numbers
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    options = common.parser("survival", __doc__)
+    options.add_argument("--examples", type=int, default=2, help="of each mesh and attack, at equal azimuths")
+    options.add_argument("--attacks", nargs="+", default=ATTACKS, help="as attack= of scripts/attack.py")
+    options.add_argument("--verify", default="reload+mitsuba", help="renderers of the files")
+    options.add_argument("--overrides", nargs="*", default=[], help="of scripts/attack.py: attack.max_steps=10")
+    args = options.parse_args(argv)
+    common.begin(args)
+    chosen = [f"classifier={args.classifier}", f"scene.light={args.light}", f"attack.verify={args.verify}"]
+    chosen += [f"weights={args.weights}"] if args.weights else []
+    for mesh in args.meshes:
+        item = common.read_item(mesh, args.label)
+        given = {name: value for name, value in asdict(item).items() if value}
+        shown = [f"scene.meshes=[{{{','.join(f'{name}:{json.dumps(value)}' for name, value in given.items())}}}]"]
+        for attack in args.attacks:
+            for example in range(args.examples):
+                view = [f"scene.azimuth={360 * example / args.examples}", f"seed={args.seed + example}"]
+                found = run_attack([f"attack={attack}", *shown, *view, *chosen, *args.overrides], args.threads)
+                kept = {name: found[name] for name in ("refusal", "steps", "fooled", "versions") if name in found}
+                common.append(args.out, {"mesh": Path(item.mesh).stem, "attack": attack, "example": example, **kept})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""Do lights and shapes that fool one network, from one side, fool others, or from other sides (Tables 3 and 4)?
+
+python -m benchmarks.paper.transfer networks --out transfer.jsonl --examples 50 \\
+    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, gain: 3}'
+python -m benchmarks.paper.transfer views --out unseen_views.jsonl --sets 10 --examples 25 --meshes ...
+python -m benchmarks.paper.table transfer.jsonl --figure transfer.png
+
+An adversary is recorded as found, at the first step that fools the network, and after ten further steps, beside random
+changes that are as large in every coefficient or coordinate.
+"""
+
+import math
+from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from augment import AttackSettings, Classifier
+from augment.descent import Part, Problem, descend
+from augment.goal import Goal
+from augment.objects import SceneObject
+from augment.perturbation import Perturbation
+from augment.phases import Phases
+from augment.seeding import generator
+from benchmarks.paper import common
+from renderer.errors import FACTOR
+from train.run_folder.classifier import load_classifier
+
+KINDS = ("lighting", "geometry")
+FURTHER = 10  # steps that an adversary goes on for
+ATTACKED = (1, 5)  # views that share one light or shape
+TARGETS = ["efficientnet_lite2", "run:pretrained/none", "run:pretrained/random", "run:pretrained/adversarial"]
+
+
+@dataclass(frozen=True)
+class Shared:
+    """All examples of a problem, of one view each, as the views of a single one that share one light or shape."""
+
+    problem: Perturbation
+
+    @property
+    def start(self) -> Tensor:
+        return self.problem.start[:1]
+
+    def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        everything = self.problem.everything
+        return self.problem.render(values.expand(len(everything), -1), everything).transpose(0, 1)
+
+    def step(self, gradient: Tensor) -> Tensor:
+        return self.problem.step(gradient)
+
+    def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        return self.problem.project(values, examples)
+
+
+def adversaries(
+    classifier: Classifier, problem: Problem, settings: AttackSettings, label: str, views: int
+) -> tuple[Tensor, Tensor]:
+    """(E, D) values where a descent first fools or ends, and (E, D) the best of `FURTHER` steps on. views: of each."""
+    goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))
+    first = descend(classifier, problem, goal, settings, Phases())
+    onwards = Part(problem, torch.arange(len(first.values)), first.values)
+    longer = replace(settings, max_steps=FURTHER, margin=FACTOR)  # which no logit reaches: all steps are taken
+    return first.values, descend(classifier, onwards, goal, longer, Phases()).values
+
+
+def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> Tensor:
+    """The start (E, D) with each entry changed by as much as in values (E, D), but up or down at random.
+
+    It is as far in any norm, and changes nothing that could not reach a pixel.
+    """
+    signs = 2 * torch.randint(2, values.shape, generator=draws) - 1
+    return start + (values - start) * signs.to(values)
+
+
+def to_networks(subject: SceneObject, classifier: Classifier, others: Sequence[Classifier], args: Namespace) -> None:
+    """A record per batch of views and kind of attack: the answers of all networks, each at its own size."""
+    draws = generator(args.seed, subject.name, "transfer")
+    for views in common.batches(common.recognized_views(subject, classifier, args.light, args.examples, draws)):
+        scenes = [common.scene_of(subject, network.size, args.light, views) for network in (classifier, *others)]
+        for kind in KINDS:
+            settings = common.attack_settings(kind, args.steps)
+            problems = [settings.problem(scene) for scene in scenes]
+            start = problems[0].start
+            first, further = adversaries(classifier, problems[0], settings, subject.label, views=1)
+            states = {
+                "before": start,
+                "first": first,
+                "first_random": with_random_signs(first, start, draws),
+                "further": further,
+                "further_random": with_random_signs(further, start, draws),
+            }
+            answers = {
+                network.name: {
+                    name: common.answers_of(network, problem.images(values)) for name, values in states.items()
+                }
+                for network, problem in zip((classifier, *others), problems, strict=True)
+            }
+            common.append(args.out, {"kind": kind, "mesh": subject.name, "label": subject.label, "answers": answers})
+
+
+def to_views(subject: SceneObject, classifier: Classifier, index: int, args: Namespace) -> None:
+    """A record per number of attacked views and kind of attack: the answers in views that the attack did not have, and
+    their degrees about the vertical from the nearest attacked view."""
+    draws = generator(args.seed, subject.name, "unseen views", index)
+    unseen = common.recognized_views(subject, classifier, args.light, args.examples, draws)
+    for count in ATTACKED:
+        attacked = common.recognized_views(subject, classifier, args.light, count, draws)
+        angles = [min(degrees_apart(view, near) for near in attacked) for view in unseen]
+        for kind in KINDS:
+            settings = common.attack_settings(kind, args.steps)
+            shared = Shared(settings.problem(common.scene_of(subject, classifier.size, args.light, attacked)))
+            first, further = adversaries(classifier, shared, settings, subject.label, count)
+            random = with_random_signs(further, shared.start, draws)
+            answers: dict[str, list[str]] = {"first": [], "further": [], "random": []}
+            for part in common.batches(unseen):
+                problem = settings.problem(common.scene_of(subject, classifier.size, args.light, part))
+                for name, values in zip(answers, (first, further, random), strict=True):
+                    answers[name] += common.answers_of(classifier, problem.images(values.expand(len(part), -1)))
+            record = {"mesh": subject.name, "label": subject.label, "set": index, "kind": kind, "attacked": count}
+            common.append(args.out, record | {"angle": angles, "answers": answers})
+
+
+def degrees_apart(one: common.View, other: common.View) -> float:
+    """About the vertical."""
+    azimuths = one[0].azimuth - other[0].azimuth
+    return round(math.degrees(abs(math.remainder(azimuths, 2 * math.pi))), 2)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    options = common.parser(None, __doc__)
+    options.add_argument("study", choices=("networks", "views"))
+    options.add_argument("--examples", type=int, default=20, help="views of each mesh, or unseen ones of each set")
+    options.add_argument("--sets", type=int, default=3, help="of attacked views, of each mesh")
+    options.add_argument("--steps", type=int, default=30, help="of a descent at most (the paper's appendix C)")
+    options.add_argument("--targets", nargs="*", default=TARGETS, help="networks that are not attacked, NAME[=WEIGHTS]")
+    args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
+    others = [load_classifier(*target.split("=", 1)) for target in args.targets] if args.study == "networks" else []
+    for subject in subjects:
+        if args.study == "networks":
+            to_networks(subject, classifier, others, args)
+        else:
+            for index in range(args.sets):
+                to_views(subject, classifier, index, args)
+
+
+if __name__ == "__main__":
+    main()

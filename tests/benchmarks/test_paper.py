@@ -1,0 +1,278 @@
+"""The paper's benchmarks, at a tiny size."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from augment import Classifier, StepSettings, attack
+from augment.attacks.settings import AttackSettings
+from augment.objects import SceneObject
+from augment.seeding import generator
+from benchmarks.paper import common, norm_balls, rendering_quality, run_time, survival, table, transfer
+from renderer import InputError, OrthographicCamera, ring
+from renderer.mesh import Mesh
+
+SIZE = 12
+BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+SUBJECT = SceneObject("orange", Mesh.plain(BALL.vertices, BALL.faces, (0.5, 0.4, 0.3)), name="ball")
+
+
+def by_brightness(grey: float = 0.2, name: str = "source", area: slice = slice(4, 8)) -> Classifier:
+    """Calls an image an orange whose middle, or another area, is brighter than a grey."""
+
+    def logits(images):
+        bright = 20 * (images[:, :, area, area].mean((1, 2, 3)) - grey)
+        return torch.stack([bright, -bright], dim=1)
+
+    return Classifier(logits, SIZE, ("orange", "coal"), name)
+
+
+def a_scene(count: int = 3):
+    return common.scene_of(SUBJECT, SIZE, "grace", [(camera, 0.5) for camera in ring(count, 3.0)])
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """A small mesh and network in place of those that are named, and the file of a run's records."""
+    BALL.export(tmp_path / "ball.ply")
+    monkeypatch.setattr(common, "VERTICES", 0)
+    monkeypatch.setattr(torch, "set_num_threads", lambda threads: None)
+    for module in (common, transfer, run_time):
+        monkeypatch.setattr(module, "load_classifier", lambda name, weights=None: by_brightness(0.1, name))
+    return ["--out", str(tmp_path / "records.jsonl"), "--meshes", str(tmp_path / "ball.ply")]
+
+
+QUALITY = ["--renders", "20"]
+SHORT = ["--examples", "2", "--steps", "2"]
+TIMED = [*SHORT, "--passes", "2", "--turns", "2", "--many", "5", "--widths", "2", "4"]
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "rows", "columns", "figure"),
+    [
+        (norm_balls, [*SHORT, "--spaces", "lighting", "geometry"], 11, 8, True),
+        (transfer, ["networks", *SHORT, "--targets", "another"], 4, 6, False),
+        (transfer, ["views", *SHORT, "--sets", "2"], 4, 8, True),
+        (run_time, TIMED, 9, 6, True),
+        (rendering_quality, QUALITY, 2, 6, True),
+    ],
+    ids=["norm_balls", "networks", "views", "run_time", "rendering_quality"],
+)
+def test_a_script_appends_records_whose_table_has_all_rows(
+    small, tmp_path, capsys, script, arguments, rows, columns, figure
+):
+    script.main([*arguments, *small])
+    drawn = ["--figure", str(tmp_path / "figure.png")] if figure else []
+    table.main([str(tmp_path / "records.jsonl"), *drawn])
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert len(lines) == rows + 2 and {line.count(" | ") for line in lines} == {columns - 1}
+    assert not figure or (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_adversaries_are_found_and_rendered_anew_by_the_attack_script(tmp_path, capsys):
+    out = tmp_path / "records.jsonl"
+    small = ["--attacks", "lighting", "--examples", "1", "--verify", "reload", "--classifier", "run:pretrained/none"]
+    short = ["attack.max_steps=1", "scene.search=0", "renderer.transport=direct", "renderer.cache=null"]
+    meshes = ["solid:orange:0", "{mesh: 'solid:orange:0', label: lamp}"]  # which is not recognized as a lamp
+    survival.main(["--out", str(out), *small, "--meshes", *meshes, "--overrides", *short])
+    orange, lamp = common.last_run(out)[1]
+    assert set(orange["versions"]) == {"float", "8 bits", "JPEG 90", "reload"} and "refusal" not in orange
+    assert orange["versions"]["reload"]["largest_difference"] <= 1 / 255
+    assert lamp["refusal"].startswith("error: ") and "versions" not in lamp
+    table.main([str(out)])
+    assert capsys.readouterr().out.splitlines()[2].startswith("| lighting | 1 | ")
+
+
+def test_a_mesh_that_is_missing_is_refused_in_one_line(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        norm_balls.main(["--out", "never.jsonl", "--meshes", "missing.glb", "--classifier", "run:pretrained/none"])
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and "missing.glb" in error and error.count("\n") == 1
+
+
+# ---------------------------------------------------------------------------------------- views and norm-balls
+
+
+def test_views_are_drawn_until_as_many_are_recognized_as_were_asked(monkeypatch):
+    bright = by_brightness(0.45)
+    views = common.recognized_views(SUBJECT, bright, "grace", 12, generator(0, "test"))
+    images = common.images_of(common.scene_of(SUBJECT, SIZE, "grace", views))
+    assert common.answers_of(bright, images) == ["orange"] * 12
+    monkeypatch.setattr(common, "LEAST_RECOGNIZED", 0.5)
+    with pytest.raises(InputError, match="recognizes only 0"):
+        common.recognized_views(SUBJECT, by_brightness(2.0), "grace", 1, generator(0, "test"))
+
+
+@pytest.mark.parametrize(("excess", "fooled"), [(0.9, True), (1.1, False)])
+def test_a_pixel_attack_lowers_a_mean_by_its_radius_and_random_draws_do_not(excess, fooled):
+    """All values lie further than the radius from 0 and 1, so that the sign step takes it off each of them."""
+    radius, scene = 0.02, a_scene(1)
+    start = common.images_of(scene)
+    assert radius < start.min() and start.max() < 1 - radius
+    verge = by_brightness(float(start.mean()) - excess * radius, area=slice(None))
+    attacked = attack(verge, scene, settings=norm_balls.settings_of("pixels", radius, 3))
+    found = norm_balls.ball(attacked, "pixels", radius, generator(0, "test"))
+    assert found["adversarial"].item() == fooled
+    assert not found["search"].item()  # the mean of 432 draws is off by radius / √(3 · 432), a thirtieth of the radius
+    assert found["reach"].item() == pytest.approx(radius, abs=1e-6)  # a few ε of values below 1
+
+
+@pytest.mark.parametrize("space", norm_balls.RADII)
+def test_a_search_holds_its_first_draw_and_fools_a_classifier_on_the_verge(space):
+    radius, scene = norm_balls.RADII[space][0], a_scene()
+    settings = norm_balls.settings_of(space, radius, 8)
+    problem = settings.problem(scene)
+    means = problem.images(problem.start).mean((1, 2, 3, 4))
+    verge = by_brightness(0.999999 * float(means.min()), area=slice(None))
+    found = norm_balls.ball(attack(verge, scene, settings=settings), space, radius, generator(0, "test"))
+    assert (found["random"] <= found["search"]).all() and found["search"].any()
+
+
+def test_light_without_its_negative_radiance_is_the_same_where_there_is_none():
+    sky = torch.zeros(49, 3)
+    sky[0] = 1.0
+    torch.testing.assert_close(norm_balls.without_negative(sky), sky, rtol=0, atol=1e-5)  # of a quadrature in float32
+    assert norm_balls.without_negative(-sky).abs().max() == 0
+
+
+# ---------------------------------------------------------------------------------------- transfer
+
+
+class Line:
+    """Images of a value's grey."""
+
+    start = torch.tensor([[0.42], [0.92]])
+
+    def render(self, values, examples):
+        return values.view(-1, 1, 1, 1, 1).expand(-1, 1, 3, SIZE, SIZE)
+
+    def step(self, gradient):
+        return 0.05 * gradient.sign()
+
+    def project(self, values, examples):
+        return values
+
+
+def test_the_descent_stops_where_it_fools_and_then_goes_on_for_as_many_steps_as_were_asked():
+    """From 0.42 in steps of 0.05 it is 5 steps to below 0.2, and from 0.92 it is 15."""
+    settings = AttackSettings(lighting=StepSettings())
+    first, further = transfer.adversaries(by_brightness(), Line(), settings, "orange", views=1)
+    # Sums of at most 25 float32 steps of size 0.05, each rounded to 2⁻²⁵.
+    torch.testing.assert_close(first, torch.tensor([[0.17], [0.17]]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(further, first - 0.05 * transfer.FURTHER, rtol=0, atol=1e-6)
+
+
+def test_random_signs_go_as_far_in_every_entry_and_to_either_side():
+    draws = generator(0, "test")
+    start = torch.randn(4, 500, generator=draws, dtype=torch.float64)
+    values = start + torch.randn(4, 500, generator=draws, dtype=torch.float64)
+    drawn = transfer.with_random_signs(values, start, draws)
+    torch.testing.assert_close((drawn - start).abs(), (values - start).abs(), rtol=0, atol=1e-14)  # two roundings
+    assert 0.45 < ((drawn - start) * (values - start) > 0).double().mean() < 0.55  # four standard deviations
+
+
+@pytest.mark.parametrize("kind", transfer.KINDS)
+def test_views_that_share_a_light_or_shape_have_the_sum_of_their_gradients(kind):
+    problem = common.attack_settings(kind).problem(a_scene())
+    shared = transfer.Shared(problem)
+    together, apart = shared.start.clone().requires_grad_(), problem.start.clone().requires_grad_()
+    views, images = shared.render(together, torch.tensor([0])), problem.render(apart, problem.everything)
+    assert torch.equal(views[0], images[:, 0])
+    views.square().sum().backward()
+    images.square().sum().backward()
+    largest = float(apart.grad.abs().amax())
+    assert largest > 0
+    # Float32 sums of three views in another order.
+    torch.testing.assert_close(together.grad[0], apart.grad.sum(0), rtol=1e-5, atol=1e-5 * largest)
+
+
+def test_the_angle_to_an_attacked_view_goes_either_way_round():
+    other, *views = ((OrthographicCamera(1.0, math.radians(each), 2.0), 0.5) for each in (10, 350, 180, 31))
+    assert [transfer.degrees_apart(each, other) for each in views] == [20, 170, 21]
+
+
+# ---------------------------------------------------------------------------------------- run time and quality
+
+
+@pytest.mark.parametrize("kind", transfer.KINDS)
+def test_an_iteration_holds_its_time_in_the_classifier_and_the_pixels_it_covers(kind):
+    settings = common.attack_settings(kind, 2, margin=run_time.NEVER)
+    scene = run_time.grid([SUBJECT], by_brightness(), "grace", 1, 4.0, (0.5,))
+    found = run_time.iteration(by_brightness(), scene, settings, turns=2)
+    assert all(whole > inside > 0 for whole, inside in zip(found["whole"], found["inside"], strict=True))
+    assert len(found["bare"]) == 2 and min(found["bare"]) > 0
+    # The unit ball fills π/16 of an image that is 4 wide; its outline of 6π/2 pixels counts whole.
+    assert 0 < found["pixels"] - math.pi / 16 * SIZE**2 < 3 * math.pi
+
+
+def test_confidences_are_those_of_the_label_where_it_is_the_answer(monkeypatch):
+    classifier = by_brightness(0.4, area=slice(None))
+    found = rendering_quality.confidences(SUBJECT, classifier, "grace", renders=5, seed=0)
+    azimuth = 2 * math.pi * float(torch.rand((), generator=generator(0, SUBJECT.name, "quality")))
+    camera = OrthographicCamera(math.pi / 3, azimuth, common.FIELDS_OF_VIEW[0])
+    for grey, confidence in zip(common.GREYS, found[0], strict=True):
+        image = common.images_of(common.scene_of(SUBJECT, SIZE, "grace", [(camera, grey)]))[:, 0]
+        share = float(classifier(image).softmax(1)[0, 0])
+        expected = share if share > 0.5 else math.nan
+        assert confidence == pytest.approx(expected, abs=1e-6, nan_ok=True)  # a few ε of float32
+    assert np.isfinite(found[:-1]).sum() < 5 <= np.isfinite(found).sum()
+    monkeypatch.setattr(common, "LEAST_RECOGNIZED", 1.0)
+    with pytest.raises(InputError, match="ball: only 0 of"):
+        rendering_quality.confidences(SUBJECT, by_brightness(2.0), "grace", renders=1, seed=0)
+
+
+def test_the_bootstrap_resamples_cameras_and_not_renders():
+    """All renders of a camera agree, so 200 cameras carry 200 outcomes: a standard error of √(0.25 / 200) = 0.035."""
+    views = np.array([[0.9 if index % 2 else math.nan] * 5 for index in range(200)])
+    found = rendering_quality.summary(views, seed=0)
+    value, low, high = found["recognized"]
+    assert value == 0.5 and sum(found["histogram"]) == 500
+    # 1000 resamples give a quantile at 2.5 % within about a tenth of the half width.
+    assert (high - low) / 2 == pytest.approx(1.96 * 0.0354, rel=0.15)
+
+
+# ---------------------------------------------------------------------------------------- tables
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "text"),
+    [([], "none of 0"), ([True] * 81 + [False] * 182, "31 % [26, 37] of 263")],
+    ids=["none", "Newcombe"],
+)
+def test_a_cell_has_the_fraction_with_its_wilson_interval(outcomes, text):
+    """81 of 263: 0.2553 to 0.3662 (Newcombe 1998, table I)."""
+    assert table.fraction(outcomes) == text
+
+
+def test_only_what_fools_the_attacked_network_and_was_recognized_counts():
+    source = {"before": ["orange"] * 4, "first": ["coal", "coal", "coal", "orange"], "first_random": ["orange"] * 4}
+    target = {
+        "before": ["orange", "orange", "coal", "orange"],
+        "first": ["coal", "orange", "coal", "coal"],
+        "first_random": ["orange", "coal", "coal", "coal"],
+    }
+    rows = [{"label": "orange", "answers": {"source": source, "target": target}}]
+    assert [*table.transferred(rows, "target", "first")] == [True, False]
+    assert [*table.transferred(rows, "target", "first_random")] == [False, True]
+    assert [*table.transferred(rows, "source", "first")] == [True, True, True, False]
+    assert [*table.transferred(rows, "source", "first_random")] == [False] * 4
+
+
+def test_views_are_counted_by_their_degrees_from_the_nearest_attacked_one():
+    row = {"label": "orange", "angle": [0, 90, 90.1], "answers": {"further": ["coal", "orange", "coal"]}}
+    assert table.within([row], 0, 90) == [True, False] and table.within([row], 90, 180) == [True]
+
+
+def test_meshes_of_the_last_run_are_pooled_by_their_number_of_examples(tmp_path, capsys):
+    ball = {"space": "pixels", "radius": 0.1, "random": 0, "search": 0, "changed_pixels": 0.5}
+    rows = [ball | {"n": 30, "adversarial": 30, "reach": 0.1}, ball | {"n": 10, "adversarial": 0, "reach": 0.5}]
+    run = {"run": {"study": "norm_balls"}}
+    lines = [run, ball | {"n": 50, "adversarial": 0, "reach": 0.9}, run, *rows]
+    (tmp_path / "a.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    table.main([str(tmp_path / "a.jsonl")])
+    row = capsys.readouterr().out.splitlines()[2].split(" | ")
+    assert row[2].startswith("75 % ") and row[2].endswith(" of 40") and row[6] == "0.2"
