@@ -35,7 +35,6 @@ def here(tmp_path) -> Path:
 
 EVALUATE = ["evaluate_photos", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
 EXPORT = ["export_light", "light=grace", "height=4"]
-PAPER = ["reproduce_paper", "classifier=run:1.10", "scene.meshes=['solid:orange:0']"]
 
 
 def test_folders_whose_names_look_like_numbers_or_have_no_utf_8_are_scored(call, here, capsys):
@@ -81,12 +80,6 @@ WRONG = [
     (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
     (["check_interruptions", "jobs=0", "out=a.md"], "jobs=0 must be at least 1"),
     (["lab", "size=0", "out=a"], "size=0 must be at least 1"),
-    ([*PAPER, "section=run_time", "scene.meshes=[]"], "scene.meshes is empty: name a mesh to attack"),
-    ([*PAPER, "section=run_time", "section.name=[1]"], "section.name=[1]: choose section=norm_balls, "),
-    (
-        [*PAPER, "section=survival", "section.overrides=[abc]"],
-        "section.overrides=['abc']: Error parsing override 'abc'",
-    ),
     (["benchmark_training", "steps=-1", "out=a.md"], "steps=-1 must be at least 0"),
 ]
 
@@ -104,8 +97,7 @@ def test_a_setting_of_another_type_or_beyond_its_range_is_one_line(call, here, c
     ("command", "out"),
     [(EXPORT, "/proc/none/out"), (EXPORT, "file/out"), (EXPORT, "x" * 300), (EVALUATE, "/dev/full/out"),
      (["publish", "run=1.10"], "file/out"), (["fit_skylight"], "file/out"),
-     (["check_interruptions"], "file/out"), (["benchmark_training"], "file/out"),
-     (["reproduce_paper", "section=run_time", "scene.meshes=[a.glb]"], "file/out"), (["lab"], "file/out"),
+     (["check_interruptions"], "file/out"), (["benchmark_training"], "file/out"), (["lab"], "file/out"),
      (["report", "a"], "x" * 300)],
 )  # fmt: skip
 def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, capsys, command, out, monkeypatch):

@@ -14,7 +14,6 @@ from train.laboratory.settings import LabSettings
 from train.studies.growth.study import GrowthSettings
 from train.studies.interruptions.study import InterruptionSettings
 from train.studies.load.study import LoadSettings
-from train.studies.paper.study import SECTIONS, PaperSettings
 from train.studies.reliability.study import ReliabilitySettings
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
@@ -37,7 +36,6 @@ GIVEN = {  # without which a command is refused
 KINDS: dict[str, tuple[type, list[str]]] = {
     **{name: (kind, [*GIVEN.get(name, [])]) for name, kind in SETTINGS.items()},
     **{name: (runpy.run_path(str(SCRIPTS / f"{name}.py"))["Settings"], GIVEN.get(name, [])) for name in OWN},
-    "reproduce_paper": (PaperSettings, ["section=run_time", "scene.meshes=[a.obj]"]),
 }
 ELSEWHERE = ("train", "attack", "benchmark_training")  # whose numbers are tried with their meaning: docs/reliability.md
 
@@ -69,13 +67,4 @@ def test_every_script_is_tried():
 def test_every_number_of_a_scripts_configuration_has_a_range(name):
     kind, given = KINDS[name]
     config = composed(name, given)
-    if "section" in config:
-        config.section = {}  # has settings of its own
     check(kind, config)
-
-
-@pytest.mark.parametrize("section", SECTIONS)
-def test_every_number_of_a_section_of_the_paper_has_a_range(section):
-    targets = ["section.targets=[a]"] if section == "gallery" else []
-    config = composed("reproduce_paper", [f"section={section}", "scene.meshes=[a.obj]", *targets])
-    check(SECTIONS[section].Settings, config.section, "section")
