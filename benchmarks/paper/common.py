@@ -17,7 +17,7 @@ import yaml
 from torch import Tensor
 
 from augment import AttackSettings, Classifier, Scene, StepSettings
-from augment.attacks.run import logits_of
+from augment.attacks.attack import logits_of
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.scene import Example
 from benchmarks.common import append_json as append
@@ -102,7 +102,7 @@ def attack_settings(kind: str, max_steps: int = 30, **more: Any) -> AttackSettin
         "geometry": StepSettings("linf", 0.002, "sign", 0.0005),
     }
     shorten = kind == "geometry"  # its gradient holds visibility fixed, so that whole steps may raise the cost
-    return AttackSettings(**{kind: steps[kind]}, light="signed", shorten=shorten, max_steps=max_steps, **more)
+    return AttackSettings(**{kind: steps[kind]}, allow_negative=True, shorten=shorten, max_steps=max_steps, **more)
 
 
 def scene_of(subject: SceneObject, size: int, light: str, views: Sequence[View]) -> Scene:

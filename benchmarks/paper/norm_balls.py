@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, StepSettings, attack
-from augment.attacks.run import Attacked, logits_of
-from augment.seeding import generator
+from augment.attacks.attack import AttackResult, logits_of
+from augment.utils import generator
 from benchmarks.paper import common
 from renderer.harmonics import basis, project
 from renderer.transfer import DEGREE
@@ -37,14 +37,14 @@ def settings_of(space: str, radius: float | None, steps: int) -> AttackSettings:
         step = StepSettings("linf", radius, "sign", radius if space == "pixels" else radius / 4)
     return AttackSettings(
         **{"lighting" if space == "physical" else space: step},
-        light="physical" if space == "physical" else "signed",
+        allow_negative=space != "physical",
         max_steps=steps,
         shorten=space == "geometry",
         batch_size=common.BATCH,
     )
 
 
-def ball(attacked: Attacked, space: str, radius: float | None, draws: torch.Generator) -> dict[str, Tensor]:
+def ball(attacked: AttackResult, space: str, radius: float | None, draws: torch.Generator) -> dict[str, Tensor]:
     """What a ball holds for each of the examples (E,) that are recognized before."""
     change = (attacked.images - attacked.images_before)[:, 0].abs().amax(1)
     reach = change.flatten(1).amax(1)
@@ -59,12 +59,14 @@ def ball(attacked: Attacked, space: str, radius: float | None, draws: torch.Gene
     if space == "lighting":
         lights = torch.stack([without_negative(light) for light in attacked.conditions.light])
         found["clipped"] = successes(attacked, lights.flatten(1))
-    return {name: values[attacked.recognised] for name, values in found.items()}
+    return {name: values[attacked.clean_correct] for name, values in found.items()}
 
 
-def successes(attacked: Attacked, values: Tensor) -> Tensor:
+def successes(attacked: AttackResult, values: Tensor) -> Tensor:
     """(E,) bool: whether the classifier errs under values (E, D)."""
-    return attacked.goal.reached(logits_of(attacked.judge, attacked.problem.images(values), common.BATCH).argmax(2))
+    return attacked.goal.reached(
+        logits_of(attacked.classifier, attacked.problem.images(values), common.BATCH).argmax(2)
+    )
 
 
 def without_negative(light: Tensor) -> Tensor:

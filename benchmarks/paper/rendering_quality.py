@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from augment import Classifier
-from augment.attacks.run import logits_of
+from augment.attacks.attack import logits_of
 from augment.objects import SceneObject
-from augment.seeding import generator
+from augment.utils import generator
 from benchmarks.paper import common
 from renderer import InputError, OrthographicCamera
 

@@ -17,11 +17,10 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier, Scene
-from augment.descent import AttackResult, descend
-from augment.goal import Goal, adversarial_cost
+from augment.attacks.criteria import Goal, adversarial_cost
+from augment.attacks.descent import DescentResult, descend
 from augment.objects import SceneObject
-from augment.phases import Phases
-from augment.seeding import generator
+from augment.utils import Phases, generator
 from benchmarks.common import seconds
 from benchmarks.paper import common
 from renderer import ImageSettings, load_light, ring
@@ -48,7 +47,7 @@ class ProcessorTime(Phases):
         return time.process_time()
 
 
-def descent(classifier: Classifier, scene: Scene, settings: AttackSettings, phases: Phases) -> AttackResult:
+def descent(classifier: Classifier, scene: Scene, settings: AttackSettings, phases: Phases) -> DescentResult:
     labels = torch.tensor([[classifier.label(label)] for label in scene.labels])
     problem = settings.problem(scene)
     with phases("attack"):
@@ -125,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             start = time.process_time()
             result = descent(classifier, one, common.attack_settings("lighting", args.steps), Phases())
             spent = time.process_time() - start  # with what is rendered once
-            numbers = {"fooled": bool(result.fooled[0]), "steps": int(result.steps[0]), "seconds": spent}
+            numbers = {"success": bool(result.success[0]), "steps": int(result.steps[0]), "seconds": spent}
             common.append(args.out, {"mesh": subject.name, **numbers})
 
 

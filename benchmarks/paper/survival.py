@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             for example in range(args.examples):
                 view = [f"scene.azimuth={360 * example / args.examples}", f"seed={args.seed + example}"]
                 found = run_attack([f"attack={attack}", *shown, *view, *chosen, *args.overrides], args.threads)
-                kept = {name: found[name] for name in ("refusal", "steps", "fooled", "versions") if name in found}
+                kept = {name: found[name] for name in ("refusal", "steps", "success", "versions") if name in found}
                 common.append(args.out, {"mesh": Path(item.mesh).stem, "attack": attack, "example": example, **kept})
 
 

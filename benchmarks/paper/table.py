@@ -120,8 +120,8 @@ def run_time(rows: Sequence[Row]) -> Table:
             yield [row["kind"], row["setup"], row["pixels"], quartiles(row["bare"]), quartiles(renderer), ratio]
     done = [row for row in rows if "seconds" in row]
     for name in ("steps", "seconds"):
-        middle = quartiles([row[name] for row in done if row["fooled"]] or [np.nan], 2)
-        yield ["lighting", f"{name} of {fraction(row['fooled'] for row in done)} that fool", "", "", "", middle]
+        middle = quartiles([row[name] for row in done if row["success"]] or [np.nan], 2)
+        yield ["lighting", f"{name} of {fraction(row['success'] for row in done)} that fool", "", "", "", middle]
 
 
 def rendering_quality(rows: Sequence[Row]) -> Table:
@@ -137,8 +137,8 @@ def survival(rows: Sequence[Row]) -> Table:
     yield ["attack", "refused", "fooled", *versions]
     for (attack,), group in groups(rows, "attack").items():
         made = [row for row in group if "versions" in row]
-        kept = ([row["versions"][name]["fooled"] for row in made if row["fooled"]] for name in versions)
-        yield [attack, len(group) - len(made), fraction(row["fooled"] for row in made), *map(fraction, kept)]
+        kept = ([row["versions"][name]["success"] for row in made if row["success"]] for name in versions)
+        yield [attack, len(group) - len(made), fraction(row["success"] for row in made), *map(fraction, kept)]
 
 
 # ---------------------------------------------------------------------------------------- figures

@@ -18,12 +18,11 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier
-from augment.descent import Part, Problem, descend
-from augment.goal import Goal
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import Part, Problem, descend
+from augment.attacks.parameters import AttackProblem
 from augment.objects import SceneObject
-from augment.perturbation import Perturbation
-from augment.phases import Phases
-from augment.seeding import generator
+from augment.utils import Phases, generator
 from benchmarks.paper import common
 from renderer.errors import FACTOR
 from train.run_folder.classifier import load_classifier
@@ -38,7 +37,7 @@ TARGETS = ["efficientnet_lite2", "run:pretrained/none", "run:pretrained/random",
 class Shared:
     """All examples of a problem, of one view each, as the views of a single one that share one light or shape."""
 
-    problem: Perturbation
+    problem: AttackProblem
 
     @property
     def start(self) -> Tensor:

@@ -8,10 +8,9 @@ import pytest
 import torch
 import trimesh
 
-from augment import Classifier, StepSettings, attack
-from augment.attacks.settings import AttackSettings
+from augment import AttackSettings, Classifier, StepSettings, attack
 from augment.objects import SceneObject
-from augment.seeding import generator
+from augment.utils import generator
 from benchmarks.paper import common, norm_balls, rendering_quality, run_time, survival, table, transfer
 from renderer import InputError, OrthographicCamera, ring
 from renderer.mesh import Mesh
@@ -73,6 +72,7 @@ def test_a_script_appends_records_whose_table_has_all_rows(
     assert not figure or (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow  # two processes that import everything
 def test_adversaries_are_found_and_rendered_anew_by_the_attack_script(tmp_path, capsys):
     out = tmp_path / "records.jsonl"
     small = ["--attacks", "lighting", "--examples", "1", "--verify", "reload", "--classifier", "run:pretrained/none"]
