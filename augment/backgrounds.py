@@ -1,4 +1,4 @@
-"""What is behind a mesh: grey values and image files."""
+"""Backgrounds of a scene: gray values and image files."""
 
 import math
 import reprlib
@@ -13,27 +13,27 @@ from renderer.files.image_files import read_image
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
-    """(B, 3, size, size) of grey values or image files, or (B, 1, size, size) where all are grey; in [0, 1]."""
+    """(B, 3, size, size) of gray values or image files, or (B, 1, size, size) where all are gray; in [0, 1]."""
     if not choices:
         raise InputError("scene.backgrounds is empty: give grey values in [0, 1] or image files")
     images = [load_background(choice, size) for choice in choices]
-    channels = max((len(image) for image in images), default=1)
+    channels = max(len(image) for image in images)
     return torch.stack([image.expand(channels, -1, -1) for image in images])
 
 
 def load_background(choice: float | str | Path, size: int, key: str = "scene.backgrounds") -> Tensor:
-    """A grey value (1, size, size), or an image's centre square (3, size, size), in [0, 1]. key: errors name it."""
+    """A gray value (1, size, size), or an image's center square (3, size, size), in [0, 1]. key: errors name it."""
     if isinstance(choice, Path):
         return _image(choice, size, key)
     try:
-        grey = float(choice)
+        gray = float(choice)
     except (ValueError, TypeError, OverflowError):
         if isinstance(choice, str):
             return _image(Path(choice), size, key)
-        grey = math.nan
-    if not 0 <= grey <= 1:
+        gray = math.nan
+    if not 0 <= gray <= 1:
         raise InputError(f"{key}={reprlib.repr(choice)}: give grey values in [0, 1] or image files")
-    return torch.full((1, size, size), grey)
+    return torch.full((1, size, size), gray)
 
 
 def _image(path: Path, size: int, key: str) -> Tensor:

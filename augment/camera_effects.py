@@ -1,4 +1,4 @@
-"""What a camera makes of rendered images: projected patterns, white balance, blur and noise."""
+"""A camera's effects on rendered images: a projected pattern, white balance, blur and noise."""
 
 import math
 from collections.abc import Callable
@@ -7,70 +7,22 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from renderer.arguments import require_fields
 from renderer.errors import require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
 
-
-def draw_patterns(count: int, size: int, draws: torch.Generator) -> Tensor:
-    """(count, 3, size, size) linear light in [0, 1], each pattern of two colours, at any angle, scale and place."""
-    middles = (torch.arange(size) + 0.5) / size * 2 - 1
-    points = torch.stack(torch.meshgrid(middles, middles, indexing="xy"))  # (2, size, size)
-    return torch.stack([_pattern(points, draws) for _ in range(count)])
-
-
-def _pattern(points: Tensor, draws: torch.Generator) -> Tensor:
-    angle, period, *place = torch.rand(4, generator=draws) * torch.tensor([2 * math.pi, 1.0, 1.0, 1.0])
-    turn = torch.stack([torch.stack([angle.cos(), -angle.sin()]), torch.stack([angle.sin(), angle.cos()])])
-    across = torch.einsum("ij,jyx->iyx", turn, points)
-    family = FAMILIES[int(torch.randint(len(FAMILIES), (), generator=draws))]
-    share = family(across / (0.25 + 0.75 * period), torch.stack(place))
-    first, second = _colour(draws), _colour(draws) * torch.rand(1, generator=draws)  # the darker one down to nothing
-    return second[:, None, None] + share * (first - second)[:, None, None]
-
-
-def _stripes(points: Tensor, place: Tensor) -> Tensor:
-    return ((points[0] + place[0]) % 1 < 0.5).float()
-
-
-def _checkers(points: Tensor, place: Tensor) -> Tensor:
-    return (((points + place[:, None, None]) % 1 < 0.5).sum(0) == 1).float()
-
-
-def _spots(points: Tensor, place: Tensor) -> Tensor:
-    """Discs on a square grid, over half of it."""
-    return (((points + place[:, None, None]) % 1 - 0.5).norm(dim=0) < 0.4).float()
-
-
-def _half(points: Tensor, place: Tensor) -> Tensor:
-    return (points[0] > place[0] - 0.5).float()
-
-
-def _solid(points: Tensor, place: Tensor) -> Tensor:
-    return torch.ones_like(points[0])
-
-
-FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (_stripes, _checkers, _spots, _half, _solid)
-
-
-def _colour(draws: torch.Generator) -> Tensor:
-    """(3,) linear, of any hue, from white to pure; the largest channel is 1."""
-    hue, saturation = torch.rand(2, generator=draws)
-    ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6  # of the hexcone (Smith 1978)
-    pure = ((ramps - 3).abs() - 1).clamp(0, 1)
-    return decode(1 - saturation * (1 - pure), "srgb")
-
-
-REACH = 3  # pixels to either side that a blur takes in
+BLUR_RADIUS = 3  # pixels to either side that a blur averages over
 
 
 @dataclass
 class CameraEffectSettings:
-    """What a camera makes of each image, uniform up to these; by default nothing.
+    """The effects on each image, each uniform up to its value; by default none.
 
-    pattern_fraction: the fraction of images under a pattern that a projector throws. pattern_fill: [least, most] of the
-    scene's own light beneath it. white_balance: stops, up or down, of each channel. blur: standard deviation in pixels.
+    pattern_fraction: of the images, under a projected pattern. pattern_fill: [least, most] of the scene's own light
+    that stays beneath it. white_balance: stops, up or down, of each channel. blur: standard deviation in pixels.
     noise: standard deviation of the image's values.
+
+    >>> CameraEffectSettings().changes, CameraEffectSettings(noise=0.02).changes
+    (False, True)
     """
 
     pattern_fraction: float = 0.0
@@ -80,24 +32,23 @@ class CameraEffectSettings:
     noise: float = 0.0
 
     def __post_init__(self) -> None:
-        require_fields(self)
-        for name, most in (("pattern_fraction", 1), ("white_balance", 5), ("blur", REACH / 2), ("noise", 1)):
+        for name, most in (("pattern_fraction", 1), ("white_balance", 5), ("blur", BLUR_RADIUS / 2), ("noise", 1)):
             require_range(f"augment.vary.camera.{name}", getattr(self, name), 0, most)
         require_limits("augment.vary.camera.pattern_fill", self.pattern_fill, 0, 1)
 
     @property
     def changes(self) -> bool:
-        """Whether images are any other than the renders."""
+        """Whether any effect is on."""
         return max(self.pattern_fraction, self.white_balance, self.blur, self.noise) > 0
 
 
 @dataclass(frozen=True)
 class CameraEffects:
-    """What becomes of the images of E examples, each part as it was drawn.
+    """The effects on the images of E examples.
 
-    gains: (E, 3, 1 or size, 1 or size), what the linear light of object and background is multiplied by: the thrown
-    pattern, times the white balance's gain of each channel. blur: (E,) standard deviation of a Gaussian, in pixels, 0
-    for none. noise: (E, 3, size, size), added to the image's values.
+    gains: (E, 3, 1 or size, 1 or size), factors of the linear light of object and background: the projected pattern
+    times the white balance. blur: (E,) standard deviation of a Gaussian, in pixels; 0 for none. noise: (E, 3, size,
+    size), added to the image's values.
     """
 
     gains: Tensor
@@ -109,7 +60,7 @@ class CameraEffects:
         return CameraEffects(self.gains.to(device), self.blur.to(device), self.noise.to(device), self.encoding)
 
     def __call__(self, images: Tensor, examples: Tensor) -> Tensor:
-        """Images (A, V, 3, size, size) of examples (A,) as they are photographed; differentiable in them."""
+        """Images (A, V, 3, size, size) of examples (A,) with their effects; differentiable in the images."""
         light = decode(images, self.encoding) * self.gains[examples, None]
         image = encode(clamp(_blurred(light, self.blur[examples])), self.encoding)
         return clamp(image + self.noise[examples, None])
@@ -118,12 +69,12 @@ class CameraEffects:
 def draw_camera_effects(
     settings: CameraEffectSettings, count: int, image: ImageSettings, draws: torch.Generator
 ) -> CameraEffects:
-    """What is drawn for each of `count` examples, on the CPU."""
-    thrown = draw_patterns(count, image.size, draws)
+    """Random effects for `count` examples, on the CPU."""
+    patterns = draw_patterns(count, image.size, draws)
     low, high = settings.pattern_fill
-    ambient = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
-    none = torch.rand(count, 1, 1, 1, generator=draws) >= settings.pattern_fraction
-    light = torch.where(none, 1.0, ambient + (1 - ambient) * thrown)
+    fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
+    plain = torch.rand(count, 1, 1, 1, generator=draws) >= settings.pattern_fraction
+    light = torch.where(plain, 1.0, fill + (1 - fill) * patterns)
     stops = settings.white_balance * (2 * torch.rand(count, 3, 1, 1, generator=draws) - 1)
     blur = settings.blur * torch.rand(count, generator=draws)
     deviation = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
@@ -133,11 +84,64 @@ def draw_camera_effects(
 
 def _blurred(images: Tensor, sigma: Tensor) -> Tensor:
     """Each example (V, 3, size, size) convolved with its Gaussian, by rows and by columns; the border is repeated."""
-    offsets = torch.arange(-REACH, REACH + 1, device=images.device)
+    offsets = torch.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, device=images.device)
     weights = torch.exp(-0.5 * (offsets / sigma.clamp(min=1e-3)[:, None]) ** 2)  # (A, taps)
     weights = (weights / weights.sum(1, keepdim=True)).to(images)
     size = images.shape[-1]
-    places = (torch.arange(size, device=images.device)[:, None] + offsets).clamp(0, size - 1)  # (size, taps)
+    columns = (torch.arange(size, device=images.device)[:, None] + offsets).clamp(0, size - 1)  # (size, taps)
     matrix = images.new_zeros(len(images), size, size)
-    matrix.scatter_add_(2, places.expand(len(images), -1, -1), weights[:, None].expand(-1, size, -1))
+    matrix.scatter_add_(2, columns.expand(len(images), -1, -1), weights[:, None].expand(-1, size, -1))
     return torch.einsum("aij,avcjk,alk->avcil", matrix, images, matrix)
+
+
+# ------------------------------------------------------------------------------------- projected patterns
+
+
+def draw_patterns(count: int, size: int, draws: torch.Generator) -> Tensor:
+    """(count, 3, size, size) linear light in [0, 1]: stripes, checkers, spots, halves and solid colors, each of two
+    random colors, at a random angle, scale and position."""
+    middles = (torch.arange(size) + 0.5) / size * 2 - 1
+    points = torch.stack(torch.meshgrid(middles, middles, indexing="xy"))  # (2, size, size)
+    return torch.stack([_pattern(points, draws) for _ in range(count)])
+
+
+def _pattern(points: Tensor, draws: torch.Generator) -> Tensor:
+    angle, period, *shift = torch.rand(4, generator=draws) * torch.tensor([2 * math.pi, 1.0, 1.0, 1.0])
+    rotation = torch.stack([torch.stack([angle.cos(), -angle.sin()]), torch.stack([angle.sin(), angle.cos()])])
+    rotated = torch.einsum("ij,jyx->iyx", rotation, points)
+    family = FAMILIES[int(torch.randint(len(FAMILIES), (), generator=draws))]
+    weight = family(rotated / (0.25 + 0.75 * period), torch.stack(shift))
+    first, second = _color(draws), _color(draws) * torch.rand(1, generator=draws)  # the darker one down to black
+    return second[:, None, None] + weight * (first - second)[:, None, None]
+
+
+def _stripes(points: Tensor, shift: Tensor) -> Tensor:
+    return ((points[0] + shift[0]) % 1 < 0.5).float()
+
+
+def _checkers(points: Tensor, shift: Tensor) -> Tensor:
+    return (((points + shift[:, None, None]) % 1 < 0.5).sum(0) == 1).float()
+
+
+def _spots(points: Tensor, shift: Tensor) -> Tensor:
+    """Discs on a square grid, over half of its area."""
+    return (((points + shift[:, None, None]) % 1 - 0.5).norm(dim=0) < 0.4).float()
+
+
+def _half(points: Tensor, shift: Tensor) -> Tensor:
+    return (points[0] > shift[0] - 0.5).float()
+
+
+def _solid(points: Tensor, shift: Tensor) -> Tensor:
+    return torch.ones_like(points[0])
+
+
+FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (_stripes, _checkers, _spots, _half, _solid)
+
+
+def _color(draws: torch.Generator) -> Tensor:
+    """(3,) linear, of any hue, from white to pure; the largest channel is 1."""
+    hue, saturation = torch.rand(2, generator=draws)
+    ramps = (6 * hue + torch.tensor([0.0, 4.0, 2.0])) % 6  # of the hexcone (Smith 1978)
+    pure = ((ramps - 3).abs() - 1).clamp(0, 1)
+    return decode(1 - saturation * (1 - pure), "srgb")

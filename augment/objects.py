@@ -1,4 +1,4 @@
-"""What a scene shows: meshes from files or solids, each with the name of its class and what stands beside it."""
+"""Objects of a scene: meshes from files or solids, each with the name of its class, props and a table."""
 
 from __future__ import annotations
 
@@ -10,27 +10,25 @@ from functools import cached_property
 import numpy as np
 
 from augment.utils import underway
-from renderer.arguments import require_fields
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, concatenate, load_mesh, normalise
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
 
-GROUND = 1.2  # half a table's width: its corners are within what cameras see in depth
-FARTHEST = 10.0  # of company, in world units
+TABLE = 1.2  # half a table's width: its corners are within the depth that cameras see
+FARTHEST = 10.0  # position and size of props, in world units
 
 
 @dataclass
 class MeshSettings:
     """mesh: a file that trimesh reads, or `solid:NAME` or `solid:NAME:SEED`, a built-in procedural solid. up: the axis
-    that points up in the file, auto|y|z. color: RGB (3), sRGB-encoded in [0, 1], of a mesh that brings no colours."""
+    that points up in the file, auto|y|z. color: RGB (3), sRGB-encoded in [0, 1], of a mesh without colors."""
 
     mesh: str
     up: str = field(default="auto", kw_only=True)
     color: list[float] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        require_fields(self)
         if not self.mesh:
             raise InputError("mesh is '': give a file or solid:NAME")
         if self.color is not None:
@@ -39,9 +37,9 @@ class MeshSettings:
 
 @dataclass
 class PropSettings(MeshSettings):
-    """A mesh that stands beside another, on the same ground.
+    """A mesh beside the object, on the same ground.
 
-    at: (2,) x and y of its centroid, in world units. scale: its largest coordinate, where the other's is 1. azimuth:
+    at: (2,) x and y of its centroid, in world units. scale: its largest coordinate, where the object's is 1. azimuth:
     degrees by which it is turned about the vertical.
     """
 
@@ -53,16 +51,22 @@ class PropSettings(MeshSettings):
         super().__post_init__()
         if len(self.at) != 2:
             raise InputError(f"props: {self.mesh}: at={self.at} must be x and y")
-        for place in self.at:
-            require_range(f"props: {self.mesh}: at", place, -FARTHEST, FARTHEST)
+        for coordinate in self.at:
+            require_range(f"props: {self.mesh}: at", coordinate, -FARTHEST, FARTHEST)
         require_range(f"props: {self.mesh}: scale", self.scale, 1 / FARTHEST, FARTHEST)
         require_range(f"props: {self.mesh}: azimuth", self.azimuth, -360, 360)
 
 
 @dataclass
 class ObjectSettings(MeshSettings):
-    """One mesh of a scene, named as in `MeshSettings`. label: the name of its class. gain: multiplies the albedo.
-    props: what is in the image, too, shadows it and is shadowed, and is no part of what is attacked."""
+    """One object of a scene, with the keys of `MeshSettings`.
+
+    label: the name of its class. gain: multiplies the albedo. props: meshes that are in the image, too, and cast and
+    receive its shadows, but are never attacked.
+
+    >>> load_object(ObjectSettings("solid:orange", label="orange")).label
+    'orange'
+    """
 
     label: str
     gain: float = 1.0
@@ -75,11 +79,11 @@ class ObjectSettings(MeshSettings):
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A mesh that spans [-1, 1], the name of its class, what multiplies its albedo, and its own name in messages.
+    """A mesh that spans [-1, 1], the name of its class, a factor of its albedo, and its own name in messages.
 
-    Company and table, whose albedo the gain multiplies, too, are in the mesh after the object's own faces.
-    own: the number of these, None where all are. props: meshes that stand on z = 0 beside the object. ground: the
-    colour of its table, None where there is none.
+    The mesh has the faces of props and table, whose albedo is multiplied, too, after the object's own. own: the number
+    of the object's faces, None where all are. props: their meshes, standing on z = 0. ground: the color of the table,
+    None without one.
     """
 
     label: str
@@ -92,69 +96,66 @@ class SceneObject:
 
     @property
     def own_faces(self) -> np.ndarray:
-        """(F,) bool"""
+        """(F,) bool: the object's, not those of props and table."""
         return np.arange(len(self.mesh.faces)) < (len(self.mesh.faces) if self.own is None else self.own)
 
     @property
     def own_vertices(self) -> np.ndarray:
-        """(V,) bool: all but those of company and table."""
+        """(V,) bool: all but those of props and table."""
         others = self.mesh.faces[~self.own_faces]
         return ~np.isin(np.arange(len(self.mesh.vertices)), others)
 
     @cached_property
     def radius(self) -> float:
-        """Around the origin, within which all of it lies, company and table, too."""
+        """Of a ball around the origin that holds the whole mesh, props and table included."""
         return float(np.linalg.norm(self.mesh.vertices, axis=1)[self.mesh.faces].max())
-
-    def among(self, others: Sequence[Mesh]) -> SceneObject:
-        """The same with more in its mesh."""
-        if not others:
-            return self
-        return replace(self, mesh=concatenate([self.mesh, *others]), own=int(self.own_faces.sum()))
 
     @property
     def lowest(self) -> float:
         """The height of the ground that it stands on."""
         return float(self.mesh.vertices[np.unique(self.mesh.faces), 2].min())
 
+    def joined(self, others: Sequence[Mesh]) -> SceneObject:
+        """The object with other meshes in its own."""
+        if not others:
+            return self
+        return replace(self, mesh=concatenate([self.mesh, *others]), own=int(self.own_faces.sum()))
+
 
 def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
-    """The mesh, subdivided until it has more than so many vertices, and normalised; and what is beside it.
+    """The mesh, subdivided until it has more than `vertices`, and normalized; with its props.
 
     InputError: as `load_mesh` and `solid`.
     """
     with underway(f"preparing {item.mesh}"):
         mesh = normalise(subdivide(_load(item), vertices))
-    return with_props(SceneObject(item.label, mesh, item.gain, item.mesh), [_prop(each) for each in item.props])
+    return with_props(SceneObject(item.label, mesh, item.gain, item.mesh), [_prop(prop) for prop in item.props])
 
 
 def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
-    """The object among meshes that stand on z = 0, which are raised or lowered to where it stands."""
+    """The object among meshes that stand on z = 0, moved to its ground."""
     height = np.array([0, 0, item.lowest])
-    placed = []
-    for each in props:
-        raised = (each.vertices + height).astype(np.float32)  # as `normalise` rounds
-        placed.append(replace(each, vertices=raised.astype(np.float64)))
-    return replace(item.among(placed), props=props)
+    raised = [(prop.vertices + height).astype(np.float32) for prop in props]  # rounded as the object is
+    meshes = [replace(prop, vertices=vertices.astype(np.float64)) for prop, vertices in zip(props, raised, strict=True)]
+    return replace(item.joined(meshes), props=props)
 
 
 def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
-    """The object on a square table, as one mesh; color: RGB, sRGB-encoded in [0, 1], multiplied with the gain, too, or
-    None for no table.
+    """The object on a square table, as one mesh; color: RGB, sRGB-encoded in [0, 1], or None for no table.
 
-    InputError: no colour.
+    The object's gain multiplies the table's albedo, too. InputError: not a color.
     """
     if color is None:
         return item
     _require_color("ground", color)
-    corners = [[x * GROUND, y * GROUND, item.lowest] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    corners = [[x * TABLE, y * TABLE, item.lowest] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     table = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]], np.array(color))
-    return replace(item.among([table]), ground=color)
+    return replace(item.joined([table]), ground=color)
 
 
 def another_instance(item: SceneObject, seed: int) -> SceneObject:
-    """Another of the same kind, in the same company and on the same table, where the object is a solid named without a
-    seed, and otherwise the object itself."""
+    """Another instance of a solid that is named without a seed, with the same props and table; of anything else, the
+    object itself."""
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item
@@ -163,7 +164,7 @@ def another_instance(item: SceneObject, seed: int) -> SceneObject:
 
 
 def _prop(item: PropSettings) -> Mesh:
-    """Where it stands, on z = 0."""
+    """Turned, scaled and moved to its position on z = 0."""
     mesh, angle = normalise(_load(item)), math.radians(item.azimuth)
     turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     turned = item.scale * mesh.vertices @ turn
@@ -194,5 +195,5 @@ def _read(item: MeshSettings) -> Mesh:
 
 
 def _require_color(name: str, color: Sequence[float]) -> None:
-    if len(color) != 3 or not all(0 <= each <= 1 for each in color):
+    if len(color) != 3 or not all(0 <= channel <= 1 for channel in color):
         raise InputError(f"{name}={color} must be red, green and blue from 0 to 1")

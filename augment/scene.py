@@ -199,7 +199,7 @@ class Scene:
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
 
     @torch.no_grad()
-    def clamped_share(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, " A"]:
+    def clamped_fraction(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, " A"]:
         """Per example, the share of its covered pixels' values that the clamp changes."""
         shares = self.lights.new_zeros(2, len(examples) * self.views)
         for layer in self._layers(conditions, examples):

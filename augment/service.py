@@ -1,4 +1,4 @@
-"""The augmentation service: fresh labelled renders, made against the current weights whenever they are asked for."""
+"""Fresh labeled renders for a training loop, attacked with the weights that the network has at the moment."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from augment import utils
-from augment.attacks.attack import AttackSettings
+from augment.attacks.attack import AttackSettings, logits_of
 from augment.attacks.criteria import NO_CLASS, Goal
 from augment.attacks.descent import DescentResult, Part, descend_in_parts
 from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting, StepSettings
 from augment.build import Shown, build_scene
 from augment.labels import is_right, label_loss, require_known
 from augment.scene import Conditions, Scene
-from augment.utils import BatchSize, Phases, as_found, generator, stream_seed
+from augment.utils import Phases, as_found, generator, stream_seed
 from augment.variation import VariationSettings, vary
-from renderer.arguments import checked, require_fields
 from renderer.basis import HARMONICS, Basis
 from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.lights import perturb
@@ -30,39 +29,32 @@ from renderer.lights import perturb
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-
 ARMS = ("none", "random", "adversarial")
 INITS = ("scene", "random")
 MOST_EXAMPLES = 10**6  # at 32 × 32 pixels they take 12 GB
 MOST_EVERY = 10**9
-MOST_CANDIDATES = 100
+SHOWN_EXAMPLES = 4  # of an attack, to look at
 
 
 @dataclass
 class RandomLightSettings:
-    """Perturbations of the initial light: uniform ±amplitude, or scaled to an L2 radius (see `lights.perturb`).
-
-    candidates: how many lights are tried of each example of the random arm, all that `vary` draws of the light and the
-    camera's part included, to keep the one of the highest loss.
-    """
+    """Random offsets of the scene's light: uniform in ±amplitude per coefficient, or scaled to an L2 radius
+    (`renderer.lights.perturb`)."""
 
     amplitude: float = 0.5
     radius: float | None = None
-    candidates: int = 1
 
     def __post_init__(self) -> None:
-        require_fields(self)
-        require_range("augment.random_light.candidates", self.candidates, 1, MOST_CANDIDATES)
-        for name in ("amplitude", "radius"):  # no radius: null
-            require_range(f"augment.random_light.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
+        require_range("augment.random_light.amplitude", self.amplitude, 1 / FACTOR, FACTOR)
+        require_range("augment.random_light.radius", self.radius, 1 / FACTOR, FACTOR)
 
 
 @dataclass
 class TrainingAttackSettings(AttackSettings):
-    """Unless kinds are named, the paper's appendix C: 0.05 along the gradient's direction of the light, 30 steps, any
-    coefficients.
+    """Unless parameters are named, the attack of the paper's appendix C on all coefficients of the light: 30 steps of
+    0.05 along the gradient's direction, negative light allowed.
 
-    step, step_size: those of that light; see `StepSettings` for what "along the direction" means.
+    step, step_size: of that attack on the light, as in `StepSettings`.
     """
 
     step: str = "unit"
@@ -81,12 +73,15 @@ class TrainingAttackSettings(AttackSettings):
 
 @dataclass
 class AugmentationSettings:
-    """What is regenerated, and when.
+    """What a service renders, and when.
 
-    init: where an attack begins, the scene as it is ("scene") or a random perturbation of it: of the light by
-    `random_light`, of all else uniform in its norm-ball. warm_start: begin where the last attack ended, not there.
-    vary: what of the scene is drawn afresh each time. every: after how many training images the renders are made anew,
-    counted within an epoch; None: each epoch.
+    arm: "none", "random" (random light or shape) or "adversarial". examples: renders per regeneration. init: where an
+    attack begins: "scene" (the scene's own values) or "random" (light by `random_light`, everything else uniform in its
+    norm-ball). warm_start: begin where the last regeneration's attack ended. every: training images between two
+    regenerations, counted within an epoch; None: one regeneration per epoch. vary: what is drawn anew each time.
+
+    >>> AugmentationSettings(arm="random", random_light=RandomLightSettings(radius=1.5)).renders
+    True
     """
 
     arm: str = "adversarial"
@@ -99,9 +94,8 @@ class AugmentationSettings:
     attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
 
     def __post_init__(self) -> None:
-        require_fields(self)
-        for name, choices in {"arm": ARMS, "init": INITS}.items():
-            require_choice(f"augment.{name}", getattr(self, name), choices)
+        require_choice("augment.arm", self.arm, ARMS)
+        require_choice("augment.init", self.init, INITS)
         require_range("augment.examples", self.examples, 0, MOST_EXAMPLES)
         require_range("augment.every", self.every, 1, MOST_EVERY)
         if self.arm == "random" or self.init == "random":
@@ -118,19 +112,16 @@ class AugmentationSettings:
 
     @property
     def relights(self) -> bool:
-        """Whether nothing but the light changes, so that the scene's operators last from epoch to epoch."""
+        """Whether nothing but the light changes, so that precomputed transfer lasts from epoch to epoch."""
         return not (self.vary.moves or {Geometry.name, Albedo.name} & self.attack.parameters.keys())
-
-
-MOST = 4
 
 
 @dataclass(frozen=True)
 class AttackExamples:
-    """S of the examples that a model errs on, as the scene had them before and under the conditions that fool.
+    """S successful examples of a regeneration, before and after the attack.
 
-    images_before, images: (S, 3, H, W) in [0, 1]. lights_before, lights: (S, basis.size, 3). answers_before, answers:
-    (S, C) probabilities. labels: (S,) int64.
+    images_before, images: (S, 3, H, W) in [0, 1]. lights_before, lights: (S, basis.size, 3). predictions_before,
+    predictions: (S, C) probabilities. labels: (S,) int64.
     """
 
     images_before: Tensor
@@ -146,38 +137,12 @@ class AttackExamples:
         return len(self.labels)
 
 
-def choose_attack_examples(
-    model: nn.Module, problem: AttackProblem, values: Tensor, success: Tensor, labels: Tensor
-) -> AttackExamples:
-    """Up to MOST of the examples that are `success` (E,), evenly drawn, under values (E, D); the model stays as it was.
-
-    The problem's examples are of one view each.
-    """
-    candidates = torch.nonzero(success).squeeze(1)
-    drawn = torch.linspace(0, max(len(candidates) - 1, 0), min(MOST, len(candidates))).round().long()
-    rows = candidates[drawn.to(candidates.device)]
-    before, after = (problem.conditions(each[rows], rows) for each in (problem.start, values))
-    with as_found(model), torch.no_grad():
-        images = [problem.scene.render(conditions, rows)[:, 0] for conditions in (before, after)]
-        predictions = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
-    return AttackExamples(
-        images[0],
-        images[1],
-        before.light,
-        after.light,
-        predictions[0],
-        predictions[1],
-        labels[rows],
-        problem.scene.basis,
-    )
-
-
 @dataclass(frozen=True)
 class Renders(Dataset[tuple[Tensor, int]]):
-    """Labelled examples: images in [0, 1], labels, and diagnostics as plain numbers.
+    """Labeled examples: images in [0, 1], labels, and diagnostics as plain numbers.
 
-    attack_examples: a few of those that fool, with what they were before; None where that is not known any more.
-    As a data set, pairs of an image on the CPU and its label as a number: `data + renders` is both.
+    attack_examples: a few successful ones with what they were before the attack; None where that is not known.
+    As a data set, it holds pairs of an image on the CPU and its label as a number, so that `data + renders` is both.
     """
 
     images: Float[Tensor, "E 3 H W"]
@@ -194,13 +159,12 @@ class Renders(Dataset[tuple[Tensor, int]]):
 
 @dataclass(eq=False, repr=False)
 class AugmentationService:
-    """Holds the scene and, where they are kept (`warm_start`), the adversaries' values from one regeneration to the
-    next.
+    """The scene and, with `warm_start`, the attack's values from one regeneration to the next.
 
-    Where several processes train together, each attacks its share of the examples, and all get all renders.
-    scene: None where nothing is rendered; one view per example. labels: (E,) int64, see `augment.labels`.
-    label: the class that is to be told from hard negatives, the examples of all other labels: attacks light these
-    towards it. None: every attack leads away from the example's own class.
+    scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.labels`. label:
+    the class that hard negatives are attacked towards, where a scene has any: these are the examples of all other
+    labels. None: every attack leads away from the example's own class. rank, world_size: of this process among those
+    that train together; each attacks its shard of the examples, and all get all renders.
     """
 
     settings: AugmentationSettings
@@ -209,16 +173,16 @@ class AugmentationService:
     seed: int
     phases: Phases
     label: int | None = None
-    _continued: Tensor | None = field(default=None, init=False)
+    rank: int = 0
+    world_size: int = 1
+    _last_values: Tensor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        require_fields(self)
         settings = self.settings
         if self.scene is None and settings.renders:
             raise InputError(f"augment.arm={settings.arm} renders augment.examples={settings.examples}: give a scene")
 
     @classmethod
-    @checked
     def from_meshes(
         cls,
         meshes: Sequence[tuple[Shown, int]],
@@ -231,14 +195,19 @@ class AugmentationService:
         device: torch.device | str = "cpu",
         **of_scene: Any,
     ) -> AugmentationService:
-        """For any training loop: meshes × views × backgrounds renders, as the paper has them unless told otherwise.
+        """A service for any training loop: meshes × views × backgrounds renders, as in the paper by default.
 
-        meshes: (file, solid:NAME or `Mesh`; the index of its class) each. size: pixels per side. of_scene: further
-        arguments of `build_scene`; as in the paper, 8 × 8 samples per pixel and flat shading are the default.
+        meshes: pairs of a file, solid:NAME or `Mesh`, and the index of its class. size: pixels per side. of_scene:
+        further arguments of `build_scene`; 8 × 8 samples per pixel and flat shading, as in the paper, by default.
+
+        >>> service = AugmentationService.from_meshes([("solid:orange", 0), ("solid:apple", 1)], 8, views=1, samples=1)
+        >>> model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 8 * 8, 2))
+        >>> service.regenerate(model, number=0).images.shape
+        torch.Size([10, 3, 8, 8])
         """
         named = [(mesh, str(label)) for mesh, label in meshes]
-        choices = {"samples": 8, "normals": "flat", "backgrounds": backgrounds, "device": device, **of_scene}
-        scene = build_scene(named, size, views, **choices)
+        options = {"samples": 8, "normals": "flat", "backgrounds": backgrounds, "device": device, **of_scene}
+        scene = build_scene(named, size, views, **options)
         labels = torch.tensor([int(label) for label in scene.labels], device=device)
         settings = replace(settings or AugmentationSettings(), examples=len(scene))
         return cls(settings, scene, labels, seed, Phases(device))
@@ -247,69 +216,64 @@ class AugmentationService:
         """Examples per regeneration."""
         return len(self.labels) if self.settings.renders else 0
 
-    @checked
     def regenerate(self, model: nn.Module, number: int) -> Renders:
-        """Fresh examples for the model's current weights; the model is left as it was found.
+        """Fresh examples for the model's current weights; the model keeps its mode, gradients and random state.
 
-        number: counts the regenerations of a run from 0. The draw depends on it and the seed alone, so a resumed run
-        repeats it.
+        model: images (N, 3, size, size) in [0, 1] → logits. number: counts a run's regenerations from 0. The draw
+        depends on it and on the seed alone, so a resumed run repeats it. InputError: a label that has no logit.
         """
         require_range("number", number, 0, math.inf)
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
-        random = self.settings.arm == "random"
-        lights = self.settings.random_light.candidates if random else 1
-        scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"), lights)
-        make = self._random if random else self._adversarial
+        scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"))
+        make = self._random if self.settings.arm == "random" else self._adversarial
         return make(model, self.settings.attack.problem(scene), number)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The adversaries' values (E, D), where they continue; empty otherwise."""
-        return {} if self._continued is None else {"values": self._continued.cpu()}
+        """The values (E, D) that the next attack begins with, with `warm_start`; otherwise empty."""
+        return {} if self._last_values is None else {"values": self._last_values.cpu()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` gave; InputError where it is from another number of examples or an old version."""
+        """Restore the result of `state_dict`; InputError for one of another number of examples."""
         if not state:
             return
-        if "values" not in state:
-            raise InputError("the checkpoint continues lights as an older version kept them: resume with that version")
         if len(state["values"]) != len(self.labels):
             raise InputError(
                 f"augment.examples: the checkpoint continues {len(state['values'])} examples and the scene has "
                 f"{len(self.labels)}; resume with the settings of the run"
             )
-        self._continued = state["values"].to(self.labels.device)
+        self._last_values = state["values"].to(self.labels.device)
 
     def _random(self, model: nn.Module, problem: AttackProblem, number: int) -> Renders:
-        values = self._perturbed(problem, number)
-        images = problem.images(values)[:, 0]
-        with as_found(model), torch.no_grad(), self.phases("attack_classifier"):
-            batches = BatchSize(self.settings.attack.batch_size).map(lambda part: model(images[part]), len(images))
-            logits = torch.cat(list(batches))
-        labels = self.labels.repeat(self.settings.random_light.candidates)
-        require_known(labels, logits)
-        success, losses = ~is_right(logits.argmax(1), labels), label_loss(logits, labels)
-        worst = losses.unflatten(0, (-1, len(self))).argmax(0) * len(self) + torch.arange(len(self)).to(labels)
-        diagnostics = {"attack_success": _mean(success[worst]), "loss": _mean(losses[worst])}
-        kept = torch.zeros_like(success).index_fill(0, worst, True)
-        attack_examples = choose_attack_examples(model, problem, values, success & kept, labels)
-        return Renders(images[worst], self.labels, diagnostics | _changes(problem, values), attack_examples)
+        values = self._random_values(problem, number)
+        images = problem.images(values)
+        with as_found(model), self.phases("attack_classifier"):
+            logits = logits_of(model, images, self.settings.attack.batch_size)[:, 0]
+        require_known(self.labels, logits)
+        success = ~is_right(logits.argmax(1), self.labels)
+        diagnostics = {"attack_success": _mean(success), "loss": _mean(label_loss(logits, self.labels))}
+        examples = choose_attack_examples(model, problem, values, success, self.labels)
+        return Renders(images[:, 0], self.labels, diagnostics | _changes(problem, values), examples)
 
     def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int) -> Renders:
-        attack, goal = self.settings.attack, self._goal()
-        mine = utils.shard(len(problem.start)).to(problem.start.device)
-        part = Part(problem, mine, self._start(problem, number)[mine])
+        attack, total = self.settings.attack, len(problem.start)
+        shard = utils.shard(total, self.rank, self.world_size).to(problem.start.device)
+        part = Part(problem, shard, self._start(problem, number)[shard])
         draws = generator(self.seed, number, "restart")
-        restarts = (problem.sample(draws)[mine] for _ in range(attack.restarts))
-        seen = attack.eot_model(model, stream_seed(self.seed, number))
-        result = descend_in_parts(seen, part, goal.of(mine), attack, self.phases, restarts, problem.scene.at_once)
-        result = result.merged(mine, len(problem.start))
+        restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
+        eot_model = attack.eot_model(model, stream_seed(self.seed, number))
+        goal = self._goal().of(shard)
+        result = descend_in_parts(eot_model, part, goal, attack, self.phases, restarts, problem.scene.at_once)
+        gathered = {item.name: getattr(result, item.name) for item in fields(result)}
+        result = DescentResult(
+            **{name: utils.merged(rows, shard, total, self.world_size) for name, rows in gathered.items()}
+        )
         if self.settings.warm_start:
-            self._continued = result.values
+            self._last_values = result.values
         diagnostics = self._attack_diagnostics(result) | _changes(problem, result.values)
         new_success = result.success & ~result.success_before
-        attack_examples = choose_attack_examples(model, problem, result.values, new_success, self.labels)
-        return Renders(result.images[:, 0], self.labels, diagnostics, attack_examples)
+        examples = choose_attack_examples(model, problem, result.values, new_success, self.labels)
+        return Renders(result.images[:, 0], self.labels, diagnostics, examples)
 
     def _goal(self) -> Goal:
         if self.label is None:
@@ -319,24 +283,23 @@ class AugmentationService:
         return Goal(source[:, None], target[:, None])
 
     def _start(self, problem: AttackProblem, number: int) -> Tensor:
-        if self._continued is not None:
-            return self._continued
-        return self._perturbed(problem, number) if self.settings.init == "random" else problem.start
+        if self._last_values is not None:
+            return self._last_values
+        return self._random_values(problem, number) if self.settings.init == "random" else problem.start
 
-    def _perturbed(self, problem: AttackProblem, number: int) -> Tensor:
-        """Random values (E, D), within the norm-balls."""
-        random, drawn = self.settings.random_light, []
+    def _random_values(self, problem: AttackProblem, number: int) -> Tensor:
+        """Random values (E, D) within the norm-balls."""
+        random, parts = self.settings.random_light, []
         for parameter, start in zip(problem.parameters, problem.split(problem.start), strict=True):
             if isinstance(parameter, Lighting):
-                none = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
+                zero = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
                 draws = generator(self.seed, number, "lights")
-                offsets = perturb(none, len(start), random.amplitude, random.radius, draws)
-                drawn.append(start + offsets.flatten(1).to(start))
+                offsets = perturb(zero, len(start), random.amplitude, random.radius, draws)
+                parts.append(start + offsets.flatten(1).to(start))
             else:
-                drawn.append(
-                    parameter.sample(generator(self.seed, number, parameter.name), problem.everything).to(start)
-                )
-        return problem.project(torch.cat(drawn, dim=1), problem.everything)
+                draws = generator(self.seed, number, parameter.name)
+                parts.append(parameter.sample(draws, problem.everything).to(start))
+        return problem.project(torch.cat(parts, dim=1), problem.everything)
 
     def _attack_diagnostics(self, result: DescentResult) -> dict[str, float]:
         attack = self.settings.attack
@@ -351,15 +314,32 @@ class AugmentationService:
         }
 
 
+def choose_attack_examples(
+    model: nn.Module, problem: AttackProblem, values: Tensor, success: Tensor, labels: Tensor
+) -> AttackExamples:
+    """Up to `SHOWN_EXAMPLES` of the examples with success (E,), evenly spaced, under values (E, D).
+
+    The problem's examples have one view each. The model keeps its state.
+    """
+    rows = torch.nonzero(success).squeeze(1)
+    chosen = torch.linspace(0, max(len(rows) - 1, 0), min(SHOWN_EXAMPLES, len(rows))).round().long()
+    rows = rows[chosen.to(rows.device)]
+    before, after = (problem.conditions(end[rows], rows) for end in (problem.start, values))
+    with as_found(model), torch.no_grad():
+        images = [problem.scene.render(conditions, rows)[:, 0] for conditions in (before, after)]
+        predictions = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
+    return AttackExamples(*images, before.light, after.light, *predictions, labels[rows], problem.scene.basis)
+
+
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:
-    """The mean L2 norm of what changed of each condition, and the share of values that are clamped."""
-    before, after = (problem.conditions(each, problem.everything) for each in (problem.start, values))
+    """The mean L2 norm of each condition's change, and the fraction of image values that are clamped."""
+    before, after = (problem.conditions(end, problem.everything) for end in (problem.start, values))
     changes = {
         f"{part.name}_change": _mean((value - getattr(before, part.name)).flatten(1).norm(dim=1))
         for part in fields(Conditions)
         if (value := getattr(after, part.name)) is not None
     }
-    return changes | {"clamped": _mean(problem.scene.clamped_share(after, problem.everything))}
+    return changes | {"clamped": _mean(problem.scene.clamped_fraction(after, problem.everything))}
 
 
 def _mean(values: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""Random draws by name, memory, progress, seconds by phase, a model's state, processes that train together."""
+"""Random streams, memory, progress bars, seconds per phase, a model's state, and shards of processes."""
 
 import logging
 import math
@@ -21,6 +21,14 @@ from tqdm import tqdm
 
 from renderer.errors import InputError, is_out_of_memory, require_range
 
+MEMORY, GROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")  # of Linux, and of a container (cgroup v2)
+PATIENCE = 5  # seconds without a progress bar
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+# ------------------------------------------------------------------------------------- random streams
+
 
 def stream_seed(*key: int | str) -> int:
     """A 63-bit seed from a key such as (run seed, epoch, "order"); different keys give independent streams."""
@@ -35,8 +43,7 @@ def generator(*key: int | str) -> torch.Generator:
     return torch.Generator().manual_seed(stream_seed(*key))
 
 
-MEMORY, GROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")  # Linux's, and a container's share of it (cgroup v2)
-Result = TypeVar("Result")
+# ------------------------------------------------------------------------------------- memory
 
 
 @dataclass
@@ -46,9 +53,9 @@ class BatchSize:
     images: int
 
     def map(self, compute: Callable[[slice], Result], total: int) -> Iterator[Result]:
-        """What comes of consecutive parts that are `total` long together. A part may be computed anew, in halves.
+        """The results of consecutive slices that are `total` long together; a slice may be computed again, in halves.
 
-        Whatever `compute` raises, also where memory runs out on a single image.
+        Raises whatever `compute` raises, also where memory runs out on a single image.
         """
         begin = 0
         while begin < total:
@@ -59,22 +66,22 @@ class BatchSize:
                 if self.images == 1 or not is_out_of_memory(error):
                     raise
                 self.images //= 2
-                _say(self.images)
+                _warn_once(self.images)
             else:
                 yield result
                 begin = part.stop
                 continue
             if torch.cuda.is_available():
-                torch.cuda.empty_cache()  # here, where the error no longer holds what was computed
+                torch.cuda.empty_cache()  # here, where the error no longer keeps the tensors of the slice
 
 
-@cache  # once, not in each epoch
-def _say(images: int) -> None:
+@cache
+def _warn_once(images: int) -> None:
     logging.getLogger(__name__).warning("memory ran out: the attack goes on with %d images per pass", images)
 
 
 def require_memory(name: str, needed: int, device: torch.device) -> None:
-    """InputError naming what needs more bytes than are free, rather than an end by the system half an hour later."""
+    """InputError naming what needs more bytes than are free, before the system ends the process for it."""
     free = _free(device)
     if free is not None and needed > free:
         raise InputError(
@@ -84,7 +91,7 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
 
 
 def _free(device: torch.device) -> int | None:
-    """Bytes on a GPU, or in the machine or the container; None where the system does not say."""
+    """Free bytes of a GPU, the machine or the container; None where the system does not say."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     try:
@@ -92,20 +99,19 @@ def _free(device: torch.device) -> int | None:
     except (OSError, KeyError, ValueError):
         return None
     try:
-        most, used = (int((GROUP / file).read_text()) for file in ("memory.max", "memory.current"))
+        limit, used = (int((GROUP / file).read_text()) for file in ("memory.max", "memory.current"))
     except (OSError, ValueError):  # no such file, or "max"
         return free
-    return min(free, most - used)
+    return min(free, limit - used)
 
 
-PATIENCE = 5  # seconds without one
-Item = TypeVar("Item")
+# ------------------------------------------------------------------------------------- progress and time
 
 
 def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterable[Item]:
-    """The items, with a bar on a terminal once they have taken some seconds; nothing elsewhere.
+    """The items, with a bar on a terminal after some seconds; without a terminal, just the items.
 
-    total: how many there are, where they have no length. done: before these.
+    total: their number, where they have no length. done: how many came before.
     """
     hidden = not sys.stderr.isatty()
     return tqdm(items, description, total, delay=PATIENCE, leave=False, disable=hidden, initial=done)
@@ -113,7 +119,7 @@ def progress(items: Iterable[Item], description: str, total: int | None = None, 
 
 @contextmanager
 def underway(description: str) -> Iterator[None]:
-    """A bar at 0 % on a terminal, at once, for as long as what has no parts to count takes; nothing elsewhere."""
+    """A bar at 0 % on a terminal, at once, during work that has no parts to count."""
     with tqdm(total=1, desc=description, leave=False, disable=not sys.stderr.isatty()):
         yield
 
@@ -142,6 +148,9 @@ class Phases:
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         return time.perf_counter()
+
+
+# ------------------------------------------------------------------------------------- a model's state
 
 
 @contextmanager
@@ -173,26 +182,29 @@ def as_found(model: nn.Module) -> Iterator[None]:
             parameter.requires_grad_(True)
 
 
+# ------------------------------------------------------------------------------------- processes
+
+
 def world_size() -> int:
-    """How many there are; 1 for a run by itself."""
+    """The number of processes that train together; 1 without `torchrun`."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def rank() -> int:
-    """This one's number, from 0."""
+    """This process's number, from 0."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
-def shard(total: int) -> Tensor:
-    """Ascending indices of this process's examples: every `world_size()`-th, at least one, also if others have it."""
-    return torch.arange(rank() % total, total, world_size())
+def shard(total: int, rank: int, world_size: int) -> Tensor:
+    """Ascending indices of a process's examples: every `world_size`-th, and at least one, even if another has it."""
+    return torch.arange(rank % total, total, world_size)
 
 
-def merged(part: Tensor, examples: Tensor, total: int) -> Tensor:
-    """All `total` rows, of which every process has those of its examples; the same in every process."""
-    if world_size() == 1:
+def merged(part: Tensor, examples: Tensor, total: int, world_size: int) -> Tensor:
+    """All `total` rows, gathered from every process's part with its examples; the same in every process."""
+    if world_size == 1:
         return part
-    parts = [(part, examples)] * world_size()  # to be overwritten
+    parts = [(part, examples)] * world_size  # to be overwritten
     dist.all_gather_object(parts, (part.cpu(), examples.cpu()))
     whole = part.new_empty(total, *part.shape[1:])
     for rows, places in parts:

@@ -1,4 +1,4 @@
-"""Rows drawn afresh: which instance is shown, from where, in which light, before what, and through which camera."""
+"""Rows of a scene drawn anew: instance, view, light, background and camera effects of each example."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,6 @@ from torch import Tensor
 from augment.camera_effects import CameraEffectSettings, draw_camera_effects
 from augment.objects import another_instance
 from augment.scene import Example, Scene
-from renderer.arguments import require_fields
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
@@ -24,21 +23,24 @@ from renderer.lights import directional, load_light
 from renderer.transfer import DEGREE
 
 UNCHANGED = (1.0, 1.0)
-LAMP_REACH = 70.0  # degrees around the mesh and up or down, from the camera
+DIRECTIONAL_ANGLE = 70.0  # degrees between camera and directional light, around the mesh and up or down, at most
 
 
 @dataclass
 class VariationSettings:
-    """What is drawn for each example in each round; by default nothing, which leaves the grid of the paper.
+    """What is drawn for each example in each regeneration; by default nothing, which leaves the paper's grid.
 
-    shift: the mesh's middle is moved by at most this share of the frame's width, to either side and up and down. scale,
-    exposure: [least, most] that its size in the frame and the light are multiplied by, uniform in the logarithm.
-    backgrounds: a folder of images, each example before one of them. instances: every solid that is named without a
-    seed is another of its kind in each of its views. azimuth: degrees that the camera goes around the mesh, at most, to
-    either side and up and down. environments: each example is in one of these, as `load_light` takes them.
-    directional_fraction: the fraction of examples that stand in the parallel light of a lamp on the camera's side, up
-    to 70° off, over [least, most] `fill_light` of their own. lit_background: a background is a wall that faces the
-    camera in the example's light. camera: what a camera makes of the images.
+    shift: of the mesh's center, at most, as a fraction of the frame's width, to either side and up and down.
+    scale, exposure: [least, most] factor of the mesh's size in the frame, and of the light; log-uniform. backgrounds:
+    a folder of images, one behind each example. instances: every solid that is named without a seed is another instance
+    in each of its views. azimuth: degrees that the camera moves around the mesh, at most, to either side and up and
+    down. environments: each example is in one of these lights, as `load_light` takes them. directional_fraction: of the
+    examples, in a directional light from the camera's side, up to 70° off, plus [least, most] `fill_light` of their own
+    light. lit_background: a background is a wall that faces the camera, in the example's light. camera: effects on
+    the images.
+
+    >>> VariationSettings(shift=0.1).moves, VariationSettings(exposure=[0.5, 2.0]).moves
+    (True, False)
     """
 
     shift: float = 0.0
@@ -54,7 +56,6 @@ class VariationSettings:
     camera: CameraEffectSettings = field(default_factory=CameraEffectSettings)
 
     def __post_init__(self) -> None:
-        require_fields(self)
         for name, most in (("shift", 1), ("azimuth", 180), ("directional_fraction", 1)):
             require_range(f"augment.vary.{name}", getattr(self, name), 0, most)
         require_limits("augment.vary.fill_light", self.fill_light, 0, 1)
@@ -63,41 +64,35 @@ class VariationSettings:
 
     @property
     def moves(self) -> bool:
-        """Whether views change, which then are rasterised in every round."""
+        """Whether views change, which then are rasterized in every regeneration."""
         return self.shift > 0 or tuple(self.scale) != UNCHANGED or self.azimuth > 0 or self.instances
 
     @property
     def varies(self) -> bool:
         """Whether anything is drawn at all."""
-        of_light = (
-            tuple(self.exposure) != UNCHANGED
-            or self.environments
-            or self.directional_fraction > 0
-            or self.lit_background
-        )
-        return bool(self.moves or of_light or self.backgrounds is not None or self.camera.changes)
+        light = tuple(self.exposure) != UNCHANGED or self.environments or self.directional_fraction > 0
+        views = self.moves or self.backgrounds is not None or self.lit_background
+        return bool(views or light or self.camera.changes)
 
 
-def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator, lights: int = 1) -> Scene:
-    """The scene with rows drawn afresh around its own; the scene itself where nothing varies.
+def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+    """The scene with rows drawn anew around its own; the scene itself where nothing varies.
 
-    All views of a row are moved alike. lights: how often all rows come, one after the other, each time the same but for
-    the light and the camera's part. InputError where the folder of backgrounds has no readable image.
+    All views of a row are moved alike. InputError where the folder of backgrounds has no readable image.
     """
-    moved = _moved_rows(scene, settings, draws) if settings.moves or settings.backgrounds is not None else scene
-    if lights > 1:
-        moved = replace(moved, examples=[*moved.examples] * lights, lights=moved.lights.repeat(lights, 1, 1))
-    return _taken_anew(moved, settings, draws) if settings.varies else moved
+    if settings.moves or settings.backgrounds is not None:
+        scene = _with_moved_rows(scene, settings, draws)
+    return _with_other_light(scene, settings, draws) if settings.varies else scene
 
 
-def _moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
-    """What is shown, where and before what."""
-    place = settings.shift * (2 * torch.rand(len(scene), 2, generator=draws, dtype=torch.float64) - 1)
-    scale = _between(settings.scale, len(scene), draws)
+def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+    """The scene with other views, instances and backgrounds."""
+    shifts = settings.shift * (2 * torch.rand(len(scene), 2, generator=draws, dtype=torch.float64) - 1)
+    scales = _log_uniform(settings.scale, len(scene), draws)
     angles = _angles(settings.azimuth, len(scene), draws)
     rows = [
-        _moved(row, right, up, size, *angle)
-        for row, (right, up), size, angle in zip(scene.examples, place.tolist(), scale, angles, strict=True)
+        _moved(row, right, up, scale, *angle)
+        for row, (right, up), scale, angle in zip(scene.examples, shifts.tolist(), scales, angles, strict=True)
     ]
     changed: dict[str, Any] = {}
     if settings.backgrounds is not None:
@@ -106,47 +101,53 @@ def _moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generato
     if settings.instances:
         views = list(dict.fromkeys((row.object, row.cameras) for row in scene.examples))
         seeds = torch.randint(2**31, (len(views),), generator=draws).tolist()
-        drawn = zip(views, seeds, strict=True)
-        changed["objects"] = [another_instance(scene.objects[index], seed) for (index, _), seed in drawn]
+        changed["objects"] = [
+            another_instance(scene.objects[index], seed) for (index, _), seed in zip(views, seeds, strict=True)
+        ]
         number = {view: index for index, view in enumerate(views)}
-        which = [number[row.object, row.cameras] for row in scene.examples]
-        rows = [replace(row, object=index) for row, index in zip(rows, which, strict=True)]
-    if settings.moves:  # views that never come again are not worth a place on the disk
+        rows = [
+            replace(row, object=number[old.object, old.cameras]) for row, old in zip(rows, scene.examples, strict=True)
+        ]
+    if settings.moves:  # views that never come again are not kept on the disk
         changed["operators"] = OperatorCache()
     return replace(scene, examples=rows, **changed)
 
 
-def _taken_anew(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
-    """In which light, and through which camera."""
-    exposure = _between(settings.exposure, len(scene), draws)
-    rows = [replace(row, exposure=row.exposure * each) for row, each in zip(scene.examples, exposure, strict=True)]
+def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
+    """The scene in other light, and with camera effects."""
+    exposures = _log_uniform(settings.exposure, len(scene), draws)
+    rows = [replace(row, exposure=row.exposure * factor) for row, factor in zip(scene.examples, exposures, strict=True)]
     changed: dict[str, Any] = {}
     if settings.environments:
-        which = torch.randint(len(settings.environments), (len(rows),), generator=draws)
-        changed["lights"] = torch.stack([load_light(light) for light in settings.environments])[which].to(scene.lights)
+        chosen = torch.randint(len(settings.environments), (len(rows),), generator=draws)
+        lights = torch.stack([load_light(light) for light in settings.environments])
+        changed["lights"] = lights[chosen].to(scene.lights)
     if settings.directional_fraction > 0:
-        changed["lights"] = _in_lamplight(changed.get("lights", scene.lights), scene, settings, draws)
+        changed["lights"] = _in_directional_light(changed.get("lights", scene.lights), scene, settings, draws)
     if settings.camera.changes:
-        changed["camera_effects"] = draw_camera_effects(settings.camera, len(rows), scene.settings, draws).to(
-            scene.lights.device
-        )
+        effects = draw_camera_effects(settings.camera, len(rows), scene.settings, draws)
+        changed["camera_effects"] = effects.to(scene.lights.device)
     varied = replace(scene, examples=rows, **changed)
     return _with_lit_walls(varied) if settings.lit_background else varied
 
 
-def _between(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
+def _log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) -> list[float]:
     low, high = (math.log(limit) for limit in limits)
     return (low + (high - low) * torch.rand(count, generator=draws, dtype=torch.float64)).exp().tolist()
 
 
+def _angles(most: float, count: int, draws: torch.Generator) -> list[list[float]]:
+    """(count, 2) in radians, uniform; `most` in degrees."""
+    return (math.radians(most) * (2 * torch.rand(count, 2, generator=draws, dtype=torch.float64) - 1)).tolist()
+
+
 def _moved(row: Example, right: float, up: float, scale: float, polar: float, azimuth: float) -> Example:
-    """By shares of the frame's width, which shows the mesh so much larger, and by radians around it."""
+    """right, up: fractions of the frame's width, which shows the mesh `scale` times as large; angles in radians."""
     cameras = []
     for camera in row.cameras:
         width = camera.field_of_view / scale
-        place = {"right": camera.right + right * width, "up": camera.up + up * width}
-        turned = _turned(camera, polar, azimuth)
-        cameras.append(replace(turned, field_of_view=width, **place))
+        shift = {"right": camera.right + right * width, "up": camera.up + up * width}
+        cameras.append(replace(_turned(camera, polar, azimuth), field_of_view=width, **shift))
     return replace(row, cameras=tuple(cameras))
 
 
@@ -155,7 +156,7 @@ def _turned(camera: Camera, polar: float, azimuth: float) -> Camera:
 
 
 def _images(folder: Path, count: int, size: int, draws: torch.Generator) -> Tensor:
-    """(count, 3, size, size), with repetition."""
+    """(count, 3, size, size), drawn with repetition."""
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
         raise InputError(f"augment.vary.backgrounds={folder} holds no image: give a folder of .jpg or .png files")
@@ -163,27 +164,22 @@ def _images(folder: Path, count: int, size: int, draws: torch.Generator) -> Tens
     return torch.stack([read_image(files[index], size) for index in chosen])
 
 
-def _angles(most: float, count: int, draws: torch.Generator) -> list[list[float]]:
-    """(count, 2) in radians, uniform, `most` in degrees."""
-    return (math.radians(most) * (2 * torch.rand(count, 2, generator=draws, dtype=torch.float64) - 1)).tolist()
+def _in_directional_light(lights: Tensor, scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Tensor:
+    """The lights (E, 49, 3), a fraction of them dimmed, plus a white directional light of irradiance 1.
 
-
-def _in_lamplight(lights: Tensor, scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Tensor:
-    """The lights (E, 49, 3), some of them dimmed, with a white lamp that gives 1 to a surface facing it.
-
-    What stands on a table has no lamp below it: one that is drawn there is mirrored.
+    An object on a table has no light from below: a direction that is drawn there is mirrored.
     """
     low, high = settings.fill_light
     shape = (len(scene), 1, 1)
-    ambient = low + (high - low) * torch.rand(shape, generator=draws)
+    fill = low + (high - low) * torch.rand(shape, generator=draws)
     chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
-    lamps = []
-    for row, angles in zip(scene.examples, _angles(LAMP_REACH, len(scene), draws), strict=True):
+    directionals = []
+    for row, angles in zip(scene.examples, _angles(DIRECTIONAL_ANGLE, len(scene), draws), strict=True):
         towards = torch.from_numpy(_turned(row.cameras[0], *angles).axes()[2])
         if scene.objects[row.object].ground is not None:
             towards[2].abs_()
-        lamps.append(directional(towards, torch.ones(3)).to(lights))
-    lit = torch.stack(lamps) + ambient.to(lights) * lights
+        directionals.append(directional(towards, torch.ones(3)).to(lights))
+    lit = torch.stack(directionals) + fill.to(lights) * lights
     return torch.where(chosen.to(lights.device), lit, lights)
 
 
@@ -191,8 +187,8 @@ def _with_lit_walls(scene: Scene) -> Scene:
     """Each row before its own background, times the irradiance of a surface that faces the row's first camera."""
     towards = torch.from_numpy(np.stack([row.cameras[0].axes()[2] for row in scene.examples]))
     exposures = torch.tensor([row.exposure for row in scene.examples])[:, None]
-    live = scene.lights.cpu().double()[:, live_coefficients(DEGREE)]
-    irradiance = torch.einsum("ek,ekc->ec", irradiance_basis(towards, DEGREE), live) * exposures
+    coefficients = scene.lights.cpu().double()[:, live_coefficients(DEGREE)]
+    irradiance = torch.einsum("ek,ekc->ec", irradiance_basis(towards, DEGREE), coefficients) * exposures
     images = scene.backgrounds[[row.background for row in scene.examples]]
     encoding = scene.settings.encoding
     lit = encode(clamp(decode(images, encoding) * irradiance.to(images)[:, :, None, None]), encoding)

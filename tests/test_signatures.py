@@ -128,7 +128,7 @@ def test_of_scenes_attacks_and_the_service():
     conditions = checked(Scene.conditions)(scene, everything)
     check_fields(conditions)
     checked(Scene.render)(scene, conditions, everything)
-    checked(Scene.clamped_share)(scene, conditions, everything)
+    checked(Scene.clamped_fraction)(scene, conditions, everything)
     goal = Goal(renders.labels[:, None])
     check_fields(goal)
     result = descend(classifier, problem, goal, DescentSettings(max_steps=1), Phases())

@@ -9,7 +9,7 @@ from augment.classifiers.adapter import class_index
 from augment.labels import complementary_label
 from augment.scene import Scene
 from augment.service import AugmentationService
-from augment.utils import Phases
+from augment.utils import Phases, rank, world_size
 from renderer.cache import OperatorCache
 from renderer.harmonics import live_coefficients
 from renderer.transfer import COEFFICIENTS, DEGREE
@@ -30,7 +30,8 @@ def build_service(
         number = {OTHER: complementary_label(under_study)} | {name: index for index, name in enumerate(data.classes)}
         labels = torch.tensor([number[name] for name in scene.labels])
         label = under_study if settings.scene.hard_negatives else None
-    return AugmentationService(settings.augment, scene, labels.to(device), settings.seed, phases, label)
+    labels = labels.to(device)
+    return AugmentationService(settings.augment, scene, labels, settings.seed, phases, label, rank(), world_size())
 
 
 def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor, nn
 
-from augment import utils
 from augment.attacks.criteria import Goal, adversarial_cost, logit_gap
 from augment.utils import BatchSize, Phases, as_found, progress
 from renderer.errors import FACTOR, require_range
@@ -76,11 +75,6 @@ class DescentResult:
     cost: Float[Tensor, " E"]
     predicted: Int[Tensor, "E V"]
     zero_gradient: Bool[Tensor, " E"]
-
-    def merged(self, examples: Tensor, total: int) -> DescentResult:
-        """The result of all `total` examples, where this one is of the process's own (A,); see `processes.merged`."""
-        rows = {item.name: utils.merged(getattr(self, item.name), examples, total) for item in fields(self)}
-        return DescentResult(**rows)
 
 
 @dataclass(frozen=True)

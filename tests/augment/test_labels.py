@@ -11,14 +11,14 @@ CLASSES = torch.tensor([0, 1, 2, 3, 4, 0])
 EXCLUDED = torch.tensor([complementary_label(label) for label in CLASSES.tolist()])
 
 
-def test_anything_but_a_class_costs_minus_the_logarithm_of_all_others_probability():
+def test_a_complementary_label_costs_minus_the_logarithm_of_all_other_classes_probability():
     others = 1 - softmax(LOGITS.numpy(), axis=1)[range(6), CLASSES]
     torch.testing.assert_close(label_loss(LOGITS, EXCLUDED), -torch.from_numpy(others).log(), rtol=0, atol=32 * EPS)
     smoothed = label_loss(LOGITS, EXCLUDED, label_smoothing=0.1)
     torch.testing.assert_close(smoothed, label_loss(LOGITS, EXCLUDED), rtol=0, atol=0)
 
 
-def test_a_class_costs_the_cross_entropy_beside_one_that_is_excluded():
+def test_a_class_costs_the_cross_entropy_in_a_batch_with_complementary_labels():
     mixed = torch.where(torch.arange(6) % 2 == 0, CLASSES, EXCLUDED)
     expected = -torch.from_numpy(log_softmax(LOGITS.numpy(), axis=1))[torch.arange(6), CLASSES]
     torch.testing.assert_close(label_loss(LOGITS, mixed)[::2], expected[::2], rtol=16 * EPS, atol=16 * EPS)
@@ -32,7 +32,7 @@ def test_the_gradient_is_exact_and_finite_where_the_excluded_class_is_certain():
 
 
 @pytest.mark.parametrize(("predicted", "label", "right"), [(2, 2, True), (1, 2, False), (2, -3, False), (0, -3, True)])
-def test_what_is_right(predicted, label, right):
+def test_a_class_is_right_for_its_label_and_for_complementary_labels_of_others(predicted, label, right):
     assert is_right(torch.tensor([predicted]), torch.tensor([label])).tolist() == [right]
 
 
@@ -41,7 +41,7 @@ def test_log_odds_are_the_probability_s_logit():
     torch.testing.assert_close(log_odds(LOGITS, 2), torch.from_numpy(expected), rtol=64 * EPS, atol=64 * EPS)
 
 
-def test_divergence_is_the_relative_entropy_of_the_answers():
+def test_divergence_is_the_relative_entropy_of_the_predictions():
     predictions = LOGITS.flip(0) / 2
     expected = rel_entr(softmax(predictions.numpy(), axis=1), softmax(LOGITS.numpy(), axis=1)).sum(1)
     torch.testing.assert_close(
@@ -58,16 +58,9 @@ def test_ranking_is_the_mean_logistic_loss_of_all_pairs_of_the_class_and_another
     )
 
 
-def test_ranking_costs_nothing_and_pulls_nowhere_without_a_pair():
+def test_ranking_is_zero_with_a_zero_gradient_without_a_pair():
     logits = LOGITS.clone().requires_grad_(True)
     for labels in (torch.full((6,), 2), torch.full((6,), complementary_label(2))):
         loss = ranking_loss(logits, labels, 2)
         loss.backward()
         assert loss == 0 and not logits.grad.any()
-
-
-def test_ranking_compares_images_and_has_no_threshold():
-    """Where every image's log-odds rise alike."""
-    labels = torch.tensor([2, 0, complementary_label(2), 2, complementary_label(2), 4])
-    shifted = LOGITS + 3 * (torch.arange(5) == 2)
-    torch.testing.assert_close(ranking_loss(shifted, labels, 2), ranking_loss(LOGITS, labels, 2))

@@ -17,7 +17,7 @@ def plain(tmp_path) -> str:
     return str(tmp_path / "plain.stl")
 
 
-def test_a_mesh_without_colours_is_given_one(plain):
+def test_a_mesh_without_colors_takes_the_given_one(plain):
     color = [0.9, 0.5, 0.1]
     mesh = load_object(ObjectSettings(plain, "orange", color=color)).mesh
     np.testing.assert_array_equal(mesh.corner_colors, np.broadcast_to(np.float32(color), mesh.corner_colors.shape))
@@ -26,7 +26,7 @@ def test_a_mesh_without_colours_is_given_one(plain):
     assert (white.corner_colors == 1).all()
 
 
-def test_a_terminal_shows_that_a_mesh_is_prepared_before_it_is_read(plain, capsys, monkeypatch):
+def test_a_terminal_shows_a_bar_before_a_mesh_is_read(plain, capsys, monkeypatch):
     shown = []
 
     def read(path, up):
@@ -41,27 +41,18 @@ def test_a_terminal_shows_that_a_mesh_is_prepared_before_it_is_read(plain, capsy
     assert capsys.readouterr().err == ""
 
 
-def test_a_mesh_that_brings_colours_keeps_them():
+def test_a_mesh_with_colors_takes_no_other():
     with pytest.raises(InputError, match="solid:orange brings colours of its own: leave color out"):
         load_object(ObjectSettings("solid:orange", "orange", color=[1.0, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("color", [[1.0, 0.5], [1.0, 0.5, 0.1, 1.0], [0.0, 0.0, 1.5], [0.0, float("nan"), 0.0]])
-def test_what_is_no_colour_is_refused(plain, color):
+def test_a_color_needs_three_channels_from_0_to_1(plain, color):
     with pytest.raises(InputError, match=r"plain\.stl: color=.* must be red, green and blue from 0 to 1"):
         ObjectSettings(plain, "orange", color=color)
 
 
-def test_another_individual_stands_on_the_same_table():
-    color = [0.2, 0.3, 0.4]
-    item = on_ground(load_object(ObjectSettings("solid:apple", "apple")), color)
-    other = another_instance(item, 5)
-    expected = on_ground(load_object(ObjectSettings("solid:apple:5", "apple")), color)
-    np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
-    np.testing.assert_array_equal(other.mesh.corner_colors, expected.mesh.corner_colors)
-
-
-def test_company_stands_on_the_objects_ground_where_it_is_put_and_turned():
+def test_props_stand_on_the_objects_ground_moved_and_turned():
     props = [PropSettings("solid:cup:1", [0.9, -0.2], scale=0.5, azimuth=90)]
     item = load_object(ObjectSettings("solid:apple", "apple", props=props))
     apple, cup = normalise(solid("apple")), normalise(solid("cup", 1))
@@ -74,7 +65,7 @@ def test_company_stands_on_the_objects_ground_where_it_is_put_and_turned():
     assert on_ground(item, (0.5, 0.5, 0.5)).lowest == item.lowest == apple.vertices[:, 2].min()
 
 
-def test_another_individual_has_the_same_company():
+def test_another_instance_has_the_same_props():
     props, color = [PropSettings("solid:cup", [1.0, 0.0], 0.5)], [0.2, 0.3, 0.4]
     kinds = [ObjectSettings(name, "apple", props=props) for name in ("solid:apple", "solid:apple:5")]
     item, expected = (on_ground(load_object(kind), color) for kind in kinds)

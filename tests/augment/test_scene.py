@@ -154,7 +154,7 @@ def test_the_gradient_is_the_transfer_where_nothing_clamps():
     torch.testing.assert_close(gradient[0, LIVE], expected, rtol=0, atol=16 * EPS32)
 
 
-def test_the_clamped_share_counts_covered_values_alone():
+def test_the_clamped_fraction_counts_covered_values_alone():
     """Radiance ±L₀₀ at three pixels of coverage 1, 1/2 and 1; a second view covers a fourth pixel, always in range."""
     unit, settings = torch.zeros(3, 31, 3), ImageSettings(size=2)
     unit[:, 0] = torch.tensor([1.0, 0.5, -1.0])
@@ -167,7 +167,7 @@ def test_the_clamped_share_counts_covered_values_alone():
     lights[:, 0] = torch.tensor([0.9, 1.6, 2.4])
     # Over black: 0.9, 1.6, 2.4; 0.45, 0.8, 1.2; all negative: 2 + 1 + 3 clamped. Over white, half of it at the second
     # pixel: 0.95, 1.3, 1.7, so 2 + 2 + 3.
-    shares = scene.clamped_share(Conditions(lights), torch.arange(4))
+    shares = scene.clamped_fraction(Conditions(lights), torch.arange(4))
     torch.testing.assert_close(shares, torch.tensor([6 / 9, 7 / 9, 0, 0]))
 
 
@@ -175,7 +175,7 @@ def test_a_scene_that_nothing_covers_is_its_backgrounds():
     scene = scene_of(["orange"], [random_operator(0, 0)], GREYS, ImageSettings(size=SIZE))
     images = render(scene, random_lights(3))
     torch.testing.assert_close(images, torch.tensor(GREYS).view(3, 1, 1, 1).expand_as(images), rtol=0, atol=0)
-    assert scene.clamped_share(Conditions(random_lights(3)), torch.arange(3)).tolist() == [0, 0, 0]
+    assert scene.clamped_fraction(Conditions(random_lights(3)), torch.arange(3)).tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(

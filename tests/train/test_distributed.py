@@ -66,13 +66,14 @@ def train_two_steps(folder: Path) -> None:
         model.zero_grad()
         loss.backward()
         losses.append(float(summed(loss.detach().clone())) / utils.world_size())
+    five, one = (utils.shard(total, utils.rank(), utils.world_size()) for total in (5, 1))
     state = {
         "losses": losses,
         "gradients": {name: parameter.grad for name, parameter in model.named_parameters()},
         "buffers": dict(model.named_buffers()),
         "any": [any_process(utils.rank() == 1), any_process(False)],
-        "merged": utils.merged(utils.shard(5) * 10, utils.shard(5), 5),
-        "few": utils.merged(utils.shard(1) + 7, utils.shard(1), 1),
+        "merged": utils.merged(10 * five, five, 5, utils.world_size()),
+        "few": utils.merged(one + 7, one, 1, utils.world_size()),
     }
     torch.save(state, folder / f"{utils.rank()}_of_{utils.world_size()}.pt")
 

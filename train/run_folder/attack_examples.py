@@ -12,7 +12,7 @@ from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from augment.service import MOST, AttackExamples
+from augment.service import SHOWN_EXAMPLES, AttackExamples
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
 from renderer.light_sphere import light_sphere
@@ -71,7 +71,7 @@ def read_attack_examples(path: Path) -> list[tuple[str, Side, Side]]:
 
 def _sides(tensors: dict[str, Tensor], answers: dict[str, Any], name: str, count: int) -> list[Side]:
     for images in (shown := [tensors[f"{kind}_{name}"] for kind in KINDS]):
-        if not (len(images) == count <= MOST and images.dtype == torch.uint8):
+        if not (len(images) == count <= SHOWN_EXAMPLES and images.dtype == torch.uint8):
             raise ValueError(f"{len(images)} images for {count} answers")
         if images.shape[1] != 3 or images.shape[2] > LARGEST_SIDE or images.shape[2] != images.shape[3]:
             raise ValueError(f"images of shape {tuple(images.shape)}")

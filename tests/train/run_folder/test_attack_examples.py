@@ -3,7 +3,7 @@ import json
 import pytest
 import torch
 
-from augment.service import MOST, AttackExamples
+from augment.service import SHOWN_EXAMPLES, AttackExamples
 from renderer.basis import HARMONICS, Sum
 from renderer.errors import InputError
 from renderer.image import to_bytes
@@ -40,7 +40,7 @@ def test_specimens_are_read_as_they_were_written(tmp_path):
 
 
 def test_a_file_stays_small_whatever_the_images_size(tmp_path):
-    write_attack_examples(tmp_path / "a", attack_examples(2 * LARGEST_SIDE, MOST), CLASSES)
+    write_attack_examples(tmp_path / "a", attack_examples(2 * LARGEST_SIDE, SHOWN_EXAMPLES), CLASSES)
     assert (tmp_path / "a").stat().st_size < 2**19
     _, before, _ = read_attack_examples(tmp_path / "a")[0]
     assert before.image.shape == (3, LARGEST_SIDE, LARGEST_SIDE)

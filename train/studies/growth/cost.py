@@ -14,7 +14,7 @@ from torch.multiprocessing.spawn import start_processes
 
 from augment.build import build_scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
-from augment.utils import Phases
+from augment.utils import Phases, rank, world_size
 from train.distributed import process_group
 from train.wideresnet import WideResNet
 
@@ -82,7 +82,7 @@ def _cost(load: Load) -> Cost:
     built = time.process_time()
     labels = torch.zeros(len(scene), dtype=torch.int64)
     attack = AugmentationSettings(attack=TrainingAttackSettings(max_steps=load.steps))
-    service = AugmentationService(attack, scene, labels, 0, phases)
+    service = AugmentationService(attack, scene, labels, 0, phases, None, rank(), world_size())
     with phases("attack"):
         service.regenerate(sure_network(), 0)
     attacked, seconds = time.process_time(), phases.take()

@@ -1,0 +1,95 @@
+import colorsys
+import math
+
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from augment.camera_effects import CameraEffects, CameraEffectSettings, draw_camera_effects, draw_patterns
+from augment.utils import generator
+from renderer.errors import InputError
+from renderer.image import ImageSettings, decode, encode
+
+SIZE, COUNT = 12, 40
+IMAGES = torch.rand(COUNT, 2, 3, SIZE, SIZE, generator=generator(0), dtype=torch.float64)
+EVERY = torch.arange(COUNT)
+PATTERNS = draw_patterns(200, 24, generator(0))
+
+
+def photographed(images=IMAGES, examples=EVERY, encoding="srgb", **settings) -> torch.Tensor:
+    image = ImageSettings(SIZE, encoding=encoding)
+    return draw_camera_effects(CameraEffectSettings(**settings), COUNT, image, generator(1))(images, examples)
+
+
+def test_no_effect_leaves_the_render():
+    torch.testing.assert_close(photographed(), IMAGES, rtol=0, atol=1e-6)  # the draws are single precision
+
+
+def test_a_pattern_multiplies_the_light_of_object_and_background_alike_over_a_fraction_of_the_light():
+    ratio = decode(photographed(pattern_fraction=1.0, pattern_fill=[0.2, 0.2]), "srgb") / decode(IMAGES, "srgb")
+    torch.testing.assert_close(ratio[:, 0], ratio[:, 1], rtol=1e-5, atol=0)
+    assert 0.2 - 1e-5 <= ratio.min() < 0.25 and 0.99 < ratio.max() <= 1 + 1e-5
+    untouched = (photographed(pattern_fraction=0.5) == photographed()).flatten(1).all(1).double().mean()
+    assert 0.3 < untouched < 0.7
+
+
+def test_white_balance_is_a_gain_of_each_channel_in_stops():
+    dark = encode(decode(IMAGES, "srgb") / 4, "srgb")
+    stops = (decode(photographed(dark, white_balance=1.0), "srgb") / decode(dark, "srgb")).log2().flatten(3)
+    torch.testing.assert_close(stops, stops[..., :1].expand_as(stops), rtol=0, atol=1e-4)
+    assert -1.001 < stops.min() < -0.8 and 0.8 < stops.max() < 1.001
+
+
+def test_a_blur_is_scipys_gaussian_of_the_linear_light():
+    blur = torch.linspace(0.3, 1.2, COUNT)
+    effects = CameraEffects(torch.ones(COUNT, 3, 1, 1), blur, torch.zeros(COUNT, 3, SIZE, SIZE), "srgb")
+    light = decode(effects(IMAGES, EVERY), "srgb")
+    for index in range(0, COUNT, 13):
+        sharp, sigma = decode(IMAGES[index], "srgb").numpy(), (0, 0, float(blur[index]), float(blur[index]))
+        expected = gaussian_filter(sharp, sigma, mode="nearest", radius=(0, 0, 3, 3))
+        torch.testing.assert_close(light[index], torch.from_numpy(expected), rtol=0, atol=1e-5)
+
+
+def test_noise_has_the_deviation_of_its_image():
+    gray = torch.full_like(IMAGES, 0.5)
+    deviations = (photographed(gray, noise=0.1) - gray).flatten(1).std(1)
+    assert deviations.max() < 0.12 and deviations.min() < 0.03 and 0.035 < deviations.mean() < 0.065
+
+
+def test_examples_keep_their_own_effects_in_any_order():
+    settings = {"pattern_fraction": 1.0, "white_balance": 0.5, "blur": 1.0, "noise": 0.05}
+    some = torch.tensor([7, 3])
+    expected = photographed(**settings)[some]
+    torch.testing.assert_close(photographed(IMAGES[some], some, **settings), expected, rtol=0, atol=1e-12)
+
+
+def test_images_are_differentiable_in_the_render():
+    effects = CameraEffects(torch.full((1, 3, 1, 1), 0.5), torch.tensor([0.8]), torch.zeros(1, 3, 4, 4), "srgb")
+    images = 0.2 + 0.5 * IMAGES[:1, :1, :, :4, :4]
+    assert torch.autograd.gradcheck(lambda values: effects(values, torch.tensor([0])), images.requires_grad_(True))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("pattern_fraction", 1.5), ("blur", -1.0), ("noise", math.nan), ("pattern_fill", [0.5, 0.2])]
+)
+def test_settings_beyond_their_range_are_refused(name, value):
+    with pytest.raises(InputError, match=name):
+        CameraEffectSettings(**{name: value})
+
+
+def colors(pattern: torch.Tensor) -> torch.Tensor:
+    return pattern.flatten(1).T.unique(dim=0)
+
+
+def test_a_pattern_has_at_most_two_colors_and_its_brighter_one_is_full():
+    assert PATTERNS.shape == (200, 3, 24, 24) and PATTERNS.min() >= 0
+    assert {len(colors(pattern)) for pattern in PATTERNS} == {1, 2}
+    brightest = torch.stack([colors(pattern).amax() for pattern in PATTERNS])
+    assert (brightest <= 1).all() and (brightest == 1).double().mean() > 0.9  # a half may leave the bright side out
+
+
+def test_a_quarter_is_plain_and_hues_and_saturations_take_the_whole_range():
+    plain = [colors(pattern)[0] for pattern in PATTERNS if len(colors(pattern)) == 1]
+    assert 0.15 < len(plain) / len(PATTERNS) < 0.4
+    hsv = torch.tensor([colorsys.rgb_to_hsv(*encode(color, "srgb").tolist()) for color in plain])
+    assert torch.histc(hsv[:, 0], 3, 0, 1).min() > 5 and hsv[:, 1].min() < 0.2 and hsv[:, 1].max() > 0.8

@@ -1,0 +1,155 @@
+import itertools
+import logging
+import os
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from augment import utils
+from augment.attacks.criteria import Goal
+from augment.attacks.descent import DescentResult, DescentSettings, descend_in_parts
+from augment.build import build_scene
+from augment.utils import BatchSize, Phases, generator, require_memory, stream_seed
+from renderer.errors import InputError
+
+ROOT = Path(__file__).parents[2]
+ERRORS = [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(), RuntimeError("can't allocate memory: you tried")]
+
+
+class Small(nn.Module):
+    """Two classes; raises an error for batches of more than `most` images."""
+
+    def __init__(self, most: int = 99, error: Exception = ERRORS[0]):
+        super().__init__()
+        self.most, self.error, self.sizes = most, error, []
+
+    def forward(self, images):
+        self.sizes.append(len(images))
+        if len(images) > self.most:
+            raise self.error
+        return torch.stack([images.sum((1, 2, 3)), 1 - images.sum((1, 2, 3))], dim=1)
+
+
+class Shades:
+    """Images of one pixel that has the value of its example."""
+
+    start = torch.linspace(0.2, 1, 10, dtype=torch.float64)[:, None]
+
+    def render(self, values, examples):
+        return values[:, None, :, None, None].expand(-1, 1, 3, 1, 1)
+
+    def step(self, gradient):
+        return 0.05 * gradient.sign()
+
+    def project(self, values, examples):
+        return values.clamp(0, 1)
+
+
+def attack(model: nn.Module, batch_size: int = 4, at_once: int = 10) -> DescentResult:
+    goal, settings = Goal(torch.zeros(10, 1, dtype=torch.int64)), DescentSettings(max_steps=6, batch_size=batch_size)
+    return descend_in_parts(model, Shades(), goal, settings, Phases(), [Shades.start.flip(0)], at_once)
+
+
+def assert_same(actual: DescentResult, expected: DescentResult) -> None:
+    for item in fields(DescentResult):
+        assert torch.equal(getattr(actual, item.name), getattr(expected, item.name)), item.name
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_an_attack_that_does_not_fit_goes_on_in_smaller_batches_with_the_same_result(caplog, error):
+    utils._warn_once.cache_clear()
+    small = Small(3, error)
+    assert_same(attack(small, batch_size=8), attack(Small(), batch_size=2))
+    assert small.sizes[:3] == [8, 4, 2] and small.sizes.count(8) <= 2  # not tried again in every step
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert warnings == [f"memory ran out: the attack goes on with {size} images per pass" for size in (4, 2)]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("shapes differ")])
+def test_no_memory_for_one_image_and_other_errors_are_raised(error):
+    with pytest.raises(type(error)):
+        attack(Small(0, error))
+
+
+def test_slices_follow_each_other_to_the_end():
+    assert list(BatchSize(4).map(lambda part: list(range(10))[part], 10)) == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    assert list(BatchSize(4).map(lambda part: part, 0)) == []
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 4])
+def test_an_attack_in_parts_is_the_attack(at_once):
+    expected = attack(Small())
+    assert 0 < expected.success.sum() < 10 or expected.steps.unique().numel() > 1
+    assert_same(attack(Small(), at_once=at_once), expected)
+
+
+def test_more_than_the_free_memory_is_refused_before_it_is_allocated(tmp_path, monkeypatch):
+    monkeypatch.setattr(utils, "MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(utils, "GROUP", tmp_path)
+    device = torch.device("cpu")
+    require_memory("renders", 2**60, device)  # a system that does not say
+    (tmp_path / "meminfo").write_text("MemTotal: 8388608 kB\nMemAvailable: 4194304 kB\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "memory.current").write_text("5\n")
+    require_memory("renders", 2**32, device)
+    with pytest.raises(InputError, match=r"^renders need 8\.0 GB of memory and 4\.0 GB are free"):
+        require_memory("renders", 2**33, device)
+    (tmp_path / "memory.max").write_text(f"{2**30 + 5}\n")
+    with pytest.raises(InputError, match=r"and 1\.0 GB are free"):
+        require_memory("renders", 2**32, device)
+
+
+def test_renders_and_their_views_need_their_memory_before_any_is_made(monkeypatch):
+    monkeypatch.setattr(utils, "_free", lambda device: 2**30)
+    orange, greys = [("solid:orange", "orange")], (0, 0.25, 0.5, 0.75, 1)
+    with pytest.raises(InputError, match=r"^100000 renders of 64 pixels per side .* need 9\.2 GB"):
+        build_scene(orange, 64, 20_000, backgrounds=greys, visibility="software")
+    scene = build_scene(orange, 128, 500, visibility="software", samples=1)
+    monkeypatch.setattr(utils, "_free", lambda device: 10**8)
+    with pytest.raises(InputError, match=r"^500 views of 128 pixels per side .* need "):
+        _ = scene.stacks
+
+
+def test_seconds_add_up_by_phase_also_nested_and_where_a_phase_fails(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("augment.utils.time.perf_counter", lambda: now[0])
+    phases = Phases()
+    for _ in range(2):
+        with phases("attack"):
+            now[0] += 1
+            with phases("classifier"):
+                now[0] += 2
+    now[0] += 50
+    with pytest.raises(RuntimeError), phases("training"):
+        now[0] += 4
+        raise RuntimeError
+    assert phases.take() == {"attack": 6, "classifier": 4, "training": 4} and phases.take() == {}
+
+
+def test_every_key_makes_a_stream_of_its_own_that_repeats_and_leaves_the_global_generator():
+    state = torch.random.get_rng_state()
+    first, again = (torch.rand(100, generator=generator(3, 7, "lights")) for _ in range(2))
+    assert torch.equal(first, again) and torch.equal(torch.random.get_rng_state(), state)
+    keys = list(itertools.product(range(30), range(30), ["lights", "batches", "dropout"]))
+    seeds = {stream_seed(*key) for key in keys}
+    assert len(seeds) == len(keys) and min(seeds) >= 0 and 2**62 < max(seeds) < 2**63
+
+
+def test_streams_of_neighboring_epochs_are_uncorrelated():
+    """Five standard errors of the correlation of 10,000 pairs."""
+    draws = torch.stack([torch.rand(10_000, generator=generator(0, epoch, "lights")) for epoch in range(6)])
+    correlation = torch.corrcoef(draws).fill_diagonal_(0)
+    assert correlation.abs().max() < 5 / 100
+
+
+def test_another_process_draws_the_same():
+    """Whatever its hash seed, since a resumed run is another process."""
+    script = "from augment.utils import stream_seed; print(stream_seed(1, 2, 'lights'))"
+    environment = os.environ | {"PYTHONHASHSEED": "1", "PYTHONPATH": str(ROOT)}
+    output = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert int(output.stdout) == stream_seed(1, 2, "lights")
