@@ -1,4 +1,4 @@
-"""Classifier and scenes to labelled images. Knows no OpenGL, no optimiser and no data set."""
+"""Classifier and scenes to labeled images. Knows no OpenGL, no optimizer and no data set."""
 
 from renderer.lazy import attach
 

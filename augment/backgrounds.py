@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.files.image_files import read_image
+from renderer.io.images import read_image
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
     """(B, 3, size, size) of gray values or image files, or (B, 1, size, size) where all are gray; in [0, 1]."""
     if not choices:
-        raise InputError("scene.backgrounds is empty: give grey values in [0, 1] or image files")
+        raise InputError("scene.backgrounds is empty: give gray values in [0, 1] or image files")
     images = [load_background(choice, size) for choice in choices]
     channels = max(len(image) for image in images)
     return torch.stack([image.expand(channels, -1, -1) for image in images])
@@ -32,7 +32,7 @@ def load_background(choice: float | str | Path, size: int, key: str = "scene.bac
             return _image(Path(choice), size, key)
         gray = math.nan
     if not 0 <= gray <= 1:
-        raise InputError(f"{key}={reprlib.repr(choice)}: give grey values in [0, 1] or image files")
+        raise InputError(f"{key}={reprlib.repr(choice)}: give gray values in [0, 1] or image files")
     return torch.full((1, size, size), gray)
 
 
@@ -40,4 +40,4 @@ def _image(path: Path, size: int, key: str) -> Tensor:
     try:
         return read_image(path, size)
     except InputError as error:
-        raise InputError(f"{key}: {error} or a grey value") from error
+        raise InputError(f"{key}: {error} or a gray value") from error

@@ -13,30 +13,29 @@ from augment.backgrounds import load_background, load_backgrounds
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
 from renderer.arguments import as_device, checked, require_fields
-from renderer.basis import with_placed
 from renderer.cache import OperatorCache
-from renderer.camera import ring
+from renderer.camera import orbit_cameras
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.files.light_files import read_light
 from renderer.image import ImageSettings
-from renderer.lamps import Lamps
-from renderer.lights import load_light
-from renderer.mesh import Mesh, normalise
-from renderer.projector import Projector
+from renderer.io.lights import read_light
+from renderer.light.basis import with_local_lights
+from renderer.light.local import Lamps, Projector
+from renderer.light.presets import load_light
+from renderer.mesh import Mesh, normalize
+from renderer.rasterizer import Rasterizer, choose
 from renderer.subdivision import subdivide
-from renderer.visibility import Backend, choose
 
 
 @dataclass
 class ProjectorSettings:
-    """A `Projector`, its angles in degrees. pattern: where attacks begin, in shares of its power: a grey value or an
+    """A `Projector`, its angles in degrees. pattern: where attacks begin, in shares of its power: a gray value or an
     image file."""
 
     pixels: int = 16
     polar: float = 45.0
     azimuth: float = 45.0
     distance: float = 4.0
-    field_of_view: float = 30.0
+    fov: float = 30.0
     power: float = 1.0
     pattern: Any = 0.0
 
@@ -47,9 +46,9 @@ class ProjectorSettings:
         """The basis, and the pattern (pixels², 3)."""
         require_range("scene.projector.polar", self.polar, 0, 180)
         require_range("scene.projector.azimuth", self.azimuth, -360, 360)
-        require_range("scene.projector.field_of_view", self.field_of_view, 0.1, 170)
-        polar, azimuth, field_of_view = map(math.radians, (self.polar, self.azimuth, self.field_of_view))
-        basis = Projector(self.pixels, polar, azimuth, self.distance, field_of_view, self.power)
+        require_range("scene.projector.fov", self.fov, 0.1, 170)
+        polar, azimuth, fov = map(math.radians, (self.polar, self.azimuth, self.fov))
+        basis = Projector(self.pixels, polar, azimuth, self.distance, fov, self.power)
         pattern = load_background(self.pattern, self.pixels, "scene.projector.pattern").expand(3, -1, -1)
         return basis, self.power * pattern.flatten(1).T
 
@@ -60,7 +59,7 @@ class LampsSettings:
     powers that attacks begin with, a number, [r, g, b] of each lamp, or the lamps.json of an adversary, whose places,
     power and radius take the others' place."""
 
-    places: list[Any] = field(default_factory=lambda: [[x, y, 2.0] for x in (2.0, -2.0) for y in (2.0, -2.0)])
+    positions: list[Any] = field(default_factory=lambda: [[x, y, 2.0] for x in (2.0, -2.0) for y in (2.0, -2.0)])
     power: float = 10.0
     radius: float = 0.0
     start: Any = 0.0
@@ -72,18 +71,18 @@ class LampsSettings:
         """The basis, and the powers (L, 3)."""
         if isinstance(self.start, str):
             lamps, powers = read_light(Path(self.start), Lamps)
-            return lamps, lamps.nearest_physical(powers)
+            return lamps, lamps.project_nonnegative(powers)
         try:
-            places = tuple((float(x), float(y), float(z)) for x, y, z in self.places)
-            start = torch.tensor(self.start, dtype=torch.float32).expand(len(places), 3)
+            positions = tuple((float(x), float(y), float(z)) for x, y, z in self.positions)
+            start = torch.tensor(self.start, dtype=torch.float32).expand(len(positions), 3)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise InputError(
-                f"scene.lamps: give places [x, y, z] and, as start, a number or [r, g, b]s ({error})"
+                f"scene.lamps: give positions [x, y, z] and, as start, a number or [r, g, b]s ({error})"
             ) from error
-        basis = Lamps(places, self.power, self.radius)
+        basis = Lamps(positions, self.power, self.radius)
         if not ((start >= 0) & (start <= self.power)).all():  # NaN is neither
             raise InputError(f"scene.lamps.start={self.start}: give powers from 0 to scene.lamps.power={self.power:g}")
-        return basis, basis.nearest_physical(start)
+        return basis, basis.project_nonnegative(start)
 
 
 Shown = str | Path | Mesh
@@ -105,40 +104,40 @@ def build_scene(
     ground: Sequence[float] | None = None,
     polar: float = 60.0,
     azimuth: float = 0.0,
-    field_of_view: float = 2.0,
-    perspective: float | None = None,
+    width: float = 2.0,
+    fov: float | None = None,
     vertices: int = 0,
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
     transport: str = "direct",
-    visibility: str | Backend = "auto",
+    rasterizer: str | Rasterizer = "auto",
     operators: OperatorCache | None = None,
     device: torch.device | str = "cpu",
 ) -> Scene:
     """Every mesh from a ring of views over every background, at `size` pixels per side.
 
     meshes: (file, solid:NAME or `Mesh`; the name of its class) each, or `ObjectSettings`. shared: the views of an
-    example share one light, shape or colour; otherwise each is an example. backgrounds: grey values or image files.
+    example share one light, shape or color; otherwise each is an example. backgrounds: gray values or image files.
     light: coefficients or what `renderer.load_light` takes; exposure multiplies it. projector, lamps: that shine as
-    well. ground: the colour of a table under each mesh (`on_ground`). polar: degrees off +z; azimuth: of the first
-    view, off +x. field_of_view: width of the image in world units. perspective: degrees between its sides, None of an
-    orthographic camera. vertices: subdivide until there are more. samples, encoding, normals, transport, visibility:
-    as for `renderer.render`, or a rasteriser that was chosen. operators: where rendered views are kept.
+    well. ground: the color of a table under each mesh (`on_ground`). polar: degrees off +z; azimuth: of the first
+    view, off +x. width: width of the image in world units. fov: degrees between its sides, None of an
+    orthographic camera. vertices: subdivide until there are more. samples, encoding, normals, transport, rasterizer:
+    as for `renderer.render`, or a rasterizer that was chosen. operators: where rendered views are kept.
     InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
     """
     settings, device = ImageSettings(size, samples, encoding, normals, transport), as_device(device)
     require_range("exposure", exposure, 0, FACTOR)
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
-    basis, lights = with_placed(sky, [each.build() for each in (projector, lamps) if each is not None])
-    angle = None if perspective is None else math.radians(perspective)
+    basis, lights = with_local_lights(sky, [each.build() for each in (projector, lamps) if each is not None])
+    angle = None if fov is None else math.radians(fov)
     return Scene.grid(
         [on_ground(_object(member, vertices), ground) for member in meshes],
-        ring(views, field_of_view, math.radians(polar), math.radians(azimuth), angle),
+        orbit_cameras(views, width, math.radians(polar), math.radians(azimuth), angle),
         load_backgrounds(backgrounds, size),
         lights.to(device),
         settings,
-        choose(visibility) if isinstance(visibility, str) else visibility,
+        choose(rasterizer) if isinstance(rasterizer, str) else rasterizer,
         operators,
         shared=shared,
         basis=basis,
@@ -150,7 +149,7 @@ def _object(member: Member, vertices: int) -> SceneObject:
         return load_object(member, vertices)
     mesh, label = member
     if isinstance(mesh, Mesh):
-        return SceneObject(label, normalise(subdivide(mesh, vertices)))
+        return SceneObject(label, normalize(subdivide(mesh, vertices)))
     return load_object(ObjectSettings(str(mesh), label), vertices)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from augment.utils import underway
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.mesh import Mesh, concatenate, load_mesh, normalise
+from renderer.mesh import Mesh, concatenate, load_mesh, normalize
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
 
@@ -61,7 +61,7 @@ class PropSettings(MeshSettings):
 class ObjectSettings(MeshSettings):
     """One object of a scene, with the keys of `MeshSettings`.
 
-    label: the name of its class. gain: multiplies the albedo. props: meshes that are in the image, too, and cast and
+    label: the name of its class. albedo_scale: multiplies the albedo. props: meshes that are in the image, too, and cast and
     receive its shadows, but are never attacked.
 
     >>> load_object(ObjectSettings("solid:orange", label="orange")).label
@@ -69,12 +69,12 @@ class ObjectSettings(MeshSettings):
     """
 
     label: str
-    gain: float = 1.0
+    albedo_scale: float = 1.0
     props: list[PropSettings] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range(f"{self.mesh}: gain", self.gain, 1 / FACTOR, FACTOR)
+        require_range(f"{self.mesh}: gain", self.albedo_scale, 1 / FACTOR, FACTOR)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class SceneObject:
 
     label: str
     mesh: Mesh
-    gain: float = 1.0
+    albedo_scale: float = 1.0
     name: str = "the mesh"
     own: int | None = None
     props: Sequence[Mesh] = ()
@@ -128,8 +128,8 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
     InputError: as `load_mesh` and `solid`.
     """
     with underway(f"preparing {item.mesh}"):
-        mesh = normalise(subdivide(_load(item), vertices))
-    return with_props(SceneObject(item.label, mesh, item.gain, item.mesh), [_prop(prop) for prop in item.props])
+        mesh = normalize(subdivide(_load(item), vertices))
+    return with_props(SceneObject(item.label, mesh, item.albedo_scale, item.mesh), [_prop(prop) for prop in item.props])
 
 
 def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
@@ -159,13 +159,13 @@ def another_instance(item: SceneObject, seed: int) -> SceneObject:
     kind, *rest = item.name.split(":")
     if kind != "solid" or len(rest) != 1:
         return item
-    other = replace(item, mesh=normalise(solid(rest[0], seed)), own=None)
+    other = replace(item, mesh=normalize(solid(rest[0], seed)), own=None)
     return on_ground(with_props(other, item.props), item.ground)
 
 
 def _prop(item: PropSettings) -> Mesh:
     """Turned, scaled and moved to its position on z = 0."""
-    mesh, angle = normalise(_load(item)), math.radians(item.azimuth)
+    mesh, angle = normalize(_load(item)), math.radians(item.azimuth)
     turn = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     turned = item.scale * mesh.vertices @ turn
     lowest = turned[np.unique(mesh.faces), 2].min()
@@ -177,7 +177,7 @@ def _load(item: MeshSettings) -> Mesh:
     if item.color is None:
         return mesh
     if mesh.textures or (mesh.corner_colors != 1).any():
-        raise InputError(f"{item.mesh} brings colours of its own: leave color out; gain brightens or dims them")
+        raise InputError(f"{item.mesh} brings colors of its own: leave color out; gain brightens or dims them")
     return Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
 
 

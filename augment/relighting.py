@@ -12,9 +12,9 @@ from torch.autograd.function import once_differentiable
 from augment.objects import SceneObject
 from augment.utils import progress, require_memory
 from renderer.camera import Camera
-from renderer.image import ImageSettings, behind
-from renderer.sparse import Sparse, joined
-from renderer.transfer import Operator, apply_transfer
+from renderer.image import ImageSettings, background_term
+from renderer.transfer import TransferOperator, apply_transfer
+from renderer.transport.local import SparseTransfer, joined
 
 Rows = list[int] | None
 
@@ -73,7 +73,7 @@ class OperatorStack:
     albedo: (O, 3, P). coverage: (O, 1, P).
     """
 
-    def __init__(self, operators: Sequence[Operator], shown: Tensor, device: torch.device | str = "cpu"):
+    def __init__(self, operators: Sequence[TransferOperator], shown: Tensor, device: torch.device | str = "cpu"):
         """shown: (N,) int64, the operator of each image. The operators are of one dtype and basis, on the CPU."""
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         slots, self._slots = _rank_among_equals(shown)
@@ -109,7 +109,7 @@ class OperatorStack:
         entries, image = self._entries(self._sparse, self.shown[images])
         return radiance + entries.radiance(lights, image, len(self.pixels))
 
-    def _entries(self, sparse: Sparse, shown: Tensor) -> tuple[Sparse, Tensor]:
+    def _entries(self, sparse: SparseTransfer, shown: Tensor) -> tuple[SparseTransfer, Tensor]:
         """(the sparse entries of operators (A,), one after the other, (N,) which of the A each is of)."""
         first, count = self._first[shown], self._first[shown + 1] - self._first[shown]
         image = torch.arange(len(shown), device=shown.device).repeat_interleave(count)
@@ -125,7 +125,9 @@ def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:
     return ranks, int(counts.max())
 
 
-def _joined(operators: Sequence[Operator], pixels: Tensor, device: torch.device | str) -> tuple[Sparse | None, Tensor]:
+def _joined(
+    operators: Sequence[TransferOperator], pixels: Tensor, device: torch.device | str
+) -> tuple[SparseTransfer | None, Tensor]:
     """(the sparse entries of all operators, over common pixels, (O + 1,) where those of each begin)."""
     counts, placed = [0], []
     for operator in operators:
@@ -138,7 +140,7 @@ def _joined(operators: Sequence[Operator], pixels: Tensor, device: torch.device 
     return entries and entries.to(device), torch.tensor(counts, device=device).cumsum(0)
 
 
-def _stack(operators: Sequence[Operator], pixels: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _stack(operators: Sequence[TransferOperator], pixels: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Operators over common pixels and coefficients: transfer (O, C, K, P), albedo (O, 3, P), coverage (O, 1, P)."""
     channels, like = max(len(operator.transfer) for operator in operators), operators[0].transfer
     transfer = like.new_zeros(len(operators), channels, len(kept) + len(kept) % 2, len(pixels))
@@ -171,7 +173,7 @@ class Relighting:
         behind: Tensor,
         backgrounds: Tensor,
         settings: ImageSettings,
-        build: Callable[[SceneObject, Sequence[Camera]], Sequence[Operator]],
+        build: Callable[[SceneObject, Sequence[Camera]], Sequence[TransferOperator]],
     ):
         """views: (object's number, camera) of each image. behind: (N,) the background of each. build: the operators
         of an object from cameras."""
@@ -217,11 +219,11 @@ class Relighting:
     def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         """(some operators, (N,) each image's place among those that show them, what is behind these (A, C, P))."""
         first = index * self._per_stack
-        views, operators = self._distinct[first : first + self._per_stack], list[Operator]()
+        views, operators = self._distinct[first : first + self._per_stack], list[TransferOperator]()
         for number in dict.fromkeys(number for number, _ in views):
             operators += self._build(self._objects[number], [camera for its, camera in views if its == number])
         here = self._operator // self._per_stack == index
         stack = OperatorStack(operators, (self._operator[here] - first).cpu(), self._backgrounds.device)
         backgrounds = self._backgrounds.index_select(2, stack.pixels)
-        added = behind(stack.coverage[stack.shown], backgrounds[self._behind[here]], self._settings.encoding)
+        added = background_term(stack.coverage[stack.shown], backgrounds[self._behind[here]], self._settings.encoding)
         return stack, here.cumsum(0) - 1, added

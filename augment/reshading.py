@@ -10,18 +10,18 @@ from torch import Tensor
 
 from augment.objects import SceneObject
 from renderer.albedo import painted_albedo, surface_albedo
-from renderer.basis import Basis, Placed, Reach, parts_of
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
-from renderer.lamps import Lamps
+from renderer.light.basis import Basis, LightPaths, LocalBasis, parts_of
+from renderer.light.local import Lamps
 from renderer.mesh import Mesh
+from renderer.rasterizer import Rasterizer
 from renderer.shading import radiance
-from renderer.transport.placed import lit, placed_radiance
+from renderer.transport.local import lit, local_radiance
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
-from renderer.visibility import Backend
 
 NEAR = 0.001  # world units: shadows are found anew once a coordinate has moved by more since they were
 
@@ -32,9 +32,9 @@ class FrozenTransport:
     It stays where it is in the image, as the outline does for derivatives, and goes with the albedo of its pixel.
     """
 
-    def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis):
+    def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis):
         self.mesh, self._settings = mesh, settings
-        self._transport = build_transport(mesh, settings, gain, basis)
+        self._transport = build_transport(mesh, settings, albedo_scale, basis)
         self._views: dict[Camera, tuple[Tensor, Tensor] | None] = {}
 
     def fits(self, vertices: np.ndarray) -> bool:
@@ -86,7 +86,7 @@ class FrozenTransports:
 
     def _of(self, item: SceneObject, mesh: Mesh) -> FrozenTransport:
         settings, basis = self._like
-        return FrozenTransport(mesh, settings, item.gain, basis)
+        return FrozenTransport(mesh, settings, item.albedo_scale, basis)
 
 
 def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
@@ -95,7 +95,7 @@ def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
     return albedo.new_zeros(3, fragments.size**2).index_add(1, pixel, albedo.T)
 
 
-class PlacedView:
+class LocalLightView:
     """A view of one shape, computed on the CPU, which casts the rays: once for what stays in its place, and anew for
     lamps at other places. Which lamps and which pixel of a pattern reach a sample is held in derivatives."""
 
@@ -105,20 +105,20 @@ class PlacedView:
         """rays: among the shape's faces. vertices: the shape's (V, 3), where they are not the mesh's."""
         vertices = None if vertices is None else vertices.cpu()
         self._rays, self._surface = rays, Surface.of(mesh, fragments.to("cpu"), settings, vertices)
-        self._standing: dict[Placed, Reach] = {}
+        self._standing: dict[LocalBasis, LightPaths] = {}
 
-    def radiance(self, basis: Placed, albedo: Tensor, light: Tensor, places: Tensor | None) -> Tensor:
+    def radiance(self, basis: LocalBasis, albedo: Tensor, light: Tensor, positions: Tensor | None) -> Tensor:
         """(3, P) of one basis with a light (size, 3), in its dtype and device, and albedo (S, 3) at the samples;
         differentiable in both, in the vertices and in the places (L, 3) of lamps, None where they stand."""
-        reach = self._reach(basis, places)
-        return placed_radiance(self._surface.fragments, albedo.cpu().double(), reach, light.cpu().double()).to(light)
+        reach = self._reach(basis, positions)
+        return local_radiance(self._surface.fragments, albedo.cpu().double(), reach, light.cpu().double()).to(light)
 
-    def _reach(self, basis: Placed, places: Tensor | None) -> Reach:
+    def _reach(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:
         points, normals = self._surface.points, self._surface.normals
-        if isinstance(basis, Lamps) and places is not None:
-            return lit(self._rays, self._surface, basis.reach(points, normals, places.cpu().double()))
+        if isinstance(basis, Lamps) and positions is not None:
+            return lit(self._rays, self._surface, basis.connect(points, normals, positions.cpu().double()))
         if basis not in self._standing:
-            self._standing[basis] = lit(self._rays, self._surface, basis.reach(points, normals))
+            self._standing[basis] = lit(self._rays, self._surface, basis.connect(points, normals))
         return self._standing[basis]
 
 
@@ -126,18 +126,29 @@ class Reshading:
     """What cameras see of objects, by their numbers; what they see of their own shapes is kept.
 
     Shadows and bounces of distant light are those of a shape close by (`FrozenTransport`), shadows of light from places
-    are a shape's own (`PlacedView`).
+    are a shape's own (`LocalLightView`).
     """
 
     def __init__(
-        self, objects: Sequence[SceneObject], settings: ImageSettings, backend: Backend, basis: Basis, like: Tensor
+        self,
+        objects: Sequence[SceneObject],
+        settings: ImageSettings,
+        rasterizer: Rasterizer,
+        basis: Basis,
+        like: Tensor,
     ):
         """basis: what lights are coefficients of. like: of the dtype and on the device of the images."""
-        self._objects, self._settings, self._backend, self._basis, self._like = objects, settings, backend, basis, like
+        self._objects, self._settings, self._rasterizer, self._basis, self._like = (
+            objects,
+            settings,
+            rasterizer,
+            basis,
+            like,
+        )
         self._own: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
         self._transports = FrozenTransports(settings, basis)
         self._rays: dict[int, Rays] = {}
-        self._placed_views: dict[tuple[int, Camera], PlacedView] = {}
+        self._placed_views: dict[tuple[int, Camera], LocalLightView] = {}
 
     @cached_property
     def vertices(self) -> list[Tensor]:
@@ -151,13 +162,13 @@ class Reshading:
             self._own[view] = self._seen(number, camera, self._objects[number].mesh.vertices)
         return self._own[view]
 
-    def placed_view(self, number: int, camera: Camera) -> PlacedView:
+    def placed_view(self, number: int, camera: Camera) -> LocalLightView:
         """Of an object in its own shape."""
         view = number, camera
         if view not in self._placed_views:
             mesh, (fragments, _) = self._objects[number].mesh, self.own(*view)
             rays = self._rays.setdefault(number, Rays(mesh))
-            self._placed_views[view] = PlacedView(rays, mesh, fragments, self._settings)
+            self._placed_views[view] = LocalLightView(rays, mesh, fragments, self._settings)
         return self._placed_views[view]
 
     def radiance(
@@ -168,15 +179,15 @@ class Reshading:
         light: Tensor,
         vertices: Tensor | None,
         added: Tensor | None,
-        places: Tensor | None,
+        positions: Tensor | None,
     ) -> tuple[Fragments, Tensor]:
         """What a camera sees of an object in a light (size, 3), and its radiance (3, P), differentiable in all tensors.
 
         example: whose shapes follow each other closely. vertices (V, 3), places (L, 3) of lamps: None where they are as
         they were. added: to each face's linear albedo, (F, 3).
         """
-        mesh, gain = self._objects[number].mesh, self._objects[number].gain
-        placed: Callable[[], PlacedView]
+        mesh, albedo_scale = self._objects[number].mesh, self._objects[number].albedo_scale
+        placed: Callable[[], LocalLightView]
         if vertices is None:
             vertices, positions = self.vertices[number], mesh.vertices
             fragments, albedo = self.own(number, camera)
@@ -187,13 +198,13 @@ class Reshading:
             # once, where lights stand in the scene: a mesh is checked as it is made, and a step's is used by them alone
             placed = cache(partial(self._moved_view, mesh, positions, fragments, vertices))
         if added is not None:
-            albedo = painted_albedo(mesh, fragments, self._settings.encoding, gain, added)
+            albedo = painted_albedo(mesh, fragments, self._settings.encoding, albedo_scale, added)
         smooth_faces = self._faces[number] if self._settings.normals == "smooth" else None
         seen = []
         for where, part in parts_of(self._basis):
             own = light[where]
-            if isinstance(part, Placed):
-                seen.append(placed().radiance(part, albedo, own, places))
+            if isinstance(part, LocalBasis):
+                seen.append(placed().radiance(part, albedo, own, positions))
                 continue
             seen.append(radiance(fragments, vertices, own, albedo, smooth_faces))
             if self._settings.transport != "direct":
@@ -201,8 +212,8 @@ class Reshading:
                 seen.append(frozen.radiance(camera, fragments, albedo, own))
         return fragments, reduce(torch.add, seen)
 
-    def _moved_view(self, mesh: Mesh, positions: np.ndarray, fragments: Fragments, vertices: Tensor) -> PlacedView:
-        return PlacedView(Rays(replace(mesh, vertices=positions)), mesh, fragments, self._settings, vertices)
+    def _moved_view(self, mesh: Mesh, positions: np.ndarray, fragments: Fragments, vertices: Tensor) -> LocalLightView:
+        return LocalLightView(Rays(replace(mesh, vertices=positions)), mesh, fragments, self._settings, vertices)
 
     def _frozen(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """Of a shape near the vertices of an example, and with the camera's view of it."""
@@ -215,9 +226,9 @@ class Reshading:
         """What a camera sees of an object's vertices, wherever they are, and the albedo there (S, 3)."""
         item, settings = self._objects[number], self._settings
         closed = item.mesh.closed
-        (fragments,) = build_fragments(vertices, item.mesh.faces, [camera], settings, self._backend, closed=closed)
+        (fragments,) = build_fragments(vertices, item.mesh.faces, [camera], settings, self._rasterizer, closed=closed)
         fragments = fragments.to(self._like.device)
-        return fragments, (surface_albedo(item.mesh, fragments, settings.encoding) * item.gain).to(self._like)
+        return fragments, (surface_albedo(item.mesh, fragments, settings.encoding) * item.albedo_scale).to(self._like)
 
     @cached_property
     def _faces(self) -> list[Tensor]:

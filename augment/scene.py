@@ -16,15 +16,15 @@ from augment.relighting import Layer, OperatorStack, Relighting, in_place
 from augment.reshading import Reshading
 from augment.utils import require_memory
 from renderer.arguments import checked, require_fields
-from renderer.basis import HARMONICS, Basis, parts_of
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
-from renderer.image import ImageSettings, behind, clamp, clamped, develop_composite
-from renderer.lamps import Lamps, moved
+from renderer.image import ImageSettings, background_term, clamp, clamped, tonemap_composite
+from renderer.light.basis import HARMONICS, Basis, parts_of
+from renderer.light.local import Lamps, moved
 from renderer.mesh import Mesh
-from renderer.transfer import Operator
-from renderer.visibility import Backend
+from renderer.rasterizer import Rasterizer
+from renderer.transfer import TransferOperator
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -50,7 +50,7 @@ class Conditions:
     """What A examples are rendered under.
 
     light: of the scene's basis. vertices: None where they are the meshes'. albedo: added to each face's linear albedo.
-    pixels: added to the values of the V images. places: of the lamps, None where they are the basis'. Where meshes
+    pixels: added to the values of the V images. positions: of the lamps, None where they are the basis'. Where meshes
     differ in size, N and F are the largest's, and a smaller mesh has the first of them.
     """
 
@@ -58,15 +58,15 @@ class Conditions:
     vertices: Float[Tensor, "A N 3"] | None = None
     albedo: Float[Tensor, "A F 3"] | None = None
     pixels: Float[Tensor, "A V 3 size size"] | None = None
-    places: Float[Tensor, "A L 3"] | None = None
+    positions: Float[Tensor, "A L 3"] | None = None
 
 
 @dataclass(eq=False, repr=False)
 class Scene:
     """E examples of V views each, over backgrounds (B, 3 or 1, size, size) of values in [0, 1].
 
-    Under a change of light alone nothing is rasterised after the first time: the operators of many views are stacked
-    (`Relighting`). Where vertices move, their view is rasterised anew each time (`Reshading`). lights: (E, size, 3), or
+    Under a change of light alone nothing is rasterized after the first time: the operators of many views are stacked
+    (`Relighting`). Where vertices move, their view is rasterized anew each time (`Reshading`). lights: (E, size, 3), or
     (size, 3) for all, where attacks begin; their dtype and device are those of the images. operators: where rendered
     views are kept. basis: what lights are coefficients of; 49 harmonics, unless another is given. camera_effects: what
     a camera makes of rendered images (A, V, 3, size, size) of examples (A,), differentiable; see `CameraEffects`.
@@ -77,7 +77,7 @@ class Scene:
     backgrounds: Tensor
     lights: Tensor
     settings: ImageSettings
-    backend: Backend
+    rasterizer: Rasterizer
     operators: OperatorCache = field(default_factory=OperatorCache)
     basis: Basis = HARMONICS
     camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
@@ -98,7 +98,7 @@ class Scene:
         asked = f"{images} renders of {size} pixels per side (augment.examples, scene.views, scene.backgrounds)"
         require_memory(asked, 24 * images * size**2, self.lights.device)
         self._relighting = self._relit_views()
-        self._reshading = Reshading(self.objects, self.settings, self.backend, self.basis, self.lights)
+        self._reshading = Reshading(self.objects, self.settings, self.rasterizer, self.basis, self.lights)
 
     def _require_consistent(self) -> None:
         if not self.examples:
@@ -118,11 +118,11 @@ class Scene:
 
     def _relit_views(self) -> Relighting:
         # without the scene, which each epoch replaces, tied to itself
-        cache, settings, backend = self.operators, self.settings, self.backend
+        cache, settings, rasterizer = self.operators, self.settings, self.rasterizer
         basis, dtype = self.basis, self.lights.dtype
 
-        def build(item: SceneObject, cameras: Sequence[Camera]) -> Sequence[Operator]:
-            return cache.operators(item.mesh, cameras, settings, backend, item.gain, basis, dtype)
+        def build(item: SceneObject, cameras: Sequence[Camera]) -> Sequence[TransferOperator]:
+            return cache.operators(item.mesh, cameras, settings, rasterizer, item.albedo_scale, basis, dtype)
 
         seen = [(example.object, camera) for example in self.examples for camera in example.cameras]
         behind_images = self._background.repeat_interleave(self.views)
@@ -137,7 +137,7 @@ class Scene:
         backgrounds: Tensor,
         light: Tensor,
         settings: ImageSettings,
-        backend: Backend,
+        rasterizer: Rasterizer,
         operators: OperatorCache | None = None,
         *,
         shared: bool = False,
@@ -147,7 +147,7 @@ class Scene:
         attacked, every object over every background from all cameras."""
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = [Example(*row) for row in product(range(len(objects)), views, range(len(backgrounds)))]
-        return cls(objects, examples, backgrounds, light, settings, backend, operators or OperatorCache(), basis)
+        return cls(objects, examples, backgrounds, light, settings, rasterizer, operators or OperatorCache(), basis)
 
     def __len__(self) -> int:
         return len(self.examples)
@@ -178,7 +178,7 @@ class Scene:
 
     def basis_under(self, conditions: Conditions, row: int) -> Basis:
         """What the light of a row of conditions is of: lamps are where the conditions have them."""
-        return self.basis if conditions.places is None else moved(self.basis, conditions.places[row].detach())
+        return self.basis if conditions.positions is None else moved(self.basis, conditions.positions[row].detach())
 
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
         """The scene's own, for some examples."""
@@ -192,7 +192,7 @@ class Scene:
         layers = list(self._layers(conditions, examples))
         canvas = self.backgrounds.flatten(2).index_select(0, self._background[examples].repeat_interleave(self.views))
         canvas = canvas.expand(-1, 3, -1).contiguous()
-        covered = [develop_composite(layer.composite, self.settings.encoding) for layer in layers]
+        covered = [tonemap_composite(layer.composite, self.settings.encoding) for layer in layers]
         images = in_place(canvas, layers, covered)
         images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
         images = images if self.camera_effects is None else self.camera_effects(images, examples)
@@ -213,9 +213,9 @@ class Scene:
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
         if conditions.vertices is None and conditions.albedo is None:
-            if conditions.places is None:
+            if conditions.positions is None:
                 return self._relit(light, examples)
-            return self._under_moved_lamps(light, conditions.places, examples)
+            return self._under_moved_lamps(light, conditions.positions, examples)
         return self._reshaded(light, conditions, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
@@ -224,7 +224,7 @@ class Scene:
         images = (examples[:, None] * self.views + views).flatten()
         return self._relighting.layers(light.repeat_interleave(self.views, dim=0) if self.views > 1 else light, images)
 
-    def _under_moved_lamps(self, light: Tensor, places: Tensor, examples: Tensor) -> Iterator[Layer]:
+    def _under_moved_lamps(self, light: Tensor, positions: Tensor, examples: Tensor) -> Iterator[Layer]:
         """By the same products for all other light, and by the lamps' image after image."""
         where, lamps = next((where, part) for where, part in parts_of(self.basis) if isinstance(part, Lamps))
         rest = torch.cat([light[:, : where.start], torch.zeros_like(light[:, where]), light[:, where.stop :]], dim=1)
@@ -235,7 +235,7 @@ class Scene:
                 example = self.examples[int(examples[row])]
                 shown = example.object, example.cameras[view]
                 placed, (fragments, albedo) = self._reshading.placed_view(*shown), self._reshading.own(*shown)
-                seen = placed.radiance(lamps, albedo, light[row, where], places[row])
+                seen = placed.radiance(lamps, albedo, light[row, where], positions[row])
                 covered = torch.searchsorted(layer.pixels, fragments.pixels)
                 added.append(seen.new_zeros(3, len(layer.pixels)).index_copy(1, covered, seen))
             yield replace(layer, composite=layer.composite + torch.stack(added))
@@ -248,11 +248,11 @@ class Scene:
             mesh, shown = self.mesh(index), (index, example.object, example.cameras[view])
             vertices = None if conditions.vertices is None else conditions.vertices[row, : len(mesh.vertices)]
             added = None if conditions.albedo is None else conditions.albedo[row, : len(mesh.faces)]
-            places = None if conditions.places is None else conditions.places[row]
-            fragments, seen = self._reshading.radiance(*shown, light[row], vertices, added, places)
+            positions = None if conditions.positions is None else conditions.positions[row]
+            fragments, seen = self._reshading.radiance(*shown, light[row], vertices, added, positions)
             coverage = fragments.coverage.to(seen)[None]
             there = self.backgrounds[example.background].flatten(1).index_select(1, fragments.pixels)
-            composite = seen + behind(coverage, there, self.settings.encoding)
+            composite = seen + background_term(coverage, there, self.settings.encoding)
             yield Layer([image], fragments.pixels, composite[None], coverage[None], [0])
 
     def _seen_whole(self, row: Example) -> Example:

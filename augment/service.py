@@ -22,9 +22,9 @@ from augment.labels import is_right, label_loss, require_known
 from augment.scene import Conditions, Scene
 from augment.utils import Phases, as_found, generator, stream_seed
 from augment.variation import VariationSettings, vary
-from renderer.basis import HARMONICS, Basis
 from renderer.errors import FACTOR, InputError, require_choice, require_range
-from renderer.lights import perturb
+from renderer.light.basis import HARMONICS, Basis
+from renderer.light.presets import perturb
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -39,7 +39,7 @@ SHOWN_EXAMPLES = 4  # of an attack, to look at
 @dataclass
 class RandomLightSettings:
     """Random offsets of the scene's light: uniform in ±amplitude per coefficient, or scaled to an L2 radius
-    (`renderer.lights.perturb`)."""
+    (`renderer.light.presets.perturb`)."""
 
     amplitude: float = 0.5
     radius: float | None = None

@@ -16,10 +16,10 @@ from augment.scene import Example, Scene
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
-from renderer.files.image_files import SUFFIXES, read_image
-from renderer.harmonics import irradiance_basis, live_coefficients
 from renderer.image import clamp, decode, encode
-from renderer.lights import directional, load_light
+from renderer.io.images import SUFFIXES, read_image
+from renderer.light.harmonics import irradiance_basis, nonzero_coefficients
+from renderer.light.presets import directional, load_light
 from renderer.transfer import DEGREE
 
 UNCHANGED = (1.0, 1.0)
@@ -145,9 +145,9 @@ def _moved(row: Example, right: float, up: float, scale: float, polar: float, az
     """right, up: fractions of the frame's width, which shows the mesh `scale` times as large; angles in radians."""
     cameras = []
     for camera in row.cameras:
-        width = camera.field_of_view / scale
+        width = camera.width / scale
         shift = {"right": camera.right + right * width, "up": camera.up + up * width}
-        cameras.append(replace(_turned(camera, polar, azimuth), field_of_view=width, **shift))
+        cameras.append(replace(_turned(camera, polar, azimuth), width=width, **shift))
     return replace(row, cameras=tuple(cameras))
 
 
@@ -187,7 +187,7 @@ def _with_lit_walls(scene: Scene) -> Scene:
     """Each row before its own background, times the irradiance of a surface that faces the row's first camera."""
     towards = torch.from_numpy(np.stack([row.cameras[0].axes()[2] for row in scene.examples]))
     exposures = torch.tensor([row.exposure for row in scene.examples])[:, None]
-    coefficients = scene.lights.cpu().double()[:, live_coefficients(DEGREE)]
+    coefficients = scene.lights.cpu().double()[:, nonzero_coefficients(DEGREE)]
     irradiance = torch.einsum("ek,ekc->ec", irradiance_basis(towards, DEGREE), coefficients) * exposures
     images = scene.backgrounds[[row.background for row in scene.examples]]
     encoding = scene.settings.encoding

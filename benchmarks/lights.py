@@ -35,23 +35,22 @@ from augment.reshading import FrozenTransport
 from benchmarks.common import append_json, machine, medians, relative_error, seconds
 from renderer import shading, sparse
 from renderer.albedo import surface_albedo
-from renderer.basis import HARMONICS, Basis, Sum
-from renderer.camera import OrthographicCamera, ring
-from renderer.environment import write_map
-from renderer.files.mitsuba_scene import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mitsuba_map, write_mitsuba_scene
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
-from renderer.lamps import Lamps
-from renderer.lights import load_light
-from renderer.mesh import Mesh, concatenate, normalise
-from renderer.projector import Projector
+from renderer.io.mitsuba import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mitsuba_map, write_mitsuba_scene
+from renderer.light.basis import HARMONICS, Basis, SumBasis
+from renderer.light.environment import write_map
+from renderer.light.local import Lamps, Projector
+from renderer.light.presets import load_light
+from renderer.mesh import Mesh, concatenate, normalize
+from renderer.rasterizer import choose
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
-from renderer.transfer import Operator, build_operators
+from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import radiosity, rays
-from renderer.transport.placed import lit, placed_radiance
+from renderer.transport.local import lit, local_radiance
 from renderer.transport.surface import Surface
-from renderer.visibility import choose
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
 LIGHT_PATHS = ("direct", "shadows", "bounces:3")
@@ -65,7 +64,7 @@ BASES: dict[str, Basis] = {
     "3 discs": replace(LAMPS, radius=0.5),
     "projector of 16²": Projector(16),
     "projector of 32²": Projector(32),
-    "harmonics and projector of 16²": Sum((HARMONICS, Projector(16))),
+    "harmonics and projector of 16²": SumBasis((HARMONICS, Projector(16))),
 }
 STEP, STEPS_AWAY = 0.0005, (0, 1, 2, 5, 10, 20)  # of an attack on a shape, which moves every coordinate
 
@@ -74,17 +73,17 @@ Row = dict[str, Any]
 
 def operator(
     mesh: Mesh, size: int, transport: str = "direct", samples: int = 8, camera: OrthographicCamera = CAMERA, **more: Any
-) -> Operator:
+) -> TransferOperator:
     settings = ImageSettings(size, samples, transport=transport)
-    return build_operators(mesh, [camera], settings, choose("software"), **more)[0]
+    return build_operators(mesh, [camera], settings, choose("numpy"), **more)[0]
 
 
-def light_step(built: Operator, light: Tensor) -> None:
+def light_step(built: TransferOperator, light: Tensor) -> None:
     """An image, clamped, and the gradient of a loss by the light, which requires it."""
     torch.autograd.grad(built.image(light).square().sum(), light)
 
 
-def image_and_gradient(built: Operator, light: Tensor) -> tuple[Tensor, Tensor]:
+def image_and_gradient(built: TransferOperator, light: Tensor) -> tuple[Tensor, Tensor]:
     """The radiance (3, size²), and the gradient of Σ radiance × normal random numbers by the light."""
     size = built.settings.size
     weights = torch.randn(3, size**2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(light)
@@ -97,7 +96,7 @@ def errors(ours: tuple[Tensor, Tensor], reference: tuple[Tensor, Tensor]) -> Row
     return {"image_error": image, "gradient_error": gradient}
 
 
-def megabytes(built: Operator) -> float:
+def megabytes(built: TransferOperator) -> float:
     return sum(tensor.nbytes for tensor in (built.transfer, *(built.sparse or ()))) / 1e6
 
 
@@ -140,7 +139,7 @@ def cost(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
         times = medians({key: partial(light_step, each, light) for key, each in built.items()}, rounds)
         for paths, size in built:
             settings = ImageSettings(size, transport=paths)
-            build = partial(build_operators, mesh, ring(VIEWS, 2.2), settings, choose("software"))
+            build = partial(build_operators, mesh, orbit_cameras(VIEWS, 2.2), settings, choose("numpy"))
             channels, coefficients = built[paths, size].transfer.shape[:2]
             yield {
                 "table": "cost", "mesh": name, "light_paths": paths, "size": size, "step_ms": times[paths, size],
@@ -158,7 +157,7 @@ def rays_and_samples(cup: Mesh, size: int, rounds: int) -> Iterator[Row]:
         rows, calls = {}, {}
         for count, samples in product(RAYS, SAMPLES):
 
-            def build(count: int = count, samples: int = samples, paths: str = paths) -> Operator:
+            def build(count: int = count, samples: int = samples, paths: str = paths) -> TransferOperator:
                 with quadrature(count):
                     return operator(cup, size, paths, samples)
 
@@ -205,17 +204,21 @@ def local_lights(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
 
 
 def lamp_steps(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
-    positions, powers, caster = torch.tensor(LAMPS.places).requires_grad_(), torch.ones(3, 3).double(), rays.Rays(cup)
+    positions, powers, caster = (
+        torch.tensor(LAMPS.positions).requires_grad_(),
+        torch.ones(3, 3).double(),
+        rays.Rays(cup),
+    )
 
     def step(surface: Surface, albedo: Tensor) -> None:
-        connections = lit(caster, surface, LAMPS.reach(surface.points, surface.normals, positions.double()))
-        radiance = placed_radiance(surface.fragments, albedo, connections, powers)
+        connections = lit(caster, surface, LAMPS.connect(surface.points, surface.normals, positions.double()))
+        radiance = local_radiance(surface.fragments, albedo, connections, powers)
         torch.autograd.grad(radiance.square().sum(), positions)
 
     calls = {}
     for size in sizes:
         settings = ImageSettings(size, 2)
-        [view] = build_fragments(cup.vertices, cup.faces, [CAMERA], settings, choose("software"))
+        [view] = build_fragments(cup.vertices, cup.faces, [CAMERA], settings, choose("numpy"))
         calls[size] = partial(step, Surface.of(cup, view, settings), surface_albedo(cup, view, settings.encoding))
     for size, milliseconds in medians(calls, rounds).items():
         yield {"table": "lamp step", "size": size, "step_ms": milliseconds}
@@ -223,14 +226,14 @@ def lamp_steps(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
 
 def stale_shadows(size: int) -> Iterator[Row]:
     """The vertices move by signed steps in one random direction, from the shape whose shadows are used."""
-    cup, light, settings = normalise(solid("cup", 0)), load_light("grace"), ImageSettings(size, 2, transport="shadows")
+    cup, light, settings = normalize(solid("cup", 0)), load_light("grace"), ImageSettings(size, 2, shadows=True)
     generator = torch.Generator().manual_seed(0)
     direction = torch.randn(cup.vertices.shape, generator=generator).sign().double().numpy()
     weights = torch.randn(3, size**2, generator=generator)
 
     def render(shadows: FrozenTransport, vertices: np.ndarray) -> tuple[Tensor, Tensor]:
         variable = torch.from_numpy(vertices).float().requires_grad_()
-        [fragments] = build_fragments(vertices, cup.faces, [CAMERA], settings, choose("software"))
+        [fragments] = build_fragments(vertices, cup.faces, [CAMERA], settings, choose("numpy"))
         albedo = surface_albedo(cup, fragments, settings.encoding)
         if not shadows.knows(CAMERA):
             shadows.add(CAMERA, fragments, albedo)
@@ -265,8 +268,8 @@ def hard_meshes() -> dict[str, Mesh]:
     boards = [Mesh.plain(box.vertices + np.array([0, 0, height]), box.faces, (0.9, 0.6, 0.4)) for height in heights]
     return {
         "convex: a ball": ball,
-        "concave: solid:cup": normalise(solid("cup", 0)),
-        "concave: solid:table": normalise(solid("table", 0)),
+        "concave: solid:cup": normalize(solid("cup", 0)),
+        "concave: solid:table": normalize(solid("table", 0)),
         "rugged: a dented ball": replace(ball, vertices=shell.vertices * dents),
         "open: half a ball": Mesh.plain(shell.vertices, shell.faces[lower], (0.8, 0.7, 0.5)),
         "self-touching: a ring without a hole": Mesh.plain(ring_shape.vertices, ring_shape.faces, (0.3, 0.8, 0.5)),
@@ -368,7 +371,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     print(machine())
-    cup, sizes, rounds = subdivide(normalise(solid("cup", 0)), options.vertices), options.sizes, options.rounds
+    cup, sizes, rounds = subdivide(normalize(solid("cup", 0)), options.vertices), options.sizes, options.rounds
     tables = [
         cost(cup, sizes, rounds),
         local_lights(cup, sizes, rounds),

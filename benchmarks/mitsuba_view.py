@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.scene import ALBEDO, CAMERA, View, coefficients
-from renderer.files.mitsuba_scene import DIFFERENTIABLE, TO_Z_UP, mitsuba, mitsuba_map
+from renderer.io.mitsuba import DIFFERENTIABLE, TO_Z_UP, mitsuba, mitsuba_map
 from renderer.transfer import DEGREE
 
 
@@ -82,7 +82,7 @@ class MitsubaView:
 
     def _sensor(self) -> dict[str, Any]:
         _, up, back = CAMERA.axes()
-        half, size = CAMERA.field_of_view / 2, self._view.size  # Mitsuba's image spans [-1, 1]
+        half, size = CAMERA.width / 2, self._view.size  # Mitsuba's image spans [-1, 1]
         look = self._mi.ScalarTransform4f().look_at(origin=list(4 * back), target=[0, 0, 0], up=list(up))
         film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
         return {"type": "orthographic", "to_world": look.scale([half, half, 1]), "film": film}

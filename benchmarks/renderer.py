@@ -26,13 +26,13 @@ from benchmarks.mitsuba_view import MitsubaView
 from benchmarks.scene import CAMERA, SAMPLES, Converged, Row, Shading, View, coefficients, cut_irradiance, ellipsoid
 from renderer import reference, shading
 from renderer.cache import OperatorCache
-from renderer.camera import ring
+from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import Fragments
-from renderer.image import ImageSettings, develop
+from renderer.image import ImageSettings, tonemap
+from renderer.rasterizer import NAMES, Rasterizer, choose
 from renderer.shapes import solid
-from renderer.transfer import COEFFICIENTS, DEGREE, Operator
-from renderer.visibility import NAMES, Backend, choose
+from renderer.transfer import COEFFICIENTS, DEGREE, TransferOperator
 
 BACKGROUND = 0.5
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float64": torch.float64}
@@ -44,14 +44,14 @@ Entries = Iterable[tuple[Row, Callable[[], object]]]
 # ---------------------------------------------------------------------------- what is timed
 
 
-def light_step(view: View, operator: Operator, light: Tensor) -> Callable[[], Tensor]:
+def light_step(view: View, operator: TransferOperator, light: Tensor) -> Callable[[], Tensor]:
     """Light → image → gradient of a scalar loss by the light."""
     upstream = view.upstream(operator.pixels, light.dtype)
     coverage, background = operator.coverage.to(light.dtype)[None], light.new_full((1, 1), BACKGROUND)
 
     def step() -> Tensor:
         variable = light.clone().requires_grad_()
-        image = develop(operator.radiance(variable), coverage, background)
+        image = tonemap(operator.radiance(variable), coverage, background)
         return torch.autograd.grad((image * upstream).sum(), variable)[0]
 
     return step
@@ -67,7 +67,7 @@ def vertex_step(
     def step() -> Tensor:
         variable = vertices.clone().requires_grad_()
         fragments, albedo, coverage = before if cached else view.rasterized(samples, variable)
-        image = develop(shade(fragments, variable, light, albedo), coverage, background)
+        image = tonemap(shade(fragments, variable, light, albedo), coverage, background)
         return torch.autograd.grad((image * image_gradient[:, fragments.pixels]).sum(), variable)[0]
 
     return step
@@ -96,10 +96,10 @@ class Bench:
     """Options of the command, and the rasterizers, the default first."""
 
     options: argparse.Namespace
-    backends: tuple[Backend, ...]
+    rasterizers: tuple[Rasterizer, ...]
 
     def view(self, vertices: int, size: int) -> View:
-        return View(ellipsoid(vertices), size, self.backends[0], self.options.device)
+        return View(ellipsoid(vertices), size, self.rasterizers[0], self.options.device)
 
     def light(self, degree: int = DEGREE, dtype: torch.dtype = torch.float32) -> Tensor:
         return coefficients(degree, dtype, self.options.device)
@@ -134,11 +134,13 @@ def light_steps(bench: Bench, view: View) -> Entries:
 def builds(bench: Bench, view: View) -> Entries:
     """An operator of one view, by samples, degree and rasterizer."""
     exact, panel = Converged(view), f"building an operator, {view.name}"
-    for choice in product(bench.backends, bench.options.samples, bench.options.degrees):
-        backend, samples, degree = choice
-        build = partial(replace(view, backend=backend).operator, samples, degree)
-        setting, default = f"{samples}² samples, degree {degree}, {backend.name}", choice[1:] == (SAMPLES, DEGREE)
-        row = row_of(view, panel, setting, samples, degree=degree, default=default and backend == bench.backends[0])
+    for choice in product(bench.rasterizers, bench.options.samples, bench.options.degrees):
+        rasterizer, samples, degree = choice
+        build = partial(replace(view, rasterizer=rasterizer).operator, samples, degree)
+        setting, default = f"{samples}² samples, degree {degree}, {rasterizer.name}", choice[1:] == (SAMPLES, DEGREE)
+        row = row_of(
+            view, panel, setting, samples, degree=degree, default=default and rasterizer == bench.rasterizers[0]
+        )
         yield row | exact.of_operator(build(), bench.light(degree)), build
 
 
@@ -148,7 +150,7 @@ def light_gradients(bench: Bench, view: View) -> Entries:
     upstream, expected = view.upstream(operator.pixels), exact.by_light[: len(light)]
     panel, errors = f"gradient by the light, {view.name}", exact.of_operator(operator, light)
 
-    def differentiate(operator: Operator) -> Tensor:
+    def differentiate(operator: TransferOperator) -> Tensor:
         operator.radiance(light)
         return operator.light_gradient(upstream)
 
@@ -224,9 +226,9 @@ def savings(bench: Bench, view: View) -> Iterator[tuple[str, Callable[[], object
         yield f"{2 * VIEWS} operators are loaded, not built", build, load
     yield unseen_faces(bench, view)
     points = CAMERA.project(view.mesh.vertices)[None]
-    for backend in bench.backends:
-        draw = partial(backend.rasterise, points, view.mesh.faces, size)
-        yield f"back faces of a closed mesh are not drawn, {backend.name}", draw, partial(draw, closed=True)
+    for rasterizer in bench.rasterizers:
+        draw = partial(rasterizer.rasterize, points, view.mesh.faces, size)
+        yield f"back faces of a closed mesh are not drawn, {rasterizer.name}", draw, partial(draw, closed=True)
 
 
 def matrix_products(bench: Bench, shape: tuple[int, int]) -> Callable[[], object]:
@@ -235,11 +237,11 @@ def matrix_products(bench: Bench, shape: tuple[int, int]) -> Callable[[], object
     return lambda: (sides[0] @ transfer, sides[1] @ transfer.T)
 
 
-def paper_operators(bench: Bench, size: int, cache: OperatorCache) -> list[Operator]:
+def paper_operators(bench: Bench, size: int, cache: OperatorCache) -> list[TransferOperator]:
     """Two meshes from ten views."""
-    settings, cameras = ImageSettings(size, SAMPLES), ring(VIEWS, 2.2)
+    settings, cameras = ImageSettings(size, SAMPLES), orbit_cameras(VIEWS, 2.2)
     meshes = [solid("orange", seed) for seed in (0, 1)]
-    return [each for mesh in meshes for each in cache.operators(mesh, cameras, settings, bench.backends[0])]
+    return [each for mesh in meshes for each in cache.operators(mesh, cameras, settings, bench.rasterizers[0])]
 
 
 def unseen_faces(bench: Bench, view: View) -> tuple[str, Callable[[], object], Callable[[], object]]:
@@ -316,15 +318,15 @@ def draw(path: Path, panels: Sequence[Sequence[Row]]) -> None:
     plt.close(figure)
 
 
-def rasterizers() -> tuple[Backend, ...]:
+def rasterizers() -> tuple[Rasterizer, ...]:
     """Those that work here, the one that "auto" chooses first."""
-    backends = [choose()]
+    rasterizers = [choose()]
     for name in NAMES[1:]:
         try:
-            backends += [choose(name)] if name != backends[0].name else []
+            rasterizers += [choose(name)] if name != rasterizers[0].name else []
         except InputError:
             print(f"{name} does not rasterize here and is left out")
-    return tuple(backends)
+    return tuple(rasterizers)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -14,15 +14,15 @@ from torch import Tensor
 from benchmarks.common import relative_error
 from renderer import reference
 from renderer.albedo import surface_albedo
-from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.harmonics import basis
 from renderer.image import ImageSettings
-from renderer.lights import probe
+from renderer.light.basis import Harmonics
+from renderer.light.harmonics import basis
+from renderer.light.presets import probe
 from renderer.mesh import Mesh
-from renderer.transfer import DEGREE, Operator, build_operators
-from renderer.visibility import Backend
+from renderer.rasterizer import Rasterizer
+from renderer.transfer import DEGREE, TransferOperator, build_operators
 
 SAMPLES = ImageSettings().samples  # the renderer's default, per side of a pixel
 ALBEDO = (0.8, 0.5, 0.3)
@@ -77,18 +77,20 @@ class View:
 
     mesh: Mesh
     size: int
-    backend: Backend
+    rasterizer: Rasterizer
     device: str = "cpu"
 
-    def operator(self, samples: int = SAMPLES, degree: int = DEGREE, dtype: torch.dtype = torch.float32) -> Operator:
+    def operator(
+        self, samples: int = SAMPLES, degree: int = DEGREE, dtype: torch.dtype = torch.float32
+    ) -> TransferOperator:
         settings, light = ImageSettings(self.size, samples), Harmonics(degree)
-        [operator] = build_operators(self.mesh, [CAMERA], settings, self.backend, basis=light, dtype=dtype)
+        [operator] = build_operators(self.mesh, [CAMERA], settings, self.rasterizer, basis=light, dtype=dtype)
         return operator.to(self.device)
 
     def rasterized(self, samples: int, vertices: Tensor) -> tuple[Fragments, Tensor, Tensor]:
         """(fragments, albedo (S, 3), coverage (1, P)) of the mesh with its vertices there."""
         positions, settings = vertices.detach().double().cpu().numpy(), ImageSettings(self.size, samples)
-        [found] = build_fragments(positions, self.mesh.faces, [CAMERA], settings, self.backend, self.mesh.closed)
+        [found] = build_fragments(positions, self.mesh.faces, [CAMERA], settings, self.rasterizer, self.mesh.closed)
         fragments = found.to(self.device)
         albedo = surface_albedo(self.mesh, fragments, "linear").to(vertices.dtype)
         return fragments, albedo, fragments.coverage.to(vertices.dtype)[None]
@@ -143,7 +145,7 @@ class Converged:
         for shift in product(range(self.shifts), repeat=2):
             points = CAMERA.project(self._view.mesh.vertices)
             points[:, :2] += 2 * ((np.array(shift) + 0.5) / self.shifts - 0.5) / (size * samples)
-            ids = self._view.backend.rasterise(points[None], faces, size * samples, closed=closed)[0]
+            ids = self._view.rasterizer.rasterize(points[None], faces, size * samples, closed=closed)[0]
             row, column = np.nonzero(ids >= 0)
             keys.append((row // samples * size + column // samples) * len(faces) + ids[row, column])
         key, count = np.unique(np.concatenate(keys), return_counts=True)
@@ -167,7 +169,7 @@ class Converged:
             "gradient_error": relative_error(gradient, expected),
         }
 
-    def of_operator(self, operator: Operator, light: Tensor) -> Row:
+    def of_operator(self, operator: TransferOperator, light: Tensor) -> Row:
         """The gradient is compared on the coefficients that the light has."""
         variable = light.clone().requires_grad_()
         radiance = operator.radiance(variable)

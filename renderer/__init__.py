@@ -5,16 +5,16 @@ from renderer.lazy import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        "camera": ["OrthographicCamera", "PerspectiveCamera", "ring"],
+        "camera": ["OrthographicCamera", "PerspectiveCamera", "orbit_cameras"],
         "errors": ["InputError"],
         "image": ["ImageSettings"],
         "files.light_files": ["save_light"],
         "lights": ["load_light"],
-        "mesh": ["Mesh", "load_mesh", "normalise"],
+        "mesh": ["Mesh", "load_mesh", "normalize"],
         "files.mesh_export": ["export_mesh"],
-        "rendering": ["operators", "render"],
+        "rendering": ["precompute_transfer", "render"],
         "shapes": ["solid"],
         "subdivision": ["subdivide"],
-        "transfer": ["Operator"],
+        "transfer": ["TransferOperator"],
     },
 )

@@ -24,7 +24,7 @@ class Texture:
 
 
 def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
-    """(S, 3) float64 linear albedo at the samples: corner colour × texture, each decoded before it is interpolated."""
+    """(S, 3) float64 linear albedo at the samples: corner color × texture, each decoded before it is interpolated."""
     textures = mesh_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
     return _albedo(mesh, fragments, textures, encoding)
 
@@ -61,19 +61,19 @@ def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
     return _of_faces(albedo.index_select(0, fragments.faces), fragments)
 
 
-def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, gain: float, added: Tensor) -> Tensor:
+def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, albedo_scale: float, added: Tensor) -> Tensor:
     """(S, 3) at the samples: the albedo times the gain plus what is `added` to each face (F, 3), within [0, 1] or up to
     what it was beyond; differentiable in what is added. InputError: NaN.
 
-    It is kept within where it is stored, at corners and texels, and then interpolated, so that colours and textures can
-    hold it: see `renderer.files.albedo_bake`.
+    It is kept within where it is stored, at corners and texels, and then interpolated, so that colors and textures can
+    hold it: see `renderer.io.texture_bake`.
     """
     there, faces = face_albedo(added, fragments), fragments.faces.cpu().numpy()
-    corners = decode(torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(added), encoding) * gain
+    corners = decode(torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(added), encoding) * albedo_scale
     albedo = fragments.interpolate(_within(corners + added.index_select(0, fragments.faces)[:, None], corners))
     if not mesh.textures:
         return albedo
-    colors = (_colors(mesh, faces, fragments, encoding) * gain).to(added)
+    colors = (_colors(mesh, faces, fragments, encoding) * albedo_scale).to(added)
     uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(fragments.coverage)).T
     texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)[fragments.face]
     for index, texture in enumerate(mesh_textures(mesh, encoding, added)):
@@ -91,7 +91,7 @@ def _within(changed: Tensor, albedo: Tensor) -> Tensor:
 
 
 def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Texture], encoding: str) -> Tensor:
-    """Corner colour × texture at the samples."""
+    """Corner color × texture at the samples."""
     faces = fragments.faces.cpu().numpy()
     albedo = _colors(mesh, faces, fragments, encoding)
     if not textures:
@@ -109,7 +109,7 @@ def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Texture], encod
 
 
 def _colors(mesh: Mesh, faces: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:
-    """(S, 3) the corners' colours, as authored for display, as linear albedo, float64 on the fragments' device."""
+    """(S, 3) the corners' colors, as authored for display, as linear albedo, float64 on the fragments' device."""
     colors = mesh.corner_colors[:1] if mesh.one_color else mesh.corner_colors.take(faces, axis=0)
     corner_colors = torch.from_numpy(colors).to(fragments.coverage)
     require_bounded(corner_colors=corner_colors)
@@ -129,7 +129,7 @@ def _of_faces(values: Tensor, fragments: Fragments) -> Tensor:
 def bilinear(texture: Texture, uvs: Tensor) -> Tensor:
     """(3, S) linear albedo of a texture that repeats, at uvs (2, S).
 
-    Texel centres are at half-integers, v = 0 is the bottom row's lower edge.
+    Texel centers are at half-integers, v = 0 is the bottom row's lower edge.
     """
     blocks = []
     for block in uvs.split(BLOCK, dim=1):
@@ -139,11 +139,11 @@ def bilinear(texture: Texture, uvs: Tensor) -> Tensor:
 
 def _taps(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Tensor]]:
     """(weight, row-major index) of the four texels around places (2, S)."""
-    columns, rows = _neighbours(uvs[0], texture.width), _neighbours(1 - uvs[1], texture.height)
+    columns, rows = _neighbors(uvs[0], texture.width), _neighbors(1 - uvs[1], texture.height)
     return [(down * across, (row * texture.width + column).long()) for row, down in rows for column, across in columns]
 
 
-def _neighbours(along: Tensor, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+def _neighbors(along: Tensor, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """(index, weight) of the texels before and after places (S,), in a texture that repeats from 0 to 1."""
     place = along * count - 0.5
     first = place.floor()

@@ -19,14 +19,14 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from renderer.basis import HARMONICS, Basis
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
+from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
-from renderer.sparse import Sparse
-from renderer.transfer import TENSORS, Operator, OperatorBuilder
-from renderer.visibility import Backend
+from renderer.rasterizer import Rasterizer
+from renderer.transfer import TENSORS, OperatorBuilder, TransferOperator
+from renderer.transport.local import SparseTransfer
 
 
 def cache_folder(choice: str | None) -> Path | None:
@@ -135,19 +135,19 @@ class OperatorCache(TensorCache):
         mesh: Mesh,
         cameras: Sequence[Camera],
         settings: ImageSettings,
-        backend: Backend,
-        gain: float = 1.0,
+        rasterizer: Rasterizer,
+        albedo_scale: float = 1.0,
         basis: Basis = HARMONICS,
         dtype: torch.dtype = torch.float32,
-    ) -> list[Operator]:
+    ) -> list[TransferOperator]:
         """`transfer.build_operators`, to the bit, but only the views that are not on disk are built."""
-        scene = content_key(RENDERER, mesh, settings, backend.name, float(gain), basis, dtype)
+        scene = content_key(RENDERER, mesh, settings, rasterizer.name, float(albedo_scale), basis, dtype)
         keys = {camera: content_key(scene, camera) for camera in cameras}
         views = {camera: view for camera, key in keys.items() if (view := self.read(key)) is not None}
         missing = [camera for camera in keys if camera not in views]
         if missing:
-            fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, backend, closed=mesh.closed)
-            builder = OperatorBuilder(mesh, settings, gain, basis, dtype)
+            fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, rasterizer, closed=mesh.closed)
+            builder = OperatorBuilder(mesh, settings, albedo_scale, basis, dtype)
             for camera, seen in zip(missing, fragments, strict=True):
                 operator = builder.operator(seen)
                 views[camera] = _pack(mesh, seen, operator)
@@ -158,13 +158,13 @@ class OperatorCache(TensorCache):
         return [_unpack(views[camera], settings, basis) for camera in cameras]
 
 
-def _pack(mesh: Mesh, seen: Fragments, operator: Operator) -> dict[str, Tensor]:
+def _pack(mesh: Mesh, seen: Fragments, operator: TransferOperator) -> dict[str, Tensor]:
     counts = torch.tensor([len(mesh.faces), len(mesh.faces) - len(seen.faces), mesh.closed])
     dense = {name: getattr(operator, name) for name in TENSORS}
     few = {} if operator.sparse is None else operator.sparse._asdict()
     return dense | few | {"counts": counts}
 
 
-def _unpack(view: Mapping[str, Tensor], settings: ImageSettings, basis: Basis) -> Operator:
-    few = Sparse(*(view[name] for name in Sparse._fields)) if "weight" in view else None
-    return Operator(**{name: view[name] for name in TENSORS}, settings=settings, basis=basis, sparse=few)
+def _unpack(view: Mapping[str, Tensor], settings: ImageSettings, basis: Basis) -> TransferOperator:
+    few = SparseTransfer(*(view[name] for name in SparseTransfer._fields)) if "weight" in view else None
+    return TransferOperator(**{name: view[name] for name in TENSORS}, settings=settings, basis=basis, sparse=few)

@@ -13,7 +13,7 @@ import numpy as np
 from renderer.arguments import checked, require_fields
 from renderer.errors import LARGEST, InputError, require_range
 
-REACH = 2.0  # enough for a normalised mesh, whose radius is at most √3
+REACH = 2.0  # enough for a normalized mesh, whose radius is at most √3
 MOST_VIEWS = 10**5
 NEAREST = 0.01  # of its distance: what comes nearer to a camera than that is no view of a mesh
 
@@ -22,7 +22,7 @@ NEAREST = 0.01  # of its distance: what comes nearer to a camera than that is no
 class Camera(ABC):
     """A square image from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
 
-    field_of_view: width of the image in world units, at the origin; a normalised mesh spans at most [-1, 1] per axis.
+    width: width of the image in world units, at the origin; a normalized mesh spans at most [-1, 1] per axis.
     right, up: where the origin lies in the image, in world units from its middle: by so much the camera stands aside.
     reach: world units from the origin along the view within which surface is seen. distance: of its plane from the
     origin. InputError where a width or distance is not positive, an angle is not
@@ -31,7 +31,7 @@ class Camera(ABC):
 
     polar: float
     azimuth: float
-    field_of_view: float
+    width: float
     right: float = 0.0
     up: float = 0.0
     reach: float = field(default=REACH, kw_only=True)
@@ -40,7 +40,7 @@ class Camera(ABC):
 
     def __post_init__(self) -> None:
         require_fields(self)
-        require_range("scene.field_of_view", self.field_of_view, 1 / LARGEST, LARGEST)
+        require_range("scene.width", self.width, 1 / LARGEST, LARGEST)
         require_range("a camera's reach", self.reach, 1 / LARGEST, LARGEST)
         for name in ("polar", "azimuth", "right", "up"):
             require_range(f"a camera's {name}", getattr(self, name), -LARGEST, LARGEST)
@@ -73,7 +73,7 @@ class Camera(ABC):
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
-        """World points (V, 3) to normalised device coordinates (V, 3): x right, y up, z depth.
+        """World points (V, 3) to normalized device coordinates (V, 3): x right, y up, z depth.
 
         The image is [-1, 1]² in x and y. Depth is smaller where nearer, from -1 at `near` to 1 at `far`, and planes
         stay planes in it.
@@ -95,7 +95,7 @@ class OrthographicCamera(Camera):
         return 2 * self.reach
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        scale = np.array([2 / self.field_of_view, 2 / self.field_of_view, -1 / self.reach])
+        scale = np.array([2 / self.width, 2 / self.width, -1 / self.reach])
         return points @ (self.axes() * scale[:, None]).T + np.array([self.right, self.up, 0.0]) * scale
 
     def depths(self, points: np.ndarray) -> None:
@@ -115,12 +115,12 @@ class PerspectiveCamera(Camera):
     @property
     def angle(self) -> float:
         """Between opposite sides of the image, in radians."""
-        return 2 * math.atan(self.field_of_view / 2 / self.distance)
+        return 2 * math.atan(self.width / 2 / self.distance)
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """InputError: as `depths`."""
         depths, (right, up, back) = self.depths(points), self.axes() @ points.T
-        scale = 2 / self.field_of_view * (self.distance / depths)
+        scale = 2 / self.width * (self.distance / depths)
         before = self.distance - self.near
         depth = 2 * self.far / (self.far - self.near) * ((before - back) / depths) - 1
         return np.stack([(right + self.right) * scale, (up + self.up) * scale, depth], axis=1)
@@ -131,24 +131,24 @@ class PerspectiveCamera(Camera):
         if not (depths >= NEAREST * self.distance).all():
             raise InputError(
                 f"the mesh reaches to a camera at distance {self.distance:g}, or beyond: give a larger distance "
-                "(a smaller scene.perspective or a larger scene.field_of_view), or normalise the mesh"
+                "(a smaller scene.fov or a larger scene.width), or normalize the mesh"
             )
         return depths
 
 
 @checked
-def ring(
-    views: int, field_of_view: float, polar: float = math.pi / 3, azimuth: float = 0.0, perspective: float | None = None
+def orbit_cameras(
+    views: int, width: float, polar: float = math.pi / 3, azimuth: float = 0.0, fov: float | None = None
 ) -> list[Camera]:
     """Cameras at one polar angle and equally spaced azimuths from a first (the paper's appendix C: π/3 and 10).
 
-    perspective: the angle between opposite sides of the image, in radians, which says how far off perspective cameras
+    fov: the angle between opposite sides of the image, in radians, which says how far off perspective cameras
     are; None of orthographic ones.
     """
     require_range("views", views, 1, MOST_VIEWS)
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
-    if perspective is None:
-        return [OrthographicCamera(polar, each, field_of_view) for each in azimuths]
-    require_range("a camera's perspective", perspective, 1e-3, 3)
-    distance = field_of_view / 2 / math.tan(perspective / 2)
-    return [PerspectiveCamera(polar, each, field_of_view, distance=distance) for each in azimuths]
+    if fov is None:
+        return [OrthographicCamera(polar, each, width) for each in azimuths]
+    require_range("a camera's fov", fov, 1e-3, 3)
+    distance = width / 2 / math.tan(fov / 2)
+    return [PerspectiveCamera(polar, each, width, distance=distance) for each in azimuths]

@@ -1,6 +1,6 @@
 """What a view sees of a mesh: the covered samples of an image, each with its pixel and its face.
 
-Rasterised once and then held fixed, while light, albedo or the positions of the vertices are differentiated.
+Rasterized once and then held fixed, while light, albedo or the positions of the vertices are differentiated.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from renderer.camera import Camera
 from renderer.errors import require_finite
 from renderer.image import ImageSettings
-from renderer.visibility import Backend
+from renderer.rasterizer import Rasterizer
 
 BLOCK = 2**14  # samples at a time
 
@@ -88,7 +88,7 @@ class Fragments:
         return _Interpolation.apply(rows, self.face, self.barycentric.T).T
 
     def merge(self, albedo: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(pixel (R,), face (R,), albedo (R, C)): neighbouring samples of one face in one pixel as one, since they
+        """(pixel (R,), face (R,), albedo (R, C)): neighboring samples of one face in one pixel as one, since they
         share a normal, with the sum of their albedos (S, C) over samples². Differentiable in them."""
         if self.samples == 1 or not len(self.pixel):
             return self.pixel, self.face, albedo
@@ -98,7 +98,7 @@ class Fragments:
 
     @cached_property
     def _runs(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(pixel (R,), face (R,), run (S,)), where neighbouring samples of one face in one pixel are a run."""
+        """(pixel (R,), face (R,), run (S,)), where neighboring samples of one face in one pixel are a run."""
         starts = torch.ones_like(self.pixel, dtype=torch.bool)
         starts[1:] = (self.pixel[1:] != self.pixel[:-1]) | (self.face[1:] != self.face[:-1])
         run = starts.cumsum(0) - 1
@@ -142,10 +142,10 @@ def build_fragments(
     faces: np.ndarray,
     cameras: Sequence[Camera],
     settings: ImageSettings,
-    backend: Backend,
+    rasterizer: Rasterizer,
     closed: bool = False,
 ) -> list[Fragments]:
-    """Rasterise a mesh of vertices (V, 3) and faces (F, 3), once per camera.
+    """Rasterize a mesh of vertices (V, 3) and faces (F, 3), once per camera.
 
     closed: the mesh is watertight and its faces are counter-clockwise from outside (`Mesh.closed`), so that the ones
     seen from behind need not be drawn, unless the near plane cuts the mesh open. A mesh outside the image has no
@@ -154,7 +154,7 @@ def build_fragments(
     require_finite(vertices=torch.from_numpy(vertices))
     points = np.stack([camera.project(vertices) for camera in cameras])
     closed = closed and bool((points[..., 2] >= -1).all())
-    ids = backend.rasterise(points, faces, settings.size * settings.samples, closed=closed)
+    ids = rasterizer.rasterize(points, faces, settings.size * settings.samples, closed=closed)
     depths = [camera.depths(vertices) for camera in cameras]
     return [_fragments(*view, faces, settings) for view in zip(points, depths, ids, strict=True)]
 

@@ -66,7 +66,7 @@ def bounces(transport: str) -> int:
     )
 
 
-def develop(
+def tonemap(
     radiance: Float[Tensor, "*batch 3 P"],
     coverage: Float[Tensor, "*#batch 1 P"],
     background: Float[Tensor, "*#batch channels #P"],
@@ -78,43 +78,43 @@ def develop(
     background: image values behind the surface, of three channels or one. InputError: NaN.
     """
     require_bounded(radiance=radiance)
-    return develop_composite(radiance + behind(coverage, background, encoding), encoding)
+    return tonemap_composite(radiance + background_term(coverage, background, encoding), encoding)
 
 
-def compose(
+def composite(
     radiance: Float[Tensor, "*batch 3 P"],
     coverage: Float[Tensor, " P"],
     pixels: Int[Tensor, " P"],
     background: Float[Tensor, "*#batch 3 size size"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 size size"]:
-    """Whole images: `develop` at the covered pixels, the background elsewhere.
+    """Whole images: `tonemap` at the covered pixels, the background elsewhere.
 
     pixels: row-major.
     """
     behind_all = background.expand(*radiance.shape[:-2], *background.shape[-3:]).flatten(-2)
-    covered = develop(radiance, coverage[None], behind_all.index_select(-1, pixels), encoding)
+    covered = tonemap(radiance, coverage[None], behind_all.index_select(-1, pixels), encoding)
     return behind_all.index_copy(-1, pixels, covered).unflatten(-1, background.shape[-2:])
 
 
 def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor:
-    """A grey value, a colour (3,) or images (..., 3, size, size), in [0, 1], as images of the dtype and device of
+    """A gray value, a color (3,) or images (..., 3, size, size), in [0, 1], as images of the dtype and device of
     `like`. InputError: another shape, values beyond [0, 1]."""
     values = torch.as_tensor(background).to(like)
     if values.ndim < 2:
         values = values.view(-1, 1, 1).expand(-1, size, size)
     if values.ndim >= 3 and values.shape[-3:] in ((1, size, size), (3, size, size)):
         if not (values.min() >= 0 and values.max() <= 1):
-            raise InputError("background holds values beyond [0, 1]: give a grey value, a colour or an image in [0, 1]")
+            raise InputError("background holds values beyond [0, 1]: give a gray value, a color or an image in [0, 1]")
         return values.expand(*values.shape[:-3], 3, size, size)
     raise InputError(
-        f"background of shape {tuple(values.shape)} is none: give a grey value, a colour (3,) or images "
+        f"background of shape {tuple(values.shape)} is none: give a gray value, a color (3,) or images "
         f"(3, {size}, {size})"
     )
 
 
-def behind(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
-    """What a background adds to the radiance in front of it, linear (..., 3 or 1, P); shapes as in `develop`.
+def background_term(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
+    """What a background adds to the radiance in front of it, linear (..., 3 or 1, P); shapes as in `tonemap`.
 
     InputError: NaN.
     """
@@ -122,13 +122,13 @@ def behind(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Te
     return (1 - coverage) * decode(background, encoding)
 
 
-def develop_composite(composite: Tensor, encoding: str = "linear") -> Tensor:
-    """`develop`, given the sum of radiance and what is `behind` it."""
+def tonemap_composite(composite: Tensor, encoding: str = "linear") -> Tensor:
+    """`tonemap`, given the sum of radiance and what is `background_term` it."""
     return encode(clamp(composite), encoding)
 
 
 def clamped(composite: Tensor) -> Tensor:
-    """Where `develop_composite` clamps and the gradient is therefore zero. Boolean, as the composite."""
+    """Where `tonemap_composite` clamps and the gradient is therefore zero. Boolean, as the composite."""
     return (composite < 0) | (composite > 1)
 
 

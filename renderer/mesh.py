@@ -1,6 +1,6 @@
-"""Triangle meshes with colours: the data class, loading, checking and normalising.
+"""Triangle meshes with colors: the data class, loading, checking and normalizing.
 
-World axes are right-handed with z up. Colours stay as authored for display (sRGB-encoded); whoever
+World axes are right-handed with z up. Colors stay as authored for display (sRGB-encoded); whoever
 needs linear light decodes them.
 """
 
@@ -22,7 +22,7 @@ Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]
 
 @dataclass(frozen=True)
 class Mesh:
-    """F triangles over V vertices, with colours held per corner so that seams need no split vertices.
+    """F triangles over V vertices, with colors held per corner so that seams need no split vertices.
 
     vertices       (V, 3) float64, world coordinates
     faces          (F, 3) int64, counter-clockwise seen from outside
@@ -82,12 +82,12 @@ class Mesh:
 
     @cached_property
     def one_color(self) -> bool:
-        """Whether all corners have the same colour."""
+        """Whether all corners have the same color."""
         return len(self.faces) > 0 and bool((self.corner_colors == self.corner_colors[:1, :1]).all())
 
     @cached_property
     def one_color_per_face(self) -> bool:
-        """Whether the corners of each face have the same colour."""
+        """Whether the corners of each face have the same color."""
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
 
     @cached_property
@@ -109,8 +109,8 @@ class Mesh:
         by_forth, by_back = np.argsort(forth), np.argsort(back)
         if (np.diff(forth[by_forth]) == 0).any() or not np.array_equal(forth[by_forth], back[by_back]):
             return False
-        neighbours = np.stack([by_forth, by_back], axis=1) // 3
-        part = connected_component_labels(neighbours, node_count=len(self.faces))
+        neighbors = np.stack([by_forth, by_back], axis=1) // 3
+        part = connected_component_labels(neighbors, node_count=len(self.faces))
         a, b, c = (self.vertices[self.faces[:, corner]] - self.vertices.mean(axis=0) for corner in range(3))
         return bool((np.bincount(part, np.einsum("fi,fi->f", a, np.cross(b, c))) > 0).all())
 
@@ -153,19 +153,19 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
 @checked
 def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
-    """Read a mesh with its colours and textures from .glb, .gltf, .obj, .ply, .stl or what else trimesh reads.
+    """Read a mesh with its colors and textures from .glb, .gltf, .obj, .ply, .stl or what else trimesh reads.
 
     All parts of a scene, placed by their nodes, become one mesh; vertices at one position become one vertex, so
-    that moving it opens no seam, and unused vertices are dropped. A colour is the product of the material's
-    colour, the texture and the vertex or face colours that the file has, white where it has none; alpha, other
-    material properties and the texture's wrap mode are left out. glTF's colours other than textures are linear
+    that moving it opens no seam, and unused vertices are dropped. A color is the product of the material's
+    color, the texture and the vertex or face colors that the file has, white where it has none; alpha, other
+    material properties and the texture's wrap mode are left out. glTF's colors other than textures are linear
     by its standard and are encoded here.
 
     up: "y" turns the y axis up to z, "z" leaves the mesh as it is, and "auto" takes y for glTF, z otherwise.
     InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
     are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area.
     """
-    from renderer.files.mesh_reading import read_parts
+    from renderer.io.mesh_reading import read_parts
 
     path = Path(path)
     require_choice(f"{path}: up", up, ("auto", "y", "z"))
@@ -182,7 +182,7 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
 
 
 @checked
-def normalise(mesh: Mesh) -> Mesh:
+def normalize(mesh: Mesh) -> Mesh:
     """Move the area-weighted centroid of the faces to the origin and scale the largest |coordinate| to 1, rounded to
     float32: so files hold the vertices exactly, and what is read back covers the same pixels.
 
@@ -192,8 +192,8 @@ def normalise(mesh: Mesh) -> Mesh:
     if not mesh.face_areas().sum() > 0:
         raise InputError("the mesh has a surface of zero area: give one with faces of some extent")
     centroids = mesh.vertices[mesh.faces].mean(axis=1)
-    centred = mesh.vertices - np.average(centroids, axis=0, weights=mesh.face_areas())
-    scaled = centred / np.abs(centred).max()
+    centered = mesh.vertices - np.average(centroids, axis=0, weights=mesh.face_areas())
+    scaled = centered / np.abs(centered).max()
     return replace(mesh, vertices=scaled.astype(np.float32).astype(np.float64))
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_finite
-from renderer.harmonics import unit_vectors
+from renderer.light.harmonics import unit_vectors
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
@@ -41,8 +41,8 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) ->
     weighted, corners = area_vectors(vertices, faces).repeat(1, 3), faces.T.flatten()
     summed = weighted.new_zeros(3, len(vertices)).index_add(1, corners, weighted)
     areas = weighted.new_zeros(len(vertices)).index_add(0, corners, _length(weighted.detach()))
-    cancelled = _length(summed.detach()) <= ROUNDING * areas
-    return unit(summed.masked_fill(cancelled, 0)).T.to(vertices.dtype)
+    canceled = _length(summed.detach()) <= ROUNDING * areas
+    return unit(summed.masked_fill(canceled, 0)).T.to(vertices.dtype)
 
 
 def unit(vectors: Tensor) -> Tensor:

@@ -17,14 +17,14 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_bounded, require_finite
 from renderer.fragments import Fragments
-from renderer.harmonics import (
+from renderer.light.harmonics import (
     bands,
     degree_of,
     homogeneous_gradients,
     lambertian_factors,
-    live_coefficients,
     monomial_coefficients,
     monomials,
+    nonzero_coefficients,
     per_degree,
     select_rows,
     unit_vectors,
@@ -98,8 +98,8 @@ class _Irradiance(torch.autograd.Function):
         value, slope = (torch.cat(parts, dim=-1) for parts in blocks)
         absent = torch.nonzero(length == 0).squeeze(1)
         if len(absent):  # the homogeneous polynomials are not those of `basis` at 0
-            live, rows = _live_harmonics(unit[:, absent], math.isqrt(len(light)) - 1)
-            value[:, absent] = light[live].T @ rows
+            nonzero, rows = _nonzero_harmonics(unit[:, absent], math.isqrt(len(light)) - 1)
+            value[:, absent] = light[nonzero].T @ rows
         ctx.save_for_backward(unit, length, slope if ctx.needs_input_grad[0] else None)
         ctx.light = light.shape
         return value
@@ -117,8 +117,8 @@ class _Irradiance(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             by_light = unit.new_zeros(ctx.light)
             for block, above in zip(unit.split(BLOCK, dim=1), upstream.split(BLOCK, dim=1), strict=True):
-                live, rows = _live_harmonics(block, math.isqrt(ctx.light[0]) - 1)
-                by_light[live] += rows @ above.T
+                nonzero, rows = _nonzero_harmonics(block, math.isqrt(ctx.light[0]) - 1)
+                by_light[nonzero] += rows @ above.T
         return by_normal, by_light
 
 
@@ -175,10 +175,10 @@ def _slopes(degree: int) -> Tensor:
     return slopes * ((l > 0) & (l % 2 == degree % 2))
 
 
-def _live_harmonics(unit: Tensor, degree: int) -> tuple[list[int], Tensor]:
+def _nonzero_harmonics(unit: Tensor, degree: int) -> tuple[list[int], Tensor]:
     """(the K coefficients that reach a surface, what one of each does at unit or zero vectors (3, N): (K, N))."""
-    live = live_coefficients(degree).tolist()
-    return live, torch.stack(select_rows(unit, live)) * _factors(degree).to(unit)[live]
+    nonzero = nonzero_coefficients(degree).tolist()
+    return nonzero, torch.stack(select_rows(unit, nonzero)) * _factors(degree).to(unit)[nonzero]
 
 
 @per_degree

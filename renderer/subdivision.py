@@ -20,7 +20,7 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
     """The same surface with more than so many vertices: each face becomes four, as often as it takes.
 
     New vertices are the middles of edges, shared by the faces that share the edge, so that a closed mesh stays closed;
-    colours (as they are stored, sRGB-encoded) and texture coordinates are interpolated. The old vertices keep their
+    colors (as they are stored, sRGB-encoded) and texture coordinates are interpolated. The old vertices keep their
     indices, and the quarters of face f are the faces 4f to 4f + 3. A mesh with enough vertices comes back as it is.
     """
     require_range("vertices", vertices, 0, MOST_VERTICES)
@@ -32,7 +32,7 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
 def refine(mesh: Mesh, area: float) -> Mesh:
     """The same surface with faces no larger than that: each that is becomes four, as often as it takes.
 
-    The faces come in another order; the old vertices keep their indices, and new ones may lie on a neighbour's edge.
+    The faces come in another order; the old vertices keep their indices, and new ones may lie on a neighbor's edge.
     """
     parts = []
     while True:

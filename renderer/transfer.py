@@ -1,4 +1,4 @@
-"""A scene as a linear operator on its light: (mesh, camera) → T, rasterised once and multiplied ever after.
+"""A scene as a linear operator on its light: (mesh, camera) → T, rasterized once and multiplied ever after.
 
 Before clamping, every pixel of a diffuse mesh is linear in the lighting coefficients U (the paper's appendix B.2):
 radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do shadows
@@ -19,18 +19,17 @@ from torch.nn.functional import linear
 
 from renderer.albedo import surface_albedo
 from renderer.arguments import as_device, checked
-from renderer.basis import HARMONICS, Basis, Distant, Placed, parts_of
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
 from renderer.fragments import Fragments, build_fragments
-from renderer.image import ImageSettings, as_background, compose
+from renderer.image import ImageSettings, as_background, composite
+from renderer.light.basis import HARMONICS, Basis, EnvironmentBasis, LocalBasis, parts_of
 from renderer.mesh import Mesh
-from renderer.sparse import Sparse, joined
-from renderer.transport.placed import placed_transfer
+from renderer.rasterizer import Rasterizer
+from renderer.transport.local import SparseTransfer, joined, local_transfer
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
-from renderer.visibility import Backend
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -42,16 +41,16 @@ BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 
 
 @dataclass(frozen=True)
-class Operator:
+class TransferOperator:
     """What is kept of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
 
     transfer: three channels of K kept coefficients and P covered pixels; or one, a third of the size and the time,
-    where no pixel mixes albedos (one sample per pixel, or a mesh of one colour).
+    where no pixel mixes albedos (one sample per pixel, or a mesh of one color).
     albedo: what the one channel is multiplied with; ones where there are three.
     coverage: in (0, 1], the share of a pixel's samples that the mesh covers.
     pixels: row-major indices of the covered pixels; row 0 is the top of the image.
     kept: ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
-    under an open sky (`Basis.live`), and all in a view with shadows.
+    under an open sky (`Basis.nonzero`), and all in a view with shadows.
     settings: of the image that they are pixels of. basis: of the lights.
     sparse: of three channels, added to the others: what a pattern's pixels reach; None where that is not little.
     """
@@ -63,7 +62,7 @@ class Operator:
     kept: Int[Tensor, " K"]
     settings: ImageSettings
     basis: Basis = HARMONICS
-    sparse: Sparse | None = None
+    sparse: SparseTransfer | None = None
 
     @checked
     def image(
@@ -75,7 +74,7 @@ class Operator:
         """
         behind = as_background(background, self.settings.size, lights)
         coverage = self.coverage.to(lights)
-        return compose(self.radiance(lights), coverage, self.pixels, behind, self.settings.encoding)
+        return composite(self.radiance(lights), coverage, self.pixels, behind, self.settings.encoding)
 
     def radiance(self, lights: Float[Tensor, "*lights coefficients 3"]) -> Float[Tensor, "*lights 3 P"]:
         """Linear radiance; differentiable, by `light_gradient`.
@@ -118,7 +117,7 @@ class Operator:
         return gradient.to(radiance_gradient.dtype)
 
     @checked
-    def to(self, device: torch.device | str) -> Operator:
+    def to(self, device: torch.device | str) -> TransferOperator:
         """The same on another device."""
         device = as_device(device)
         sparse = self.sparse and self.sparse.to(device)
@@ -139,7 +138,7 @@ class Operator:
 
 class _Radiance(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, lights: Tensor, operator: Operator) -> Tensor:
+    def forward(ctx: Any, lights: Tensor, operator: TransferOperator) -> Tensor:
         ctx.operator = operator
         return _radiance(operator, lights)
 
@@ -149,7 +148,7 @@ class _Radiance(torch.autograd.Function):
         return ctx.operator.light_gradient(upstream), None
 
 
-def _radiance(operator: Operator, lights: Tensor) -> Tensor:
+def _radiance(operator: TransferOperator, lights: Tensor) -> Tensor:
     kept = lights.index_select(-2, operator.kept).to(operator.transfer.dtype)
     if operator._shared is not None:
         product = (kept.mT @ operator._shared).mul_(operator.albedo)
@@ -162,7 +161,7 @@ def _radiance(operator: Operator, lights: Tensor) -> Tensor:
     return product.to(lights.dtype)
 
 
-def _repeated(entries: Sparse, images: int) -> tuple[Sparse, Tensor]:
+def _repeated(entries: SparseTransfer, images: int) -> tuple[SparseTransfer, Tensor]:
     """(the entries for each of several images, (N,) which one each is of)."""
     every = torch.arange(len(entries.function), device=entries.function.device)
     image = torch.arange(images, device=every.device).repeat_interleave(len(every))
@@ -182,33 +181,39 @@ def build_operators(
     mesh: Mesh,
     cameras: Sequence[Camera],
     settings: ImageSettings,
-    backend: Backend,
-    gain: float = 1.0,
+    rasterizer: Rasterizer,
+    albedo_scale: float = 1.0,
     basis: Basis = HARMONICS,
     dtype: torch.dtype = torch.float32,
-) -> list[Operator]:
+) -> list[TransferOperator]:
     """One operator per camera, for lights of one basis; computed in float64 and stored in `dtype`.
 
     gain multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side that the
     camera sees, with normals as the settings say. InputError: `renderer.transport`.
     """
-    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, backend, closed=mesh.closed)
-    builder = OperatorBuilder(mesh, settings, gain, basis, dtype)
+    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
+    builder = OperatorBuilder(mesh, settings, albedo_scale, basis, dtype)
     return [builder.operator(view) for view in views]
 
 
 class OperatorBuilder:
     """Operators of one mesh in lights of one basis; see `build_operators`. What the views share is made once."""
 
-    def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis, dtype: torch.dtype):
-        require_bounded(gain=torch.tensor(float(gain)))
-        self._mesh, self._settings, self._gain, self._basis, self._dtype = mesh, settings, gain, basis, dtype
-        self._transport = build_transport(mesh, settings, gain, basis)
+    def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis, dtype: torch.dtype):
+        require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
+        self._mesh, self._settings, self._albedo_scale, self._basis, self._dtype = (
+            mesh,
+            settings,
+            albedo_scale,
+            basis,
+            dtype,
+        )
+        self._transport = build_transport(mesh, settings, albedo_scale, basis)
         self._rays = self._transport.rays if self._transport else Rays(mesh)
 
-    def operator(self, fragments: Fragments) -> Operator:
-        """Of one view that has been rasterised."""
-        albedo = surface_albedo(self._mesh, fragments, self._settings.encoding) * self._gain
+    def operator(self, fragments: Fragments) -> TransferOperator:
+        """Of one view that has been rasterized."""
+        albedo = surface_albedo(self._mesh, fragments, self._settings.encoding) * self._albedo_scale
         colors = self._transport and self._transport.colors
         factor = None if colors else _pixel_albedo(fragments, albedo, self._dtype)
         if factor is None:
@@ -218,18 +223,18 @@ class OperatorBuilder:
         surface, pixels = Surface.of(self._mesh, fragments, self._settings), len(fragments.pixels)
         transfers, kept, sparse = [torch.empty(albedo.shape[1], 0, pixels, dtype=self._dtype)], [torch.arange(0)], None
         for where, part in parts_of(self._basis):
-            if isinstance(part, Placed):
-                entries = placed_transfer(self._rays, surface, albedo, part)
+            if isinstance(part, LocalBasis):
+                entries = local_transfer(self._rays, surface, albedo, part)
                 if entries.few(pixels):
                     weight = (entries.weight * factor[entries.pixel]).to(self._dtype)
-                    sparse = joined(sparse, Sparse(where.start + entries.function, entries.pixel, weight))
+                    sparse = joined(sparse, SparseTransfer(where.start + entries.function, entries.pixel, weight))
                     continue
                 transfer, reaching = entries.dense(pixels)
             else:
                 transfer, reaching = self._distant_transfer(surface, albedo, part)
             transfers.append(transfer.to(self._dtype))
             kept.append(where.start + reaching)
-        return Operator(
+        return TransferOperator(
             transfer=torch.cat(transfers, dim=1),
             albedo=factor.T.to(self._dtype).contiguous(),
             coverage=fragments.coverage.to(self._dtype),
@@ -240,13 +245,13 @@ class OperatorBuilder:
             sparse=sparse,
         )
 
-    def _distant_transfer(self, surface: Surface, albedo: Tensor, basis: Distant) -> tuple[Tensor, Tensor]:
+    def _distant_transfer(self, surface: Surface, albedo: Tensor, basis: EnvironmentBasis) -> tuple[Tensor, Tensor]:
         """((C, K, P), the K coefficients that reach a pixel (K,)); albedo: (S, C), at the samples."""
         transfer = _box_filter(surface, albedo, basis, self._dtype)
         change = self._transport.change(surface, albedo) if self._transport else None
         if change is None:
-            return transfer, basis.live
-        return change.index_add_(1, basis.live, transfer.double()), torch.arange(basis.size)
+            return transfer, basis.nonzero
+        return change.index_add_(1, basis.nonzero, transfer.double()), torch.arange(basis.size)
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:
@@ -256,7 +261,7 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     return by_pixel if (spread <= torch.finfo(dtype).eps * albedo).all() else None
 
 
-def _box_filter(surface: Surface, albedo: Tensor, basis: Distant, dtype: torch.dtype) -> Tensor:
+def _box_filter(surface: Surface, albedo: Tensor, basis: EnvironmentBasis, dtype: torch.dtype) -> Tensor:
     """(C, K, P): albedo (S, C) × A_l Y_lm(n), summed over each pixel's samples, by blocks of pixels in float64."""
     fragments, smooth = surface.fragments, surface.smooth_faces is not None
     pixels = len(fragments.pixels)
@@ -267,7 +272,7 @@ def _box_filter(surface: Surface, albedo: Tensor, basis: Distant, dtype: torch.d
         shading = basis.irradiance(surface.face_planes)
     starts = torch.arange(0, pixels, BLOCK)
     ends = torch.searchsorted(pixel, starts + BLOCK).tolist()
-    filtered = torch.empty(albedo.shape[1], len(basis.live), pixels, dtype=dtype)
+    filtered = torch.empty(albedo.shape[1], len(basis.nonzero), pixels, dtype=dtype)
     for first, begin, end in zip(starts.tolist(), [0, *ends], ends, strict=False):
         some = slice(begin, end)
         rows = basis.irradiance(surface.normals[some]) if smooth else shading.index_select(0, face[some])

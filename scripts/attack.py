@@ -1,4 +1,4 @@
-"""Attack a classifier through a mesh's light, shape, colour or pixels: python scripts/attack.py attack=lighting ..."""
+"""Attack a classifier through a mesh's light, shape, color or pixels: python scripts/attack.py attack=lighting ..."""
 
 import re
 import sys
@@ -13,7 +13,7 @@ from augment.attacks.evaluate import Sweep
 from augment.attacks.files import LINES
 from augment.attacks.parameters import PARAMETERS
 from renderer.errors import InputError
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 from train.attacks.curve import FIGURE, TABLE, curve, format_curve, write_curve
 from train.attacks.experiment import attacks
 from train.attacks.search import overrides
@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
     device = choose_device(settings.device)
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
     if adversary is not None:
-        images = adversary.render(choose(settings.renderer.visibility)).to(device)
+        images = adversary.render(choose(settings.renderer.rasterizer)).to(device)
         logits = logits_of(settings.attack.preprocessed_model(classifier), images[None], len(images))[0]
         print(format_reloaded(adversary, images, logits, classifier.classes))
         if not settings.attack.parameters:
@@ -49,7 +49,7 @@ def main(config: DictConfig) -> None:
     with sole_writer("out", out):
         for index, (name, scene, attacked) in enumerate(attacks(settings, classifier, device, adversary)):
             if scene != settings.scene:
-                print(f"{name} is not recognised in the scene as it is, but is with {overrides(scene, settings.scene)}")
+                print(f"{name} is not recognized in the scene as it is, but is with {overrides(scene, settings.scene)}")
             checks = attacked.check() if settings.attack.checks else None
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
             rerender_checks = attacked.save(folder, checks, settings.attack.renderers)

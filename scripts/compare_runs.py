@@ -7,7 +7,7 @@ import train.command_line.entry_points as command
 from augment.utils import progress
 from renderer.errors import InputError
 from train.report.comparison import format_comparison
-from train.report.summary import summarise
+from train.report.summary import summarize
 
 
 @dataclass
@@ -27,7 +27,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    runs = [summarise(Path(run)) for run in progress(settings.runs, "runs")]
+    runs = [summarize(Path(run)) for run in progress(settings.runs, "runs")]
     print(format_comparison(runs, settings.exclude, settings.photographs))
 
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import train.command_line.entry_points as command
-from renderer.environment import check_map_name, negative_share, to_map, write_map
 from renderer.errors import InputError, require_range
-from renderer.lights import load_light
+from renderer.light.environment import check_map_name, negative_fraction, to_map, write_map
+from renderer.light.presets import load_light
 from train.command_line.outputs import writable_file
 
 LARGEST_HEIGHT = 8192  # of a map that fits in memory: 3 GB
@@ -38,7 +38,7 @@ def main(settings: Settings) -> None:
     fate = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"
     print(
         f"{out}: {radiance.shape[1]} × {radiance.shape[0]} texels, radiance {radiance.min():.3g} to "
-        f"{radiance.max():.3g}; {negative_share(radiance):.2%} of it is negative and {fate}"
+        f"{radiance.max():.3g}; {negative_fraction(radiance):.2%} of it is negative and {fate}"
     )
 
 

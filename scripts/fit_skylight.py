@@ -7,7 +7,7 @@ from safetensors.torch import save
 
 import train.command_line.entry_points as command
 from renderer.errors import InputError, require_range
-from renderer.skylight import fit_error, fit_polynomials
+from renderer.light.skylight import fit_error, fit_polynomials
 from train.command_line.outputs import writable_file
 
 

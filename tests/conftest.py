@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from renderer.visibility import Backend
+from renderer.rasterizer import Rasterizer
 from train.interruption import heed_interrupts
 
 ROOT = Path(__file__).parents[1]
@@ -31,7 +31,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def interrupts() -> None:
-    """Reach what tests start, also where the tests run in the background."""
+    """LightPaths what tests start, also where the tests run in the background."""
     heed_interrupts()
 
 
@@ -66,16 +66,16 @@ def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
 
 
 @pytest.fixture
-def rasterised(monkeypatch) -> list[int]:
+def rasterized(monkeypatch) -> list[int]:
     """The number of views of every call to a back end, in order."""
     calls = []
-    rasterise = Backend.rasterise
+    rasterize = Rasterizer.rasterize
 
     def counted(self, points, faces, resolution, closed=False):
         calls.append(len(points))
-        return rasterise(self, points, faces, resolution, closed=closed)
+        return rasterize(self, points, faces, resolution, closed=closed)
 
-    monkeypatch.setattr(Backend, "rasterise", counted)
+    monkeypatch.setattr(Rasterizer, "rasterize", counted)
     return calls
 
 

@@ -23,18 +23,18 @@ MANY = [
     *(torch.tensor(1), torch.zeros(0), torch.full((49, 3), math.nan)),
     *(torch.zeros(49, 3, dtype=torch.int64), torch.zeros(49, 3, dtype=torch.complex64)),
 ]
-RESULTS = {"InputError", "Operator"}  # which nobody makes; their methods are below
-SMALL = {"samples": 1, "encoding": "linear", "normals": "smooth", "transport": "direct", "visibility": "software"}
+RESULTS = {"InputError", "TransferOperator"}  # which nobody makes; their methods are below
+SMALL = {"samples": 1, "encoding": "linear", "normals": "smooth", "shadows": False, "rasterizer": "numpy"}
 ARRAYS = ("vertices", "faces", "corner_colors", "corner_uvs", "texture_ids", "textures")
-CAMERA = {"polar": 1.0, "azimuth": 0.0, "field_of_view": 2.0, "right": 0.0, "up": 0.0, "reach": 2.0}
+CAMERA = {"polar": 1.0, "azimuth": 0.0, "width": 2.0, "right": 0.0, "up": 0.0, "reach": 2.0}
 
 
 @cache
 def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
     """What can be called by name, with arguments that are good."""
-    mesh, cameras, light = renderer.solid("plate"), renderer.ring(1, 2.2), renderer.load_light("grace")
+    mesh, cameras, light = renderer.solid("plate"), renderer.orbit_cameras(1, 2.2), renderer.load_light("grace")
     image = renderer.ImageSettings(8, 1)
-    operator = renderer.operators(mesh, cameras, 8, samples=1, visibility="software")[0]
+    operator = renderer.precompute_transfer(mesh, cameras, 8, samples=1, rasterizer="numpy")[0]
     whole = {name: getattr(mesh, name) for name in ARRAYS}
 
     def fields(settings: object) -> dict[str, object]:
@@ -42,25 +42,25 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
 
     return {
         "render": (renderer.render, {"mesh": mesh, "cameras": cameras, "light": light, "size": 8, "background": 0.5}
-                   | {"vertices": None, "albedo": None, "gain": 1.0} | SMALL),
-        "operators": (renderer.operators, {"mesh": mesh, "cameras": cameras, "size": 8, "gain": 1.0} | SMALL),
-        "ring": (renderer.ring, {"views": 2, "field_of_view": 2.0, "polar": 1.0, "azimuth": 0.0, "perspective": None}),
+                   | {"vertices": None, "albedo": None, "albedo_scale": 1.0} | SMALL),
+        "operators": (renderer.precompute_transfer, {"mesh": mesh, "cameras": cameras, "size": 8, "albedo_scale": 1.0} | SMALL),
+        "ring": (renderer.orbit_cameras, {"views": 2, "width": 2.0, "polar": 1.0, "azimuth": 0.0, "fov": None}),
         "OrthographicCamera": (renderer.OrthographicCamera, CAMERA),
         "PerspectiveCamera": (renderer.PerspectiveCamera, CAMERA | {"distance": 4.0}),
         "ImageSettings": (renderer.ImageSettings, fields(image)),
         "load_light": (renderer.load_light, {"light": "grace"}),
         "save_light": (renderer.save_light, {"path": Path("light.json"), "coefficients": light}),
         "load_mesh": (renderer.load_mesh, {"path": "mesh.glb", "up": "auto"}),
-        "normalise": (renderer.normalise, {"mesh": mesh}),
+        "normalize": (renderer.normalize, {"mesh": mesh}),
         "export_mesh": (renderer.export_mesh, {"mesh": mesh, "path": "mesh.glb", "normals": "flat", "cameras": ()}),
         "solid": (renderer.solid, {"name": "plate", "seed": 0}),
         "subdivide": (renderer.subdivide, {"mesh": mesh, "vertices": 1}),
         "Mesh": (renderer.Mesh, whole),
         "Mesh.plain": (renderer.Mesh.plain, {"vertices": mesh.vertices, "faces": mesh.faces, "color": (1, 1, 1)}),
-        "Operator.image": (operator.image, {"lights": light, "background": 0.5}),
-        "Operator.radiance": (operator.radiance, {"lights": light}),
-        "Operator.light_gradient": (operator.light_gradient, {"radiance_gradient": operator.radiance(light)}),
-        "Operator.to": (operator.to, {"device": "cpu"}),
+        "TransferOperator.image": (operator.image, {"lights": light, "background": 0.5}),
+        "TransferOperator.radiance": (operator.radiance, {"lights": light}),
+        "TransferOperator.light_gradient": (operator.light_gradient, {"radiance_gradient": operator.radiance(light)}),
+        "TransferOperator.to": (operator.to, {"device": "cpu"}),
     }  # fmt: skip
 
 
@@ -126,4 +126,4 @@ def test_an_argument_too_many_or_too_few_is_pythons_own_error():
     with pytest.raises(TypeError, match="positional argument"):
         example()
     with pytest.raises(TypeError, match="positional argument"):
-        renderer.normalise(renderer.solid("plate"), 1)
+        renderer.normalize(renderer.solid("plate"), 1)

@@ -13,10 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from renderer.environment import read_map, write_map
 from renderer.errors import InputError
-from renderer.files.light_files import save_light
-from renderer.lights import load_light, probe
+from renderer.io.lights import save_light
+from renderer.light.environment import read_map, write_map
+from renderer.light.presets import load_light, probe
 from train.data import load_npz
 from train.photographs.answers import ANSWERS, Answer, read_answers, write_answers
 from train.photographs.folder import Photograph, find_photographs, load_photographs

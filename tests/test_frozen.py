@@ -34,54 +34,54 @@ import augment
 import renderer
 from augment.attacks.eot import EOTSettings
 from augment.scene import Conditions
-from renderer.lights import directional
-from renderer.skylight import coefficients as skylight
+from renderer.light.presets import directional
+from renderer.light.skylight import coefficients as skylight
 
 RECORDS = Path(__file__).with_name("frozen.json")
 LIBRARIES = ("torch", "numpy", "scipy", "embreex", "pillow")
-SOFTWARE = {"visibility": "software"}  # the same on every machine; "compiled" has a case of its own
+SOFTWARE = {"rasterizer": "numpy"}  # the same on every machine; "compiled" has a case of its own
 SIZE = 24
 
 ABOVE = renderer.OrthographicCamera(math.pi / 3, 0.4, 2.2)
 ASIDE = renderer.OrthographicCamera(1.4, 2.5, 2.6, 0.2, -0.1)
 NEAR = renderer.PerspectiveCamera(1.1, -0.7, 2.2, distance=4.0)
-RING = renderer.ring(3, 2.2, perspective=math.radians(40))
+RING = renderer.orbit_cameras(3, 2.2, fov=math.radians(40))
 
 # name: (mesh, cameras, light, keywords of `render`, differentiated arguments)
 RENDERS = {
     "flat_linear": ("orange:0", ABOVE, "grace", {"normals": "flat", "samples": 1}, ()),
     "smooth_srgb_perspective": ("apple:1", NEAR, "eucalyptus", {"encoding": "srgb", "samples": 3}, ()),
-    "compiled": ("lemon:2", RING, "st_peters", {"visibility": "compiled"}, ()),
-    "shadows": ("pear:0", ASIDE, "environment", {"transport": "shadows"}, ()),
-    "bounces": ("cup:0", NEAR, "uniform", {"transport": "bounces:2", "normals": "flat", "encoding": "srgb"}, ()),
-    "sky": ("mushroom:3", RING, "skylight", {"gain": 0.7, "background": 0.1}, ()),
+    "compiled": ("lemon:2", RING, "st_peters", {"rasterizer": "numba"}, ()),
+    "shadows": ("pear:0", ASIDE, "environment", {"shadows": True}, ()),
+    "bounces": ("cup:0", NEAR, "uniform", {"bounces": 2, "normals": "flat", "encoding": "srgb"}, ()),
+    "sky": ("mushroom:3", RING, "skylight", {"albedo_scale": 0.7, "background": 0.1}, ()),
     "subdivided": ("table:0+2000", ABOVE, "lamp", {"normals": "flat", "samples": 3}, ()),
     "exported": ("bottle:1.glb", ASIDE, "grace", {"encoding": "srgb"}, ()),
     "textured": ("tent", NEAR, "grace", {"encoding": "srgb"}, ("light", "albedo")),
     "flat_gradients": ("sweet_pepper:0", ABOVE, "grace", {"normals": "flat"}, ("light", "vertices", "albedo")),
     "smooth_gradients": ("peach:0", NEAR, "eucalyptus", {"encoding": "srgb"}, ("light", "vertices", "albedo")),
-    "bounces_gradients": ("lamp:0", ABOVE, "uniform", {"transport": "bounces:1"}, ("light", "vertices", "albedo")),
+    "bounces_gradients": ("lamp:0", ABOVE, "uniform", {"bounces": 1}, ("light", "vertices", "albedo")),
 }
 # name: (mesh, cameras, keywords of `operators`)
 OPERATORS = {
     "one_color": ("ball:0", ABOVE, {"normals": "flat"}),
-    "colors": ("orange:3", RING, {"encoding": "srgb", "gain": 1.3, "samples": 3}),
-    "shadows": ("plate:0", NEAR, {"transport": "shadows"}),
-    "bounces": ("cup:1", ASIDE, {"transport": "bounces:2"}),
+    "colors": ("orange:3", RING, {"encoding": "srgb", "albedo_scale": 1.3, "samples": 3}),
+    "shadows": ("plate:0", NEAR, {"shadows": True}),
+    "bounces": ("cup:1", ASIDE, {"bounces": 2}),
 }
 CUP = augment.PropSettings("solid:cup:0", at=[0.9, 0.6], scale=0.6, azimuth=30.0)
 LEMON = augment.PropSettings("solid:lemon:1", at=[-0.9, 0.4], scale=0.4)
-AMONG_PROPS = augment.ObjectSettings("solid:pear:0", "orange", gain=0.9, props=[CUP, LEMON])
+AMONG_PROPS = augment.ObjectSettings("solid:pear:0", "orange", albedo_scale=0.9, props=[CUP, LEMON])
 PROJECTOR = augment.ProjectorSettings(pixels=6, polar=50.0, azimuth=20.0, power=2.0, pattern=0.5)
 LAMPS = augment.LampsSettings([[2.0, 1.0, 2.0], [-2.0, 0.5, 1.5]], power=8.0, start=3.0)
 DISCS = augment.LampsSettings([[2.0, 1.0, 2.0], [0.5, -2.0, 2.5]], power=8.0, radius=0.4, start=[[4, 3, 2], [1, 2, 3]])
 # name: (meshes, views, keywords of `build_scene`)
 SCENES = {
     "grid": ([("solid:orange:0", "orange"), ("solid:apple:0", "apple")], 2, {"backgrounds": [0.2, 0.8]}),
-    "props": ([AMONG_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "transport": "shadows", "perspective": 40.0}),
+    "props": ([AMONG_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "shadows": True, "perspective": 40.0}),
     "projector": ([("solid:mushroom:0", "orange")], 1, {"projector": PROJECTOR, "encoding": "srgb"}),
     "lamps": ([("solid:cup:2", "orange")], 2, {"lamps": DISCS, "shared": True, "ground": [0.5, 0.5, 0.5]}),
-    "all_lights": ([AMONG_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "transport": "shadows"}),
+    "all_lights": ([AMONG_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "shadows": True}),
 }
 
 CLASSES = ["orange", "apple", "pear", "bottle"]
@@ -98,10 +98,10 @@ ATTACKS = {
     "lighting_signed": ({"lighting": Step(step_size=0.3)}, {}, {"allow_negative": True, "margin": 0.0}, None),
     "skylight": ({"skylight": Sky(zenith=30.0, step_size=0.3)}, {"normals": "smooth"}, {}, None),
     "projector": ({"projector": Step(step_size=1.0)}, {"projector": PROJECTOR, "encoding": "srgb"}, {}, None),
-    "lamps": ({"lamps": Step(step_size=2.0)}, {"lamps": LAMPS, "transport": "shadows"}, {}, None),
+    "lamps": ({"lamps": Step(step_size=2.0)}, {"lamps": LAMPS, "shadows": True}, {}, None),
     "places": ({"places": Step("l2", 1.0, step_size=0.3)}, {"lamps": DISCS}, {}, None),
-    "geometry": (SHAPE, {"normals": "smooth", "transport": "shadows"}, {"shorten": True}, None),
-    "albedo": (COLOR, {"transport": "shadows", "ground": [0.5, 0.4, 0.3]}, {}, None),
+    "geometry": (SHAPE, {"normals": "smooth", "shadows": True}, {"shorten": True}, None),
+    "albedo": (COLOR, {"shadows": True, "ground": [0.5, 0.4, 0.3]}, {}, None),
     "pixels": ({"pixels": Step("linf", 0.03, "sign", 0.01)}, {}, {}, augment.LeastLikely()),
     "shared_views": (BOTH, {"views": 3, "shared": True, "perspective": 35.0}, {"shorten": True}, None),
     "targeted": ({"lighting": Step(step="raw", step_size=0.5)}, {"views": 2}, {}, augment.Targeted("pear")),
@@ -110,7 +110,7 @@ ATTACKS = {
 
 SMALL = """
 data=shapes data.train_per_class=10 data.test_per_class=4 data.size=16 data.images=null model.depth=10 model.width=1
-train.epochs=2 train.batch_size=16 train.precision=float32 train.device=cpu train.threads=1 renderer.visibility=software
+train.epochs=2 train.batch_size=16 train.precision=float32 train.device=cpu train.threads=1 renderer.rasterizer=numpy
 renderer.samples=2 scene.backgrounds=[0.2,0.8]
 """
 RUNS = {
@@ -146,7 +146,7 @@ def test_render_by_operators(name, tmp_path, verify):
     shown, cameras, keywords = OPERATORS[name]
     named = ("grace", "skylight", "environment")
     lights = torch.stack([light_named(light, tmp_path) for light in named]).requires_grad_()
-    found = renderer.operators(mesh_named(shown, tmp_path), cameras, SIZE, **SOFTWARE, **keywords)
+    found = renderer.precompute_transfer(mesh_named(shown, tmp_path), cameras, SIZE, **SOFTWARE, **keywords)
     images = torch.stack([operator.image(lights, 0.3) for operator in found])
     verify(images, *gradients(images, [lights]), found[0].radiance(lights.detach()))
 

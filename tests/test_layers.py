@@ -31,4 +31,4 @@ def test_only_one_module_imports_opengl():
         for path in (ROOT / package).rglob("*.py")
         if "moderngl" in imported_packages(path)
     ]
-    assert users == ["renderer/visibility/opengl.py"]
+    assert users == ["renderer/rasterizer/opengl.py"]

@@ -23,11 +23,11 @@ from augment.scene import Scene
 from augment.service import AugmentationService, Renders
 from augment.utils import Phases
 from renderer import harmonics, image, normals, shading
-from renderer.camera import ring
-from renderer.transfer import Operator
+from renderer.camera import orbit_cameras
+from renderer.transfer import TransferOperator
 
 ROOT, PACKAGES = Path(__file__).parents[1], ("renderer", "augment", "train")
-MESH, CAMERAS, LIGHT = renderer.solid("plate"), ring(2, 2.0), renderer.load_light("grace")
+MESH, CAMERAS, LIGHT = renderer.solid("plate"), orbit_cameras(2, 2.0), renderer.load_light("grace")
 VERTICES, FACES = torch.from_numpy(MESH.vertices), torch.from_numpy(MESH.faces)
 DIRECTIONS = torch.rand(4, 5, 3)
 
@@ -81,22 +81,27 @@ def test_of_rendering():
 
 
 def test_of_operators():
-    [operator] = renderer.operators(MESH, CAMERAS[:1], 8)
+    [operator] = renderer.precompute_transfer(MESH, CAMERAS[:1], 8)
     check_fields(operator)
     for lights in (LIGHT, LIGHT.expand(5, 4, -1, -1)):
-        checked(Operator.image)(operator, lights, torch.rand(3, 8, 8))
-        seen = checked(Operator.radiance)(operator, lights)
-        checked(Operator.light_gradient)(operator, seen)
-        behind = checked(image.compose)(seen, operator.coverage, operator.pixels, torch.rand(3, 8, 8))
+        checked(TransferOperator.image)(operator, lights, torch.rand(3, 8, 8))
+        seen = checked(TransferOperator.radiance)(operator, lights)
+        checked(TransferOperator.light_gradient)(operator, seen)
+        behind = checked(image.composite)(seen, operator.coverage, operator.pixels, torch.rand(3, 8, 8))
         assert checked(image.to_unit)(checked(image.to_bytes)(behind)).shape[-2:] == (8, 8)
-        checked(image.develop)(seen, operator.coverage[None], torch.rand(1, 1))
+        checked(image.tonemap)(seen, operator.coverage[None], torch.rand(1, 1))
 
 
 def test_of_harmonics_and_normals():
     for function in (harmonics.basis, harmonics.basis_gradient, harmonics.irradiance_basis):
         for directions in (DIRECTIONS, DIRECTIONS[0, 0], DIRECTIONS.double()):
             checked(function)(directions, 6)
-    for function in (harmonics.bands, harmonics.lambertian_factors, harmonics.live_coefficients, harmonics.quadrature):
+    for function in (
+        harmonics.bands,
+        harmonics.lambertian_factors,
+        harmonics.nonzero_coefficients,
+        harmonics.quadrature,
+    ):
         checked(function.__wrapped__ if hasattr(function, "cache_info") else function)(6)
     directions, _ = checked(harmonics.equirectangular)(4, 8)
     light = checked(harmonics.project)(directions, 2)

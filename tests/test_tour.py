@@ -22,8 +22,8 @@ def test_the_tour_runs_from_the_root_of_a_clone_and_fools_the_network(tour):
     NotebookClient(tour, timeout=600, resources={"metadata": {"path": str(ROOT)}}).execute()
     gc.collect()  # so that no later test is warned of the kernel
     said = "".join(output.get("text", "") for cell in tour.cells for output in cell.get("outputs", []))
-    fooled, _, recognised, *_ = said.split()
-    assert int(recognised) > 0 and int(fooled) >= 0.9 * int(recognised)
+    fooled, _, recognized, *_ = said.split()
+    assert int(recognized) > 0 and int(fooled) >= 0.9 * int(recognized)
 
 
 def test_the_tour_is_kept_with_its_images_and_without_a_machines_path(tour):

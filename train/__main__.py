@@ -21,7 +21,7 @@ from train.distributed import broadcast, first_process_first, process_group
 from train.experiment import load_data, prepare, write_images
 from train.interruption import Interrupted
 from train.report.overview import format_table
-from train.report.summary import summarise
+from train.report.summary import summarize
 from train.report.write import report_of
 from train.run_folder.files import sole_writer
 from train.run_folder.logs import console
@@ -68,7 +68,7 @@ def _train_arms(arms: Mapping[Path, DictConfig], data: DataSet, folder: Path) ->
             console.info("ended by %s; to go on: %s", stop.signal, resume_command(folder))
             raise
     if utils.rank() == 0:
-        console.info("\n%s", format_table([summarise(path) for path in arms]))
+        console.info("\n%s", format_table([summarize(path) for path in arms]))
         console.info("%s", report_of([folder], folder))
 
 

@@ -1,4 +1,4 @@
-"""Labelled images as uint8 arrays: CIFAR-100, an .npz file, a folder of class folders, or rendered shapes."""
+"""Labeled images as uint8 arrays: CIFAR-100, an .npz file, a folder of class folders, or rendered shapes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -118,7 +118,7 @@ def load_npz(path: str) -> DataSet:
 
 
 def load_folder(path: str, size: int, test_share: float) -> DataSet:
-    """Class folders of images, or `train` and `test` folders of them; centre squares reduced to size × size.
+    """Class folders of images, or `train` and `test` folders of them; center squares reduced to size × size.
 
     Without a `test` folder, that share of every class is held out as the test split.
     """

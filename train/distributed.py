@@ -70,17 +70,17 @@ def summed(values: Tensor) -> Tensor:
 def replicated(model: nn.Module) -> nn.Module:
     """The model whose gradients are averaged over all processes; itself where there is but one.
 
-    Batch normalisation takes its statistics over the global batch (`nn.SyncBatchNorm`), so that the result does not
+    Batch normalization takes its statistics over the global batch (`nn.SyncBatchNorm`), so that the result does not
     depend on the number of processes.
     """
     if utils.world_size() == 1:
         return model
-    synchronise_norms(model)
+    synchronize_norms(model)
     return DistributedDataParallel(model)
 
 
-def synchronise_norms(model: nn.Module) -> None:
-    """Replace every batch normalisation inside the model by one over all processes."""
+def synchronize_norms(model: nn.Module) -> None:
+    """Replace every batch normalization inside the model by one over all processes."""
     like = next(model.parameters())
     kind: type[nn.Module] = nn.SyncBatchNorm if like.is_cuda else SyncBatchNormCPU
     for parent in list(model.modules()):
@@ -97,13 +97,13 @@ class SyncBatchNormCPU(nn.BatchNorm2d):
             return super().forward(x)
         values = x.to(torch.promote_types(x.dtype, torch.float32))
         mean = _average(values.mean((0, 2, 3)))
-        centred = values - mean.view(1, -1, 1, 1)
-        variance = _average(centred.square().mean((0, 2, 3)))
+        centered = values - mean.view(1, -1, 1, 1)
+        variance = _average(centered.square().mean((0, 2, 3)))
         self._track(mean.detach(), variance.detach(), utils.world_size() * x.numel() // x.shape[1])
         scale = (variance + self.eps).rsqrt()
         if not self.affine:
-            return (centred * scale.view(1, -1, 1, 1)).to(x.dtype)
-        return (centred * (self.weight * scale).view(1, -1, 1, 1) + self.bias.view(1, -1, 1, 1)).to(x.dtype)
+            return (centered * scale.view(1, -1, 1, 1)).to(x.dtype)
+        return (centered * (self.weight * scale).view(1, -1, 1, 1) + self.bias.view(1, -1, 1, 1)).to(x.dtype)
 
     @torch.no_grad()
     def _track(self, mean: Tensor, variance: Tensor, count: int) -> None:

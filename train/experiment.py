@@ -119,7 +119,7 @@ def _one_error_without_room(folder: Path | str) -> Iterator[None]:
 
 
 def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
-    """The run's network, optimiser and scene, ready for `Trainer.fit`; nothing is written before."""
+    """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before."""
     phases = Phases(device)
     precision = choose_precision(settings.train.precision, device)
     mean, std = channel_statistics(data.train.images)

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import Normalised
+from augment.classifiers.adapter import Normalized
 from augment.classifiers.imagenet import require_architecture
 from augment.classifiers.python_function import call_python
 from augment.utils import eval_mode
@@ -29,13 +29,13 @@ def build_network(
     """A network with fresh weights from images (N, 3, size, size), RGB in [0, 1], to logits of the classes.
 
     name: wideresnet, which alone has a shape (depth, width, dropout), torchvision:NAME, or
-    python:package.module:function, a function that returns (module, size, classes) and whose module normalises by
+    python:package.module:function, a function that returns (module, size, classes) and whose module normalizes by
     itself. mean, std: the data's. InputError where there is no such network, or it does not take the data.
     """
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
     if name.startswith(TORCHVISION):
-        network: nn.Module = Normalised(_torchvision_network(name, len(classes), size), mean, std)
+        network: nn.Module = Normalized(_torchvision_network(name, len(classes), size), mean, std)
     elif name.startswith(PYTHON):
         network = _python_network(name, classes, size)
     else:

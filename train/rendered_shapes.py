@@ -1,4 +1,4 @@
-"""A small labelled data set that the project renders itself, so that the experiment runs with nothing downloaded.
+"""A small labeled data set that the project renders itself, so that the experiment runs with nothing downloaded.
 
 Training and test images stand in soft, even light, as stock photographs do. The held-out images, written to a
 folder and scored like photographs, show other instances in hard light from one side: every class under the same
@@ -23,10 +23,10 @@ from augment.utils import generator
 from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings, to_bytes
-from renderer.lights import ambient, directional
-from renderer.mesh import Mesh, normalise
+from renderer.light.presets import ambient, directional
+from renderer.mesh import Mesh, normalize
+from renderer.rasterizer import Rasterizer, choose
 from renderer.shapes import SOLIDS, solid
-from renderer.visibility import Backend, choose
 from train.data import DataSet, Split
 from train.run_folder.logs import console
 
@@ -77,7 +77,7 @@ def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
 
 
 def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
-    """One lamp of any colour from above, far to one side of the camera, in dim surroundings. (49, 3)"""
+    """One lamp of any color from above, far to one side of the camera, in dim surroundings. (49, 3)"""
     direction = _unit(torch.randn(3, generator=draws) + 0.5 * torch.tensor([0.0, 0.0, 1.0]) - 0.3 * back)
     tint = torch.tensor([1.0, 0.8, 0.6]).lerp(torch.tensor([0.6, 0.8, 1.0]), torch.rand(1, generator=draws))
     strength = 0.5 + 1.2 * torch.rand(1, generator=draws)
@@ -100,7 +100,7 @@ def _render_split(part: str, per_class: int, seed: int, settings: ImageSettings,
 def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:
     """Images of every class, in order: uint8 (classes × per_class, 3, size, size). Held out, all classes have the same
     draws of light and camera."""
-    backend = choose("software")
+    rasterizer = choose("numpy")
     instances = math.ceil(per_class / (VIEWS * BACKGROUNDS))
     light = hard_light if part == HELD_OUT else even_light
     draws = seeds = generator(seed, part)
@@ -109,13 +109,13 @@ def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Te
         if part == HELD_OUT:
             draws, seeds = generator(seed, part), generator(seed, part, name)
         meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(instances))
-        portraits = [_portraits(name, mesh, light, settings, backend, draws) for mesh in meshes]
+        portraits = [_portraits(name, mesh, light, settings, rasterizer, draws) for mesh in meshes]
         images.append(torch.cat(portraits)[:per_class])
     return torch.cat(images)
 
 
 def _portraits(
-    name: str, mesh: Mesh, light: Lights, settings: ImageSettings, backend: Backend, draws: torch.Generator
+    name: str, mesh: Mesh, light: Lights, settings: ImageSettings, rasterizer: Rasterizer, draws: torch.Generator
 ) -> Tensor:
     """20 images of one instance: uint8 (20, 3, size, size)."""
     polar, azimuth, field = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
@@ -127,7 +127,7 @@ def _portraits(
     towards = [torch.tensor(camera.axes()[2], dtype=torch.float32) for camera in cameras for _ in backgrounds]
     lights = torch.stack([light(back, draws) for back in towards])
     behind = load_backgrounds(backgrounds, settings.size)
-    scene = Scene.grid([SceneObject(name, normalise(mesh))], cameras, behind, lights, settings, backend)
+    scene = Scene.grid([SceneObject(name, normalize(mesh))], cameras, behind, lights, settings, rasterizer)
     return to_bytes(scene.render(Conditions(lights), torch.arange(len(scene))).flatten(0, 1))
 
 

@@ -11,7 +11,7 @@ from augment.scene import Scene
 from augment.service import AugmentationService
 from augment.utils import Phases, rank, world_size
 from renderer.cache import OperatorCache
-from renderer.harmonics import live_coefficients
+from renderer.light.harmonics import nonzero_coefficients
 from renderer.transfer import COEFFICIENTS, DEGREE
 from train.data import DataSet
 from train.distributed import first_process_first
@@ -39,13 +39,13 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         if item.label != OTHER:
             class_index(data.classes, item.label, f"label of {key}")
     choices, start = settings.renderer.choices, time.perf_counter()
-    console.info("visibility: %s", choices["visibility"].description)
+    console.info("rasterizer: %s", choices["rasterizer"].description)
     objects = list(settings.objects.values())
     built = build_scene(objects, data.size, settings.views, **settings.scene.choices, **choices, device=device)
     if settings.augment.relights:
         _log_skipped(built, choices["operators"], start)
     else:
-        console.info("operators: none are kept, since views are rasterised in every epoch")
+        console.info("operators: none are kept, since views are rasterized in every epoch")
     return built
 
 
@@ -63,9 +63,9 @@ def _log_skipped(scene: Scene, cache: OperatorCache, start: float) -> None:
         f"; not kept: {cache.problem}" if cache.problem else "",
     )
     console.info(
-        "skipped: rasterisation in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background), "
+        "skipped: rasterization in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background), "
         "%.0f %% of the faces (seen by no sample), back faces in %d of %d views (closed meshes)",
-        COEFFICIENTS - len(live_coefficients(DEGREE)),
+        COEFFICIENTS - len(nonzero_coefficients(DEGREE)),
         COEFFICIENTS,
         100 * (1 - covered / scene.settings.size**2),
         100 * tally["unseen_faces"] / tally["faces"],

@@ -14,8 +14,8 @@ from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import LARGEST_SIZE
+from renderer.rasterizer import choose
 from renderer.subdivision import MOST_VERTICES
-from renderer.visibility import choose
 from train.command_line.configuration import read_settings
 from train.fit.recipe import TrainSettings
 from train.networks import WIDERESNET
@@ -60,8 +60,8 @@ class SceneSettings:
     views: int | None = None
     polar: float = 60.0
     azimuth: float = 0.0
-    field_of_view: float = 2.0
-    perspective: float | None = None
+    width: float = 2.0
+    fov: float | None = None
     vertices: int = 0
     light: str = "grace"
     exposure: float = 1.0
@@ -75,7 +75,7 @@ class SceneSettings:
         require_range("scene.vertices", self.vertices, 0, MOST_VERTICES)
         require_range("scene.polar", self.polar, 0, 180)
         require_range("scene.azimuth", self.azimuth, -360, 360)
-        require_range("scene.perspective", self.perspective, 0.1, 150)
+        require_range("scene.fov", self.fov, 0.1, 150)
 
     @property
     def choices(self) -> dict[str, Any]:
@@ -97,14 +97,14 @@ class TrainingSceneSettings(SceneSettings):
 
 @dataclass
 class RendererSettings:
-    """visibility: auto, opengl, compiled or software. samples per pixel side. encoding: linear or srgb. normals: flat
+    """rasterizer: auto, opengl, numba or numpy. samples per pixel side. encoding: linear or srgb. normals: flat
     or smooth.
 
     transport: direct, shadows or bounces:N; see `renderer.render`. cache: the folder of what is rendered once, auto or
     None; see `renderer.cache.cache_folder`.
     """
 
-    visibility: str = "auto"
+    rasterizer: str = "auto"
     samples: int = 8
     encoding: str = "linear"
     normals: str = "flat"
@@ -115,7 +115,7 @@ class RendererSettings:
     def choices(self) -> dict[str, Any]:
         """Arguments of `augment.build_scene`."""
         drawn = {name: getattr(self, name) for name in ("samples", "encoding", "normals", "transport")}
-        return {**drawn, "visibility": choose(self.visibility), "operators": OperatorCache(cache_folder(self.cache))}
+        return {**drawn, "rasterizer": choose(self.rasterizer), "operators": OperatorCache(cache_folder(self.cache))}
 
 
 @dataclass

@@ -29,7 +29,7 @@ from renderer.errors import InputError
 from train.command_line.entry_points import one_sentence, one_sentence_errors
 from train.experiment import load_data, run, write_images
 from train.report.overview import format_spread, format_table
-from train.report.summary import is_finished, summarise
+from train.report.summary import is_finished, summarize
 from train.report.write import report_of
 from train.run_folder import checkpoint
 from train.run_folder.continuation import CIRCUMSTANCES, differing_settings, require_same_inputs
@@ -196,7 +196,7 @@ def _check_same_settings(folder: Path, cell: DictConfig) -> None:
 
 def format_sweep(folders: Sequence[Path]) -> str:
     """The finished cells' table, means over seeds where there are several, and what became of the others."""
-    finished = [summarise(folder) for folder in folders if is_finished(folder)]
+    finished = [summarize(folder) for folder in folders if is_finished(folder)]
     parts = [f"{len(finished)} of {len(folders)} cells are finished"]
     if finished:
         parts += filter(None, [format_table(finished), format_spread(finished)])

@@ -17,7 +17,7 @@ LEVELS = 2**16
 class WideResNet(nn.Module):
     """WRN-depth-width for small images of any size.
 
-    Takes (N, 3, H, W) RGB in [0, 1], normalises with the data's own mean and std inside, gives logits (N, classes).
+    Takes (N, 3, H, W) RGB in [0, 1], normalizes with the data's own mean and std inside, gives logits (N, classes).
     depth is 6n + 4: n blocks of two convolutions in each of three groups.
     """
 
@@ -58,7 +58,7 @@ class WideResNet(nn.Module):
         )
         self.norm = nn.BatchNorm2d(channels[3])
         self.head = nn.Linear(channels[3], classes)
-        self.apply(_initialise)
+        self.apply(_initialize)
 
     def forward(self, images: Tensor) -> Tensor:
         features = self.groups(self.stem((images - self.mean) / self.std))
@@ -90,8 +90,8 @@ def _group(inputs: int, outputs: int, blocks: int, stride: int, dropout: float) 
     return nn.Sequential(first, *(_Block(outputs, outputs, 1, dropout) for _ in range(blocks - 1)))
 
 
-def _initialise(module: nn.Module) -> None:
-    """He initialisation (He et al. 2015)."""
+def _initialize(module: nn.Module) -> None:
+    """He initialization (He et al. 2015)."""
     if isinstance(module, nn.Conv2d):
         nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
     elif isinstance(module, nn.Linear):

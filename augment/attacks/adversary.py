@@ -14,28 +14,27 @@ from torch import Tensor
 from augment.backgrounds import load_background
 from augment.objects import SceneObject
 from augment.scene import Conditions, Example, Scene
-from renderer.basis import Basis, parts_of, with_placed
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.environment import negative_share, to_map, write_map
 from renderer.errors import FACTOR, InputError, require_bounded, require_file, require_range
-from renderer.files.albedo_bake import with_added_albedo
-from renderer.files.array_files import read_numbers
-from renderer.files.light_files import read_light, save_light
-from renderer.files.mesh_export import export_mesh
-from renderer.files.mitsuba_scene import mitsuba_map, write_mitsuba_scene
 from renderer.image import ImageSettings, to_bytes
-from renderer.lamps import Lamps
-from renderer.lights import load_light
+from renderer.io.export import export_mesh
+from renderer.io.images import read_numbers
+from renderer.io.lights import read_light, save_light
+from renderer.io.mitsuba import mitsuba_map, write_mitsuba_scene
+from renderer.io.texture_bake import with_added_albedo
+from renderer.light.basis import Basis, parts_of, with_local_lights
+from renderer.light.environment import negative_fraction, to_map, write_map
+from renderer.light.local import Lamps, Projector
+from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
-from renderer.projector import Projector
-from renderer.visibility import Backend
+from renderer.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)
 class Adversary:
     """V views of one object, each (3, size, size), before an attack and after.
 
-    shown: with the shape and the colours that the attack left, in the scene's own coordinates. light: (size, 3) of the
+    shown: with the shape and the colors that the attack left, in the scene's own coordinates. light: (size, 3) of the
     basis, exposure included. background: (C, size, size), C 3 or 1. pixels: (V, 3, size, size) added to the images, or
     None.
     """
@@ -54,15 +53,15 @@ class Adversary:
     def of(scene: Scene, example: int, after: Conditions, before: Tensor, images: Tensor) -> Adversary:
         """An example of a scene under its row of all conditions, with its images (V, 3, size, size)."""
         row, shown = scene.examples[example], scene.objects[scene.examples[example].object]
-        mesh, gain = shown.mesh, shown.gain
+        mesh, albedo_scale = shown.mesh, shown.albedo_scale
         if after.albedo is not None:
             added = after.albedo[example, : len(mesh.faces)].detach().cpu().double().numpy()
-            mesh, gain = with_added_albedo(mesh, added, scene.settings.encoding, gain)
+            mesh, albedo_scale = with_added_albedo(mesh, added, scene.settings.encoding, albedo_scale)
         if after.vertices is not None:
             vertices = after.vertices[example, : len(mesh.vertices)].detach().cpu().double().numpy()
             mesh = replace(mesh, vertices=vertices)
         return Adversary(
-            shown=replace(shown, mesh=mesh, gain=gain),
+            shown=replace(shown, mesh=mesh, albedo_scale=albedo_scale),
             cameras=row.cameras,
             light=after.light[example].detach().cpu() * row.exposure,
             basis=scene.basis_under(after, example),
@@ -73,18 +72,18 @@ class Adversary:
             pixels=None if after.pixels is None else after.pixels[example].detach().cpu(),
         )
 
-    def scene(self, backend: Backend, device: torch.device | str = "cpu") -> Scene:
+    def scene(self, rasterizer: Rasterizer, device: torch.device | str = "cpu") -> Scene:
         """Its one example."""
         background, light = self.background[None], self.light.to(device)
         return Scene(
-            [self.shown], [Example(0, self.cameras, 0)], background, light, self.settings, backend, basis=self.basis
+            [self.shown], [Example(0, self.cameras, 0)], background, light, self.settings, rasterizer, basis=self.basis
         )
 
     @torch.no_grad()
-    def render(self, backend: Backend) -> Tensor:
+    def render(self, rasterizer: Rasterizer) -> Tensor:
         """Its images (V, 3, size, size) anew."""
         pixels = None if self.pixels is None else self.pixels[None]
-        return self.scene(backend).render(Conditions(self.light[None], pixels=pixels), torch.arange(1))[0]
+        return self.scene(rasterizer).render(Conditions(self.light[None], pixels=pixels), torch.arange(1))[0]
 
 
 DESCRIPTION, MESH, LIGHT = "adversary.json", "mesh.glb", "light.json"
@@ -108,7 +107,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         "name": Path(shown.name).name,
         "mesh": MESH,
         "own_faces": shown.own,
-        "gain": shown.gain,
+        "albedo_scale": shown.albedo_scale,
         "light": LIGHT,
         "placed_lights": [f"{basis.name}.json" for _, basis in placed],
         "background": _write_background(adversary.background, folder),
@@ -135,9 +134,9 @@ def _write_radiance(adversary: Adversary, folder: Path) -> dict[str, float]:
             write_map(folder / f"light{suffix}", radiance)
     shown, placed = adversary.shown, [(basis, adversary.light[own]) for own, basis in parts_of(adversary.basis)[1:]]
     cameras, settings = adversary.cameras, adversary.settings
-    write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.gain, cameras, settings, "light.exr", placed)
+    write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.albedo_scale, cameras, settings, "light.exr", placed)
     write_map(folder / MITSUBA / "light.exr", mitsuba_map(adversary.light[where], MAP_HEIGHT).clamp(min=0))
-    return {"negative_light": negative_share(radiance)}
+    return {"negative_light": negative_fraction(radiance)}
 
 
 def read_adversary(folder: Path) -> Adversary:
@@ -148,7 +147,11 @@ def read_adversary(folder: Path) -> Adversary:
         description = json.loads(path.read_text(encoding="utf-8"))
         settings = ImageSettings(**description["image"])
         cameras = tuple(_camera(**camera) for camera in description["cameras"])
-        label, name, gain = str(description["label"]), str(description["name"]), float(description["gain"])
+        label, name, albedo_scale = (
+            str(description["label"]),
+            str(description["name"]),
+            float(description["albedo_scale"]),
+        )
         mesh, light, pixels = (folder / str(description.get(key)) for key in ("mesh", "light", "pixels"))
         background = description["background"]
         own = None if description.get("own_faces") is None else int(description["own_faces"])
@@ -160,15 +163,15 @@ def read_adversary(folder: Path) -> Adversary:
         raise InputError(f"{path}: {error}") from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
         raise InputError(f"{path} does not describe an adversary ({error}): write it again") from error
-    require_range(f"{path}: gain", gain, 1 / FACTOR, FACTOR)
+    require_range(f"{path}: gain", albedo_scale, 1 / FACTOR, FACTOR)
     if not cameras:
         raise InputError(f"{path} has no cameras: write it again")
     shape = (len(cameras), 3, settings.size, settings.size)
     if own is not None:
         require_range(f"{path}: own_faces", own, 1, len(surface.faces))
-    basis, coefficients = with_placed(load_light(str(light)), placed)
+    basis, coefficients = with_local_lights(load_light(str(light)), placed)
     return Adversary(
-        shown=SceneObject(label, surface, gain, name, own),
+        shown=SceneObject(label, surface, albedo_scale, name, own),
         cameras=cameras,
         light=coefficients,
         basis=basis,
@@ -187,10 +190,10 @@ def _camera(**described: float) -> Camera:
 
 
 def _write_background(background: Tensor, folder: Path) -> float | str:
-    """A grey value, or the file of what is none."""
-    grey = float(background.flatten()[0])
-    if (background == grey).all():
-        return grey
+    """A gray value, or the file of what is none."""
+    gray = float(background.flatten()[0])
+    if (background == gray).all():
+        return gray
     Image.fromarray(to_bytes(background.expand(3, -1, -1)).permute(1, 2, 0).numpy()).save(folder / BACKGROUND)
     return BACKGROUND
 

@@ -40,7 +40,7 @@ class AttackSettings(DescentSettings):
     skylight: SkylightSettings | None = None
     projector: StepSettings | None = None
     lamps: StepSettings | None = None
-    places: StepSettings | None = None
+    positions: StepSettings | None = None
     geometry: StepSettings | None = None
     albedo: StepSettings | None = None
     pixels: StepSettings | None = None
@@ -85,7 +85,7 @@ class AttackSettings(DescentSettings):
     def problem(self, scene: Scene) -> AttackProblem:
         """What is changed of a scene, in light that is possible."""
         if not self.allow_negative:
-            scene = replace(scene, lights=scene.basis.nearest_physical(scene.lights))
+            scene = replace(scene, lights=scene.basis.project_nonnegative(scene.lights))
         parameters = PARAMETERS | {Lighting.name: partial(Lighting, physical=not self.allow_negative)}
         return AttackProblem(scene, [parameters[name](scene, settings) for name, settings in self.parameters.items()])
 
@@ -99,8 +99,8 @@ class AttackResult:
     """What was attacked and what came of it, for E examples of V views.
 
     images_before, images: (E, V, 3, size, size), neither of them rounded, with the shadows and bounces of each shape in
-    its own colours; logits_before, logits: (E, V, C) of them, rounded where the settings say so. descent: where the
-    descent ended, which holds shadows and bounces while shape and colours change. seconds: of the descent.
+    its own colors; logits_before, logits: (E, V, C) of them, rounded where the settings say so. descent: where the
+    descent ended, which holds shadows and bounces while shape and colors change. seconds: of the descent.
     """
 
     problem: AttackProblem
@@ -198,7 +198,7 @@ def attack(
     criterion: `Misclassification` (the default), `Targeted`, `LeastLikely`. settings: what is changed, within which
     norm-balls; by default the light, without a limit. seed: of the restarts. force: also where the classifier is wrong
     to begin with. The scene lies on the classifier's device.
-    NotCleanCorrectError where an example is not recognised before; InputError where the classifier lacks a class, or a
+    NotCleanCorrectError where an example is not recognized before; InputError where the classifier lacks a class, or a
     target is the right one.
     """
     settings = settings or AttackSettings(lighting=StepSettings())
@@ -233,7 +233,7 @@ def _with_own_transport(problem: AttackProblem, result: DescentResult) -> Tensor
     if scene.settings.transport == "direct" or (after.vertices is None and after.albedo is None):
         return result.images
     left = (Adversary.of(scene, example, after, each, each) for example, each in enumerate(result.images))
-    return torch.stack([each.render(scene.backend) for each in left]).to(result.images)
+    return torch.stack([each.render(scene.rasterizer) for each in left]).to(result.images)
 
 
 @torch.no_grad()
@@ -262,6 +262,6 @@ def require_clean_correct(scene: Scene, logits: Tensor, labels: Tensor, classifi
             for share, index in zip(best.values.tolist(), best.indices.tolist(), strict=True)
         )
         raise NotCleanCorrectError(
-            f"{len(wrong)} of {logits.shape[0] * logits.shape[1]} images of {shown.name} are not recognised as "
+            f"{len(wrong)} of {logits.shape[0] * logits.shape[1]} images of {shown.name} are not recognized as "
             f"{shown.label!r} before any attack (the first: {predictions}): change the scene, or set attack.force=true"
         )

@@ -20,9 +20,9 @@ from augment.classifiers import Classifier
 from augment.objects import SceneObject
 from augment.utils import Phases, generator, progress
 from renderer.errors import InputError, require_choice
-from renderer.files.mitsuba_scene import SCENE, mitsuba, render_mitsuba_scene
-from renderer.image import behind, clamp, develop_composite, to_bytes, to_unit
-from renderer.visibility import Backend
+from renderer.image import background_term, clamp, to_bytes, to_unit, tonemap_composite
+from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
+from renderer.rasterizer import Rasterizer
 
 GROWTH = (1, 3, 10)
 
@@ -32,7 +32,7 @@ class Checks:
     """Shares of the examples, in [0, 1], and mean costs.
 
     cost_fell: of those that were not fooled to begin with. success, random_search and success_by_steps: of those that
-    were recognised before. random_search: fooled by any of as many draws as the attack had passes, each as far from the
+    were recognized before. random_search: fooled by any of as many draws as the attack had passes, each as far from the
     start as the attack may go or went. success_by_steps: fooled within the steps, ×3 and ×10.
     """
 
@@ -103,7 +103,7 @@ def _share(values: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What norm-balls of R radii hold for the N examples that were recognised before.
+    """What norm-balls of R radii hold for the N examples that were recognized before.
 
     radii: of each kind of parameter by name, R times, ascending. adversarial, random: (R, N) bool, whether a descent or
     a random search has fooled the classifier in this ball or in a smaller one, which lies within it.
@@ -152,11 +152,11 @@ OF_MESH, OF_VIEW = ("geometry", "albedo", "pixels"), ("pixels",)  # kinds of whi
 
 @dataclass(frozen=True)
 class Transfer:
-    """What the A adversaries, examples that were recognised and then fooled, do elsewhere.
+    """What the A adversaries, examples that were recognized and then fooled, do elsewhere.
 
     kind: "network", "azimuth" or "mesh"; name: which. classes: the network's. before, after: (A, V, C) logits.
     clean_correct: (A,) bool, in every view before the attack. success: (A,) bool, whether the attack's criterion is met
-    in every view after it; it counts only of what was recognised.
+    in every view after it; it counts only of what was recognized.
     """
 
     kind: str
@@ -235,8 +235,8 @@ def _turned(adversary: Adversary, angle: float) -> Adversary:
 
 def _judged(attacked: AttackResult, pairs: Sequence[Pair], kind: str, name: str, classifier: Classifier) -> Transfer:
     goal, settings = _goal(attacked, [new.shown.label for _, new in pairs], classifier), attacked.settings
-    backend, views, preprocessed_model = (
-        attacked.problem.scene.backend,
+    rasterizer, views, preprocessed_model = (
+        attacked.problem.scene.rasterizer,
         attacked.problem.scene.views,
         settings.preprocessed_model(classifier),
     )
@@ -244,7 +244,7 @@ def _judged(attacked: AttackResult, pairs: Sequence[Pair], kind: str, name: str,
     def logits(adversaries: Sequence[Adversary]) -> Tensor:
         if not adversaries:
             return torch.empty(0, views, len(classifier.classes))
-        images = torch.stack([each.render(backend) for each in adversaries]).to(attacked.images)
+        images = torch.stack([each.render(rasterizer) for each in adversaries]).to(attacked.images)
         return logits_of(preprocessed_model, images, settings.batch_size).cpu()
 
     before, after = (logits([pair[side] for pair in pairs]) for side in (0, 1))
@@ -308,16 +308,16 @@ def verify(attacked: AttackResult, folders: Sequence[Path], renderers: Sequence[
     images = attacked.images.cpu()
     rounded = to_unit(to_bytes(images))
     versions = {"float": images, "8 bits": rounded, f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY)}
-    anew = [rendered(folder, renderers, attacked.problem.scene.backend) for folder in folders if renderers]
+    anew = [rendered(folder, renderers, attacked.problem.scene.rasterizer) for folder in folders if renderers]
     versions |= {name: torch.stack([each[name] for each in anew]) for name in renderers}
     return [_verdict(attacked, name, seen.to(attacked.images)) for name, seen in versions.items()]
 
 
-def rendered(folder: Path, renderers: Sequence[str], backend: Backend) -> dict[str, Tensor]:
+def rendered(folder: Path, renderers: Sequence[str], rasterizer: Rasterizer) -> dict[str, Tensor]:
     """(V, 3, size, size) by each renderer, from an adversary's files alone, which are read once."""
     adversary = read_adversary(folder)
     by = {
-        "reload": lambda: adversary.render(backend),
+        "reload": lambda: adversary.render(rasterizer),
         "mitsuba": lambda: _by_mitsuba(adversary, folder / MITSUBA / SCENE),
     }
     return {name: by[name]() for name in renderers}
@@ -326,7 +326,7 @@ def rendered(folder: Path, renderers: Sequence[str], backend: Backend) -> dict[s
 def _by_mitsuba(adversary: Adversary, scene: Path) -> Tensor:
     seen = render_mitsuba_scene(scene, len(adversary.cameras))
     encoding = adversary.settings.encoding
-    images = develop_composite(seen[:, :3] + behind(seen[:, 3:], adversary.background, encoding), encoding)
+    images = tonemap_composite(seen[:, :3] + background_term(seen[:, 3:], adversary.background, encoding), encoding)
     return images if adversary.pixels is None else clamp(images + adversary.pixels)
 
 

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
-from renderer.tiles import GAP, INK, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
+from renderer.io.tiles import GAP, INK, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
 
 SIDE = 192  # px: smaller images are enlarged by a whole factor to at least this width
 COLUMNS = "columns"  # the text in a .png that says where its tiles are
@@ -25,7 +25,7 @@ class Panel:
     """What one side of an attack, initial or adversarial, shows in V views.
 
     images: (V, 3, H, W) RGB in [0, 1]. captions: V times lines of text, as `prediction_caption` gives them, the first
-    in ink and the others faint. spheres: (V, 3, S, S) in [0, 1], each view's light (`renderer.light_sphere`), or None.
+    in ink and the others faint. spheres: (V, 3, S, S) in [0, 1], each view's light (`renderer.light.light_sphere`), or None.
     """
 
     images: Tensor
@@ -42,7 +42,7 @@ def prediction_caption(probabilities: Tensor, classes: Sequence[str], label: str
 def save_figure(initial: Panel, adversarial: Panel, path: Path) -> None:
     """Write the image, a row per view, as a .png, whose tiles `read_figure` returns.
 
-    The differences are grey where there is none, and scaled alike so that the largest reaches black or white.
+    The differences are gray where there is none, and scaled alike so that the largest reaches black or white.
     Images are enlarged without smoothing, so that one sees the pixels that the classifier saw.
     """
     columns = [

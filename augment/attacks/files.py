@@ -15,9 +15,9 @@ from augment.attacks.evaluate import Checks, RerenderCheck, require_renderers, v
 from augment.attacks.figure import Panel, prediction_caption, save_figure
 from augment.scene import Conditions
 from renderer.arguments import checked
-from renderer.basis import Basis
-from renderer.files.mesh_damage import mesh_damage
-from renderer.light_sphere import light_sphere
+from renderer.io.mesh_damage import mesh_damage
+from renderer.light.basis import Basis
+from renderer.light.light_sphere import light_sphere
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
 SPHERE = 192

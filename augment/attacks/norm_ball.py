@@ -7,8 +7,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from renderer.convex import Ball, nearest_in_box
 from renderer.errors import FACTOR, InputError, require_choice, require_range
+from renderer.light.convex import Ball, nearest_in_box
 
 NORMS = ("linf", "l2")
 
@@ -17,7 +17,7 @@ class Domain(Protocol):
     """A convex set of values (D,)."""
 
     def __call__(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Its nearest points to values (A, D), within a ball whose centres are of it."""
+        """Its nearest points to values (A, D), within a ball whose centers are of it."""
 
 
 def anywhere(values: Tensor, within: Ball | None = None) -> Tensor:
@@ -27,7 +27,7 @@ def anywhere(values: Tensor, within: Ball | None = None) -> Tensor:
 
 @dataclass
 class NormBall:
-    """All values (D,) within a radius of a centre; radius None is the whole space.
+    """All values (D,) within a radius of a center; radius None is the whole space.
 
     The paper's radii (Section 4.1): linf 0.1 per lighting coefficient and 0.002 per vertex axis.
     InputError: unknown norm, radius below zero.
@@ -40,29 +40,29 @@ class NormBall:
         require_choice("attack: norm", self.norm, NORMS)
         require_range("attack: radius", self.radius, 0, FACTOR)  # no limit: null
 
-    def project(self, values: Tensor, centre: Tensor, domain: Domain = anywhere) -> Tensor:
-        """The nearest points of what ball and domain share, in the Euclidean sense; values and centre (A, D).
+    def project(self, values: Tensor, center: Tensor, domain: Domain = anywhere) -> Tensor:
+        """The nearest points of what ball and domain share, in the Euclidean sense; values and center (A, D).
 
-        The domain holds the centre.
+        The domain holds the center.
         """
-        return domain(values, within=None if self.radius is None else Ball(centre, self.radius, self.norm))
+        return domain(values, within=None if self.radius is None else Ball(center, self.radius, self.norm))
 
-    def sample(self, centre: Tensor, generator: torch.Generator, used: Tensor | None = None) -> Tensor:
-        """A uniform draw around each centre (A, D), on the generator's device. InputError where there is no radius.
+    def sample(self, center: Tensor, generator: torch.Generator, used: Tensor | None = None) -> Tensor:
+        """A uniform draw around each center (A, D), on the generator's device. InputError where there is no radius.
 
         used: (A, D) bool, the axes along which each is drawn; None for all.
         """
         if self.radius is None:
             raise InputError("attack: radius=null has no uniform draw: set a radius to compare with random ones")
         if self.norm == "linf":
-            offset = 2 * torch.rand(centre.shape, generator=generator) - 1
+            offset = 2 * torch.rand(center.shape, generator=generator) - 1
         else:
-            direction = torch.randn(centre.shape, generator=generator)
-            axes: int | Tensor = centre.shape[1]
+            direction = torch.randn(center.shape, generator=generator)
+            axes: int | Tensor = center.shape[1]
             if used is not None:
                 direction, axes = direction * used.cpu(), used.cpu().sum(1, keepdim=True)
-            share = torch.rand(len(centre), 1, generator=generator) ** (1 / axes)
+            share = torch.rand(len(center), 1, generator=generator) ** (1 / axes)
             offset = direction / direction.norm(dim=1, keepdim=True) * share
         if used is not None:
             offset = offset * used.cpu()
-        return centre + self.radius * offset.to(centre)
+        return center + self.radius * offset.to(center)

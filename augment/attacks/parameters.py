@@ -15,13 +15,12 @@ from torch.nn.utils.rnn import pad_sequence
 from augment.attacks.norm_ball import NormBall, anywhere
 from augment.scene import Conditions, Scene
 from renderer.arguments import require_fields
-from renderer.basis import Distant, Placed, parts_of
-from renderer.convex import Ball, nearest_in_box
 from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
-from renderer.lamps import Lamps
-from renderer.lights import mean_luminance
-from renderer.projector import Projector
-from renderer.skylight import TURBIDITY, ZENITH, coefficients
+from renderer.light.basis import EnvironmentBasis, LocalBasis, parts_of
+from renderer.light.convex import Ball, nearest_in_box
+from renderer.light.local import Lamps, Projector
+from renderer.light.presets import mean_luminance
+from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
 
 STEPS = ("unit", "raw", "sign")
 
@@ -55,7 +54,7 @@ def direction(gradient: Tensor, step: str) -> Tensor:
 
 
 class Parameter(ABC):
-    """One kind of parameter of a scene's E examples. `start` (E, D) is where attacks begin and its balls' centre.
+    """One kind of parameter of a scene's E examples. `start` (E, D) is where attacks begin and its balls' center.
 
     used: (E, D) bool, where examples differ in how many values they use: the others stay as they are. None: all.
     """
@@ -132,11 +131,13 @@ class OfLight(Parameter):
     """Every coefficient of one of the bases that a scene's light is of. The start is the examples' own; or, where light
     is to be physical, what is nearest to it that something can emit, and so is every light from there on."""
 
-    def __init__(self, scene: Scene, settings: StepSettings, where: slice, basis: Distant | Placed, physical: bool):
+    def __init__(
+        self, scene: Scene, settings: StepSettings, where: slice, basis: EnvironmentBasis | LocalBasis, physical: bool
+    ):
         """where: the coefficients of the basis among the scene's."""
         self.basis, self.physical, self._where = basis, physical or not basis.signed, where
         start = scene.lights[:, where]
-        super().__init__(scene, (basis.nearest_physical(start) if self.physical else start).flatten(1), settings)
+        super().__init__(scene, (basis.project_nonnegative(start) if self.physical else start).flatten(1), settings)
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return _relit(conditions, self._where, values.unflatten(1, (-1, 3)))
@@ -145,7 +146,7 @@ class OfLight(Parameter):
         if not self.physical:
             return super().within_domain(values, within)
         of_lights = None if within is None else within.unflatten(-1, 3)
-        return self.basis.nearest_physical(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
+        return self.basis.project_nonnegative(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
 
 
 def _relit(conditions: Conditions, where: slice, own: Tensor) -> Conditions:
@@ -196,15 +197,15 @@ class LampPlaces(Parameter):
     """Where each lamp is, three coordinates in world units. Shadows are cast anew in each image, and are held in its
     derivative. InputError where the scene has no lamps."""
 
-    name = "places"
+    name = "positions"
 
     def __init__(self, scene: Scene, settings: StepSettings):
         lamps = _of_name(scene, Lamps.name, self.name)[1]
-        start = torch.tensor(lamps.places).to(scene.lights).flatten()
+        start = torch.tensor(lamps.positions).to(scene.lights).flatten()
         super().__init__(scene, start.expand(len(scene), -1), settings)
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        return replace(conditions, places=values.unflatten(1, (-1, 3)))
+        return replace(conditions, positions=values.unflatten(1, (-1, 3)))
 
 
 class Skylight(Parameter):

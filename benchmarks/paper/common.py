@@ -1,7 +1,7 @@
 """What the paper's benchmarks share: options, networks, meshes, views that a network recognizes, and JSON lines.
 
 Run from the root of the clone: python -m benchmarks.paper.norm_balls --help. A mesh is a file, solid:NAME:SEED, or a
-YAML mapping such as '{mesh: banana.glb, label: banana, gain: 2}'.
+YAML mapping such as '{mesh: banana.glb, label: banana, albedo_scale: 2}'.
 """
 
 import argparse
@@ -23,16 +23,16 @@ from augment.scene import Example
 from benchmarks.common import append_json as append
 from benchmarks.common import machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 from train.run_folder.classifier import load_classifier
 
 VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
 FIELDS_OF_VIEW = (2.0, 3.0)  # width of the image in world units (the paper's appendix on rendering quality)
-GREYS = (0.0, 0.25, 0.5, 0.75, 1.0)
+GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
 BATCH = 10  # examples that are rendered or attacked at once: a shape's gradient keeps all samples of its images
 LEAST_RECOGNIZED = 0.02  # a fraction; below it the search for recognized views is given up
 
-View = tuple[OrthographicCamera, float]  # and the grey of the background
+View = tuple[OrthographicCamera, float]  # and the gray of the background
 
 
 def parser(study: str | None, description: str | None) -> argparse.ArgumentParser:
@@ -110,7 +110,7 @@ def scene_of(subject: SceneObject, size: int, light: str, views: Sequence[View])
     return Scene(
         [subject],
         [Example(0, (camera,), index) for index, (camera, _) in enumerate(views)],
-        torch.tensor([grey for _, grey in views]).view(-1, 1, 1, 1).expand(-1, 3, size, size),
+        torch.tensor([gray for _, gray in views]).view(-1, 1, 1, 1).expand(-1, 3, size, size),
         load_light(light),
         ImageSettings(size, samples=2, normals="smooth"),
         choose(),
@@ -118,13 +118,13 @@ def scene_of(subject: SceneObject, size: int, light: str, views: Sequence[View])
 
 
 def random_views(count: int, draws: torch.Generator) -> list[View]:
-    """Views from π/3 off the zenith (the paper's) and any azimuth, with a field of view of 2 or 3, on a grey."""
+    """Views from π/3 off the zenith (the paper's) and any azimuth, with a field of view of 2 or 3, on a gray."""
     azimuths = (2 * math.pi * torch.rand(count, generator=draws)).tolist()
     widths = torch.randint(len(FIELDS_OF_VIEW), (count,), generator=draws).tolist()
-    greys = torch.randint(len(GREYS), (count,), generator=draws).tolist()
+    grays = torch.randint(len(GRAYS), (count,), generator=draws).tolist()
     return [
-        (OrthographicCamera(math.pi / 3, azimuth, FIELDS_OF_VIEW[width]), GREYS[grey])
-        for azimuth, width, grey in zip(azimuths, widths, greys, strict=True)
+        (OrthographicCamera(math.pi / 3, azimuth, FIELDS_OF_VIEW[width]), GRAYS[gray])
+        for azimuth, width, gray in zip(azimuths, widths, grays, strict=True)
     ]
 
 

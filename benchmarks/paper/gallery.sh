@@ -10,14 +10,14 @@ picture() {
     shift
     folder=$(mktemp -d)
     "${PYTHON:-python}" scripts/attack.py "out=$folder/out" attack.allow_negative=true attack.margin=0 attack.rounded=false \
-        attack.max_steps=100 attack.checks=false attack.verify=null renderer.transport=direct "$@"
+        attack.max_steps=100 attack.checks=false attack.verify=null renderer.shadows=false "$@"
     cp "$folder"/out/0_*/example_000.png "$OUT/gallery_$name.png"
     rm -r "$folder"
 }
 
 mkdir -p "${OUT:?name the folder of the pictures}"
 lamp=('scene.meshes=["solid:lamp:0"]' 'label=table lamp')
-orange=("scene.meshes=[{mesh: ${ORANGE:?name a mesh of an orange}, gain: 3}]" label=orange)
+orange=("scene.meshes=[{mesh: ${ORANGE:?name a mesh of an orange}, albedo_scale: 3}]" label=orange)
 evening=(attack.skylight.zenith=75 attack.skylight.turbidity=8 'scene.backgrounds=[0.0]')
 shape=(attack=geometry scene.vertices=10000)
 three_views=(scene.views=3 attack.shared=true)

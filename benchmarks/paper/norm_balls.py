@@ -1,7 +1,7 @@
 """Adversarial against random perturbations in norm-balls (the paper's Section 4.1 and appendix A).
 
 python -m benchmarks.paper.norm_balls --out norm_balls.jsonl --examples 50 --meshes orange_studio.glb \\
-    '{mesh: orange_sketchfab.glb, gain: 3}'
+    '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
 python -m benchmarks.paper.table norm_balls.jsonl --figure norm_balls.png
 
 Every ball is searched by a descent and by as many uniform draws. The space "physical" is light whose radiance is
@@ -18,7 +18,7 @@ from augment import AttackSettings, StepSettings, attack
 from augment.attacks.attack import AttackResult, logits_of
 from augment.utils import generator
 from benchmarks.paper import common
-from renderer.harmonics import basis, project
+from renderer.light.harmonics import basis, project
 from renderer.transfer import DEGREE
 
 LIGHT_RADII = (0.02, 0.05, 0.1, 0.3, 1.0, None)

@@ -1,10 +1,10 @@
 """How surely a classifier recognizes the renders (the paper's appendix "Evaluate Rendering Quality").
 
 python -m benchmarks.paper.rendering_quality --out rendering_quality.jsonl --renders 10000 \\
-    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, gain: 3}'
+    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
 python -m benchmarks.paper.table rendering_quality.jsonl --figure rendering_quality.png
 
-Cameras are random, and each sees the mesh on five greys. Intervals resample cameras, whose renders resemble each other.
+Cameras are random, and each sees the mesh on five grays. Intervals resample cameras, whose renders resemble each other.
 """
 
 import math
@@ -22,7 +22,7 @@ from renderer import InputError, OrthographicCamera
 
 BINS = np.linspace(0, 1, 21)
 RESAMPLES = 1000
-STATISTICS: Mapping[str, Callable[[np.ndarray], float]] = {  # of confidences (cameras, greys), NaN where it errs
+STATISTICS: Mapping[str, Callable[[np.ndarray], float]] = {  # of confidences (cameras, grays), NaN where it errs
     "recognized": lambda views: float(np.isfinite(views).mean()),
     "median confidence": lambda views: float(np.nanmedian(views)),
     "confidence above one half": lambda views: float((views[np.isfinite(views)] > 0.5).mean()),
@@ -30,21 +30,21 @@ STATISTICS: Mapping[str, Callable[[np.ndarray], float]] = {  # of confidences (c
 
 
 def confidences(subject: SceneObject, classifier: Classifier, light: str, renders: int, seed: int) -> np.ndarray:
-    """(cameras, greys): of as many cameras as hold so many recognized renders, the confidence in the label where it is
+    """(cameras, grays): of as many cameras as hold so many recognized renders, the confidence in the label where it is
     the answer, else NaN. InputError: too few are recognized."""
     draws, label = generator(seed, subject.name, "quality"), classifier.label(subject.label)
     rows: list[np.ndarray] = []
     while (recognized := int(np.isfinite(rows).sum())) < renders:
-        if len(rows) * len(common.GREYS) > max(100, renders) / common.LEAST_RECOGNIZED:
+        if len(rows) * len(common.GRAYS) > max(100, renders) / common.LEAST_RECOGNIZED:
             raise InputError(
-                f"{subject.name}: only {recognized} of {len(rows) * len(common.GREYS)} renders are recognized"
+                f"{subject.name}: only {recognized} of {len(rows) * len(common.GRAYS)} renders are recognized"
             )
         azimuth = 2 * math.pi * float(torch.rand((), generator=draws))
         camera = OrthographicCamera(math.pi / 3, azimuth, common.FIELDS_OF_VIEW[len(rows) % len(common.FIELDS_OF_VIEW)])
         images = common.images_of(
-            common.scene_of(subject, classifier.size, light, [(camera, grey) for grey in common.GREYS])
+            common.scene_of(subject, classifier.size, light, [(camera, gray) for gray in common.GRAYS])
         )
-        shares = logits_of(classifier, images, len(common.GREYS))[:, 0].softmax(1)
+        shares = logits_of(classifier, images, len(common.GRAYS))[:, 0].softmax(1)
         rows.append(torch.where(shares.argmax(1) == label, shares[:, label], torch.nan).double().numpy())
     return np.stack(rows)
 

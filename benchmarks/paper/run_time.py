@@ -1,7 +1,7 @@
 """The cost of an attack's iteration, and the number of iterations it takes (the paper's Section 4.2, "Runtime").
 
 python -m benchmarks.paper.run_time --out run_time.jsonl --turns 5 --passes 10 --examples 20 \\
-    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, gain: 3}'
+    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
 python -m benchmarks.paper.table run_time.jsonl --figure run_time.png
 
 An iteration renders, asks the classifier, differentiates both, steps and projects. The attack and the classifier's own
@@ -25,7 +25,7 @@ from benchmarks.common import seconds
 from benchmarks.paper import common
 from renderer import ImageSettings, load_light, ring
 from renderer.errors import FACTOR
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 from train.run_folder.classifier import load_classifier
 
 WIDTHS = (2.0, 2.8, 4.0, 5.7, 8.0)  # of the field of view: each halves the pixels of the one before
@@ -82,13 +82,13 @@ def grid(
     light: str,
     views: int,
     width: float,
-    greys: Sequence[float],
+    grays: Sequence[float],
 ) -> Scene:
-    """Every subject from a ring of views on every grey, with smooth normals and 2×2 samples a pixel."""
+    """Every subject from a ring of views on every gray, with smooth normals and 2×2 samples a pixel."""
     size = classifier.size
-    backgrounds = torch.tensor(greys).view(-1, 1, 1, 1).expand(-1, 3, size, size)
+    backgrounds = torch.tensor(grays).view(-1, 1, 1, 1).expand(-1, 3, size, size)
     settings = ImageSettings(size, samples=2, normals="smooth")
-    return Scene.grid(subjects, ring(views, width), backgrounds, load_light(light), settings, choose())
+    return Scene.grid(subjects, orbit_cameras(views, width), backgrounds, load_light(light), settings, choose())
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -102,10 +102,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     options.add_argument("--trained", default="run:pretrained/none", help="network of the training's attack")
     args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
     first, trained = subjects[0], load_classifier(args.trained)
-    many = args.many // len(common.GREYS)  # views
+    many = args.many // len(common.GRAYS)  # views
     for kind in ("lighting", "geometry"):
         setups = [(first.name, grid([first], classifier, args.light, 1, width, (0.5,))) for width in args.widths]
-        at_once = grid([first], classifier, args.light, many, args.widths[0], common.GREYS)
+        at_once = grid([first], classifier, args.light, many, args.widths[0], common.GRAYS)
         setups.append((f"{first.name}, {len(at_once)} examples", at_once))
         for setup, scene in setups:
             passes = args.passes if len(scene) == 1 else 2
@@ -113,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             common.append(
                 args.out, {"setup": setup, "kind": kind, **iteration(classifier, scene, settings, args.turns)}
             )
-    scene = grid(subjects, trained, args.light, many // len(subjects), 2.0, common.GREYS)
+    scene = grid(subjects, trained, args.light, many // len(subjects), 2.0, common.GRAYS)
     settings = common.attack_settings("lighting", args.passes - 1, margin=NEVER, batch_size=len(scene))
     setup = f"{trained.name}, {len(scene)} examples"
     common.append(args.out, {"setup": setup, "kind": "lighting", **iteration(trained, scene, settings, args.turns)})

@@ -4,7 +4,7 @@ python -m benchmarks.paper.survival --out survival.jsonl --meshes orange_studio.
     '{mesh: banana.glb, label: banana}' '{mesh: "solid:cup:3", label: coffee mug}'
 python -m benchmarks.paper.table survival.jsonl
 
-Each is found and rendered anew by scripts/attack.py; --overrides are its own, such as renderer.transport=direct to
+Each is found and rendered anew by scripts/attack.py; --overrides are its own, such as renderer.shadows=false to
 count how many lights that were found without shadows fool where Mitsuba casts them.
 """
 

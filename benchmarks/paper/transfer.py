@@ -1,7 +1,7 @@
 """Do lights and shapes that fool one network, from one side, fool others, or from other sides (Tables 3 and 4)?
 
 python -m benchmarks.paper.transfer networks --out transfer.jsonl --examples 50 \\
-    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, gain: 3}'
+    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
 python -m benchmarks.paper.transfer views --out unseen_views.jsonl --sets 10 --examples 25 --meshes ...
 python -m benchmarks.paper.table transfer.jsonl --figure transfer.png
 

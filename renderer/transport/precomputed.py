@@ -7,9 +7,9 @@ what the surface there sends instead (`renderer.transport.radiosity`).
 import torch
 from torch import Tensor
 
-from renderer.basis import Basis, Distant, Placed, parts_of
 from renderer.errors import InputError
 from renderer.image import ImageSettings, bounces
+from renderer.light.basis import Basis, EnvironmentBasis, LocalBasis, parts_of
 from renderer.mesh import Mesh
 from renderer.transport import rays
 from renderer.transport.radiosity import Patches, Radiosity
@@ -20,15 +20,17 @@ from renderer.transport.surface import Surface
 class Transport:
     """The shadows that a mesh casts on itself and the light that it sends itself, per unit of a basis.
 
-    colors: whether that light is of other colours than the sky's. rays: among the mesh's surfaces.
+    colors: whether that light is of other colors than the sky's. rays: among the mesh's surfaces.
     """
 
-    def __init__(self, mesh: Mesh, settings: ImageSettings, gain: float, basis: Distant):
+    def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: EnvironmentBasis):
         """gain multiplies the albedo of what sends light."""
         count = bounces(settings.transport)
         patches = Patches.of(mesh) if count else None
         self.rays = Rays(patches.pieces if patches else mesh)
-        self._radiosity = Radiosity(patches, self.rays, settings.encoding, gain, basis, count) if patches else None
+        self._radiosity = (
+            Radiosity(patches, self.rays, settings.encoding, albedo_scale, basis, count) if patches else None
+        )
         self._directions = sphere(rays.DIRECTIONS)
         self._sky = basis.radiance(self._directions)
         self.colors = self._radiosity is not None and self._radiosity.colors
@@ -60,11 +62,11 @@ class Transport:
         return torch.einsum("ckp,kc->cp", change.to(light), light)
 
 
-def build_transport(mesh: Mesh, settings: ImageSettings, gain: float, basis: Basis) -> Transport | None:
+def build_transport(mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis) -> Transport | None:
     """None where light goes from the sky to a surface and from there to the camera only, and where it comes from
     places: that throws shadows anyway. InputError: bounces of such light."""
     parts = [part for _, part in parts_of(basis)]
-    distant = [part for part in parts if not isinstance(part, Placed)]
+    distant = [part for part in parts if not isinstance(part, LocalBasis)]
     if len(distant) < len(parts) and bounces(settings.transport):
         raise InputError(f"renderer.transport={settings.transport}: light of {basis} does not bounce; set shadows")
-    return Transport(mesh, settings, gain, distant[0]) if distant and settings.transport != "direct" else None
+    return Transport(mesh, settings, albedo_scale, distant[0]) if distant and settings.transport != "direct" else None

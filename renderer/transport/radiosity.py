@@ -14,8 +14,8 @@ from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
 from renderer.albedo import surface_albedo
-from renderer.basis import Distant
 from renderer.fragments import Fragments
+from renderer.light.basis import EnvironmentBasis
 from renderer.mesh import Mesh
 from renderer.subdivision import refine
 from renderer.transport.rays import Looks, Rays, sphere
@@ -89,13 +89,15 @@ class Patches:
 class Radiosity:
     """What the patches of a mesh send per unit of each coefficient of a basis, after one bounce or several.
 
-    colors: whether any patch is not grey.
+    colors: whether any patch is not gray.
     """
 
-    def __init__(self, patches: Patches, rays: Rays, encoding: str, gain: float, basis: Distant, bounces: int):
+    def __init__(
+        self, patches: Patches, rays: Rays, encoding: str, albedo_scale: float, basis: EnvironmentBasis, bounces: int
+    ):
         """rays: among the patches' pieces. gain multiplies the mesh's albedo."""
         self.patches = patches
-        albedo = patches.mean(surface_albedo(patches.pieces, patches.view, encoding)) * gain
+        albedo = patches.mean(surface_albedo(patches.pieces, patches.view, encoding)) * albedo_scale
         self.colors = bool((albedo != albedo[:, :1]).any())
         reflected = albedo[:, None, : 3 if self.colors else 1] / math.pi
         from_sky, receiving, links = _first_bounce(patches, rays, basis)
@@ -110,12 +112,12 @@ class Radiosity:
         return torch.from_numpy(self.patches.seen(looks, weights) @ sent)
 
 
-def _first_bounce(patches: Patches, rays: Rays, basis: Distant) -> tuple[Tensor, Tensor, csr_matrix]:
+def _first_bounce(patches: Patches, rays: Rays, basis: EnvironmentBasis) -> tuple[Tensor, Tensor, csr_matrix]:
     """(N, size, 1) irradiance of the patches from the sky alone; those (M,) that see others, and how much of the
     radiance of each (M, N) is their irradiance."""
     surface = Surface(patches.view, torch.from_numpy(patches.pieces.vertices))
     from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
-    from_sky[:, basis.live] = patches.mean(basis.irradiance(surface.planes))
+    from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
     directions = sphere(DIRECTIONS)
     receiving, links, radiance = [], [], basis.radiance(directions)
     for looks in rays.looks(surface, directions):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.harmonics import per_degree
+from renderer.light.harmonics import per_degree
 from renderer.mesh import Mesh
 from renderer.transport.surface import Surface
 
@@ -138,7 +138,7 @@ def _embree_scene(mesh: Mesh) -> Any:
         from embreex.rtcore_scene import EmbreeScene
     except ImportError as error:
         raise InputError(
-            "shadows are found by rays that Embree casts: pip install embreex, or choose renderer.transport=direct and "
+            "shadows are found by rays that Embree casts: pip install embreex, or choose renderer.shadows=false and "
             "no lights that stand in the scene"
         ) from error
     scene = EmbreeScene(robust=True)

@@ -13,9 +13,9 @@ from augment.objects import SceneObject
 from augment.scene import Example, Scene
 from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings
-from renderer.lights import ambient
+from renderer.light.presets import ambient
 from renderer.mesh import Mesh
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 
 SIZE = 6
 FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth in ((0.9, 0.3), (1.3, 1.9), (1.1, 3.5)))
@@ -23,7 +23,7 @@ FRONT, SIDE, BACK = (OrthographicCamera(polar, azimuth, 2.2) for polar, azimuth 
 
 @pytest.fixture(scope="session")
 def stone() -> Mesh:
-    """A turned icosahedron whose faces have a colour each."""
+    """A turned icosahedron whose faces have a color each."""
     solid, rng = trimesh.creation.icosahedron(), np.random.default_rng(0)
     vertices = solid.vertices @ Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix() * [1.0, 0.9, 0.8]
     corners = Mesh.plain(vertices, solid.faces)
@@ -41,7 +41,7 @@ def make_scene(stone) -> Callable[..., Scene]:
         backgrounds: Tensor | None = None,
         dtype: torch.dtype = torch.float64,
         encoding: str = "linear",
-        gain: float = 1.0,
+        albedo_scale: float = 1.0,
         size: int = SIZE,
     ) -> Scene:
         draws = torch.Generator().manual_seed(0)
@@ -50,8 +50,8 @@ def make_scene(stone) -> Callable[..., Scene]:
             backgrounds = 0.2 + 0.6 * torch.rand(len(cameras), 3, size, size, generator=draws)
         settings = ImageSettings(size, samples=2, encoding=encoding)
         rows = [Example(0, tuple(views), index) for index, views in enumerate(cameras)]
-        objects = [SceneObject("", mesh, gain)]
-        return Scene(objects, rows, backgrounds, light.to(dtype), settings, choose("software"))
+        objects = [SceneObject("", mesh, albedo_scale)]
+        return Scene(objects, rows, backgrounds, light.to(dtype), settings, choose("numpy"))
 
     return build
 

@@ -18,7 +18,7 @@ def test_without_a_target_the_cost_is_the_log_probability_of_the_true_class():
 
 
 def test_with_a_target_the_cost_is_the_difference_of_the_log_probabilities():
-    """In which the normalisation cancels: the difference of the logits."""
+    """In which the normalization cancels: the difference of the logits."""
     cost = adversarial_cost(LOGITS, TRUE, TARGET)
     np.testing.assert_allclose(cost, log_probability(TRUE) - log_probability(TARGET), rtol=0, atol=64 * EPS)
     rows = torch.arange(20)

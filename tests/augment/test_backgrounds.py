@@ -18,7 +18,7 @@ def wide(tmp_path) -> Path:
     return tmp_path / "wide.png"
 
 
-def test_a_background_is_grey_or_an_images_centre_square(wide):
+def test_a_background_is_gray_or_an_images_center_square(wide):
     assert torch.equal(load_background(0.25, 4), torch.full((1, 4, 4), 0.25))
     assert torch.equal(load_background("0.25", 4), load_background(0.25, 4))
     with Image.open(wide) as image:
@@ -27,15 +27,15 @@ def test_a_background_is_grey_or_an_images_centre_square(wide):
         assert torch.equal(load_background(name, 4), square)
 
 
-def test_greys_have_one_channel_unless_there_is_an_image(wide):
+def test_grays_have_one_channel_unless_there_is_an_image(wide):
     assert load_backgrounds([0, 0.5], 4).shape == (2, 1, 4, 4)
     mixed = load_backgrounds([0.5, wide], 4)
     assert mixed.shape == (2, 3, 4, 4) and mixed[0].eq(0.5).all() and torch.equal(mixed[1], load_background(wide, 4))
 
 
 @pytest.mark.parametrize("choice", [-0.1, 1.01, 255, math.nan, None, [0.5]])
-def test_greys_outside_0_to_1_and_what_is_no_background_are_refused(choice):
-    with pytest.raises(InputError, match=r"scene.backgrounds=.*give grey values in \[0, 1\] or image files"):
+def test_grays_outside_0_to_1_and_what_is_no_background_are_refused(choice):
+    with pytest.raises(InputError, match=r"scene.backgrounds=.*give gray values in \[0, 1\] or image files"):
         load_backgrounds([0.5, choice], 4)
 
 
@@ -44,5 +44,5 @@ def test_an_unreadable_background_is_named(tmp_path):
     broken.write_bytes(b"no image")
     faults = {broken: "cannot be read .*", tmp_path / "absent.png": "does not exist", tmp_path: "is no file"}
     for path, fault in faults.items():
-        with pytest.raises(InputError, match=f"scene.backgrounds: {path} {fault}: give an image file or a grey value"):
+        with pytest.raises(InputError, match=f"scene.backgrounds: {path} {fault}: give an image file or a gray value"):
             load_background(str(path), 4)

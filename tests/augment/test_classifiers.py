@@ -16,7 +16,7 @@ from torch import nn
 from torchvision.models import WeightsEnum, get_model, get_model_weights, list_models, squeezenet1_0, squeezenet1_1
 
 from augment.classifiers import Classifier, load_classifier
-from augment.classifiers.adapter import Normalised, class_index, nearest
+from augment.classifiers.adapter import Normalized, class_index, nearest
 from augment.classifiers.imagenet import build_network, imagenet_classes, published_weights
 from renderer.errors import InputError
 
@@ -74,7 +74,7 @@ def first_input(classifier: Classifier, images: torch.Tensor) -> torch.Tensor:
 def test_the_pixel_gradient_of_a_linear_network_is_its_weight_over_std_back_in_rgb(bgr):
     mean, std = (0.1, 0.4, 0.6), (0.2, 0.5, 3.0)
     layer = nn.Linear(3 * 5 * 5, 2)
-    classifier = Classifier(Normalised(nn.Sequential(nn.Flatten(), layer), mean, std, bgr), 5, ["fig", "lime"]).double()
+    classifier = Classifier(Normalized(nn.Sequential(nn.Flatten(), layer), mean, std, bgr), 5, ["fig", "lime"]).double()
     images = random_images(5).double().requires_grad_()
     logits = classifier(images)
     (gradient,) = torch.autograd.grad(logits[:, 1].sum(), images)
@@ -89,7 +89,7 @@ def test_the_pixel_gradient_of_a_linear_network_is_its_weight_over_std_back_in_r
 
 
 def test_a_callable_is_a_classifier_of_the_images_as_they_are():
-    classifier = Classifier(lambda images: images.mean((2, 3)), 8, ["red", "green", "blue"], name="colour")
+    classifier = Classifier(lambda images: images.mean((2, 3)), 8, ["red", "green", "blue"], name="color")
     images = random_images(8).requires_grad_()
     assert torch.equal(classifier(images), images.mean((2, 3)))
     (gradient,) = torch.autograd.grad(classifier(images)[:, 1].sum(), images)
@@ -238,7 +238,7 @@ def test_squeezenets_last_convolution_is_padded_by_one(squeezenet_file):
 
 
 def as_in_2017(state: dict) -> dict:
-    """With dots in DenseNet's names of layers, and before batch normalisation counted its batches."""
+    """With dots in DenseNet's names of layers, and before batch normalization counted its batches."""
     renamed = {re.sub(r"(norm|conv)([12])\.", r"\1.\2.", key): value for key, value in state.items()}
     return {key: value for key, value in renamed.items() if not key.endswith("num_batches_tracked")}
 
@@ -408,7 +408,7 @@ def test_a_file_that_holds_no_weights_of_the_network_is_named_and_runs_no_code(t
 
 
 def test_weights_older_than_the_batch_counters_fit(tmp_path):
-    """Batch normalisation has counted its batches since 2018."""
+    """Batch normalization has counted its batches since 2018."""
     state = get_model("mobilenet_v3_small").state_dict()
     old = {key: value for key, value in state.items() if not key.endswith("num_batches_tracked")}
     assert len(old) < len(state)
@@ -466,7 +466,7 @@ def share_called_orange(classifier: Classifier, images: torch.Tensor) -> float:
 
 
 @pytest.mark.realdata
-def test_efficientnet_lite_recognises_most_oranges(lite, oranges):
+def test_efficientnet_lite_recognizes_most_oranges(lite, oranges):
     """0.72 of all 255 that are larger than 64 × 64; 0.18 with red and blue exchanged."""
     images = oranges(lite.size)
     assert share_called_orange(lite, images) > 0.6
@@ -474,7 +474,7 @@ def test_efficientnet_lite_recognises_most_oranges(lite, oranges):
 
 
 @pytest.mark.realdata
-def test_squeezenet_recognises_oranges_only_in_the_right_order_of_channels(oranges):
+def test_squeezenet_recognizes_oranges_only_in_the_right_order_of_channels(oranges):
     """0.53 of all 255 that are larger than 64 × 64; 0.004 with red and blue exchanged."""
     classifier = load_classifier("squeezenet_caffe", DATA / "weights" / "squeezenet1_0.pth")
     images = oranges(classifier.size)

@@ -48,10 +48,10 @@ class LinearScene:
     size: float = 0.05
     ball: NormBall = field(default_factory=NormBall)
     views: int = 1
-    centre: Tensor | None = None  # of the balls, where it is not the start
+    center: Tensor | None = None  # of the balls, where it is not the start
 
     def __post_init__(self):
-        self.centre = self.start if self.centre is None else self.centre
+        self.center = self.start if self.center is None else self.center
         self.rendered = torch.zeros(len(self.start), dtype=torch.int64)
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ class LinearScene:
         return self.size * direction(gradient, self.rule)
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self.ball.project(values, self.centre[examples])
+        return self.ball.project(values, self.center[examples])
 
 
 def attack(model: nn.Module, problem, classes: Tensor, steps: int = 30, **settings) -> DescentResult:
@@ -118,13 +118,13 @@ def test_on_a_linear_classifier_every_step_is_as_in_closed_form(step, size):
 @pytest.mark.parametrize("step", ["unit", "raw"])
 @pytest.mark.parametrize("views", [1, 2])
 def test_the_lowest_point_of_a_sphere_is_reached_from_anywhere_in_it(views, step):
-    """Also from starts off its centre, where the steps first lead elsewhere: the way along the surface converges."""
-    ball, centre = NormBall("l2", 0.4), random(8, DIMENSIONS, seed=2)
-    problem = LinearScene(ball.sample(centre, torch.Generator().manual_seed(0)), step, 0.3, ball, views, centre)
+    """Also from starts off its center, where the steps first lead elsewhere: the way along the surface converges."""
+    ball, center = NormBall("l2", 0.4), random(8, DIMENSIONS, seed=2)
+    problem = LinearScene(ball.sample(center, torch.Generator().manual_seed(0)), step, 0.3, ball, views, center)
     goal = Goal(torch.zeros(8, views, dtype=torch.int64), torch.ones(8, views, dtype=torch.int64))
     result = descend(Linear(WEIGHT, bias=50.0), problem, goal, DescentSettings(120), Phases())
     slope = (CAMERAS[:views] @ (WEIGHT[0] - WEIGHT[1])).sum(0)
-    expected = centre - 0.4 * slope / slope.norm()
+    expected = center - 0.4 * slope / slope.norm()
     # Each step turns the values towards the end by a factor of at least 0.4 / 0.7, and 120 of them by 1e-29.
     torch.testing.assert_close(result.values, expected, rtol=0, atol=64 * EPS)
 
@@ -337,15 +337,15 @@ def test_the_same_attack_gives_the_same_to_the_bit():
 
 def test_restarts_go_on_with_those_that_are_left_and_keep_what_fools():
     """Against as many descents one by one: an example's result is that of the first that fools it, or of the first."""
-    centre, ball, network = random(40, DIMENSIONS, seed=3), NormBall("linf", 0.5), Linear(WEIGHT)
+    center, ball, network = random(40, DIMENSIONS, seed=3), NormBall("linf", 0.5), Linear(WEIGHT)
     goal, settings = Goal(torch.arange(40)[:, None] % 2), DescentSettings(2)
-    starts = [ball.sample(centre, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
-    problem = LinearScene(centre, "sign", 0.1, ball)
+    starts = [ball.sample(center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
+    problem = LinearScene(center, "sign", 0.1, ball)
     result = descend_repeatedly(network, problem, goal, settings, Phases(), starts)
     counted = problem.rendered.clone()
-    problems = [LinearScene(start, "sign", 0.1, ball, centre=centre) for start in (centre, *starts)]
+    problems = [LinearScene(start, "sign", 0.1, ball, center=center) for start in (center, *starts)]
     single = [descend(network, each, goal, settings, Phases()) for each in problems]
-    assert torch.isclose((single[1].values - centre).abs(), torch.tensor(0.5).double()).any()  # the ball holds some
+    assert torch.isclose((single[1].values - center).abs(), torch.tensor(0.5).double()).any()  # the ball holds some
     rounds = torch.stack([each.success for each in single]).long().argmax(0)
     assert set(rounds.tolist()) == {0, 1, 2} and not result.success.all()
     assert torch.equal(result.success, torch.stack([each.success for each in single]).any(0))

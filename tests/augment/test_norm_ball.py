@@ -11,8 +11,8 @@ from scipy import optimize, stats
 from torch import Tensor
 
 from augment.attacks.norm_ball import NORMS, NormBall
-from renderer.convex import nearest_in_box
 from renderer.errors import InputError
+from renderer.light.convex import nearest_in_box
 
 DTYPES = [torch.float32, torch.float64]
 COORDINATES = st.floats(-100, 100).map(lambda value: round(value, 6))  # squares of smaller ones vanish in float32
@@ -35,10 +35,10 @@ def dual_norm(offset: Tensor, name: str) -> Tensor:
 def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radius):
     """p is nearest to v exactly when it lies in the ball and (v - p)·(q - p) ≤ 0 for all of its points q; the largest
     of these products is (v - p)·(c - p) + radius × the dual norm of v - p."""
-    values, centre = torch.from_numpy(pair).to(dtype)
-    nearest = NormBall(name, radius).project(values, centre)
+    values, center = torch.from_numpy(pair).to(dtype)
+    nearest = NormBall(name, radius).project(values, center)
     assert nearest.dtype == dtype
-    moved, inward = (values - nearest).double(), (centre - nearest).double()
+    moved, inward = (values - nearest).double(), (center - nearest).double()
     rounding = 16 * torch.finfo(dtype).eps * 200  # of differences of numbers up to 200
     assert (norm(inward, name) <= radius + rounding).all()
     products = (moved * inward).sum(1) + radius * dual_norm(moved, name)
@@ -50,12 +50,12 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
 @given(pair=arrays(np.float64, (2, 4, 6), elements=COORDINATES), radius=RADII)
 @settings(max_examples=60, deadline=None)
 def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
-    values, centre = torch.from_numpy(pair).to(dtype)
-    nearest = NormBall(name, radius).project(values, centre)
-    inside = norm((values - centre).double(), name) <= radius * (1 - 1e-6)  # clear of the rounding at the surface
+    values, center = torch.from_numpy(pair).to(dtype)
+    nearest = NormBall(name, radius).project(values, center)
+    inside = norm((values - center).double(), name) <= radius * (1 - 1e-6)  # clear of the rounding at the surface
     assert torch.equal(nearest[inside], values[inside])
-    assert torch.equal(NormBall(name, 0.0).project(values, centre), centre)
-    assert torch.equal(NormBall(name, None).project(values, centre), values)
+    assert torch.equal(NormBall(name, 0.0).project(values, center), center)
+    assert torch.equal(NormBall(name, None).project(values, center), values)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -69,15 +69,15 @@ def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
 def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with_the_ball(
     name, dtype, pair, ends, radius
 ):
-    """The ends are distances from the centre, downwards and upwards. No descent by scipy gets nearer."""
-    (values, centre), (down, up) = torch.from_numpy(pair).to(dtype), torch.from_numpy(ends).to(dtype)
-    low, high = centre - down, centre + up
-    nearest = NormBall(name, radius).project(values[None], centre[None], partial(nearest_in_box, low=low, high=high))[0]
+    """The ends are distances from the center, downwards and upwards. No descent by scipy gets nearer."""
+    (values, center), (down, up) = torch.from_numpy(pair).to(dtype), torch.from_numpy(ends).to(dtype)
+    low, high = center - down, center + up
+    nearest = NormBall(name, radius).project(values[None], center[None], partial(nearest_in_box, low=low, high=high))[0]
     rounding = 64 * torch.finfo(dtype).eps
     assert nearest.dtype == dtype and (low <= nearest).all() and (nearest <= high).all()
-    offset = (nearest - centre).double()[None]
+    offset = (nearest - center).double()[None]
     assert norm(offset, name) <= radius + rounding
-    v, c = values.double().numpy(), centre.double().numpy()
+    v, c = values.double().numpy(), center.double().numpy()
     box = [(max(a, d - radius), min(b, d + radius)) for a, b, d in zip(low.double(), high.double(), c, strict=True)]
     ball = {"type": "ineq", "fun": lambda x: radius**2 - ((x - c) ** 2).sum(), "jac": lambda x: 2 * (c - x)}
     found = optimize.minimize(
@@ -94,11 +94,11 @@ def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with
 
 
 def test_a_corner_is_reached_exactly():
-    """Also where centre plus offset rounds."""
+    """Also where center plus offset rounds."""
     draws = torch.Generator().manual_seed(0)
-    centre, signs = torch.randn(50, 7, generator=draws), torch.randn(50, 7, generator=draws).sign()
-    corner = NormBall("linf", 0.1).project(centre + 3 * signs, centre)
-    assert torch.equal(corner, torch.where(signs > 0, centre + 0.1, centre - 0.1))
+    center, signs = torch.randn(50, 7, generator=draws), torch.randn(50, 7, generator=draws).sign()
+    corner = NormBall("linf", 0.1).project(center + 3 * signs, center)
+    assert torch.equal(corner, torch.where(signs > 0, center + 0.1, center - 0.1))
 
 
 @pytest.mark.parametrize("dimensions", [1, 3, 12])
@@ -106,8 +106,8 @@ def test_a_corner_is_reached_exactly():
 def test_draws_are_uniform_in_the_ball(name, dimensions):
     """(norm / radius)^D is uniform in [0, 1], and no direction is preferred: the means vanish and the covariances are
     those of the ball, r²/3 along each axis of a cube and r²/(D + 2) of a sphere, to five standard errors."""
-    radius, centre = 0.3, torch.linspace(-1, 1, dimensions, dtype=torch.float64).expand(DRAWS, -1)
-    offset = (NormBall(name, radius).sample(centre, torch.Generator().manual_seed(1)) - centre) / radius
+    radius, center = 0.3, torch.linspace(-1, 1, dimensions, dtype=torch.float64).expand(DRAWS, -1)
+    offset = (NormBall(name, radius).sample(center, torch.Generator().manual_seed(1)) - center) / radius
     assert norm(offset, name).max() <= 1 + 1e-6  # draws have float32's digits
     assert stats.kstest(norm(offset, name).numpy() ** dimensions, "uniform").pvalue > 0.01
     variance = 1 / 3 if name == "linf" else 1 / (dimensions + 2)
@@ -119,11 +119,11 @@ def test_draws_are_uniform_in_the_ball(name, dimensions):
 
 @pytest.mark.parametrize("name", NORMS)
 def test_draws_repeat_with_the_generator_and_leave_the_global_one(name):
-    centre, state = torch.zeros(5, 9), torch.random.get_rng_state()
-    first, again = (NormBall(name, 1.0).sample(centre, torch.Generator().manual_seed(3)) for _ in range(2))
+    center, state = torch.zeros(5, 9), torch.random.get_rng_state()
+    first, again = (NormBall(name, 1.0).sample(center, torch.Generator().manual_seed(3)) for _ in range(2))
     assert torch.equal(first, again) and len(first.unique(dim=0)) == 5
     assert torch.equal(torch.random.get_rng_state(), state)
-    assert torch.equal(NormBall(name, 0.0).sample(centre, torch.Generator()), centre)
+    assert torch.equal(NormBall(name, 0.0).sample(center, torch.Generator()), center)
 
 
 @pytest.mark.parametrize(

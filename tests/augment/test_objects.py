@@ -6,13 +6,13 @@ import trimesh
 
 from augment.objects import ObjectSettings, PropSettings, another_instance, load_object, on_ground
 from renderer.errors import InputError
-from renderer.mesh import load_mesh, normalise
+from renderer.mesh import load_mesh, normalize
 from renderer.shapes import solid
 
 
 @pytest.fixture
 def plain(tmp_path) -> str:
-    """A file that brings neither colours nor textures."""
+    """A file that brings neither colors nor textures."""
     trimesh.creation.icosphere(1).export(tmp_path / "plain.stl")
     return str(tmp_path / "plain.stl")
 
@@ -42,7 +42,7 @@ def test_a_terminal_shows_a_bar_before_a_mesh_is_read(plain, capsys, monkeypatch
 
 
 def test_a_mesh_with_colors_takes_no_other():
-    with pytest.raises(InputError, match="solid:orange brings colours of its own: leave color out"):
+    with pytest.raises(InputError, match="solid:orange brings colors of its own: leave color out"):
         load_object(ObjectSettings("solid:orange", "orange", color=[1.0, 0.0, 0.0]))
 
 
@@ -55,7 +55,7 @@ def test_a_color_needs_three_channels_from_0_to_1(plain, color):
 def test_props_stand_on_the_objects_ground_moved_and_turned():
     props = [PropSettings("solid:cup:1", [0.9, -0.2], scale=0.5, azimuth=90)]
     item = load_object(ObjectSettings("solid:apple", "apple", props=props))
-    apple, cup = normalise(solid("apple")), normalise(solid("cup", 1))
+    apple, cup = normalize(solid("apple")), normalize(solid("cup", 1))
     np.testing.assert_array_equal(item.mesh.faces[item.own_faces], apple.faces)
     np.testing.assert_array_equal(item.mesh.vertices[item.own_vertices], apple.vertices)
     np.testing.assert_array_equal(item.mesh.corner_colors[~item.own_faces], cup.corner_colors)

@@ -29,12 +29,12 @@ from augment.attacks.parameters import (
 )
 from augment.scene import Conditions, Scene
 from augment.utils import Phases
-from renderer.environment import read_map, to_map, write_map
 from renderer.errors import InputError
-from renderer.harmonics import project
-from renderer.lights import directional, mean_luminance
-from renderer.nonnegative import TOLERANCE
-from renderer.skylight import TURBIDITY, ZENITH, coefficients_by_quadrature
+from renderer.light.environment import read_map, to_map, write_map
+from renderer.light.harmonics import project
+from renderer.light.nonnegative import TOLERANCE
+from renderer.light.presets import directional, mean_luminance
+from renderer.light.skylight import TURBIDITY, ZENITH, coefficients_by_quadrature
 from renderer.transfer import DEGREE
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -56,7 +56,7 @@ SIZES = {"lighting": 49 * 3, "skylight": 3, "geometry": 12 * 3, "albedo": 20 * 3
 
 
 def test_every_kind_has_a_name_of_its_own():
-    assert PARAMETERS.keys() - {"projector", "lamps", "places"} == MAKERS.keys() == SIZES.keys()
+    assert PARAMETERS.keys() - {"projector", "lamps", "positions"} == MAKERS.keys() == SIZES.keys()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -72,7 +72,7 @@ def test_a_kind_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scen
         assert mean_luminance(light) == pytest.approx(mean_luminance(scene.lights[0]), rel=1e-6)
         expected = coefficients_by_quadrature(*SKY)
         expected *= mean_luminance(scene.lights[0]) / mean_luminance(expected)
-        assert (light - expected).norm() < 1e-4 * expected.norm()  # the error of the fit, see `renderer.skylight`
+        assert (light - expected).norm() < 1e-4 * expected.norm()  # the error of the fit, see `renderer.light.skylight`
     else:
         images = scene.render(scene.conditions(EVERY), EVERY)
         rounding = 64 * torch.finfo(dtype).eps
@@ -84,9 +84,9 @@ def fixed_visibility(monkeypatch) -> None:
     """Whatever moves, each camera sees what it saw first, which is what the analytic gradient assumes."""
     build, seen = reshading.build_fragments, {}
 
-    def still(vertices, faces, cameras, settings, backend, closed=False):
+    def still(vertices, faces, cameras, settings, rasterizer, closed=False):
         if cameras[0] not in seen:
-            seen[cameras[0]] = build(vertices, faces, cameras, settings, backend, closed=closed)
+            seen[cameras[0]] = build(vertices, faces, cameras, settings, rasterizer, closed=closed)
         return seen[cameras[0]]
 
     monkeypatch.setattr(reshading, "build_fragments", still)
@@ -158,10 +158,10 @@ def attack(model: torch.nn.Module, problem: AttackProblem, goal: Goal, steps: in
     return result.values, result.images
 
 
-@pytest.mark.parametrize("grey", [0.0, 0.5, 1.0])
-def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, grey):
+@pytest.mark.parametrize("gray", [0.0, 0.5, 1.0])
+def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, gray):
     """x + ε sign(∂CE/∂x), clamped, with ∂CE/∂x = Σ (p_c - [c = y]) W_c; before black and white backgrounds too."""
-    scene, epsilon = make_scene(backgrounds=torch.full((3, 3, 6, 6), grey)), 8 / 255
+    scene, epsilon = make_scene(backgrounds=torch.full((3, 3, 6, 6), gray)), 8 / 255
     model, before = make_linear(4), scene.render(scene.conditions(EVERY), EVERY)
     logits = model(before.flatten(0, 1)).detach()
     truth = logits.argmax(1)
@@ -234,7 +234,7 @@ def ringing(scene: Scene) -> Scene:
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 def test_physical_light_is_the_nearest_within_the_ball_that_something_emits(make_scene, norm):
     """q is nearest to v exactly when (v - q)·(p - q) ≤ 0 for all p of the set: here other lights that were projected
-    into it, the centre, and the light's own way there and beyond."""
+    into it, the center, and the light's own way there and beyond."""
     scene, draws = ringing(make_scene()), torch.Generator().manual_seed(3)
     light = Lighting(scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), physical=True)
     assert not torch.equal(light.start, scene.lights.flatten(1))
@@ -283,8 +283,8 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
     def check(start: tuple, values: tuple, radius: float | None):
         sky = Skylight(scene, sky_at(start, norm=norm, radius=radius))
         problem = AttackProblem(scene, [sky])
-        centre, ends = sky.start[0], torch.tensor([[ZENITH[0], -99, 0.5], [ZENITH[1], 99, 2.5]], dtype=dtype)
-        torch.testing.assert_close(centre * torch.tensor([1, 1, 4], dtype=dtype), torch.tensor(start, dtype=dtype))
+        center, ends = sky.start[0], torch.tensor([[ZENITH[0], -99, 0.5], [ZENITH[1], 99, 2.5]], dtype=dtype)
+        torch.testing.assert_close(center * torch.tensor([1, 1, 4], dtype=dtype), torch.tensor(start, dtype=dtype))
         anywhere = torch.tensor(values, dtype=dtype).expand(3, 3)
         projected = problem.project(anywhere, EVERY)
         assert projected.dtype == dtype
@@ -292,11 +292,11 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
         for sky_values in moved:
             assert sky.apply(sky_values, scene.conditions(EVERY), EVERY).light.isfinite().all()
             assert (ends[0] <= sky_values).all() and (sky_values <= ends[1]).all()
-            offset = (sky_values - centre).abs()
+            offset = (sky_values - center).abs()
             reach = offset.norm(dim=1) if norm == "l2" else offset.amax(1)
             assert radius is None or (reach <= radius + rounding * 20).all()
         if norm == "linf":  # boxes both, so that the nearest point of what they share is that of each axis
-            low, high = (ends[0], ends[1]) if radius is None else (centre - radius, centre + radius)
+            low, high = (ends[0], ends[1]) if radius is None else (center - radius, center + radius)
             nearest = anywhere.clamp(torch.maximum(low, ends[0]), torch.minimum(high, ends[1]))
             torch.testing.assert_close(projected, nearest, rtol=0, atol=0)
 

@@ -19,14 +19,14 @@ from augment.attacks.parameters import (
 )
 from augment.scene import Scene
 from augment.utils import Phases
-from renderer.camera import ring
-from renderer.harmonics import live_coefficients
+from renderer.camera import orbit_cameras
+from renderer.light.harmonics import nonzero_coefficients
 from renderer.transfer import build_operators
 
 EPS = torch.finfo(torch.float64).eps
 EVERY = torch.arange(3)
-DEAD = torch.ones(49, dtype=torch.bool).index_fill(0, live_coefficients(6), False)
-FRONT, SIDE, BACK = ring(3, 2.2)
+DEAD = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero_coefficients(6), False)
+FRONT, SIDE, BACK = orbit_cameras(3, 2.2)
 
 
 def attack(model: nn.Module, problem: AttackProblem, goal: Goal, steps: int, **settings) -> DescentResult:
@@ -43,10 +43,10 @@ def light_slope(scene: Scene, weight: Tensor) -> Tensor:
     """(E, 49, 3) the derivative by the light of weight · images, summed over views, from the operators alone."""
     slope = torch.zeros(len(scene), 49, 3, dtype=weight.dtype)
     for row, cameras in enumerate(scene.cameras):
-        operators = build_operators(scene.mesh(row), cameras, scene.settings, scene.backend, dtype=weight.dtype)
+        operators = build_operators(scene.mesh(row), cameras, scene.settings, scene.rasterizer, dtype=weight.dtype)
         for operator in operators:
             transfer, seen = operator.transfer * operator.albedo[:, None], weight.view(3, -1)[:, operator.pixels]
-            slope[row, live_coefficients(6)] += torch.einsum("ckp,cp->kc", transfer, seen)
+            slope[row, nonzero_coefficients(6)] += torch.einsum("ckp,cp->kc", transfer, seen)
     return slope
 
 
@@ -223,30 +223,30 @@ def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
     assert (problem.split(drawn)[2].norm(dim=1) <= 0.1 + 1e-6).all()
 
 
-def test_an_attack_on_light_rasterises_a_camera_once_and_one_on_shape_every_view_and_step(
-    make_scene, make_linear, rasterised
+def test_an_attack_on_light_rasterizes_a_camera_once_and_one_on_shape_every_view_and_step(
+    make_scene, make_linear, rasterized
 ):
     model = make_linear(3, bias=50.0)
     scene = make_scene(cameras=TWO_VIEWS)
     problem = AttackProblem(scene, [Lighting(scene, StepSettings()), Pixels(scene, StepSettings())])
     attack(model, problem, towards(problem), steps=9)
-    assert rasterised == [3]
+    assert rasterized == [3]
     problem = AttackProblem(scene, [Lighting(scene, StepSettings()), Albedo(scene, StepSettings())])
     attack(model, problem, towards(problem), steps=9)
-    assert rasterised == [3] + [1] * 3
+    assert rasterized == [3] + [1] * 3
     problem = AttackProblem(scene, [Lighting(scene, StepSettings()), Geometry(scene, StepSettings())])
     result = attack(model, problem, towards(problem), steps=4)
-    assert result.steps.tolist() == [4, 4, 4] and rasterised == [3] + [1] * (3 + 5 * 6)
+    assert result.steps.tolist() == [4, 4, 4] and rasterized == [3] + [1] * (3 + 5 * 6)
 
 
-def test_shapes_are_rasterised_only_while_they_are_attacked(make_scene, make_linear, rasterised):
+def test_shapes_are_rasterized_only_while_they_are_attacked(make_scene, make_linear, rasterized):
     scene, model = make_scene(cameras=ONE_VIEW), make_linear(2, seed=7)
     problem = AttackProblem(scene, [Geometry(scene, StepSettings(step_size=0.3))])
     truth = model(problem.render(problem.start, EVERY).flatten(0, 1)).argmax(1)[:, None]
-    rasterised.clear()
+    rasterized.clear()
     result = attack(model, problem, Goal(truth), steps=6)
     assert result.success.any() and not result.success.all()
-    assert rasterised == [1] * int((result.steps + 1).sum())
+    assert rasterized == [1] * int((result.steps + 1).sum())
 
 
 def test_with_shortened_steps_no_shape_is_worse_than_the_one_before_when_rendered_anew(make_scene, make_linear):
@@ -266,7 +266,7 @@ def test_with_shortened_steps_no_shape_is_worse_than_the_one_before_when_rendere
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_hundreds_of_examples_are_attacked_in_one_batch_and_the_same_each_time(make_scene, make_linear, dtype):
     """300 images of ten cameras, from random lights of a seed; whether fooled at once, on the way or never."""
-    cameras = [[camera] for _ in range(30) for camera in ring(10, 2.2)]
+    cameras = [[camera] for _ in range(30) for camera in orbit_cameras(10, 2.2)]
     scene, model = make_scene(cameras=cameras, dtype=dtype), make_linear(6, dtype=dtype, seed=2)
     problem = AttackProblem(scene, [Lighting(scene, StepSettings("l2", 0.4, step_size=0.1))])
     classes = model(problem.render(problem.start, torch.arange(300)).flatten(0, 1)).argmax(1)[:, None]

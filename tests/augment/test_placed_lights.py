@@ -11,12 +11,12 @@ from augment.attacks.parameters import AttackProblem, LampPlaces, LampPowers, Li
 from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from augment.service import TrainingAttackSettings
-from renderer import sparse
-from renderer.basis import parts_of
 from renderer.cache import OperatorCache
 from renderer.errors import InputError
+from renderer.light.basis import parts_of
+from renderer.rasterizer import choose
 from renderer.transfer import build_operators
-from renderer.visibility import choose
+from renderer.transport import local as sparse
 
 SIZE, EVERY = 16, torch.arange(2)
 PROJECTOR = ProjectorSettings(pixels=6, polar=50, azimuth=10, power=2.0, pattern=0.1)
@@ -25,9 +25,9 @@ CLASSES = ("orange", "lime", "sky")
 
 
 def scene(size: int = SIZE, **choices) -> Scene:
-    """Two views of an orange before grey."""
+    """Two views of an orange before gray."""
     lights = {"projector": PROJECTOR, "lamps": LAMPS, "light": "st_peters"} | choices
-    return augment.build_scene([("solid:orange", "orange")], size, 2, visibility="software", **lights)
+    return augment.build_scene([("solid:orange", "orange")], size, 2, rasterizer="numpy", **lights)
 
 
 def test_the_image_under_several_lights_is_the_sum_of_those_under_each():
@@ -82,14 +82,14 @@ def test_an_adversary_with_lights_in_the_scene_is_read_back_and_seen_by_mitsuba(
     write_adversary(written, tmp_path)
     found = read_adversary(tmp_path)
     assert torch.equal(found.light, written.light) and found.basis == written.basis
-    torch.testing.assert_close(found.render(choose("software")), done.images[0], rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.render(choose("numpy")), done.images[0], rtol=0, atol=1e-6)
     thrown, pattern = ProjectorSettings(6, power=2.0, pattern=str(tmp_path / "projector.png")).build()
     torch.testing.assert_close(pattern, written.light[49:85], rtol=0, atol=thrown.power / 255)
 
     pytest.importorskip("mitsuba")
     from augment.attacks.evaluate import rendered
 
-    seen = rendered(tmp_path, ["mitsuba"], choose("software"))["mitsuba"]
+    seen = rendered(tmp_path, ["mitsuba"], choose("numpy"))["mitsuba"]
     assert (seen - done.images[0]).abs().median() < 2 / 255
 
 
@@ -98,14 +98,14 @@ def test_a_pattern_is_read_from_an_image(tmp_path):
     Image.fromarray(pixels.numpy()).save(tmp_path / "pattern.png")
     basis, pattern = ProjectorSettings(pixels=6, power=2.0, pattern=str(tmp_path / "pattern.png")).build()
     torch.testing.assert_close(pattern, 2 * pixels.flatten(0, 1).float() / 255)
-    assert basis.field_of_view == math.radians(30)
+    assert basis.fov == math.radians(30)
 
 
 def test_a_table_receives_the_pattern_and_the_shadow():
     """Lit from straight above, from where a screen through the origin, at 4, would be white: but for the shadow of the
     orange, the table below it is even, and darker by the squares of the distances."""
-    above = ProjectorSettings(pixels=1, polar=0, pattern=1.0, field_of_view=60)
-    alone = {"exposure": 1e-9, "projector": above, "lamps": None, "backgrounds": [0.0], "field_of_view": 4.0}
+    above = ProjectorSettings(pixels=1, polar=0, pattern=1.0, fov=60)
+    alone = {"exposure": 1e-9, "projector": above, "lamps": None, "backgrounds": [0.0], "width": 4.0}
     shown, bare = (scene(48, **alone, polar=0, ground=color, samples=4) for color in ([0.2, 0.5, 0.7], None))
     table, orange = (each.render(each.conditions(EVERY), EVERY)[0, 0] for each in (shown, bare))
     beside = table[:, (orange.sum(0) == 0) & (table.sum(0) > 0)]
@@ -121,7 +121,7 @@ def test_training_draws_and_attacks_patterns_beside_the_light(arm):
     attack = TrainingAttackSettings(lighting=step, projector=step, max_steps=2)
     settings = augment.AugmentationSettings(arm=arm, attack=attack)
     service = augment.AugmentationService.from_meshes(
-        [("solid:orange", 0)], SIZE, settings, views=2, backgrounds=[0.5], visibility="software", projector=PROJECTOR
+        [("solid:orange", 0)], SIZE, settings, views=2, backgrounds=[0.5], rasterizer="numpy", projector=PROJECTOR
     )
     network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * SIZE**2, 3))
     torch.nn.init.normal_(network[1].weight, std=0.01, generator=torch.Generator().manual_seed(0))
@@ -134,17 +134,17 @@ def test_training_draws_and_attacks_patterns_beside_the_light(arm):
     [
         (lambda: ProjectorSettings(pixels=0).build(), r"projector\.pixels=0 must be"),
         (lambda: ProjectorSettings(distance=1.0).build(), r"projector\.distance=1\.0 must be"),
-        (lambda: ProjectorSettings(field_of_view=180).build(), r"scene\.projector\.field_of_view=180"),
+        (lambda: ProjectorSettings(fov=180).build(), r"scene\.projector\.fov=180"),
         (lambda: ProjectorSettings(polar=math.nan).build(), r"scene\.projector\.polar=nan"),
         (lambda: ProjectorSettings(azimuth=1e9).build(), r"scene\.projector\.azimuth=1000000000\.0"),
         (lambda: ProjectorSettings(pattern="gone.png").build(), r"scene\.projector\.pattern: gone\.png"),
-        (lambda: ProjectorSettings(pattern=2).build(), r"scene\.projector\.pattern=2: give grey"),
+        (lambda: ProjectorSettings(pattern=2).build(), r"scene\.projector\.pattern=2: give gray"),
         (lambda: LampsSettings([[0, 0, 0]]).build(), r"none at the origin"),
-        (lambda: LampsSettings([[math.nan, 0, 3]]).build(), r"a coordinate of lamps\.places=nan"),
-        (lambda: LampsSettings([[1e30, 0, 3]]).build(), r"a coordinate of lamps\.places=1e\+30"),
+        (lambda: LampsSettings([[math.nan, 0, 3]]).build(), r"a coordinate of lamps\.positions=nan"),
+        (lambda: LampsSettings([[1e30, 0, 3]]).build(), r"a coordinate of lamps\.positions=1e\+30"),
         (lambda: LampsSettings(radius=-0.1).build(), r"lamps\.radius=-0\.1"),
-        (lambda: LampsSettings([[1, 0]]).build(), r"scene\.lamps: give places"),
-        (lambda: LampsSettings(start=[[1], [2]]).build(), r"scene\.lamps: give places"),
+        (lambda: LampsSettings([[1, 0]]).build(), r"scene\.lamps: give positions"),
+        (lambda: LampsSettings(start=[[1], [2]]).build(), r"scene\.lamps: give positions"),
         (
             lambda: LampsSettings(start=math.nan).build(),
             r"scene\.lamps\.start=nan: give powers from 0 to scene\.lamps\.",
@@ -164,17 +164,17 @@ def test_lights_that_make_no_sense_are_refused_by_name(make, message):
 def test_lamps_are_moved_within_their_ball_and_stand_where_they_ended_when_read_back(tmp_path):
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
     steps, ball = StepSettings("linf", None, "unit", 0.5), StepSettings("l2", 0.6, "unit", 0.5)
-    settings = augment.AttackSettings(projector=steps, places=ball, max_steps=3)
+    settings = augment.AttackSettings(projector=steps, positions=ball, max_steps=3)
     done = augment.attack(classifier, scene(exposure=0.3), settings=settings, force=True)
-    start = torch.tensor(LAMPS.places)
-    reach = (done.conditions.places - start).flatten(1).norm(dim=1)
+    start = torch.tensor(LAMPS.positions)
+    reach = (done.conditions.positions - start).flatten(1).norm(dim=1)
     assert (reach > 0.1).all() and (reach <= 0.6 * (1 + 1e-5)).all()
     after = Adversary.of(done.problem.scene, 1, done.conditions, done.images_before[1], done.images[1])
     write_adversary(after, tmp_path)
     found = read_adversary(tmp_path)
     (lamps,) = [part for _, part in parts_of(found.basis) if part.name == "lamps"]
-    assert torch.equal(torch.tensor(lamps.places), done.conditions.places[1])
-    torch.testing.assert_close(found.render(choose("software")), done.images[1], rtol=0, atol=1e-6)
+    assert torch.equal(torch.tensor(lamps.positions), done.conditions.positions[1])
+    torch.testing.assert_close(found.render(choose("numpy")), done.images[1], rtol=0, atol=1e-6)
     standing, powers = LampsSettings(start=str(tmp_path / "lamps.json")).build()
     assert standing == lamps and torch.equal(powers, after.light[-len(powers) :])
     with pytest.raises(InputError, match=r"projector\.json: its basis is 'projector', give one of lamps"):
@@ -184,7 +184,7 @@ def test_lamps_are_moved_within_their_ball_and_stand_where_they_ended_when_read_
 def test_the_gradient_by_places_is_that_of_the_image_where_views_share_lamps():
     """On an orange, most of which no shadow falls on: within a share of what moves."""
     shown = augment.build_scene(
-        [("solid:orange", "orange")], SIZE, 2, shared=True, visibility="software", light="st_peters", exposure=0.3,
+        [("solid:orange", "orange")], SIZE, 2, shared=True, rasterizer="numpy", light="st_peters", exposure=0.3,
         lamps=LAMPS, samples=4,
     )  # fmt: skip
     problem = AttackProblem(shown, [LampPlaces(shown, StepSettings())])
@@ -200,7 +200,7 @@ def test_the_gradient_by_places_is_that_of_the_image_where_views_share_lamps():
 
 
 def test_places_want_lamps():
-    with pytest.raises(InputError, match="attack=places: the scene has no lamps"):
+    with pytest.raises(InputError, match="attack=positions: the scene has no lamps"):
         LampPlaces(scene(lamps=None), StepSettings())
 
 
@@ -217,7 +217,9 @@ def test_a_stack_of_sparse_operators_gives_each_image_its_own_in_any_order(tmp_p
         (gradient,) = torch.autograd.grad((images * weights).sum(), light)
         for row, image, own, its, weight in zip(rows.tolist(), images, light, gradient, weights, strict=True):
             item, camera = shown.objects[0], shown.examples[row].cameras[0]
-            single = build_operators(item.mesh, [camera], shown.settings, shown.backend, item.gain, shown.basis)[0]
+            single = build_operators(
+                item.mesh, [camera], shown.settings, shown.rasterizer, item.albedo_scale, shown.basis
+            )[0]
             assert single.sparse is not None
             alone = own.detach().requires_grad_(True)
             expected = single.image(alone)

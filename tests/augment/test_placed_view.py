@@ -1,4 +1,4 @@
-"""Shapes, colours and lights in the scene, attacked at once."""
+"""Shapes, colors and lights in the scene, attacked at once."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from augment.attacks.adversary import Adversary, read_adversary, write_adversary
 from augment.attacks.parameters import AttackProblem, Skylight, StepSettings
 from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 
 SIZE, EVERY = 16, torch.arange(2)
 PROJECTOR = ProjectorSettings(pixels=6, polar=50, azimuth=10, power=2.0, pattern=0.3)
@@ -21,7 +21,7 @@ STEPS = {
     "skylight": augment.SkylightSettings("linf", None, "unit", 0.2),
     "projector": StepSettings("linf", None, "unit", 0.5),
     "lamps": StepSettings("linf", None, "unit", 0.2),
-    "places": StepSettings("l2", 1.0, "unit", 0.3),
+    "positions": StepSettings("l2", 1.0, "unit", 0.3),
     "geometry": StepSettings("linf", 0.02, "sign", 0.01),
     "albedo": StepSettings("linf", 0.1, "sign", 0.05),
 }
@@ -30,7 +30,7 @@ STEPS = {
 def scene(solid: str = "solid:cup", **choices) -> Scene:
     """Two views before black, of what throws shadows on itself."""
     lights = {"projector": PROJECTOR, "lamps": LAMPS, "light": "st_peters", "exposure": 0.2} | choices
-    return augment.build_scene([(solid, "orange")], SIZE, 2, visibility="software", backgrounds=[0.0], **lights)
+    return augment.build_scene([(solid, "orange")], SIZE, 2, rasterizer="numpy", backgrounds=[0.0], **lights)
 
 
 @pytest.mark.parametrize("transport", ["direct", "shadows"])
@@ -42,8 +42,8 @@ def test_a_moved_mesh_is_seen_as_one_that_was_made_so(normals, transport):
     draws = torch.Generator().manual_seed(0)
     far = 1e-3 if transport == "shadows" else 0.1
     vertices = shown.vertices[0] + far * (torch.rand(shown.vertices[0].shape, generator=draws) - 0.5)
-    places = torch.tensor(LAMPS.places) + 0.3 * torch.randn(2, 3, generator=draws)
-    given = Conditions(shown.lights, vertices.expand(2, -1, -1), places=places.expand(2, -1, -1))
+    positions = torch.tensor(LAMPS.positions) + 0.3 * torch.randn(2, 3, generator=draws)
+    given = Conditions(shown.lights, vertices.expand(2, -1, -1), positions=positions.expand(2, -1, -1))
     mesh = replace(shown.mesh(0), vertices=vertices.double().numpy())
     other = replace(shown, objects=[replace(shown.objects[0], mesh=mesh)], basis=shown.basis_under(given, 0))
     expected = other.render(other.conditions(EVERY), EVERY)
@@ -52,7 +52,7 @@ def test_a_moved_mesh_is_seen_as_one_that_was_made_so(normals, transport):
     assert (seen - shown.render(shown.conditions(EVERY), EVERY)).abs().max() > 0.02
 
 
-def test_gradients_by_shape_and_colour_add_up_over_the_lights():
+def test_gradients_by_shape_and_color_add_up_over_the_lights():
     """Of a weighted sum of the image, where nothing is clamped."""
     weights = torch.rand(2, 1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
 
@@ -70,7 +70,9 @@ def test_gradients_by_shape_and_colour_add_up_over_the_lights():
         torch.testing.assert_close(whole, sum(each), rtol=0, atol=1e-5 * float(whole.abs().max()))
 
 
-@pytest.mark.parametrize("kinds", ["projector+geometry", "lamps+albedo", "lighting+places+geometry+albedo", "geometry"])
+@pytest.mark.parametrize(
+    "kinds", ["projector+geometry", "lamps+albedo", "lighting+positions+geometry+albedo", "geometry"]
+)
 def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_the_same_image(kinds, tmp_path):
     steps = {name: STEPS[name] for name in kinds.split("+")}
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
@@ -81,7 +83,7 @@ def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_the_same_image(kinds
     for example in range(2):
         images = done.images_before[example], done.images[example]
         write_adversary(Adversary.of(done.problem.scene, example, done.conditions, *images), tmp_path)
-        seen = read_adversary(tmp_path).render(choose("software"))
+        seen = read_adversary(tmp_path).render(choose("numpy"))
         torch.testing.assert_close(seen, done.images[example], rtol=0, atol=1 / 255)
 
 

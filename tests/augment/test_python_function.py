@@ -31,7 +31,7 @@ value = 4
 def here(tmp_path, monkeypatch) -> Path:
     (tmp_path / "own_networks").mkdir()
     (tmp_path / "own_networks" / "__init__.py").touch()
-    (tmp_path / "own_networks" / "colour.py").write_text(textwrap.dedent(SOURCE))
+    (tmp_path / "own_networks" / "color.py").write_text(textwrap.dedent(SOURCE))
     (tmp_path / "own_networks" / "broken.py").write_text("import a_library_that_is_not_there")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)  # and taken off again, with what was imported from there
@@ -39,36 +39,36 @@ def here(tmp_path, monkeypatch) -> Path:
 
 
 def test_a_function_in_the_current_folder_makes_a_classifier():
-    classifier = load_classifier("python:own_networks.colour:red_or_not")
+    classifier = load_classifier("python:own_networks.color:red_or_not")
     assert (classifier.size, classifier.classes) == (16, ("red", "other"))
     assert classifier(torch.rand(2, 3, 16, 16)).shape == (2, 2)
-    assert classifier.name == "python:own_networks.colour:red_or_not" and not classifier.training
+    assert classifier.name == "python:own_networks.color:red_or_not" and not classifier.training
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("own_networks.colour", "names no function: give python:package.module:function"),
+        ("own_networks.color", "names no function: give python:package.module:function"),
         (":red_or_not", "names no function"),
         ("own_networks.shape:f", "there is no module own_networks.shape in the current folder or installed"),
-        ("no_such_package.colour:f", "there is no module no_such_package in"),
-        ("own_networks.colour:blue", "own_networks.colour has no function blue"),
-        ("own_networks.colour:value", "has no function value"),
-        ("own_networks.colour:one", r"returns int: return \(module, size, classes\)"),
-        ("own_networks.colour:no_module", "returns str first: return a torch.nn.Module"),
-        ("own_networks.colour:no_size", "returns the size '16'"),
-        ("own_networks.colour:no_classes", "returns no list of class names"),
-        ("own_networks.colour:classes_without_order", "returns no list of class names"),
-        ("own_networks.colour:a_truth_for_a_size", "returns the size True"),
-        ("own_networks.colour:huge", ": size=1000000000 must be at least 1 and at most 4096"),
-        ("own_networks.colour:needs_more", "raises TypeError .*missing 1 required positional argument"),
-        ("own_networks.colour:leaves", r"raises SystemExit \(0\) in line 15 of .*colour.py: mend it"),
+        ("no_such_package.color:f", "there is no module no_such_package in"),
+        ("own_networks.color:blue", "own_networks.color has no function blue"),
+        ("own_networks.color:value", "has no function value"),
+        ("own_networks.color:one", r"returns int: return \(module, size, classes\)"),
+        ("own_networks.color:no_module", "returns str first: return a torch.nn.Module"),
+        ("own_networks.color:no_size", "returns the size '16'"),
+        ("own_networks.color:no_classes", "returns no list of class names"),
+        ("own_networks.color:classes_without_order", "returns no list of class names"),
+        ("own_networks.color:a_truth_for_a_size", "returns the size True"),
+        ("own_networks.color:huge", ": size=1000000000 must be at least 1 and at most 4096"),
+        ("own_networks.color:needs_more", "raises TypeError .*missing 1 required positional argument"),
+        ("own_networks.color:leaves", r"raises SystemExit \(0\) in line 15 of .*color.py: mend it"),
         (
-            "own_networks.colour:broken",
-            r"raises ZeroDivisionError \(division by zero\) in line 16 of .*colour.py",
+            "own_networks.color:broken",
+            r"raises ZeroDivisionError \(division by zero\) in line 16 of .*color.py",
         ),
         ("own_networks.broken:f", r"raises ModuleNotFoundError \(No module named 'a_library_that_is_not_there'\)"),
-        ("..colour:f", "raises TypeError"),
+        ("..color:f", "raises TypeError"),
     ],
 )
 def test_what_makes_no_classifier_is_refused_in_one_sentence(name, message):
@@ -78,4 +78,4 @@ def test_what_makes_no_classifier_is_refused_in_one_sentence(name, message):
 
 def test_weights_of_a_file_are_refused():
     with pytest.raises(InputError, match=r"weights=w\.pt is not for classifier=python:"):
-        load_classifier("python:own_networks.colour:red_or_not", "w.pt")
+        load_classifier("python:own_networks.color:red_or_not", "w.pt")

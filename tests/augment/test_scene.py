@@ -18,38 +18,38 @@ from augment.reshading import NEAR
 from augment.scene import Conditions, Example, Scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from augment.utils import Phases
-from renderer.basis import Distant
 from renderer.cache import OperatorCache
-from renderer.camera import OrthographicCamera, ring
-from renderer.convex import nearest_in_box
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
-from renderer.harmonics import live_coefficients
-from renderer.image import ENCODINGS, ImageSettings, develop
-from renderer.lights import ambient, probe
-from renderer.mesh import Mesh, normalise
+from renderer.image import ENCODINGS, ImageSettings, tonemap
+from renderer.light.basis import EnvironmentBasis
+from renderer.light.convex import nearest_in_box
+from renderer.light.harmonics import nonzero_coefficients
+from renderer.light.presets import ambient, probe
+from renderer.mesh import Mesh, normalize
+from renderer.rasterizer import choose
 from renderer.shapes import solid
-from renderer.transfer import Operator, build_operators
-from renderer.visibility import choose
+from renderer.transfer import TransferOperator, build_operators
 
 EPS32 = torch.finfo(torch.float32).eps
-BACKEND = choose("software")
+RASTERIZER = choose("numpy")
 SETTINGS = ImageSettings(size=8, samples=2)
 SIZE = 5
-GREYS = [0.0, 0.25, 1.0]
-LIVE = live_coefficients(6)
-DEAD = torch.ones(49, dtype=torch.bool).index_fill(0, LIVE, False)
+GRAYS = [0.0, 0.25, 1.0]
+NONZERO = nonzero_coefficients(6)
+DEAD = torch.ones(49, dtype=torch.bool).index_fill(0, NONZERO, False)
 
 
-def random_operator(seed: int, count: int) -> Operator:
+def random_operator(seed: int, count: int) -> TransferOperator:
     """Covers `count` random pixels of an image of SIZE², dark enough that clamping is the exception."""
     draws = torch.Generator().manual_seed(seed)
     coverage = 0.1 + 0.9 * torch.rand(count, generator=draws)
-    return Operator(
+    return TransferOperator(
         transfer=0.2 * torch.rand(3, 31, count, generator=draws) * coverage,
         albedo=torch.ones(3, count),
         coverage=coverage,
         pixels=torch.randperm(SIZE**2, generator=draws)[:count].sort().values,
-        kept=LIVE,
+        kept=NONZERO,
         settings=ImageSettings(size=SIZE),
     )
 
@@ -57,19 +57,21 @@ def random_operator(seed: int, count: int) -> Operator:
 class Given(OperatorCache):
     """In place of an `OperatorCache`: these operators, whatever the mesh."""
 
-    def __init__(self, *operators: Operator):
+    def __init__(self, *operators: TransferOperator):
         self.left = list(operators)
 
-    def operators(self, mesh, cameras, *settings, **more) -> list[Operator]:
+    def operators(self, mesh, cameras, *settings, **more) -> list[TransferOperator]:
         return [self.left.pop(0) for _ in cameras]
 
 
-def scene_of(labels: list[str], operators: list[Operator], grey_values: list[float], settings: ImageSettings) -> Scene:
+def scene_of(
+    labels: list[str], operators: list[TransferOperator], gray_values: list[float], settings: ImageSettings
+) -> Scene:
     """As many views of each label's object as there are operators for it."""
-    objects = [SceneObject(label, normalise(solid("plate"))) for label in labels]
-    cameras = ring(len(operators) // len(labels), 2.0)
-    behind = load_backgrounds(grey_values, settings.size)
-    return Scene.grid(objects, cameras, behind, probe("grace"), settings, BACKEND, Given(*operators))
+    objects = [SceneObject(label, normalize(solid("plate"))) for label in labels]
+    cameras = orbit_cameras(len(operators) // len(labels), 2.0)
+    behind = load_backgrounds(gray_values, settings.size)
+    return Scene.grid(objects, cameras, behind, probe("grace"), settings, RASTERIZER, Given(*operators))
 
 
 def render(scene: Scene, lights: torch.Tensor, examples: torch.Tensor | None = None) -> torch.Tensor:
@@ -82,7 +84,7 @@ def render(scene: Scene, lights: torch.Tensor, examples: torch.Tensor | None = N
 def scene(request) -> Scene:
     """Two meshes of 2 views over 3 backgrounds; one view covers nothing."""
     operators = [random_operator(seed, count) for seed, count in enumerate([6, 4, 9, 0])]
-    return scene_of(["orange", "pear"], operators, GREYS, ImageSettings(size=SIZE, encoding=request.param))
+    return scene_of(["orange", "pear"], operators, GRAYS, ImageSettings(size=SIZE, encoding=request.param))
 
 
 def random_lights(count: int, seed: int = 0) -> torch.Tensor:
@@ -95,11 +97,11 @@ def composed(scene: Scene, lights: torch.Tensor) -> torch.Tensor:
     """Every example by itself: (E, 3, SIZE, SIZE)."""
     operators = [random_operator(seed, count) for seed, count in enumerate([6, 4, 9, 0])]
     images = []
-    for light, (operator, grey) in zip(lights, [(o, g) for o in operators for g in GREYS], strict=True):
-        canvas = torch.full((3, SIZE**2), grey)
-        radiance = torch.einsum("kc,ckp->cp", light[LIVE], operator.transfer)
-        behind = torch.full((1, 1), grey)
-        canvas[:, operator.pixels] = develop(radiance, operator.coverage[None], behind, scene.settings.encoding)
+    for light, (operator, gray) in zip(lights, [(o, g) for o in operators for g in GRAYS], strict=True):
+        canvas = torch.full((3, SIZE**2), gray)
+        radiance = torch.einsum("kc,ckp->cp", light[NONZERO], operator.transfer)
+        behind = torch.full((1, 1), gray)
+        canvas[:, operator.pixels] = tonemap(radiance, operator.coverage[None], behind, scene.settings.encoding)
         images.append(canvas.view(3, SIZE, SIZE))
     return torch.stack(images)
 
@@ -127,14 +129,14 @@ def test_examples_are_meshes_by_views_by_backgrounds(scene):
     free = sorted(set(range(SIZE**2)) - set(scene.stacks[0].pixels.tolist()))
     assert free
     corner = render(scene, random_lights(12)).flatten(2)[:, :, free[0]]
-    torch.testing.assert_close(corner, torch.tensor(GREYS * 4)[:, None].expand(12, 3), rtol=0, atol=0)
+    torch.testing.assert_close(corner, torch.tensor(GRAYS * 4)[:, None].expand(12, 3), rtol=0, atol=0)
 
 
 def test_uncovered_pixels_and_dead_coefficients_have_gradients_of_exactly_zero(scene):
     lights = random_lights(12).requires_grad_(True)
     images = render(scene, lights)
     (gradient,) = torch.autograd.grad(images.sum(), lights, retain_graph=True)
-    assert (gradient[:9, LIVE] != 0).any(dim=2).all()
+    assert (gradient[:9, NONZERO] != 0).any(dim=2).all()
     assert not gradient[:, DEAD].any() and DEAD.sum() == 18
     uncovered = torch.ones(12, SIZE**2)
     for view, (seed, count) in enumerate(enumerate([6, 4, 9, 0])):
@@ -151,7 +153,7 @@ def test_the_gradient_is_the_transfer_where_nothing_clamps():
     weights = torch.randn(1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
     (gradient,) = torch.autograd.grad(render(scene, lights), lights, weights)
     expected = torch.einsum("ckp,cp->kc", operator.transfer, weights.view(3, -1)[:, operator.pixels])
-    torch.testing.assert_close(gradient[0, LIVE], expected, rtol=0, atol=16 * EPS32)
+    torch.testing.assert_close(gradient[0, NONZERO], expected, rtol=0, atol=16 * EPS32)
 
 
 def test_the_clamped_fraction_counts_covered_values_alone():
@@ -159,8 +161,10 @@ def test_the_clamped_fraction_counts_covered_values_alone():
     unit, settings = torch.zeros(3, 31, 3), ImageSettings(size=2)
     unit[:, 0] = torch.tensor([1.0, 0.5, -1.0])
     views = [
-        Operator(unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2]), LIVE, settings),
-        Operator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3]), LIVE, settings),
+        TransferOperator(
+            unit, torch.ones(3, 3), torch.tensor([1.0, 0.5, 1.0]), torch.tensor([0, 1, 2]), NONZERO, settings
+        ),
+        TransferOperator(torch.zeros(3, 31, 1), torch.ones(3, 1), torch.ones(1), torch.tensor([3]), NONZERO, settings),
     ]
     scene = scene_of(["orange"], views, [0.0, 1.0], settings)
     lights = torch.zeros(4, 49, 3)
@@ -172,9 +176,9 @@ def test_the_clamped_fraction_counts_covered_values_alone():
 
 
 def test_a_scene_that_nothing_covers_is_its_backgrounds():
-    scene = scene_of(["orange"], [random_operator(0, 0)], GREYS, ImageSettings(size=SIZE))
+    scene = scene_of(["orange"], [random_operator(0, 0)], GRAYS, ImageSettings(size=SIZE))
     images = render(scene, random_lights(3))
-    torch.testing.assert_close(images, torch.tensor(GREYS).view(3, 1, 1, 1).expand_as(images), rtol=0, atol=0)
+    torch.testing.assert_close(images, torch.tensor(GRAYS).view(3, 1, 1, 1).expand_as(images), rtol=0, atol=0)
     assert scene.clamped_fraction(Conditions(random_lights(3)), torch.arange(3)).tolist() == [0, 0, 0]
 
 
@@ -203,21 +207,21 @@ def test_numbers_that_make_no_product_are_refused(examples, objects, backgrounds
         count_views(examples, objects, backgrounds, views)
 
 
-def same(a: Operator, b: Operator) -> bool:
+def same(a: TransferOperator, b: TransferOperator) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("transfer", "coverage", "pixels"))
 
 
 def built(items: list[ObjectSettings], cameras: list, settings: ImageSettings, *cache: OperatorCache) -> Scene:
-    """Of all meshes from all cameras over GREYS."""
+    """Of all meshes from all cameras over GRAYS."""
     objects = [load_object(item) for item in items]
-    behind = load_backgrounds(GREYS, settings.size)
-    return Scene.grid(objects, cameras, behind, probe("grace"), settings, BACKEND, *cache)
+    behind = load_backgrounds(GRAYS, settings.size)
+    return Scene.grid(objects, cameras, behind, probe("grace"), settings, RASTERIZER, *cache)
 
 
 @pytest.mark.parametrize(("spec", "name", "seed"), [("solid:plate", "plate", 0), ("solid:table:3", "table", 3)])
-def test_a_solid_is_normalised_and_named(spec, name, seed):
-    loaded, expected = load_object(ObjectSettings(spec, "thing", gain=2.0)), normalise(solid(name, seed))
-    assert (loaded.label, loaded.gain) == ("thing", 2.0)
+def test_a_solid_is_normalized_and_named(spec, name, seed):
+    loaded, expected = load_object(ObjectSettings(spec, "thing", albedo_scale=2.0)), normalize(solid(name, seed))
+    assert (loaded.label, loaded.albedo_scale) == ("thing", 2.0)
     assert np.array_equal(loaded.mesh.vertices, expected.vertices) and np.array_equal(loaded.mesh.faces, expected.faces)
 
 
@@ -228,9 +232,9 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
     walls = [
         ObjectSettings(str(path), "wall"),
         ObjectSettings(str(path), "wall", up="y"),
-        ObjectSettings(str(path), "wall", up="y", gain=2.0),
+        ObjectSettings(str(path), "wall", up="y", albedo_scale=2.0),
     ]
-    (stack,) = built(walls, [ring(4, 4.0)[1]], ImageSettings(size=32, samples=4)).stacks
+    (stack,) = built(walls, [orbit_cameras(4, 4.0)[1]], ImageSettings(size=32, samples=4)).stacks
     # From azimuth π/2: as wide as it was and sin π/3 high standing, cos π/3 high lying; half a sample's width of 1/64
     # off along the outline of 6 at the most.
     for coverage, foreshortening in zip(stack.coverage, (0.5, np.sqrt(3) / 2), strict=False):
@@ -257,30 +261,30 @@ def test_a_mesh_that_is_not_there_is_refused(spec, message):
         load_object(ObjectSettings(spec, "orange"))
 
 
-@pytest.mark.parametrize("gain", [0.0, -1.0, float("nan")])
-def test_a_gain_that_leaves_nothing_is_refused(gain):
-    with pytest.raises(InputError, match="gain="):
-        ObjectSettings("solid:orange", "orange", gain=gain)
+@pytest.mark.parametrize("albedo_scale", [0.0, -1.0, float("nan")])
+def test_a_gain_that_leaves_nothing_is_refused(albedo_scale):
+    with pytest.raises(InputError, match="albedo_scale="):
+        ObjectSettings("solid:orange", "orange", albedo_scale=albedo_scale)
 
 
 TWO = [ObjectSettings(f"solid:{name}", name) for name in ("plate", "cup")]
 
 
-def test_a_lighting_attack_rasterises_nothing(rasterised):
-    """Each mesh is rasterised once, in all views; 30 steps on 24 examples that are never fooled add nothing."""
-    scene = built(TWO, ring(4, 2), SETTINGS)
-    assert rasterised == [] and scene.stacks and rasterised == [4, 4]
+def test_a_lighting_attack_rasterizes_nothing(rasterized):
+    """Each mesh is rasterized once, in all views; 30 steps on 24 examples that are never fooled add nothing."""
+    scene = built(TWO, orbit_cameras(4, 2), SETTINGS)
+    assert rasterized == [] and scene.stacks and rasterized == [4, 4]
     network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 3))
     torch.nn.init.constant_(network[1].bias[0], 1000)
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=30))
     service = AugmentationService(settings, scene, torch.zeros(24, dtype=torch.int64), 0, Phases())
-    assert service.regenerate(network, number=0).diagnostics["steps"] == 30 and rasterised == [4, 4]
+    assert service.regenerate(network, number=0).diagnostics["steps"] == 30 and rasterized == [4, 4]
 
 
 def test_a_scene_stores_no_background_pixel_and_no_backgrounds_or_dead_bands_of_a_view():
     bottle = ObjectSettings("solid:bottle", "bottle")
-    scene = built([bottle], ring(4, 2), SETTINGS)
-    operators = build_operators(load_object(bottle).mesh, ring(4, 2), SETTINGS, BACKEND)
+    scene = built([bottle], orbit_cameras(4, 2), SETTINGS)
+    operators = build_operators(load_object(bottle).mesh, orbit_cameras(4, 2), SETTINGS, RASTERIZER)
     covered = set(np.concatenate([operator.pixels for operator in operators]).tolist())
     (stack,) = scene.stacks
     assert len(scene) == 12 and 0 < len(covered) < 64 / 2
@@ -289,20 +293,20 @@ def test_a_scene_stores_no_background_pixel_and_no_backgrounds_or_dead_bands_of_
     assert stack.coverage.shape == (4, 1, len(covered)) and stack.pixels.tolist() == sorted(covered)
 
 
-def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterised):
-    items = [ObjectSettings("solid:plate", "plate"), ObjectSettings("solid:plate:1", "plate", gain=2.0)]
+def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterized):
+    items = [ObjectSettings("solid:plate", "plate"), ObjectSettings("solid:plate:1", "plate", albedo_scale=2.0)]
     images = []
     for calls in ([3, 3], [3, 3]):
         cache = OperatorCache(tmp_path)
-        images.append(render(built(items, ring(3, 2), SETTINGS, cache), random_lights(18)))
-        assert rasterised == calls
+        images.append(render(built(items, orbit_cameras(3, 2), SETTINGS, cache), random_lights(18)))
+        assert rasterized == calls
     assert (cache.tally["views"], cache.tally["built"]) == (6, 0)
     assert torch.equal(*images)
 
 
 def test_under_grace_a_plate_is_brighter_from_above_than_from_below():
     """The whole way from a spec to an image."""
-    scene = built([ObjectSettings("solid:plate", "plate")], ring(1, 2.0), SETTINGS)
+    scene = built([ObjectSettings("solid:plate", "plate")], orbit_cameras(1, 2.0), SETTINGS)
     light = probe("grace").expand(3, -1, -1)
     upside_down = light.clone()
     upside_down[:, 2] *= -1
@@ -315,7 +319,7 @@ def test_under_grace_a_plate_is_brighter_from_above_than_from_below():
 @pytest.fixture(scope="module", params=[relighting.STACKED, 1], ids=["one stack", "a stack per view"])
 def mixed(request) -> Iterator[Scene]:
     """Two meshes of different sizes in no order, two views per row, own lights, exposures and backgrounds."""
-    views, draws = ring(3, 2.2), torch.Generator().manual_seed(3)
+    views, draws = orbit_cameras(3, 2.2), torch.Generator().manual_seed(3)
     rows = [
         Example(1, (views[0], views[1]), 0),
         Example(0, (views[2], views[1]), 1, exposure=0.5),
@@ -326,13 +330,13 @@ def mixed(request) -> Iterator[Scene]:
     behind = 0.2 + 0.6 * torch.rand(3, 3, 8, 8, generator=draws)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(relighting, "STACKED", request.param)
-        yield Scene([load_object(item) for item in TWO], rows, behind, lights, SETTINGS, BACKEND)
+        yield Scene([load_object(item) for item in TWO], rows, behind, lights, SETTINGS, RASTERIZER)
 
 
 @pytest.mark.parametrize("by", ["light", "vertices"])
 @pytest.mark.parametrize("examples", [[0, 1, 2, 3], [3, 0], [2, 2, 1]])
 def test_rows_of_several_meshes_are_what_each_is_by_itself(mixed, examples, by):
-    """By stacked operators and by rasterising anew, beside `renderer.render`, which shares no code with the stacks."""
+    """By stacked operators and by rasterizing anew, beside `renderer.render`, which shares no code with the stacks."""
     chosen, conditions = torch.tensor(examples), mixed.conditions(torch.tensor(examples))
     if by == "vertices":
         conditions = replace(conditions, vertices=mixed.vertices[mixed.object_of[chosen]])
@@ -342,7 +346,7 @@ def test_rows_of_several_meshes_are_what_each_is_by_itself(mixed, examples, by):
         row = mixed.examples[example]
         light = mixed.lights[example] * row.exposure
         behind = mixed.backgrounds[row.background].view(3, 8, 8)
-        alone = {"samples": 2, "normals": "flat", "visibility": "software"}
+        alone = {"samples": 2, "normals": "flat", "rasterizer": "numpy"}
         expected = renderer.render(mixed.mesh(example), row.cameras, light, 8, behind, **alone)
         torch.testing.assert_close(image, expected, rtol=0, atol=64 * torch.finfo(torch.float64).eps)
     assert mixed.labels == ["cup", "plate", "cup", "plate"]
@@ -390,12 +394,12 @@ def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_its_own_values_only(mixed
 
 
 @dataclass(frozen=True)
-class Lamps(Distant):
+class Lamps(EnvironmentBasis):
     """A basis that the package does not have: three lamps far away, along the axes, of power from 0 to 1."""
 
     name = "lamps"
     size = 3
-    live = torch.arange(3)
+    nonzero = torch.arange(3)
 
     def irradiance(self, normals: torch.Tensor) -> torch.Tensor:
         return normals.clamp(min=0)
@@ -403,7 +407,7 @@ class Lamps(Distant):
     def radiance(self, directions: torch.Tensor) -> torch.Tensor:
         raise NotImplementedError  # lamps are points
 
-    def nearest_physical(self, coefficients: torch.Tensor, within=None) -> torch.Tensor:
+    def project_nonnegative(self, coefficients: torch.Tensor, within=None) -> torch.Tensor:
         return nearest_in_box(coefficients, 0, 1, within)
 
 
@@ -412,7 +416,7 @@ def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its
     box = SceneObject("box", Mesh.plain(trimesh.creation.box().vertices, trimesh.creation.box().faces))
     start = torch.tensor([[0.2] * 3, [0.3] * 3, [0.4, 0.5, 0.6]], dtype=torch.float64)
     above = OrthographicCamera(0.0, 0.0, 0.9)  # nothing but the top
-    scene = Scene.grid([box], [above], load_backgrounds([1.0], 8), start, SETTINGS, BACKEND, basis=Lamps())
+    scene = Scene.grid([box], [above], load_backgrounds([1.0], 8), start, SETTINGS, RASTERIZER, basis=Lamps())
     chosen = torch.zeros(1, dtype=torch.int64)
     image = scene.render(scene.conditions(chosen), chosen)
     expected = start[2].view(3, 1, 1).expand_as(image)
@@ -433,28 +437,28 @@ def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its
 def test_a_light_of_another_basis_is_refused():
     with pytest.raises(InputError, match=r"lights of shape \(9, 3\) is not of harmonics of degree 6: give 49 rows"):
         plate = SceneObject("plate", solid("plate"))
-        Scene.grid([plate], ring(1, 2.0), load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, BACKEND)
+        Scene.grid([plate], orbit_cameras(1, 2.0), load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, RASTERIZER)
 
 
 def test_a_scene_of_shadowed_and_open_meshes_shows_each_as_its_operator_does():
     """The one has 49 coefficients and the other 31."""
     items = [ObjectSettings("solid:cup", "cup"), ObjectSettings("solid:ball", "ball")]
-    settings, cameras = replace(SETTINGS, transport="shadows"), ring(2, 2)
+    settings, cameras = replace(SETTINGS, shadows=True), orbit_cameras(2, 2)
     scene, lights = built(items, cameras, settings), random_lights(12)
     images = render(scene, lights)
     expected, kept = [], set()
     for item in items:
-        for operator in build_operators(load_object(item).mesh, cameras, settings, BACKEND):
+        for operator in build_operators(load_object(item).mesh, cameras, settings, RASTERIZER):
             kept.add(len(operator.kept))
-            for grey in GREYS:
-                expected.append(operator.image(lights[len(expected)], grey))
+            for gray in GRAYS:
+                expected.append(operator.image(lights[len(expected)], gray))
     assert kept == {49, 31}
     torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=100 * EPS32)
 
 
 @pytest.mark.parametrize("transport", ["shadows", "bounces:2"])
-def test_where_no_vertex_or_colour_has_moved_yet_shadows_are_those_of_the_operators(transport):
-    scene = built([ObjectSettings("solid:cup", "cup")], ring(2, 2), replace(SETTINGS, transport=transport))
+def test_where_no_vertex_or_color_has_moved_yet_shadows_are_those_of_the_operators(transport):
+    scene = built([ObjectSettings("solid:cup", "cup")], orbit_cameras(2, 2), replace(SETTINGS, transport=transport))
     examples, lights = torch.arange(len(scene)), random_lights(len(scene))
     mesh = scene.mesh(0)
     still = replace(scene.conditions(examples), light=lights)
@@ -467,12 +471,12 @@ def test_where_no_vertex_or_colour_has_moved_yet_shadows_are_those_of_the_operat
         torch.testing.assert_close(images, expected, rtol=0, atol=1000 * EPS32)
 
 
-def test_a_table_is_shadowed_by_the_object_on_it_and_returns_light_of_its_own_colour():
+def test_a_table_is_shadowed_by_the_object_on_it_and_returns_light_of_its_own_color():
     """Green, mostly to the object; where the sky alone lights it, nothing changes."""
-    seen = {"size": 16, "views": 1, "light": "st_peters", "exposure": 0.2, "backgrounds": [0.0], "field_of_view": 3.0}
+    seen = {"size": 16, "views": 1, "light": "st_peters", "exposure": 0.2, "backgrounds": [0.0], "width": 3.0}
 
     def image(transport: str, ground: list[float] | None = (0.1, 0.8, 0.1)) -> torch.Tensor:
-        fixed = {"transport": transport, "ground": ground, "visibility": "software"}
+        fixed = {"transport": transport, "ground": ground, "rasterizer": "numpy"}
         scene = build_scene([("solid:orange", "orange")], **seen | fixed)
         return render(scene, scene.lights)[0]
 
@@ -487,7 +491,7 @@ def test_a_table_is_shadowed_by_the_object_on_it_and_returns_light_of_its_own_co
 
 def test_shadows_are_found_anew_for_a_shape_that_is_not_near_and_held_for_one_that_is():
     """Each example has its own shape; back where it began, it has the mesh's own shadows."""
-    settings, cameras = replace(SETTINGS, transport="shadows"), ring(2, 2)
+    settings, cameras = replace(SETTINGS, shadows=True), orbit_cameras(2, 2)
     scene = built([ObjectSettings("solid:cup", "cup")], cameras, settings)
     mesh, examples, lights = scene.mesh(0), torch.arange(len(scene)), random_lights(len(scene))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(scene), *mesh.vertices.shape))
@@ -501,8 +505,8 @@ def test_shadows_are_found_anew_for_a_shape_that_is_not_near_and_held_for_one_th
         expected = []
         for index, vertices in enumerate(moved.astype(np.float64)):
             shaped, [camera] = replace(mesh, vertices=vertices), scene.cameras[index]
-            [operator] = build_operators(shaped, [camera], settings, BACKEND)
-            expected.append(operator.image(lights[index], GREYS[index % len(GREYS)]))
+            [operator] = build_operators(shaped, [camera], settings, RASTERIZER)
+            expected.append(operator.image(lights[index], GRAYS[index % len(GRAYS)]))
         return float((images[:, 0] - torch.stack(expected)).abs().max())
 
     assert off(0.02) < 1000 * EPS32
@@ -510,20 +514,20 @@ def test_shadows_are_found_anew_for_a_shape_that_is_not_near_and_held_for_one_th
     assert off(0.0) < 1000 * EPS32
 
 
-def test_a_shadow_goes_with_the_colour_of_its_pixel():
+def test_a_shadow_goes_with_the_color_of_its_pixel():
     """Half the albedo leaves half of all light, shadows included."""
-    grey = replace(load_object(ObjectSettings("solid:cup", "cup")).mesh, textures=())
-    grey = replace(grey, corner_colors=np.full_like(grey.corner_colors, 0.5))
-    settings = replace(SETTINGS, transport="shadows")
+    gray = replace(load_object(ObjectSettings("solid:cup", "cup")).mesh, textures=())
+    gray = replace(gray, corner_colors=np.full_like(gray.corner_colors, 0.5))
+    settings = replace(SETTINGS, shadows=True)
     scene = Scene.grid(
-        [SceneObject("cup", grey)],
-        ring(1, 2),
+        [SceneObject("cup", gray)],
+        orbit_cameras(1, 2),
         torch.zeros(1, 1, 8, 8),
         ambient(torch.full((3,), 0.3)),
         settings,
-        BACKEND,
+        RASTERIZER,
     )
-    half = torch.full((1, len(grey.faces), 3), -0.25)
+    half = torch.full((1, len(gray.faces), 3), -0.25)
     conditions, examples = scene.conditions(torch.arange(1)), torch.arange(1)
     halved = scene.render(replace(conditions, albedo=half), examples)
     torch.testing.assert_close(halved, scene.render(conditions, examples) / 2, rtol=0, atol=100 * EPS32)
@@ -532,14 +536,14 @@ def test_a_shadow_goes_with_the_colour_of_its_pixel():
 @pytest.mark.parametrize("nothing", [{"meshes": []}, {"views": 0}, {"backgrounds": ()}])
 def test_a_scene_of_nothing_is_refused(nothing):
     with pytest.raises(InputError, match=r"nothing is to be rendered|backgrounds is empty|views=0 must be"):
-        build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "visibility": "software"} | nothing)
+        build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "rasterizer": "numpy"} | nothing)
 
 
 def with_apple(*at: float, **more: float) -> torch.Tensor:
     """From +x, the image of an orange, and of an apple beside it if places are given."""
     beside = [PropSettings("solid:apple", list(at), 0.5)] if at else []
-    orange, seen = ObjectSettings("solid:orange", "orange", props=beside), {"polar": 90.0, "field_of_view": 5.0}
-    scene = build_scene([orange], 16, samples=1, visibility=BACKEND, **seen | more)
+    orange, seen = ObjectSettings("solid:orange", "orange", props=beside), {"polar": 90.0, "width": 5.0}
+    scene = build_scene([orange], 16, samples=1, rasterizer=RASTERIZER, **seen | more)
     return scene.render(scene.conditions(torch.arange(1)), torch.arange(1))
 
 
@@ -551,4 +555,4 @@ def test_parallel_rays_show_company_alike_however_near_or_far_it_is(along):
 
 
 def test_in_perspective_company_far_behind_is_seen():
-    assert not torch.equal(with_apple(-10.0, 4.0, perspective=40.0), with_apple(perspective=40.0))
+    assert not torch.equal(with_apple(-10.0, 4.0, fov=40.0), with_apple(fov=40.0))

@@ -7,12 +7,12 @@ from torch import Tensor
 
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
-from renderer.image import ENCODINGS, decode, develop, encode
+from renderer.image import ENCODINGS, decode, encode, tonemap
+from renderer.rasterizer import choose
 from renderer.transfer import build_operators
-from renderer.visibility import choose
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
-BACKEND = choose("software")
+RASTERIZER = choose("numpy")
 EVERY = torch.arange(3)
 # Sums of 31 products below 1 in another order, and the slope of 12.92 of the sRGB curve near black.
 ROUNDING = 13 * 8 * EPS
@@ -29,10 +29,12 @@ def composed(scene: Scene, lights: Tensor) -> Tensor:
     images = []
     (item,) = scene.objects
     for light, cameras, behind in zip(lights, scene.cameras, scene.backgrounds.flatten(2), strict=True):
-        operators = build_operators(item.mesh, cameras, scene.settings, BACKEND, item.gain, dtype=lights.dtype)
+        operators = build_operators(
+            item.mesh, cameras, scene.settings, RASTERIZER, item.albedo_scale, dtype=lights.dtype
+        )
         for operator in operators:
             canvas, seen = behind.clone(), operator.radiance(light)
-            canvas[:, operator.pixels] = develop(
+            canvas[:, operator.pixels] = tonemap(
                 seen, operator.coverage[None], behind[:, operator.pixels], scene.settings.encoding
             )
             images.append(canvas.unflatten(1, (scene.settings.size, -1)))
@@ -43,7 +45,7 @@ def composed(scene: Scene, lights: Tensor) -> Tensor:
 @pytest.mark.parametrize(("dtype", "rounding"), [(torch.float32, ROUNDING * EPS32 / EPS), (torch.float64, ROUNDING)])
 def test_under_light_alone_images_are_those_of_the_views_one_by_one(make_scene, dtype, rounding, encoding):
     """In the dtype of the light, whatever the backgrounds have."""
-    scene = make_scene(dtype=dtype, encoding=encoding, gain=1.2)
+    scene = make_scene(dtype=dtype, encoding=encoding, albedo_scale=1.2)
     lights = own_lights(scene)
     images = scene.render(Conditions(lights), EVERY)
     assert images.shape == (3, 2, 3, 6, 6) and images.dtype == dtype
@@ -69,7 +71,7 @@ def test_any_examples_in_any_order_are_rendered_as_all_are(make_scene, part):
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_nothing_changes_where_the_other_conditions_are_the_scenes_own(make_scene, encoding):
     """By operators and by shading, which share no code between the albedo and the image."""
-    scene = make_scene(encoding=encoding, gain=1.2)
+    scene = make_scene(encoding=encoding, albedo_scale=1.2)
     light = scene.conditions(EVERY).light
     assert torch.equal(light, scene.lights)
     plain = scene.render(scene.conditions(EVERY), EVERY)
@@ -110,13 +112,13 @@ def test_a_change_of_albedo_is_seen_as_another_paint_would_be(make_scene, stone,
 
 
 def test_a_gain_may_lift_the_albedo_above_one_and_a_change_lifts_it_no_further(make_scene):
-    scene = make_scene(gain=2.0)
+    scene = make_scene(albedo_scale=2.0)
     lifted = scene.render(Conditions(0.4 * own_lights(scene), albedo=torch.ones(3, 20, 3).double()), EVERY)
     own = scene.render(Conditions(0.4 * own_lights(scene)), EVERY)
     brightest = torch.from_numpy(scene.mesh(0).corner_colors).double() * 2
     assert (brightest > 1).any() and (brightest < 1).any()
     painted = replace(scene.mesh(0), corner_colors=(brightest.clamp(min=1) / 2).float().numpy())
-    other = make_scene(mesh=painted, gain=2.0).render(Conditions(0.4 * own_lights(scene)), EVERY)
+    other = make_scene(mesh=painted, albedo_scale=2.0).render(Conditions(0.4 * own_lights(scene)), EVERY)
     torch.testing.assert_close(lifted, other, rtol=0, atol=4 * EPS32)
     assert (lifted >= own - 4 * EPS32).all()
 
@@ -151,19 +153,19 @@ def test_black_and_white_pixels_and_paints_have_the_gradients_of_others(make_sce
     torch.testing.assert_close(sums[2], sums[1], rtol=0, atol=ROUNDING)
 
 
-def test_a_camera_is_rasterised_once_and_moved_vertices_once_per_view(make_scene, rasterised):
+def test_a_camera_is_rasterized_once_and_moved_vertices_once_per_view(make_scene, rasterized):
     """Three cameras in six views of three examples."""
     scene = make_scene()
     for _ in range(3):
         scene.render(Conditions(own_lights(scene)), EVERY)
-    assert rasterised == [3]
+    assert rasterized == [3]
     for _ in range(3):
         scene.render(replace(scene.conditions(EVERY), albedo=torch.zeros(3, 20, 3).double()), EVERY)
-    assert rasterised == [3] + [1] * 3
+    assert rasterized == [3] + [1] * 3
     moved = replace(scene.conditions(EVERY[:2]), vertices=scene.vertices.expand(2, -1, -1))
     for calls in (7, 11):
         scene.render(moved, EVERY[:2])
-        assert rasterised == [3] + [1] * calls
+        assert rasterized == [3] + [1] * calls
 
 
 def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(make_scene, stone):

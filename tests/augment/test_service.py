@@ -13,12 +13,12 @@ from augment.scene import Conditions, Scene
 from augment.service import AugmentationService, AugmentationSettings, RandomLightSettings, TrainingAttackSettings
 from augment.utils import Phases
 from augment.variation import VariationSettings
-from renderer.camera import ring
+from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.image import ImageSettings
-from renderer.lights import probe
+from renderer.light.presets import probe
+from renderer.rasterizer import choose
 from renderer.shapes import solid
-from renderer.visibility import choose
 
 EPS32 = torch.finfo(torch.float32).eps
 LIGHT = probe("grace")
@@ -33,7 +33,7 @@ def scene() -> Scene:
     settings = ImageSettings(size=8, samples=2)
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in CLASSES]
     behind = load_backgrounds([0, 0.25, 0.5, 0.75, 1], settings.size)
-    return Scene.grid(objects, ring(10, 2.0), behind, LIGHT, settings, choose("software"))
+    return Scene.grid(objects, orbit_cameras(10, 2.0), behind, LIGHT, settings, choose("numpy"))
 
 
 def render(scene: Scene, lights: Tensor) -> Tensor:
@@ -249,10 +249,10 @@ SHAPE_AND_ALBEDO = {
 
 @pytest.fixture(scope="module")
 def few() -> tuple[Scene, Tensor]:
-    """Both meshes from one view over one grey, since shapes are rasterised in every step."""
+    """Both meshes from one view over one gray, since shapes are rasterized in every step."""
     settings = ImageSettings(size=8, samples=2)
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in CLASSES]
-    scene = Scene.grid(objects, ring(1, 2.0), load_backgrounds([0.5], 8), LIGHT, settings, choose("software"))
+    scene = Scene.grid(objects, orbit_cameras(1, 2.0), load_backgrounds([0.5], 8), LIGHT, settings, choose("numpy"))
     return scene, torch.tensor(list(CLASSES.values()))
 
 
@@ -290,14 +290,14 @@ def test_a_service_needs_no_trainer_and_its_renders_join_any_data_set(model, mon
     meshes = [("solid:plate", 0), (solid("table"), 2)]
     attack = TrainingAttackSettings(max_steps=2)
     settings = AugmentationSettings(warm_start=True, attack=attack)
-    choices = dict(views=2, backgrounds=[0.25, 0.75], samples=2, visibility="software")
+    choices = dict(views=2, backgrounds=[0.25, 0.75], samples=2, rasterizer="numpy")
     service = AugmentationService.from_meshes(meshes, 8, settings, **choices)
     renders = service.regenerate(model, 0)
     assert renders.labels.tolist() == [0] * 4 + [2] * 4 and len(service) == len(renders) == 8
 
     objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in ("plate", "table")]
     image, behind = ImageSettings(size=8, samples=2), load_backgrounds([0.25, 0.75], 8)
-    scene = Scene.grid(objects, ring(2, 2.0), behind, LIGHT, image, choose("software"))
+    scene = Scene.grid(objects, orbit_cameras(2, 2.0), behind, LIGHT, image, choose("numpy"))
     same = AugmentationService(AugmentationSettings(examples=8, attack=attack), scene, renders.labels, 0, Phases())
     assert torch.equal(same.regenerate(model, 0).images, renders.images)
 

@@ -106,10 +106,10 @@ def test_more_than_the_free_memory_is_refused_before_it_is_allocated(tmp_path, m
 
 def test_renders_and_their_views_need_their_memory_before_any_is_made(monkeypatch):
     monkeypatch.setattr(utils, "_free", lambda device: 2**30)
-    orange, greys = [("solid:orange", "orange")], (0, 0.25, 0.5, 0.75, 1)
+    orange, grays = [("solid:orange", "orange")], (0, 0.25, 0.5, 0.75, 1)
     with pytest.raises(InputError, match=r"^100000 renders of 64 pixels per side .* need 9\.2 GB"):
-        build_scene(orange, 64, 20_000, backgrounds=greys, visibility="software")
-    scene = build_scene(orange, 128, 500, visibility="software", samples=1)
+        build_scene(orange, 64, 20_000, backgrounds=grays, rasterizer="numpy")
+    scene = build_scene(orange, 128, 500, rasterizer="numpy", samples=1)
     monkeypatch.setattr(utils, "_free", lambda device: 10**8)
     with pytest.raises(InputError, match=r"^500 views of 128 pixels per side .* need "):
         _ = scene.stacks

@@ -17,12 +17,12 @@ from augment.scene import Scene
 from augment.service import AugmentationService, AugmentationSettings
 from augment.utils import Phases, generator
 from augment.variation import VariationSettings, vary
-from renderer.camera import ring
+from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode
-from renderer.lights import ambient, probe
+from renderer.light.presets import ambient, probe
 from renderer.mesh import Mesh
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 
 SIZE = 48
 LIGHT = ambient(torch.full((3,), 0.1))
@@ -32,7 +32,7 @@ LIGHT = ambient(torch.full((3,), 0.1))
 def scene() -> Scene:
     """A plate twelve times, on black."""
     plate, settings = load_object(ObjectSettings("solid:plate", "plate")), ImageSettings(SIZE, samples=2)
-    return Scene.grid([plate], ring(12, 6.0), load_backgrounds([0.0], SIZE), LIGHT, settings, choose("software"))
+    return Scene.grid([plate], orbit_cameras(12, 6.0), load_backgrounds([0.0], SIZE), LIGHT, settings, choose("numpy"))
 
 
 def drawn(scene: Scene, seed: int = 0, **settings) -> Scene:
@@ -75,7 +75,7 @@ def test_a_scale_magnifies_about_the_middle(scene):
 
 
 def test_in_perspective_rows_are_zoomed_and_aside_and_turned_from_where_their_camera_stands():
-    scene = augment.build_scene([("solid:orange", "orange")], 16, 6, visibility="software", perspective=40.0)
+    scene = augment.build_scene([("solid:orange", "orange")], 16, 6, rasterizer="numpy", fov=40.0)
     rows = drawn(scene, shift=0.3, scale=[0.5, 1.5], azimuth=20.0)
     (before,), cameras = {view.distance for (view,) in scene.cameras}, [view for (view,) in rows.cameras]
     origins = np.concatenate([camera.project(np.zeros((1, 3))) for camera in cameras])[:, :2]
@@ -118,7 +118,7 @@ def test_instances_are_drawn_of_solids_without_a_seed_alone(scene):
     objects = [load_object(ObjectSettings(name, name)) for name in kinds]
     settings, row = ImageSettings(SIZE, samples=2), scene.examples[0]
     rows = [replace(row, object=index) for index in range(3)]
-    mixed = Scene(objects, rows, load_backgrounds([0.0], SIZE), LIGHT, settings, choose("software"))
+    mixed = Scene(objects, rows, load_backgrounds([0.0], SIZE), LIGHT, settings, choose("numpy"))
     first, second = (drawn(mixed, seed, instances=True).objects for seed in (0, 1))
     assert first[1] is objects[1] and [item.label for item in first] == kinds
     for index in (0, 2):
@@ -130,7 +130,7 @@ def test_each_view_shows_an_instance_of_its_own_before_all_backgrounds():
     """In directional light, which depends on the objects of the rows."""
     apple, settings = load_object(ObjectSettings("solid:apple", "apple")), ImageSettings(SIZE, samples=2)
     backgrounds = load_backgrounds([0.0, 1.0], SIZE)
-    grid = Scene.grid([apple, apple], ring(3, 3.0), backgrounds, LIGHT, settings, choose("software"))
+    grid = Scene.grid([apple, apple], orbit_cameras(3, 3.0), backgrounds, LIGHT, settings, choose("numpy"))
     varied = drawn(grid, instances=True, directional_fraction=0.5)
     assert [row.object for row in varied.examples] == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
     assert [row.background for row in varied.examples] == [row.background for row in grid.examples]
@@ -181,18 +181,18 @@ def test_a_fraction_of_the_examples_is_in_directional_light_and_the_rest_in_thei
 
 
 def test_a_lit_background_is_a_wall_that_faces_the_camera():
-    """It looks as the middle of a white ball does, and is white or grey in the same light."""
+    """It looks as the middle of a white ball does, and is white or gray in the same light."""
     ball = trimesh.creation.icosphere(subdivisions=4)
     settings = ImageSettings(SIZE, samples=2, encoding="srgb", normals="smooth")
     white = SceneObject("ball", Mesh.plain(ball.vertices, ball.faces, (1.0, 1.0, 1.0)))
     behind = load_backgrounds([1.0, 0.5], SIZE)
-    balls = Scene.grid([white], ring(3, 2.5), behind, probe("grace"), settings, choose("software"))
+    balls = Scene.grid([white], orbit_cameras(3, 2.5), behind, probe("grace"), settings, choose("numpy"))
     seen = decode(images(drawn(balls, lit_background=True, exposure=[0.3, 0.6])), "srgb")
     middle, corner = seen[:, :, SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1], seen[:, :, 0, 0]
     middle = middle.mean((2, 3))
-    white, grey = corner[::2], corner[1::2] / decode(torch.tensor(0.5), "srgb")
+    white, gray = corner[::2], corner[1::2] / decode(torch.tensor(0.5), "srgb")
     torch.testing.assert_close(white, middle[::2], rtol=0.01, atol=0)  # the middle is four pixels wide
-    torch.testing.assert_close(grey, middle[1::2], rtol=0.01, atol=0)
+    torch.testing.assert_close(gray, middle[1::2], rtol=0.01, atol=0)
 
 
 def test_camera_effects_act_on_the_renders(scene):

@@ -11,12 +11,12 @@ import torch
 import trimesh
 
 from benchmarks import common, lights, renderer, scene
-from renderer import sparse
 from renderer.errors import InputError
-from renderer.files.mitsuba_scene import DIFFERENTIABLE, mitsuba
+from renderer.io.mitsuba import DIFFERENTIABLE, mitsuba
 from renderer.mesh import Mesh
+from renderer.rasterizer import choose
+from renderer.transport import local as sparse
 from renderer.transport import radiosity, rays
-from renderer.visibility import choose
 
 
 def test_calls_take_turns_in_every_round(monkeypatch):
@@ -39,7 +39,7 @@ def finite(rows: list[dict[str, str]], *columns: str) -> bool:
 def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     monkeypatch.setenv("LP_NUM_THREADS", "0")
     monkeypatch.setattr(renderer, "VIEWS", 1)
-    monkeypatch.setattr(renderer, "rasterizers", lambda: (choose("software"),))
+    monkeypatch.setattr(renderer, "rasterizers", lambda: (choose("numpy"),))
     options = "--sizes 8 --vertices 42 --degrees 2 6 --samples 1 8 --rounds 1"
     renderer.main(["--out", str(tmp_path), *options.split()])
     rows = read(tmp_path / "renderer_pareto.csv")
@@ -55,14 +55,14 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
 
 def test_the_benchmarks_reference_is_what_more_samples_converge_to():
     """By Monte Carlo's rate at least: a factor of 4 in samples per side, 4 in the error."""
-    view = scene.View(scene.ellipsoid(160), 8, choose("software"))
+    view = scene.View(scene.ellipsoid(160), 8, choose("numpy"))
     exact, light = scene.Converged(view), scene.coefficients(6).float()
     errors = [exact.of_operator(view.operator(samples), light)["gradient_error"] for samples in (2, 8, 32)]
     assert errors[1] < errors[0] / 4 and errors[2] < errors[1] / 4
 
 
 def test_the_benchmarks_plain_autograd_is_the_analytic_gradient():
-    view, light = scene.View(scene.ellipsoid(160), 8, choose("software")), scene.coefficients(6)
+    view, light = scene.View(scene.ellipsoid(160), 8, choose("numpy")), scene.coefficients(6)
     first, *others = (renderer.vertex_step(view, 3, light, shade)() for shade in renderer.SHADINGS.values())
     for other in others:
         torch.testing.assert_close(other, first, rtol=0, atol=1e3 * 2.2e-16 * float(first.abs().max()))

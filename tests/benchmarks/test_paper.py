@@ -20,18 +20,18 @@ BALL = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
 SUBJECT = SceneObject("orange", Mesh.plain(BALL.vertices, BALL.faces, (0.5, 0.4, 0.3)), name="ball")
 
 
-def by_brightness(grey: float = 0.2, name: str = "source", area: slice = slice(4, 8)) -> Classifier:
-    """Calls an image an orange whose middle, or another area, is brighter than a grey."""
+def by_brightness(gray: float = 0.2, name: str = "source", area: slice = slice(4, 8)) -> Classifier:
+    """Calls an image an orange whose middle, or another area, is brighter than a gray."""
 
     def logits(images):
-        bright = 20 * (images[:, :, area, area].mean((1, 2, 3)) - grey)
+        bright = 20 * (images[:, :, area, area].mean((1, 2, 3)) - gray)
         return torch.stack([bright, -bright], dim=1)
 
     return Classifier(logits, SIZE, ("orange", "coal"), name)
 
 
 def a_scene(count: int = 3):
-    return common.scene_of(SUBJECT, SIZE, "grace", [(camera, 0.5) for camera in ring(count, 3.0)])
+    return common.scene_of(SUBJECT, SIZE, "grace", [(camera, 0.5) for camera in orbit_cameras(count, 3.0)])
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_a_script_appends_records_whose_table_has_all_rows(
 def test_adversaries_are_found_and_rendered_anew_by_the_attack_script(tmp_path, capsys):
     out = tmp_path / "records.jsonl"
     small = ["--attacks", "lighting", "--examples", "1", "--verify", "reload", "--classifier", "run:pretrained/none"]
-    short = ["attack.max_steps=1", "scene.search=0", "renderer.transport=direct", "renderer.cache=null"]
+    short = ["attack.max_steps=1", "scene.search=0", "renderer.shadows=false", "renderer.cache=null"]
     meshes = ["solid:orange:0", "{mesh: 'solid:orange:0', label: lamp}"]  # which is not recognized as a lamp
     survival.main(["--out", str(out), *small, "--meshes", *meshes, "--overrides", *short])
     orange, lamp = common.last_run(out)[1]
@@ -143,7 +143,7 @@ def test_light_without_its_negative_radiance_is_the_same_where_there_is_none():
 
 
 class Line:
-    """Images of a value's grey."""
+    """Images of a value's gray."""
 
     start = torch.tensor([[0.42], [0.92]])
 
@@ -214,8 +214,8 @@ def test_confidences_are_those_of_the_label_where_it_is_the_answer(monkeypatch):
     found = rendering_quality.confidences(SUBJECT, classifier, "grace", renders=5, seed=0)
     azimuth = 2 * math.pi * float(torch.rand((), generator=generator(0, SUBJECT.name, "quality")))
     camera = OrthographicCamera(math.pi / 3, azimuth, common.FIELDS_OF_VIEW[0])
-    for grey, confidence in zip(common.GREYS, found[0], strict=True):
-        image = common.images_of(common.scene_of(SUBJECT, SIZE, "grace", [(camera, grey)]))[:, 0]
+    for gray, confidence in zip(common.GRAYS, found[0], strict=True):
+        image = common.images_of(common.scene_of(SUBJECT, SIZE, "grace", [(camera, gray)]))[:, 0]
         share = float(classifier(image).softmax(1)[0, 0])
         expected = share if share > 0.5 else math.nan
         assert confidence == pytest.approx(expected, abs=1e-6, nan_ok=True)  # a few ε of float32

@@ -208,7 +208,7 @@ def added(count: int, index: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 @cache
 def _legendre(l: int, m: int) -> list[tuple[int, Any]]:
-    """Normalised dᵐP_l/dzᵐ as (power, 256-bit factor)."""
+    """Normalized dᵐP_l/dzᵐ as (power, 256-bit factor)."""
     norm = MP.sqrt((2 * l + 1) * (2 if m else 1) * MP.mpf(factorial(l - m)) / factorial(l + m) / (4 * MP.pi))
     return [(power, norm * _number(factor)) for power, factor in _derivative_of_legendre(l, m)]
 

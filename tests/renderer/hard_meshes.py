@@ -1,4 +1,4 @@
-"""Meshes that are hard to shade, one color per face, and a rasteriser that shows any face."""
+"""Meshes that are hard to shade, one color per face, and a rasterizer that shows any face."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,17 +8,17 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from renderer.mesh import Mesh, concatenate
-from renderer.visibility import Backend
+from renderer.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)
-class Chart(Backend):
+class Chart(Rasterizer):
     """Whose every image is a chart: sample i sees face i, however thin that is."""
 
     name: str = "chart"
     description: str = "a chart of the faces"
 
-    def rasterise(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
+    def rasterize(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
         ids = np.full((len(points), resolution**2), -1, dtype=np.int32)
         ids[:, : len(faces)] = np.arange(len(faces))
         return ids.reshape(-1, resolution, resolution)

@@ -25,21 +25,21 @@ from scipy.special import eval_legendre, sph_harm_y
 from torch import Tensor
 
 from renderer.albedo import surface_albedo
-from renderer.basis import Harmonics
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
-from renderer.harmonics import basis, basis_gradient
 from renderer.image import ImageSettings
-from renderer.lights import ambient
-from renderer.mesh import Mesh, normalise
+from renderer.light.basis import Harmonics
+from renderer.light.harmonics import basis, basis_gradient
+from renderer.light.presets import ambient
+from renderer.mesh import Mesh, normalize
+from renderer.rasterizer import Rasterizer, choose
 from renderer.shading import radiance
 from renderer.transfer import build_operators
 from renderer.transport import radiosity, rays
 from renderer.transport.surface import Surface
-from renderer.visibility import Backend, choose
 
-BACKEND = choose("software")
-CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, field_of_view=2.2)
+RASTERIZER = choose("numpy")
+CAMERA = OrthographicCamera(polar=1.0, azimuth=0.5, width=2.2)
 TOWARDS = CAMERA.axes()[2]
 SETTINGS = ImageSettings(size=16, samples=2)
 DTYPES = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
@@ -98,7 +98,7 @@ def of_meshes(subdivisions: int) -> Iterator[Condition]:
     flipped, opened = hard.painted(ball.vertices, ball.faces[:, ::-1]), hard.opened(ball)
     twice = hard.painted(ball.vertices, np.concatenate([ball.faces, ball.faces[:, ::-1]]))
     offsets = [1e6 * np.array(axis) for axis in ([1, 0, 0], [0, -1, 0], [1, -1, 1])]
-    small = Setup(replace(ball, vertices=1e-6 * ball.vertices), camera=framing(1e-6 * CAMERA.field_of_view))
+    small = Setup(replace(ball, vertices=1e-6 * ball.vertices), camera=framing(1e-6 * CAMERA.width))
     away = [replace(ball, vertices=vertices) for vertices in (ball.vertices * 1e6, ball.vertices + 1e6)]
     yield case("a dented sphere of 320 faces, radius 1", 8, [Setup(ball)], "the baseline")
     scaled = [moved(ball.vertices * 10.0**power) for power in (-6, -3, 3, 6)]
@@ -139,7 +139,7 @@ def of_thin_faces(count: int) -> Iterator[Condition]:
 
     def setup(mesh: Mesh, dtype: torch.dtype) -> Setup:
         settings = ImageSettings(size=math.ceil(math.sqrt(len(mesh.faces))), samples=1)
-        return Setup(mesh, settings=settings, backend=hard.Chart(), lift=exact, dtype=dtype)
+        return Setup(mesh, settings=settings, rasterizer=hard.Chart(), lift=exact, dtype=dtype)
 
     double = [setup(mesh, torch.float64) for mesh in heights.values()]
     reason = "rounding errors of differences and products are added back"
@@ -208,7 +208,7 @@ def of_transport() -> Iterator[Condition]:
         yield case(name, 8, [Setup(mesh)], reason, shadows_and_bounces)
     reason_of_convex = "no ray is cast; the operator of direct light"
     yield case("convex", 8, [Setup(hard.box())], reason_of_convex, by_transport)
-    small = Setup(replace(lumpy, vertices=1e-3 * lumpy.vertices), camera=framing(1e-3 * CAMERA.field_of_view))
+    small = Setup(replace(lumpy, vertices=1e-3 * lumpy.vertices), camera=framing(1e-3 * CAMERA.width))
     reason_of_scale = "rays start 1e-5 of the mesh's extent above it"
     yield case("scaled by 10⁻³, not normalized", 8, [small], reason_of_scale, shadows_and_bounces)
     yield case("closed and lumpy, float64", 8, [Setup(lumpy)], reason, double_shadows_and_bounces)
@@ -245,7 +245,7 @@ def case(
 
 
 def framing(width: float) -> OrthographicCamera:
-    return replace(CAMERA, field_of_view=width)
+    return replace(CAMERA, width=width)
 
 
 def rounded(mesh: Mesh, dtype: torch.dtype) -> Mesh:
@@ -255,7 +255,7 @@ def rounded(mesh: Mesh, dtype: torch.dtype) -> Mesh:
 def moved(vertices: np.ndarray, dtype: torch.dtype = torch.float64) -> "Setup":
     """The sphere with other vertices, rounded to a dtype: normalized for the camera, as they are for the shading."""
     mesh = rounded(replace(hard.sphere(), vertices=vertices), dtype)
-    return Setup(normalise(mesh), vertices=mesh.vertices, dtype=dtype)
+    return Setup(normalize(mesh), vertices=mesh.vertices, dtype=dtype)
 
 
 def merged(mesh: Mesh) -> np.ndarray:
@@ -284,7 +284,7 @@ class Setup:
     vertices: np.ndarray | None = None
     camera: OrthographicCamera = CAMERA
     settings: ImageSettings = SETTINGS
-    backend: Backend = BACKEND
+    rasterizer: Rasterizer = RASTERIZER
     dtype: torch.dtype = torch.float64
     lift: Callable[..., Any] = extended
 
@@ -300,13 +300,13 @@ class Setup:
         mesh, samples, lift = self.mesh, self.settings.samples, self.lift
         points = self.camera.project(mesh.vertices)
         closed = mesh.closed and bool((points[:, 2] >= -1).all())
-        [ids] = self.backend.rasterise(points[None], mesh.faces, self.settings.size * samples, closed=closed)
+        [ids] = self.rasterizer.rasterize(points[None], mesh.faces, self.settings.size * samples, closed=closed)
         albedo, vertices = mesh.corner_colors[:, 0].astype(np.float64), self.shaded().double().numpy()
         return wide.view(ids, samples, mesh.vertices, vertices, mesh.faces, albedo, self.camera.axes()[2], lift)
 
     def fragments(self) -> Fragments:
         mesh = self.mesh
-        return build_fragments(mesh.vertices, mesh.faces, [self.camera], self.settings, self.backend, mesh.closed)[0]
+        return build_fragments(mesh.vertices, mesh.faces, [self.camera], self.settings, self.rasterizer, mesh.closed)[0]
 
 
 def units(ours: Tensor, reference: np.ndarray) -> float:
@@ -334,7 +334,7 @@ def by_operator(setup: Setup, dtype: torch.dtype = torch.float32, lost: np.ndarr
     """Image and its gradient by the light, through an operator in `dtype`. lost: (P, (degree + 1)², 3) what the image
     loses to shadows per unit of each coefficient."""
     [operator] = build_operators(
-        setup.mesh, [setup.camera], setup.settings, setup.backend, basis=Harmonics(setup.degree), dtype=dtype
+        setup.mesh, [setup.camera], setup.settings, setup.rasterizer, basis=Harmonics(setup.degree), dtype=dtype
     )
     view, light = setup.view(), setup.light.to(dtype)
     upstream = random_upstream(len(view.pixels))

@@ -11,11 +11,11 @@ from scipy.ndimage import map_coordinates
 
 from renderer.albedo import face_albedo, painted_albedo, surface_albedo, textured_albedo
 from renderer.camera import OrthographicCamera
-from renderer.files.albedo_bake import with_added_albedo
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ENCODINGS, ImageSettings
+from renderer.io.texture_bake import with_added_albedo
 from renderer.mesh import Mesh, concatenate
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
 ABOVE = OrthographicCamera(0, -math.pi / 2, 2.0)  # x is right, y is up
@@ -26,7 +26,7 @@ HALVES = [[0, 1, 2], [0, 2, 3]]
 
 def view(mesh: Mesh, size: int, samples: int = 1, camera: OrthographicCamera = ABOVE) -> Fragments:
     settings = ImageSettings(size, samples)
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("software"))
+    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
     return fragments
 
 
@@ -46,7 +46,7 @@ def draw(*shape: int) -> torch.Tensor:
 
 
 def patchwork(seed: int = 0) -> Mesh:
-    """A dented sphere: two textures and bare faces, colours at all corners, UVs that wrap round."""
+    """A dented sphere: two textures and bare faces, colors at all corners, UVs that wrap round."""
     draws = np.random.default_rng(seed)
     sphere = trimesh.creation.icosphere(subdivisions=1)
     mesh = Mesh.plain(sphere.vertices * draws.uniform(0.7, 1.0, (len(sphere.vertices), 1)), sphere.faces)
@@ -72,7 +72,7 @@ def linear_of(colors: np.ndarray, encoding: str) -> np.ndarray:
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_texture_over_the_image_at_its_own_resolution_is_the_image(encoding):
-    """Every sample is a texel's centre: v starts at the bottom and texels are decoded."""
+    """Every sample is a texel's center: v starts at the bottom and texels are decoded."""
     texture = random_texture(16, 16)
     mesh = poster(texture)
     albedo = surface_albedo(mesh, view(mesh, 16), encoding)
@@ -96,7 +96,7 @@ def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repe
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_corner_colours_are_decoded_and_then_interpolated(encoding):
+def test_corner_colors_are_decoded_and_then_interpolated(encoding):
     """Over a triangle whose corners are the image's and two beyond it: weights are the coordinates."""
     colors = np.array([[0.0, 0.5, 1.0], [1.0, 0.25, 0.5], [0.125, 0.0, 0.75]])
     mesh = Mesh.plain([[-1, -1, 0], [3, -1, 0], [-1, 3, 0]], [[0, 1, 2]], colors)
@@ -107,14 +107,14 @@ def test_corner_colours_are_decoded_and_then_interpolated(encoding):
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_a_texture_multiplies_the_corner_colour(encoding):
+def test_a_texture_multiplies_the_corner_color(encoding):
     mesh = poster(np.full((3, 3, 3), 51, dtype=np.uint8), color=(1, 0.5, 0))
     expected = linear_of(np.array(0.2), encoding) * linear_of(np.array([1, 0.5, 0]), encoding)
     albedo = surface_albedo(mesh, view(mesh, 3), encoding)
     np.testing.assert_allclose(albedo, np.tile(expected, (9, 1)), rtol=16 * EPS)
 
 
-def test_concatenated_meshes_keep_their_colours():
+def test_concatenated_meshes_keep_their_colors():
     """A red, a green and a blue third side by side; the red and the blue are textures."""
     red, blue = (np.full((2, 2, 3), rgb, dtype=np.uint8) for rgb in ([255, 0, 0], [0, 0, 255]))
     thirds = [poster(red), Mesh.plain(ALL_OF_IT, HALVES, (0, 1, 0)), poster(blue)]
@@ -149,7 +149,7 @@ def test_albedo_per_texel_has_the_derivative_of_central_differences(mesh, camera
     assert torch.autograd.gradcheck(lambda *given: textured_albedo(mesh, fragments, given, "srgb"), inputs)
 
 
-def test_texels_that_no_sample_sees_have_a_gradient_of_exactly_zero_and_the_others_share_the_corner_colour():
+def test_texels_that_no_sample_sees_have_a_gradient_of_exactly_zero_and_the_others_share_the_corner_color():
     """Bilinear weights add up to one. The left half of the texture is on the image; samples lie between texels."""
     mesh = poster(np.zeros((8, 8, 3), dtype=np.uint8), UNIT_UVS * [0.5, 1], color=(0.5, 0.25, 1.0))
     texture = draw(8, 8, 3).requires_grad_(True)
@@ -217,22 +217,24 @@ def middling(colors_differ: bool) -> Mesh:
     return replace(mesh, corner_colors=colors, textures=textures)
 
 
-@pytest.mark.parametrize("gain", [1.0, 0.5, 1.2])
-def test_what_is_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped(gain):
+@pytest.mark.parametrize("albedo_scale", [1.0, 0.5, 1.2])
+def test_what_is_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped(albedo_scale):
     mesh = middling(True)
     fragments, added = view(mesh, 16, 2), 0.1 * (draw(len(mesh.faces), 3) - 0.5)
-    expected = surface_albedo(mesh, fragments, "linear") * gain + face_albedo(added, fragments)
-    torch.testing.assert_close(painted_albedo(mesh, fragments, "linear", gain, added), expected, rtol=0, atol=8 * EPS)
+    expected = surface_albedo(mesh, fragments, "linear") * albedo_scale + face_albedo(added, fragments)
+    torch.testing.assert_close(
+        painted_albedo(mesh, fragments, "linear", albedo_scale, added), expected, rtol=0, atol=8 * EPS
+    )
 
 
-@pytest.mark.parametrize("gain", [1.0, 3.0])
-def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(gain):
+@pytest.mark.parametrize("albedo_scale", [1.0, 3.0])
+def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(albedo_scale):
     mesh = patchwork()
     fragments = view(mesh, 16, 2)
     much = torch.full((len(mesh.faces), 3), 9.0, dtype=torch.float64)
-    assert (painted_albedo(mesh, fragments, "srgb", gain, -much) == 0).all()
-    most = painted_albedo(mesh, fragments, "srgb", gain, much)
-    assert most.min() >= 1 - 4 * EPS and most.max() <= gain * (1 + 4 * EPS)
+    assert (painted_albedo(mesh, fragments, "srgb", albedo_scale, -much) == 0).all()
+    most = painted_albedo(mesh, fragments, "srgb", albedo_scale, much)
+    assert most.min() >= 1 - 4 * EPS and most.max() <= albedo_scale * (1 + 4 * EPS)
 
 
 def test_the_derivative_by_what_is_added_is_that_of_finite_differences():
@@ -243,38 +245,40 @@ def test_the_derivative_by_what_is_added_is_that_of_finite_differences():
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_the_gain_that_is_left_is_no_larger_than_the_lightest_colour_needs(encoding):
+def test_the_gain_that_is_left_is_no_larger_than_the_lightest_color_needs(encoding):
     """So that a dark texture, which a large gain brightens, loses little to 8 bits."""
     texture = random_texture(16, 16) // 3
     mesh, added = poster(texture, color=(0.9, 0.5, 0.7)), np.zeros((2, 3))
     lightest = float(linear_of(texture / 255, encoding).max() * linear_of(np.array(0.9), encoding))
-    painted, gain = with_added_albedo(mesh, added, encoding, 4 / lightest)
-    assert gain == pytest.approx(4, rel=1e-5) and painted.textures[0].max() <= 255
+    painted, albedo_scale = with_added_albedo(mesh, added, encoding, 4 / lightest)
+    assert albedo_scale == pytest.approx(4, rel=1e-5) and painted.textures[0].max() <= 255
     assert with_added_albedo(mesh, added, encoding, 0.5 / lightest)[1] == 1
 
 
-@pytest.mark.parametrize(("encoding", "gain"), [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)])
-def test_colours_and_textures_hold_what_was_added(encoding, gain):
-    """Colours at corners to float32; texels, in which no colours vary, to half of a step of 8 bits, encoded."""
+@pytest.mark.parametrize(("encoding", "albedo_scale"), [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)])
+def test_colors_and_textures_hold_what_was_added(encoding, albedo_scale):
+    """Colors at corners to float32; texels, in which no colors vary, to half of a step of 8 bits, encoded."""
     mesh = patchwork()
     even = mesh.corner_colors[:, :1].repeat(3, axis=1)
     mesh = replace(mesh, corner_colors=np.where((mesh.texture_ids >= 0)[:, None, None], even, mesh.corner_colors))
     added = 0.6 * (draw(len(mesh.faces), 3) - 0.5)
-    painted, new_gain = with_added_albedo(mesh, added.numpy(), encoding, gain)
-    assert 1 <= new_gain <= max(1, gain)
+    painted, new_albedo_scale = with_added_albedo(mesh, added.numpy(), encoding, albedo_scale)
+    assert 1 <= new_albedo_scale <= max(1, albedo_scale)
     bare = torch.from_numpy(mesh.texture_ids < 0)
-    step = {"linear": 0.5 / 255, "srgb": 0.5 / 255 * 2.4 / 1.055}[encoding] * new_gain  # the curve's steepest, at 1
+    step = {"linear": 0.5 / 255, "srgb": 0.5 / 255 * 2.4 / 1.055}[
+        encoding
+    ] * new_albedo_scale  # the curve's steepest, at 1
     for polar in (0.3, 1.5, 2.8):
         fragments = view(mesh, 24, 2, OrthographicCamera(polar, polar, 2.0))
-        expected = painted_albedo(mesh, fragments, encoding, gain, added)
-        off = (surface_albedo(painted, fragments, encoding) * new_gain - expected).abs().amax(1)
+        expected = painted_albedo(mesh, fragments, encoding, albedo_scale, added)
+        off = (surface_albedo(painted, fragments, encoding) * new_albedo_scale - expected).abs().amax(1)
         without = bare[fragments.faces][fragments.face]
         assert without.any() and not without.all()
         assert off[without].max() < 1e-6 and off[~without].max() < step + 1e-5
 
 
-def test_corners_of_different_colours_are_painted_into_the_texels_between_them():
-    """A texture of one colour, under a blend of four: the blend, to what texels can tell."""
+def test_corners_of_different_colors_are_painted_into_the_texels_between_them():
+    """A texture of one color, under a blend of four: the blend, to what texels can tell."""
     mesh = poster(
         np.full((64, 64, 3), 255, np.uint8), color=np.array([[0.2] * 3, [0.9, 0.2, 0.2], [0.8] * 3, [0.4] * 3])
     )

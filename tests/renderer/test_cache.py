@@ -14,19 +14,19 @@ import torch
 
 from renderer import cache as cache_module
 from renderer import transfer
-from renderer.basis import Harmonics
 from renderer.cache import OperatorCache, TensorCache, cache_folder, content_key, source_key
-from renderer.camera import OrthographicCamera, ring
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.image import ImageSettings
-from renderer.mesh import Mesh, normalise
+from renderer.light.basis import Harmonics
+from renderer.mesh import Mesh, normalize
+from renderer.rasterizer import Rasterizer, choose, software
 from renderer.shapes import solid
-from renderer.transfer import Operator, build_operators
-from renderer.visibility import Backend, choose, software
+from renderer.transfer import TransferOperator, build_operators
 
-BACKEND = choose("software")
+RASTERIZER = choose("numpy")
 SETTINGS = ImageSettings(size=8, samples=2)
 CAMERA = OrthographicCamera(1.0, 0.5, 2.0)
-PLATE = normalise(solid("plate"))
+PLATE = normalize(solid("plate"))
 KEY = "a key"
 TENSORS = {
     "ratios": torch.tensor([[0.1, -0.0], [float("inf"), 1e-45]]),
@@ -46,14 +46,14 @@ def textured(texels: np.ndarray) -> Mesh:
 TEXELS = np.random.default_rng(0).integers(0, 256, (4, 4, 3), dtype=np.uint8)
 TEXTURED = textured(TEXELS)
 MESHES = {
-    "open, one colour": Mesh.plain([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], [[0, 1, 2]], color=(0.2, 0.5, 0.7)),
-    "closed, many colours": PLATE,
+    "open, one color": Mesh.plain([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], [[0, 1, 2]], color=(0.2, 0.5, 0.7)),
+    "closed, many colors": PLATE,
     "textured": TEXTURED,
     "out of the image": replace(TEXTURED, vertices=TEXTURED.vertices + np.array([0, 0, 9])),
 }
 
 
-def same(first: list[Operator], second: list[Operator]) -> bool:
+def same(first: list[TransferOperator], second: list[TransferOperator]) -> bool:
     return all(
         a.basis == b.basis
         and all(torch.equal(getattr(a, name), getattr(b, name)) for name in transfer.TENSORS)
@@ -66,58 +66,58 @@ def same(first: list[Operator], second: list[Operator]) -> bool:
 
 
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
-def test_a_second_run_builds_nothing_and_has_the_same_operators_to_the_bit(mesh, tmp_path, rasterised):
-    cameras = ring(3, 2.0)
-    expected = build_operators(mesh, cameras, SETTINGS, BACKEND, 1.5)
-    rasterised.clear()
+def test_a_second_run_builds_nothing_and_has_the_same_operators_to_the_bit(mesh, tmp_path, rasterized):
+    cameras = orbit_cameras(3, 2.0)
+    expected = build_operators(mesh, cameras, SETTINGS, RASTERIZER, 1.5)
+    rasterized.clear()
     for built, calls in [(3, [3]), (0, [3]), (0, [3])]:
         cache = OperatorCache(tmp_path)
-        assert same(cache.operators(mesh, cameras, SETTINGS, BACKEND, 1.5), expected)
-        assert (cache.tally["built"], cache.tally["views"], rasterised) == (built, 3, calls)
+        assert same(cache.operators(mesh, cameras, SETTINGS, RASTERIZER, 1.5), expected)
+        assert (cache.tally["built"], cache.tally["views"], rasterized) == (built, 3, calls)
 
 
 @pytest.mark.parametrize("options", [{"basis": Harmonics(2)}, {"dtype": torch.float64}])
 def test_operators_of_another_degree_or_dtype_come_back_as_such(options, tmp_path):
-    expected = build_operators(PLATE, [CAMERA], SETTINGS, BACKEND, **options)
+    expected = build_operators(PLATE, [CAMERA], SETTINGS, RASTERIZER, **options)
     for _ in range(2):
-        assert same(OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, BACKEND, **options), expected)
+        assert same(OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, RASTERIZER, **options), expected)
 
 
-def test_rings_share_the_views_that_they_have_in_common(tmp_path, rasterised):
+def test_rings_share_the_views_that_they_have_in_common(tmp_path, rasterized):
     """Every other view of 10 is one of 5; the order is that of the cameras."""
-    ten, five = ring(10, 2.0), ring(5, 2.0)
-    OperatorCache(tmp_path).operators(PLATE, five, SETTINGS, BACKEND)
+    ten, five = orbit_cameras(10, 2.0), orbit_cameras(5, 2.0)
+    OperatorCache(tmp_path).operators(PLATE, five, SETTINGS, RASTERIZER)
     cache = OperatorCache(tmp_path)
-    everything = cache.operators(PLATE, ten, SETTINGS, BACKEND)
-    assert rasterised == [5, 5] and cache.tally["views"] == 2 * cache.tally["built"] == 10
-    assert same(everything, build_operators(PLATE, ten, SETTINGS, BACKEND))
+    everything = cache.operators(PLATE, ten, SETTINGS, RASTERIZER)
+    assert rasterized == [5, 5] and cache.tally["views"] == 2 * cache.tally["built"] == 10
+    assert same(everything, build_operators(PLATE, ten, SETTINGS, RASTERIZER))
     cache = OperatorCache(tmp_path)
-    assert same(cache.operators(PLATE, five, SETTINGS, BACKEND), everything[::2]) and cache.tally["built"] == 0
+    assert same(cache.operators(PLATE, five, SETTINGS, RASTERIZER), everything[::2]) and cache.tally["built"] == 0
 
 
-def test_a_view_asked_for_twice_is_built_once(rasterised):
-    first, second = OperatorCache().operators(PLATE, [CAMERA, CAMERA], SETTINGS, BACKEND)
-    assert rasterised == [1] and same([first], [second])
+def test_a_view_asked_for_twice_is_built_once(rasterized):
+    first, second = OperatorCache().operators(PLATE, [CAMERA, CAMERA], SETTINGS, RASTERIZER)
+    assert rasterized == [1] and same([first], [second])
 
 
 @pytest.mark.parametrize("folder", [True, False])
-def test_without_a_folder_every_run_builds(folder, tmp_path, monkeypatch, rasterised):
+def test_without_a_folder_every_run_builds(folder, tmp_path, monkeypatch, rasterized):
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
-        OperatorCache(tmp_path / "kept" if folder else None).operators(PLATE, [CAMERA], SETTINGS, BACKEND)
-    assert rasterised == ([1] if folder else [1, 1])
+        OperatorCache(tmp_path / "kept" if folder else None).operators(PLATE, [CAMERA], SETTINGS, RASTERIZER)
+    assert rasterized == ([1] if folder else [1, 1])
     assert [path.name for path in tmp_path.iterdir()] == (["kept"] if folder else [])
 
 
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 def test_the_tally_counts_faces_and_closed_meshes_alike_whether_built_or_loaded(mesh, tmp_path):
-    cameras = ring(4, 2.0)
+    cameras = orbit_cameras(4, 2.0)
     points = np.stack([camera.project(mesh.vertices) for camera in cameras])
-    views = BACKEND.rasterise(points, mesh.faces, SETTINGS.size * SETTINGS.samples)
+    views = RASTERIZER.rasterize(points, mesh.faces, SETTINGS.size * SETTINGS.samples)
     unseen = sum(len(set(range(len(mesh.faces))) - set(view.flat)) for view in views)
     for built in (4, 0):
         cache = OperatorCache(tmp_path)
-        cache.operators(mesh, cameras, SETTINGS, BACKEND)
+        cache.operators(mesh, cameras, SETTINGS, RASTERIZER)
         faces, closed = 4 * len(mesh.faces), 4 * (mesh is PLATE)
         assert cache.tally == dict(views=4, built=built, faces=faces, unseen_faces=unseen, closed=closed)
 
@@ -136,33 +136,35 @@ CHANGES = {
     "a texture's shape": {"mesh": textured(TEXELS.reshape(2, 8, 3))},
     "a vertex, by one rounding": {"mesh": replace(TEXTURED, vertices=moved(TEXTURED.vertices, (2, 1), 2.0**-52))},
     "a face": {"mesh": replace(TEXTURED, faces=TEXTURED.faces[:, [1, 2, 0]])},
-    "a corner's colour": {"mesh": replace(TEXTURED, corner_colors=moved(TEXTURED.corner_colors, (0, 0, 0), -0.1))},
+    "a corner's color": {"mesh": replace(TEXTURED, corner_colors=moved(TEXTURED.corner_colors, (0, 0, 0), -0.1))},
     "a corner's texel": {"mesh": replace(TEXTURED, corner_uvs=moved(TEXTURED.corner_uvs, (0, 0, 0), 0.1))},
     "no texture": {"mesh": replace(TEXTURED, texture_ids=np.full(1, -1, np.int32))},
     "another texture beside": {"mesh": replace(TEXTURED, textures=(TEXELS, TEXELS))},
     "the polar angle": {"camera": replace(CAMERA, polar=np.nextafter(CAMERA.polar, 2))},
     "the azimuth": {"camera": replace(CAMERA, azimuth=np.nextafter(CAMERA.azimuth, 1))},
-    "the field of view": {"camera": replace(CAMERA, field_of_view=2.1)},
+    "the field of view": {"camera": replace(CAMERA, width=2.1)},
     "the size": {"settings": replace(SETTINGS, size=9)},
     "the samples": {"settings": replace(SETTINGS, samples=3)},
     "the encoding": {"settings": replace(SETTINGS, encoding="srgb")},
-    "the transport": {"settings": replace(SETTINGS, transport="shadows")},
-    "the gain": {"gain": 1.1},
+    "the transport": {"settings": replace(SETTINGS, shadows=True)},
+    "the gain": {"albedo_scale": 1.1},
     "the basis": {"basis": Harmonics(2)},
     "the dtype": {"dtype": torch.float64},
-    "the back end": {"backend": Backend("other", BACKEND.description)},
+    "the back end": {"rasterizer": Rasterizer("other", RASTERIZER.description)},
     "the renderer's code": {"code": "other"},
 }
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "renderer.visibility.other", software)
+    monkeypatch.setitem(sys.modules, "renderer.rasterizer.other", software)
 
-    def built(mesh=TEXTURED, camera=CAMERA, settings=SETTINGS, backend=BACKEND, code=cache_module.RENDERER, **options):
+    def built(
+        mesh=TEXTURED, camera=CAMERA, settings=SETTINGS, rasterizer=RASTERIZER, code=cache_module.RENDERER, **options
+    ):
         monkeypatch.setattr(cache_module, "RENDERER", code)
         cache = OperatorCache(tmp_path)
-        cache.operators(mesh, [camera], settings, backend, **options)
+        cache.operators(mesh, [camera], settings, rasterizer, **options)
         return cache.tally["built"]
 
     assert built() == 1
@@ -172,10 +174,10 @@ def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, 
 
 def test_equal_contents_are_one_key_wherever_they_lie(tmp_path):
     cache = OperatorCache(tmp_path)
-    cache.operators(TEXTURED, [CAMERA], SETTINGS, BACKEND)
+    cache.operators(TEXTURED, [CAMERA], SETTINGS, RASTERIZER)
     strided = replace(textured(np.asfortranarray(TEXELS)), vertices=TEXTURED.vertices.repeat(2, axis=0)[::2])
-    described = replace(BACKEND, description="on another machine")
-    cache.operators(strided, [replace(CAMERA)], replace(SETTINGS), described, gain=1)
+    described = replace(RASTERIZER, description="on another machine")
+    cache.operators(strided, [replace(CAMERA)], replace(SETTINGS), described, albedo_scale=1)
     assert (cache.tally["built"], cache.tally["views"]) == (1, 2)
 
 
@@ -210,7 +212,7 @@ def test_any_change_of_the_sources_is_another_key(tmp_path):
     shutil.copytree(Path(cache_module.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     assert source_key(package) == cache_module.RENDERER
     keys = {source_key(package)}
-    module = package / "visibility" / "software.py"
+    module = package / "rasterizer" / "software.py"
     module.write_text(module.read_text() + "\n")
     keys.add(source_key(package))
     module.rename(package / "software.py")
@@ -274,13 +276,13 @@ def test_a_file_under_another_key_is_not_taken_for_the_file(kept):
 
 @pytest.mark.parametrize("kind", damaged(bytes(64)))
 def test_a_damaged_file_is_built_anew_and_written_over(kind, tmp_path):
-    expected = OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, BACKEND)
+    expected = OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, RASTERIZER)
     (path,) = tmp_path.iterdir()
     content = path.read_bytes()
     path.write_bytes(damaged(content)[kind])
     for built in (1, 0):
         cache = OperatorCache(tmp_path)
-        assert same(cache.operators(PLATE, [CAMERA], SETTINGS, BACKEND), expected)
+        assert same(cache.operators(PLATE, [CAMERA], SETTINGS, RASTERIZER), expected)
         assert (cache.tally["built"], cache.problem) == (built, None)
     assert path.read_bytes() == content
 
@@ -311,8 +313,8 @@ def test_a_full_disk_stops_no_run_and_is_tried_once(tmp_path, monkeypatch):
     tries = []
     monkeypatch.setattr(Path, "write_bytes", lambda *arguments: tries.append(1) or full())
     cache = OperatorCache(tmp_path)
-    operators = cache.operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND)
-    assert same(operators, build_operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND))
+    operators = cache.operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER)
+    assert same(operators, build_operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER))
     assert "No space left on device" in cache.problem and len(tries) == 1
     assert not list(tmp_path.iterdir())
 
@@ -321,34 +323,37 @@ def test_a_full_disk_stops_no_run_and_is_tried_once(tmp_path, monkeypatch):
 def test_a_folder_that_cannot_be_made_stops_no_run(place, tmp_path):
     (tmp_path / "file").touch()
     cache = OperatorCache(tmp_path / "file" / place)
-    operators = cache.operators(PLATE, [CAMERA], SETTINGS, BACKEND)
-    assert same(operators, build_operators(PLATE, [CAMERA], SETTINGS, BACKEND))
+    operators = cache.operators(PLATE, [CAMERA], SETTINGS, RASTERIZER)
+    assert same(operators, build_operators(PLATE, [CAMERA], SETTINGS, RASTERIZER))
     assert str(tmp_path / "file") in cache.problem
 
 
 def test_a_folder_that_is_deleted_between_two_views_or_while_one_is_written_stops_no_run(tmp_path, monkeypatch):
-    cache, expected = OperatorCache(tmp_path / "cache"), build_operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND)
-    cache.operators(PLATE, ring(3, 2.0)[:1], SETTINGS, BACKEND)
+    cache, expected = (
+        OperatorCache(tmp_path / "cache"),
+        build_operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER),
+    )
+    cache.operators(PLATE, orbit_cameras(3, 2.0)[:1], SETTINGS, RASTERIZER)
     shutil.rmtree(cache.folder)
-    assert same(cache.operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND), expected) and cache.problem is None
+    assert same(cache.operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER), expected) and cache.problem is None
     shutil.rmtree(cache.folder)
     whole = Path.write_bytes
     monkeypatch.setattr(Path, "write_bytes", lambda path, content: shutil.rmtree(cache.folder) or whole(path, content))
-    assert same(cache.operators(PLATE, ring(3, 2.0), SETTINGS, BACKEND), expected)
+    assert same(cache.operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER), expected)
     assert "No such file" in cache.problem and not cache.folder.exists()
 
 
 def test_runs_may_share_a_folder_at_once(tmp_path):
-    cameras = ring(3, 2.0)
+    cameras = orbit_cameras(3, 2.0)
 
-    def run(_) -> list[Operator]:
-        return OperatorCache(tmp_path).operators(PLATE, cameras, SETTINGS, BACKEND)
+    def run(_) -> list[TransferOperator]:
+        return OperatorCache(tmp_path).operators(PLATE, cameras, SETTINGS, RASTERIZER)
 
     with ThreadPoolExecutor(4) as pool:
         runs = list(pool.map(run, range(8)))
     assert all(same(runs[0], other) for other in runs)
     cache = OperatorCache(tmp_path)
-    cache.operators(PLATE, cameras, SETTINGS, BACKEND)
+    cache.operators(PLATE, cameras, SETTINGS, RASTERIZER)
     assert cache.tally["views"] - cache.tally["built"] == 3 == len(list(tmp_path.iterdir()))
 
 

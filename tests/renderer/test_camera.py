@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 
 from renderer.cache import content_key
-from renderer.camera import OrthographicCamera, PerspectiveCamera, ring
+from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
 
 EPS = np.finfo(np.float64).eps
-CAMERAS = [*ring(7, 2.0), OrthographicCamera(0, 0, 2.0), OrthographicCamera(math.pi, 1, 3.0)]
+CAMERAS = [*orbit_cameras(7, 2.0), OrthographicCamera(0, 0, 2.0), OrthographicCamera(math.pi, 1, 3.0)]
 
 
 def test_a_ring_has_equal_azimuths_from_0_at_the_papers_polar_angle():
-    cameras = ring(10, 2.5)
+    cameras = orbit_cameras(10, 2.5)
     assert [camera.polar for camera in cameras] == [math.pi / 3] * 10
-    assert {camera.field_of_view for camera in cameras} == {2.5}
+    assert {camera.width for camera in cameras} == {2.5}
     azimuths = np.unwrap([math.atan2(*camera.axes()[2, 1::-1]) for camera in cameras])
     np.testing.assert_allclose(azimuths, np.arange(10) * math.pi / 5, rtol=0, atol=8 * EPS)
     np.testing.assert_allclose([camera.axes()[2, 2] for camera in cameras], 0.5, rtol=2 * EPS)
@@ -28,7 +28,7 @@ def test_right_up_and_back_are_right_handed_and_orthonormal(camera):
     np.testing.assert_allclose(np.cross(axes[0], axes[1]), axes[2], atol=4 * EPS)
 
 
-@pytest.mark.parametrize("camera", ring(7, 2.0))
+@pytest.mark.parametrize("camera", orbit_cameras(7, 2.0))
 def test_world_z_points_straight_up_in_the_image(camera):
     (x, y, _) = camera.project(np.array([[0.0, 0.0, 1.0]]))[0]
     assert x == 0
@@ -37,7 +37,7 @@ def test_world_z_points_straight_up_in_the_image(camera):
 
 def test_a_point_lands_where_it_does_by_hand():
     """From θ = π/3 on the +x side: right is +y, up is (-1/2, 0, √3/2) and back is (√3/2, 0, 1/2)."""
-    camera = OrthographicCamera(math.pi / 3, 0, field_of_view=4.0)
+    camera = OrthographicCamera(math.pi / 3, 0, width=4.0)
     points = np.array([[1.0, 1.0, 1.0], [0.5, -0.25, 0.0], [0.0, 0.0, 0.0]])
     half, root = 0.5, math.sqrt(3) / 2
     expected = [[half, (root - half) / 2, -(root + half) / 2], [-0.125, -0.125, -root / 4], [0, 0, 0]]
@@ -54,7 +54,7 @@ def test_from_each_side_the_right_is_right(azimuth, rightwards):
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_depth_is_smaller_where_nearer_and_fits_every_normalised_mesh(camera):
+def test_depth_is_smaller_where_nearer_and_fits_every_normalized_mesh(camera):
     towards = camera.axes()[2]
     near, far = camera.project(np.stack([towards, -towards]))
     assert near[2] < 0 < far[2]
@@ -75,8 +75,8 @@ def test_a_camera_that_sees_a_radius_has_it_between_its_planes_and_at_the_same_p
 
 @pytest.mark.parametrize("width", [0.0, -2.0, math.nan])
 def test_a_image_without_width_is_refused(width):
-    with pytest.raises(InputError, match="field_of_view"):
-        ring(3, width)
+    with pytest.raises(InputError, match="width"):
+        orbit_cameras(3, width)
 
 
 def test_a_place_moves_the_image_by_world_units_and_not_the_depth():
@@ -121,7 +121,7 @@ def test_in_perspective_depth_is_smaller_where_nearer_from_the_near_plane_to_the
 
 @pytest.mark.parametrize("camera", CLOSE)
 def test_in_perspective_planes_stay_planes_in_depth_and_lines_lines_in_the_image(camera):
-    """As rasterisers, which interpolate depth across the image, need it."""
+    """As rasterizers, which interpolate depth across the image, need it."""
     a, b, c = np.random.default_rng(0).uniform(-1, 1, (3, 3))
     shares = np.random.default_rng(1).dirichlet(np.ones(3), 8)
     plane = camera.project(np.vstack([a, b, c, shares @ [a, b, c]]))
@@ -132,10 +132,10 @@ def test_in_perspective_planes_stay_planes_in_depth_and_lines_lines_in_the_image
 
 @pytest.mark.parametrize("distance", [0.5, 1.0, 1.731])
 def test_a_camera_within_or_before_the_mesh_is_refused_in_one_sentence(distance):
-    """A normalised mesh ends √3 from the origin."""
+    """A normalized mesh ends √3 from the origin."""
     camera = PerspectiveCamera(math.acos(1 / math.sqrt(3)), math.pi / 4, 2.0, distance=distance)
     corner = np.ones((1, 3))
-    with pytest.raises(InputError, match=r"distance .*scene\.perspective.*normalise the mesh$") as refused:
+    with pytest.raises(InputError, match=r"distance .*scene\.perspective.*normalize the mesh$") as refused:
         camera.project(corner)
     assert "\n" not in str(refused.value)
     assert np.isfinite(replace(camera, distance=1.8).project(corner)).all()
@@ -150,11 +150,11 @@ def test_a_distance_that_is_none_is_refused(distance):
 @pytest.mark.parametrize("angle", [0.0, -0.5, math.pi, math.nan])
 def test_an_angle_that_is_none_is_refused(angle):
     with pytest.raises(InputError, match=r"a camera's perspective=.* must be at least"):
-        ring(1, 2.0, perspective=angle)
+        orbit_cameras(1, 2.0, fov=angle)
 
 
 def test_cameras_of_two_kinds_or_distances_are_never_taken_for_one():
     """They are keys of what is kept of a view, here and on disk."""
-    place = {"polar": 1.0, "azimuth": 0.4, "field_of_view": 2.0}
+    place = {"polar": 1.0, "azimuth": 0.4, "width": 2.0}
     cameras = [OrthographicCamera(**place), *(PerspectiveCamera(**place, distance=each) for each in (4.0, 5.0))]
     assert len(set(cameras)) == len({content_key(camera) for camera in cameras}) == 3

@@ -11,18 +11,18 @@ from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError, require_bounded, require_finite
 from renderer.fragments import build_fragments
-from renderer.harmonics import basis, basis_gradient, project, rotate
-from renderer.image import ImageSettings, develop
+from renderer.image import ImageSettings, tonemap
+from renderer.light.harmonics import basis, basis_gradient, project, rotate
 from renderer.mesh import Mesh
 from renderer.normals import face_normals, vertex_normals
+from renderer.rasterizer import choose
 from renderer.shading import irradiance, radiance
 from renderer.transfer import build_operators
-from renderer.visibility import choose
 
 MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-CAMERA, SETTINGS, BACKEND = OrthographicCamera(0, 0, 2.0), ImageSettings(2, 2), choose("software")
-[FRAGMENTS] = build_fragments(MESH.vertices, MESH.faces, [CAMERA], SETTINGS, BACKEND)
-[OPERATOR] = build_operators(MESH, [CAMERA], SETTINGS, BACKEND)
+CAMERA, SETTINGS, RASTERIZER = OrthographicCamera(0, 0, 2.0), ImageSettings(2, 2), choose("numpy")
+[FRAGMENTS] = build_fragments(MESH.vertices, MESH.faces, [CAMERA], SETTINGS, RASTERIZER)
+[OPERATOR] = build_operators(MESH, [CAMERA], SETTINGS, RASTERIZER)
 FACES = torch.from_numpy(MESH.faces)
 GOOD = {
     "vertices": torch.from_numpy(MESH.vertices),
@@ -48,7 +48,7 @@ FINITE = [  # the tensor's name, a good one, who takes it: positions and directi
     ("rotation", torch.eye(3), lambda x: rotate(torch.ones(9, 3), x)),
     ("vertices", torch.ones(4, 3), lambda x: face_normals(x, FACES)),
     ("vertices", torch.ones(4, 3), lambda x: vertex_normals(x, FACES)),
-    ("vertices", torch.ones(4, 3), lambda x: build_fragments(x.numpy(), MESH.faces, [CAMERA], SETTINGS, BACKEND)),
+    ("vertices", torch.ones(4, 3), lambda x: build_fragments(x.numpy(), MESH.faces, [CAMERA], SETTINGS, RASTERIZER)),
     ("vertices", GOOD["vertices"], lambda x: lit(None, "vertices", x)),
     ("vertices", GOOD["vertices"], lambda x: lit(FACES, "vertices", x)),
     ("normals", torch.ones(2, 3), lambda x: irradiance(x, torch.ones(9, 3))),
@@ -61,12 +61,12 @@ BOUNDED = [  # what is multiplied with each other
     ("light", GOOD["light"], lambda x: lit(None, "light", x)),
     ("albedo", GOOD["albedo"], lambda x: lit(None, "albedo", x)),
     ("albedo", GOOD["albedo"], lambda x: lit(FACES, "albedo", x)),
-    ("gain", torch.ones(1), lambda x: build_operators(MESH, [CAMERA], SETTINGS, BACKEND, gain=x.item())),
+    ("albedo_scale", torch.ones(1), lambda x: build_operators(MESH, [CAMERA], SETTINGS, RASTERIZER, albedo_scale=x.item())),
     ("lights", torch.ones(2, 49, 3), OPERATOR.radiance),
     ("radiance_gradient", torch.ones(2, 3, 4), OPERATOR.light_gradient),
-    ("radiance", torch.ones(3, 4), lambda x: develop(x, torch.ones(1, 4), torch.ones(3, 1))),
-    ("coverage", torch.ones(1, 4), lambda x: develop(torch.ones(3, 4), x, torch.ones(3, 1))),
-    ("background", torch.ones(3, 1), lambda x: develop(torch.ones(3, 4), torch.ones(1, 4), x)),
+    ("radiance", torch.ones(3, 4), lambda x: tonemap(x, torch.ones(1, 4), torch.ones(3, 1))),
+    ("coverage", torch.ones(1, 4), lambda x: tonemap(torch.ones(3, 4), x, torch.ones(3, 1))),
+    ("background", torch.ones(3, 1), lambda x: tonemap(torch.ones(3, 4), torch.ones(1, 4), x)),
 ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""What a view sees of a mesh, against loops over the rasterised image."""
+"""What a view sees of a mesh, against loops over the rasterized image."""
 
 from dataclasses import fields, replace
 
@@ -7,13 +7,13 @@ import pytest
 import torch
 import trimesh
 
-from renderer.camera import OrthographicCamera, ring
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
-BACKEND = choose("software")
+RASTERIZER = choose("numpy")
 CAMERA = OrthographicCamera(1.0, 0.4, 2.2)
 CAMERAS = [CAMERA, OrthographicCamera(2.5, -2.0, 1.6)]
 
@@ -31,7 +31,7 @@ def open_shell() -> tuple[np.ndarray, np.ndarray]:
 
 
 def fragments_of(mesh, settings: ImageSettings, camera: OrthographicCamera = CAMERA, closed: bool = False) -> Fragments:
-    [fragments] = build_fragments(*mesh, [camera], settings, BACKEND, closed)
+    [fragments] = build_fragments(*mesh, [camera], settings, RASTERIZER, closed)
     return fragments
 
 
@@ -47,7 +47,7 @@ def test_the_samples_are_those_of_the_image_pixel_by_pixel(size, samples, camera
     vertices, faces = open_shell()
     fragments = fragments_of((vertices, faces), ImageSettings(size, samples), camera)
     points, resolution = camera.project(vertices), size * samples
-    ids = BACKEND.rasterise(points[None], faces, resolution)[0]
+    ids = RASTERIZER.rasterize(points[None], faces, resolution)[0]
     seen = sorted(set(ids[ids >= 0]))
     expected = []
     for pixel in range(size**2):
@@ -124,8 +124,8 @@ def test_merging_adds_up_the_albedo_of_a_face_in_a_pixel(size, samples):
 
 
 def test_each_view_is_what_it_is_alone():
-    mesh, settings, cameras = open_shell(), ImageSettings(6, 2), ring(3, 2.0)
-    for camera, view in zip(cameras, build_fragments(*mesh, cameras, settings, BACKEND), strict=True):
+    mesh, settings, cameras = open_shell(), ImageSettings(6, 2), orbit_cameras(3, 2.0)
+    for camera, view in zip(cameras, build_fragments(*mesh, cameras, settings, RASTERIZER), strict=True):
         assert_same(view, fragments_of(mesh, settings, camera))
 
 
@@ -135,7 +135,7 @@ def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(camera):
     whole, culled = (fragments_of(dented_sphere(), settings, camera, closed) for closed in (False, True))
     assert torch.equal(culled.pixels, whole.pixels) and torch.equal(culled.coverage, whole.coverage)
     assert (culled.facing == 1).all()
-    # Only along the outline may a face turned away be as near as its neighbour.
+    # Only along the outline may a face turned away be as near as its neighbor.
     assert (culled.faces[culled.face] != whole.faces[whole.face]).double().mean() < 0.01
 
 

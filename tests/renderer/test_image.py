@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from renderer.errors import InputError
-from renderer.image import ENCODINGS, ImageSettings, behind, clamped, decode, develop, encode
+from renderer.image import ENCODINGS, ImageSettings, background_term, clamped, decode, encode, tonemap
 
 EPS = torch.finfo(torch.float64).eps
 
@@ -27,21 +27,21 @@ def share(coverage: float) -> torch.Tensor:
     return torch.full((1, 1), coverage, dtype=torch.float64)
 
 
-def grey(value: float) -> torch.Tensor:
+def gray(value: float) -> torch.Tensor:
     return torch.full((1, 1), value, dtype=torch.float64)
 
 
 def composite(radiance: torch.Tensor, coverage: torch.Tensor, background: torch.Tensor, encoding: str) -> torch.Tensor:
-    return radiance + behind(coverage, background, encoding)
+    return radiance + background_term(coverage, background, encoding)
 
 
 def test_the_surface_lies_over_the_background_by_its_coverage():
-    image = develop(pixel(0.1, 0.2, 0.3), share(0.25), grey(0.4))
+    image = tonemap(pixel(0.1, 0.2, 0.3), share(0.25), gray(0.4))
     torch.testing.assert_close(image, pixel(0.4, 0.5, 0.6), rtol=4 * EPS, atol=0)
 
 
 def test_under_srgb_the_compositing_is_linear():
-    image = develop(pixel(0.1, 0.2, 0.3), share(0.25), grey(0.5), "srgb")
+    image = tonemap(pixel(0.1, 0.2, 0.3), share(0.25), gray(0.5), "srgb")
     expected = pixel(*(srgb_of(surface + 0.75 * linear_of(0.5)) for surface in (0.1, 0.2, 0.3)))
     torch.testing.assert_close(image, expected, rtol=8 * EPS, atol=0)
 
@@ -49,29 +49,29 @@ def test_under_srgb_the_compositing_is_linear():
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_the_clamp_comes_last(encoding):
     """Half a pixel at radiance 1.5, -0.4 and 2.5: clamped before compositing, the first two would be 0.5 and 0.5."""
-    image = develop(pixel(0.75, -0.2, 1.25), share(0.5), pixel(0, 1, 1), encoding)
+    image = tonemap(pixel(0.75, -0.2, 1.25), share(0.5), pixel(0, 1, 1), encoding)
     composite = pixel(0.75, 0.3, 1.0)
     torch.testing.assert_close(image, encode(composite, encoding), rtol=4 * EPS, atol=0)
 
 
-def test_colour_backgrounds_and_batches_broadcast():
+def test_color_backgrounds_and_batches_broadcast():
     draws = torch.Generator().manual_seed(0)
     radiance = torch.rand(2, 1, 3, 5, generator=draws, dtype=torch.float64) / 2
     coverage = torch.rand(2, 1, 1, 5, generator=draws, dtype=torch.float64)
     background = torch.rand(4, 3, 1, generator=draws, dtype=torch.float64)
-    images = develop(radiance, coverage, background, "srgb")
+    images = tonemap(radiance, coverage, background, "srgb")
     assert images.shape == (2, 4, 3, 5)
-    alone = develop(radiance[1, 0], coverage[1, 0], background[2], "srgb")
-    torch.testing.assert_close(images[1, 2], alone, rtol=4 * EPS, atol=0)  # vectorised powers round otherwise
+    alone = tonemap(radiance[1, 0], coverage[1, 0], background[2], "srgb")
+    torch.testing.assert_close(images[1, 2], alone, rtol=4 * EPS, atol=0)  # vectorized powers round otherwise
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_the_background_comes_back_where_nothing_covers_it(encoding):
-    greys = torch.linspace(0, 1, 256).view(256, 1, 1)
-    images = develop(torch.zeros(1, 3, 1), torch.zeros(1, 1, 1), greys, encoding)
+    grays = torch.linspace(0, 1, 256).view(256, 1, 1)
+    images = tonemap(torch.zeros(1, 3, 1), torch.zeros(1, 1, 1), grays, encoding)
     # Exactly as it stands; through sRGB and back in float32, powers of some 4 ulps each, multiplied by up to 2.4.
     tolerance = 0 if encoding == "linear" else 16 * torch.finfo(torch.float32).eps
-    torch.testing.assert_close(images, greys.expand(-1, 3, 1), rtol=0, atol=tolerance)
+    torch.testing.assert_close(images, grays.expand(-1, 3, 1), rtol=0, atol=tolerance)
 
 
 def test_encoding_and_decoding_are_the_srgb_standards():
@@ -116,7 +116,7 @@ def test_gradients_by_radiance_coverage_and_background_are_central_differences(e
     assert (composite < 0).any() and (composite > 1).any()
     assert min(composite.abs().min(), (composite - 1).abs().min(), (composite - 0.0031308).abs().min()) > 1e-4
     inputs = [tensor.requires_grad_(True) for tensor in (radiance, coverage, background)]
-    assert torch.autograd.gradcheck(lambda *scene: develop(*scene, encoding), inputs)
+    assert torch.autograd.gradcheck(lambda *scene: tonemap(*scene, encoding), inputs)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
@@ -128,9 +128,9 @@ def test_shorter_dtypes_stay_what_they_are(encoding, dtype):
         torch.full((1, 50), 0.5, dtype=dtype),
         torch.full((1, 1), 0.25, dtype=dtype),
     )
-    image = develop(*scene, encoding)
+    image = tonemap(*scene, encoding)
     assert image.dtype == dtype
-    full = develop(*(tensor.double() for tensor in scene), encoding)
+    full = tonemap(*(tensor.double() for tensor in scene), encoding)
     # Decoding, compositing and encoding round a few times; the encoding's slope is up to 12.92.
     slack = 4 * (12.92 if encoding == "srgb" else 1) * torch.finfo(dtype).eps
     torch.testing.assert_close(image.double(), full, rtol=0, atol=slack)
@@ -140,20 +140,20 @@ def test_shorter_dtypes_stay_what_they_are(encoding, dtype):
 def test_clamped_values_are_those_without_a_gradient(encoding):
     radiance = pixel(-0.3, 0.2, 1.4).requires_grad_(True)
     for background in (0.0, 0.5, 1.0):
-        scene = (radiance, share(0.5), grey(background))
-        (gradient,) = torch.autograd.grad(develop(*scene, encoding).sum(), radiance)
+        scene = (radiance, share(0.5), gray(background))
+        (gradient,) = torch.autograd.grad(tonemap(*scene, encoding).sum(), radiance)
         assert gradient.isfinite().all()
         torch.testing.assert_close(clamped(composite(*scene, encoding)), gradient == 0)
-    assert clamped(composite(radiance, share(0.5), grey(0.0), encoding)).flatten().tolist() == [True, False, True]
+    assert clamped(composite(radiance, share(0.5), gray(0.0), encoding)).flatten().tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_black_and_white_themselves_are_not_clamped(encoding):
     """So that a light of zero can grow."""
     radiance = pixel(0, 0.5, 1).requires_grad_(True)
-    scene = (radiance, share(1.0), grey(math.pi / 4))
+    scene = (radiance, share(1.0), gray(math.pi / 4))
     assert not clamped(composite(*scene, encoding)).any()
-    (gradient,) = torch.autograd.grad(develop(*scene, encoding).sum(), radiance)
+    (gradient,) = torch.autograd.grad(tonemap(*scene, encoding).sum(), radiance)
     slopes = [12.92, 1.055 / 2.4 * 0.5 ** (1 / 2.4 - 1), 1.055 / 2.4] if encoding == "srgb" else [1, 1, 1]
     np.testing.assert_allclose(gradient[:, 0], slopes, rtol=8 * EPS)
 
@@ -161,13 +161,13 @@ def test_black_and_white_themselves_are_not_clamped(encoding):
 def test_a_background_may_be_a_image():
     draws = torch.Generator().manual_seed(1)
     scene = [torch.rand(*shape, generator=draws, dtype=torch.float64) for shape in ((2, 3, 7), (1, 7), (3, 7))]
-    images = develop(*scene, "srgb")
+    images = tonemap(*scene, "srgb")
     for at in range(7):
-        alone = develop(*(part[..., at : at + 1] for part in scene), "srgb")
+        alone = tonemap(*(part[..., at : at + 1] for part in scene), "srgb")
         torch.testing.assert_close(images[..., at : at + 1], alone, rtol=4 * EPS, atol=0)
 
 
-@pytest.mark.parametrize("function", [encode, decode, lambda x, encoding: develop(x, share(1), grey(0), encoding)])
+@pytest.mark.parametrize("function", [encode, decode, lambda x, encoding: tonemap(x, share(1), gray(0), encoding)])
 def test_an_unknown_encoding_is_refused(function):
     with pytest.raises(InputError, match=r"renderer\.encoding=gamma: choose one of linear, srgb"):
         function(pixel(0, 0, 0), "gamma")

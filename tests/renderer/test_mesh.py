@@ -12,12 +12,12 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from renderer.albedo import surface_albedo
-from renderer.camera import ring
+from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
-from renderer.mesh import Mesh, concatenate, load_mesh, normalise
-from renderer.visibility import choose
+from renderer.mesh import Mesh, concatenate, load_mesh, normalize
+from renderer.rasterizer import choose
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 WHITE = (1.0, 1.0, 1.0)
@@ -181,26 +181,26 @@ def test_whether_a_changed_mesh_is_closed_is_told_anew():
     assert not replace(mesh, vertices=-mesh.vertices).closed
 
 
-# Normalising
+# Normalizing
 
 
-def test_normalise_centres_on_the_centroid_of_the_surface_and_fits_the_unit_cube():
+def test_normalize_centers_on_the_centroid_of_the_surface_and_fits_the_unit_cube():
     """trimesh's centroid is the same average of the faces, by their area."""
     cone = trimesh.creation.cone(radius=0.3, height=2)
     cone.apply_translation([7, -3, 11])
-    mesh = normalise(Mesh.plain(cone.vertices, cone.faces))
+    mesh = normalize(Mesh.plain(cone.vertices, cone.faces))
     assert_allclose(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).centroid, 0, atol=2**-25)
     assert np.abs(mesh.vertices).max() == 1
-    centred = cone.vertices - cone.centroid
-    assert_allclose(mesh.vertices, centred / np.abs(centred).max(), atol=2**-25)  # half of float32's step below 1
+    centered = cone.vertices - cone.centroid
+    assert_allclose(mesh.vertices, centered / np.abs(centered).max(), atol=2**-25)  # half of float32's step below 1
     assert_array_equal(mesh.vertices, mesh.vertices.astype(np.float32))
 
 
-def test_normalise_weights_by_area_not_by_vertex():
+def test_normalize_weights_by_area_not_by_vertex():
     """Two parallel triangles, the second of four times the area: the centroid is 4/5 of the way to it."""
     small = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     vertices = np.concatenate([small, 2 * small + [0, 0, 10]])
-    mesh = normalise(Mesh.plain(vertices, [[0, 1, 2], [3, 4, 5]]))
+    mesh = normalize(Mesh.plain(vertices, [[0, 1, 2], [3, 4, 5]]))
     assert_allclose(mesh.vertices[[0, 3], 2], [-1, 2 / 8], atol=1e-12)
 
 
@@ -452,14 +452,16 @@ def test_an_unknown_up_axis_is_refused(tmp_path):
     ("name", "faces", "textures"),
     [("orange_studio", 1500, [2048]), ("orange_sketchfab", 10412, [1024]), ("orange_leaf", 1728, [])],
 )
-def test_the_shared_oranges_are_closed_around_their_centre_and_orange(name, faces, textures):
-    mesh = normalise(load_mesh(DATA / "meshes" / f"{name}.glb"))
+def test_the_shared_oranges_are_closed_around_their_center_and_orange(name, faces, textures):
+    mesh = normalize(load_mesh(DATA / "meshes" / f"{name}.glb"))
     assert len(mesh.faces) == faces
     assert [texture.shape[:2] for texture in mesh.textures] == [(size, size) for size in textures]
     outward = (corner_positions(mesh).mean(axis=1) * mesh.face_normals()).sum(axis=1)
     fruit = np.arange(faces)[-960:] if name == "orange_leaf" else np.arange(faces)
     assert np.average(outward[fruit] > 0, weights=mesh.face_areas()[fruit]) > 0.95
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, ring(1, 2.0), ImageSettings(32, 1), choose("software"))
+    [fragments] = build_fragments(
+        mesh.vertices, mesh.faces, orbit_cameras(1, 2.0), ImageSettings(32, 1), choose("numpy")
+    )
     albedo = surface_albedo(mesh, fragments, "linear").numpy()
     red, green, blue = albedo[np.isin(fragments.faces[fragments.face], fruit)].mean(axis=0)
     assert red > 1.4 * green > 1.4 * 2 * blue
@@ -482,4 +484,4 @@ def test_faces_of_vertices_that_are_not_there_are_refused(faces):
 
 def test_a_surface_of_zero_area_has_no_size_to_scale():
     with pytest.raises(InputError, match="the mesh has a surface of zero area"):
-        normalise(Mesh.plain(np.zeros((3, 3)), [[0, 1, 2]]))
+        normalize(Mesh.plain(np.zeros((3, 3)), [[0, 1, 2]]))

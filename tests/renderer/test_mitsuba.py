@@ -16,9 +16,9 @@ from scipy.special import sph_harm_y
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.mesh import Mesh, concatenate
+from renderer.rasterizer import choose
 from renderer.transfer import ImageSettings, build_operators
 from renderer.transport import rays
-from renderer.visibility import choose
 
 mi = pytest.importorskip("mitsuba")
 
@@ -81,7 +81,7 @@ def facets() -> Mesh:
     return Mesh.plain(sphere.vertices, sphere.faces, (0.9, 0.5, 0.2))
 
 
-def coloured_cube() -> Mesh:
+def colored_cube() -> Mesh:
     cube = trimesh.creation.box((1.1, 1.1, 1.1))
     return Mesh.plain(cube.vertices, cube.faces, np.random.default_rng(1).uniform(0.1, 1, (8, 3)))
 
@@ -127,11 +127,11 @@ each_case = pytest.mark.parametrize(
     [
         (facets, "near the pole"),
         (facets, "from above"),
-        (coloured_cube, "from above"),
-        (coloured_cube, "from below"),
+        (colored_cube, "from above"),
+        (colored_cube, "from below"),
         (textured_hull, "near the pole"),
         (textured_hull, "from below"),
-        (coloured_cube, "from close by"),
+        (colored_cube, "from close by"),
         (textured_hull, "from close by"),
     ],
 )
@@ -139,10 +139,10 @@ each_case = pytest.mark.parametrize(
 # ---------------------------------------------------------------------------- images
 
 
-def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, transport="direct") -> np.ndarray:
+def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, shadows=False) -> np.ndarray:
     """(size, size, 4): radiance and coverage."""
     settings = ImageSettings(size, samples, transport=transport)
-    [operator] = build_operators(mesh, [camera], settings, choose("software"))
+    [operator] = build_operators(mesh, [camera], settings, choose("numpy"))
     canvas = np.zeros((size * size, 4))
     canvas[operator.pixels, :3] = operator.radiance(torch.from_numpy(LIGHT)).T
     canvas[operator.pixels, 3] = operator.coverage
@@ -178,7 +178,7 @@ def mitsuba_sensor(camera: Camera, size: int) -> dict:
     right, up, back = camera.axes()
     aim = -camera.right * right - camera.up * up
     look = mi.ScalarTransform4f().look_at(origin=list(aim + camera.distance * back), target=list(aim), up=list(up))
-    half = camera.field_of_view / 2
+    half = camera.width / 2
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "rfilter": {"type": "box"}}
     if isinstance(camera, PerspectiveCamera):
         return {"type": "perspective", "fov": 2 * math.degrees(math.atan(half / camera.distance)), "to_world": look} | {
@@ -189,7 +189,7 @@ def mitsuba_sensor(camera: Camera, size: int) -> dict:
 
 
 def mitsuba_mesh(mesh: Mesh):
-    """Every face gets corners of its own, as our colours are kept."""
+    """Every face gets corners of its own, as our colors are kept."""
     properties = mi.Properties()
     properties["face_normals"] = True
     diffuse = {"type": "diffuse", "reflectance": mitsuba_albedo(mesh)}
@@ -206,7 +206,7 @@ def mitsuba_mesh(mesh: Mesh):
 
 
 def mitsuba_albedo(mesh: Mesh) -> dict:
-    """The texture where there is one, else the corners' colours."""
+    """The texture where there is one, else the corners' colors."""
     if not mesh.textures:
         return {"type": "mesh_attribute", "name": "vertex_color"}
     [texture] = mesh.textures

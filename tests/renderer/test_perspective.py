@@ -10,21 +10,21 @@ import pytest
 import torch
 import trimesh
 
-from renderer.camera import OrthographicCamera, PerspectiveCamera, ring
+from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
-from renderer.lights import load_light
+from renderer.light.presets import load_light
 from renderer.mesh import Mesh
+from renderer.rasterizer import choose
 from renderer.transfer import build_operators
 from renderer.transport.surface import Surface
-from renderer.visibility import choose
 
-SOFTWARE = choose("software")
+SOFTWARE = choose("numpy")
 CAMERA = PerspectiveCamera(0.9, 0.4, 2.4, right=0.2, up=-0.1, distance=1.9)
 POSITION = CAMERA.pose()[:3, 3]
 BACKENDS = [
-    "software",
-    pytest.param("compiled", marks=pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")),
+    "numpy",
+    pytest.param("numba", marks=pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")),
     pytest.param("opengl", marks=pytest.mark.skipif(find_library("EGL") is None, reason="no EGL on this machine")),
 ]
 
@@ -39,7 +39,7 @@ def rays(size: int) -> np.ndarray:
     """(size², 3) from CAMERA through the middles of pixels, as far as the plane through the origin."""
     middles = (2 * np.arange(size) + 1) / size - 1
     y, x = np.meshgrid(-middles, middles, indexing="ij")
-    half = CAMERA.field_of_view / 2
+    half = CAMERA.width / 2
     return np.stack([half * x, half * y, np.full_like(x, -CAMERA.distance)], axis=-1).reshape(-1, 3) @ CAMERA.axes()
 
 
@@ -119,7 +119,7 @@ def test_from_ever_further_away_the_image_becomes_the_orthographic_one(normals):
 
 
 def test_a_ring_in_perspective_spans_the_angle_and_the_same_width_at_the_origin():
-    for camera in ring(3, 2.0, perspective=math.radians(40)):
+    for camera in orbit_cameras(3, 2.0, fov=math.radians(40)):
         assert camera.angle == pytest.approx(math.radians(40))
         edges = np.array([[1.0], [-1.0]]) * camera.axes()[0]
         np.testing.assert_allclose(camera.project(edges)[:, 0], [1, -1], rtol=1e-14)

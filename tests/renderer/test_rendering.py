@@ -10,16 +10,16 @@ from torch import Tensor
 import renderer
 from renderer.errors import InputError
 from renderer.image import ENCODINGS, NORMALS, as_background
-from renderer.lights import ambient
+from renderer.light.presets import ambient
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
-CAMERAS = renderer.ring(3, 2.4)
-SMALL = {"size": 9, "visibility": "software"}
+CAMERAS = renderer.orbit_cameras(3, 2.4)
+SMALL = {"size": 9, "rasterizer": "numpy"}
 
 
 @pytest.fixture(scope="module")
 def stone() -> renderer.Mesh:
-    """No symmetry, a colour per face."""
+    """No symmetry, a color per face."""
     solid, rng = trimesh.creation.icosahedron(), np.random.default_rng(0)
     plain = renderer.Mesh.plain(solid.vertices * [1.0, 0.9, 0.8], solid.faces)
     colors = np.broadcast_to(rng.uniform(0.2, 0.8, (len(solid.faces), 1, 3)), plain.corner_colors.shape)
@@ -36,10 +36,10 @@ def light() -> Tensor:
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("normals", NORMALS)
 def test_an_operators_image_is_the_rendered_one(stone, light, encoding, normals):
-    choices = SMALL | {"encoding": encoding, "normals": normals, "gain": 1.2}
+    choices = SMALL | {"encoding": encoding, "normals": normals, "albedo_scale": 1.2}
     images = renderer.render(stone, CAMERAS, light, background=0.3, **choices)
     assert images.shape == (3, 3, 9, 9)
-    for image, operator in zip(images, renderer.operators(stone, CAMERAS, **choices), strict=True):
+    for image, operator in zip(images, renderer.precompute_transfer(stone, CAMERAS, **choices), strict=True):
         # The operator is in float32: sums of 31 terms below 1, and the slope of 12.92 of the sRGB curve near black.
         torch.testing.assert_close(operator.image(light, 0.3), image, rtol=0, atol=13 * 8 * EPS32)
 
@@ -84,13 +84,13 @@ def test_a_texture_can_be_taken_in_place_of_the_one_that_a_mesh_has(stone, light
     torch.testing.assert_close(found, expected, rtol=0, atol=4 * EPS)
 
 
-def test_backgrounds_are_greys_colours_and_images_of_one_view_or_all(stone, light):
+def test_backgrounds_are_grays_colors_and_images_of_one_view_or_all(stone, light):
     empty = replace(stone, vertices=stone.vertices + 10)
     draws = torch.rand(3, 3, 9, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    colour = torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
+    color = torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
     for given, expected in [
         (0.25, torch.full((3, 3, 9, 9), 0.25)),
-        (colour, colour.view(1, 3, 1, 1).expand(3, 3, 9, 9)),
+        (color, color.view(1, 3, 1, 1).expand(3, 3, 9, 9)),
         (draws[0], draws[:1].expand(3, -1, -1, -1)),
         (draws, draws),
     ]:
@@ -115,7 +115,7 @@ def test_what_is_no_background_is_refused(background):
         ({"cameras": []}, "cameras is empty"),
         ({"size": 0}, "size=0 must be at least 1"),
         ({"encoding": "jpeg"}, "encoding=jpeg"),
-        ({"visibility": "eyes"}, "visibility=eyes"),
+        ({"rasterizer": "eyes"}, "rasterizer=eyes"),
     ],
 )
 def test_bad_input_is_refused_in_one_sentence(stone, light, wrong, message):

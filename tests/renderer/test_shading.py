@@ -22,15 +22,15 @@ from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import LARGEST, InputError
 from renderer.fragments import Fragments, build_fragments
-from renderer.harmonics import MAX_DEGREE, irradiance_basis, lambertian_factors, live_coefficients, rotate
-from renderer.image import ImageSettings, behind, clamped, develop
+from renderer.image import ImageSettings, background_term, clamped, tonemap
+from renderer.light.harmonics import MAX_DEGREE, irradiance_basis, lambertian_factors, nonzero_coefficients, rotate
 from renderer.mesh import Mesh
+from renderer.rasterizer import choose
 from renderer.shading import irradiance, radiance
 from renderer.transfer import build_operators
-from renderer.visibility import choose
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
-BACKEND = choose("software")
+RASTERIZER = choose("numpy")
 DEGREES = [0, 1, 2, 3, 6, 13, MAX_DEGREE]
 SPECIAL = [[0.0, 0.0, 1.0], [-0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-1.0, -0.0, 0.0], [0.0, -1.0, -0.0], [1e-9, 0.0, 1.0]]
 
@@ -114,7 +114,7 @@ def test_bands_that_reach_no_surface_have_a_gradient_of_exactly_zero():
     for degree, dead in ((6, 18), (MAX_DEGREE, sum(2 * l + 1 for l in range(3, MAX_DEGREE, 2)))):
         light = draw((degree + 1) ** 2, 3).requires_grad_(True)
         (gradient,) = torch.autograd.grad(irradiance(some_normals(20), light).sum(), light)
-        mask = torch.ones(len(light), dtype=torch.bool).index_fill(0, live_coefficients(degree), False)
+        mask = torch.ones(len(light), dtype=torch.bool).index_fill(0, nonzero_coefficients(degree), False)
         assert mask.sum() == dead
         assert not gradient[mask].any() and gradient[~mask].any(dim=1).all()
 
@@ -135,7 +135,7 @@ def test_a_zero_normal_has_the_irradiance_of_the_basis_at_zero():
     normals, light = some_normals(5).index_fill(0, torch.tensor([1, 4]), 0), draw(49, 3).requires_grad_(True)
     lit = irradiance(normals, light)
     rows = irradiance_basis(normals, 6)
-    expected = rows @ light[live_coefficients(6)]
+    expected = rows @ light[nonzero_coefficients(6)]
     torch.testing.assert_close(lit, expected.T, rtol=0, atol=16 * EPS * brightest(light))
     upstream = draw(*lit.shape, seed=1)
     (found,), (by_basis,) = (torch.autograd.grad(value, light, upstream) for value in (lit, expected.T))
@@ -179,7 +179,7 @@ def test_second_derivatives_are_refused_rather_than_wrong():
 
 
 def solid(seed: int = 0, closed: bool = True) -> Mesh:
-    """A dented icosahedron with two textures and bare faces, vertex colours on all; or two thirds of it."""
+    """A dented icosahedron with two textures and bare faces, vertex colors on all; or two thirds of it."""
     draws = np.random.default_rng(seed)
     shape = trimesh.creation.icosahedron()
     faces = shape.faces[: 20 if closed else 13]
@@ -228,7 +228,7 @@ class Scene:
     @cached_property
     def fragments(self) -> Fragments:
         settings = ImageSettings(self.size, self.samples)
-        [fragments] = build_fragments(self.mesh.vertices, self.mesh.faces, [self.camera], settings, BACKEND)
+        [fragments] = build_fragments(self.mesh.vertices, self.mesh.faces, [self.camera], settings, RASTERIZER)
         return fragments
 
     def vertices(self) -> torch.Tensor:
@@ -286,7 +286,7 @@ class Image:
         return [tensor.requires_grad_(True) for tensor in (self.scene.vertices(), light, *textures)]
 
     def parts(self, vertices, light, *textures) -> tuple[Fragments, tuple]:
-        """What `develop` takes."""
+        """What `tonemap` takes."""
         fragments = self.scene.fragments
         albedo = textured_albedo(self.scene.mesh, fragments, textures, self.encoding)
         lit = radiance(fragments, vertices, light, albedo, self.scene.all_faces(self.smooth))
@@ -296,7 +296,7 @@ class Image:
     def __call__(self, *inputs) -> torch.Tensor:
         fragments, parts = self.parts(*inputs)
         canvas = parts[2].expand(3, self.scene.size**2)
-        return canvas.index_copy(1, fragments.pixels, develop(*parts))
+        return canvas.index_copy(1, fragments.pixels, tonemap(*parts))
 
     def clamped(self, *inputs) -> torch.Tensor:
         lit, *around = self.parts(*inputs)[1]
@@ -364,12 +364,12 @@ def test_albedo_per_face_has_the_derivative_of_central_differences(smooth):
 @each_scene
 @flat_and_smooth
 def test_what_no_sample_sees_has_a_gradient_of_exactly_zero(scene, smooth):
-    """Coefficients of the dead bands, vertices of no seen face (nor of a neighbour's, where normals are smooth)."""
+    """Coefficients of the dead bands, vertices of no seen face (nor of a neighbor's, where normals are smooth)."""
     image = Image(scene, "linear", smooth)
     inputs = image.inputs()
     fragments = scene.fragments
     by_vertex, by_light, *_ = torch.autograd.grad(image(*inputs), inputs, draw(3, scene.size**2))
-    dead = torch.ones(49, dtype=torch.bool).index_fill(0, live_coefficients(6), False)
+    dead = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero_coefficients(6), False)
     assert not by_light[dead].any() and by_light[~dead].all()
     moving = np.unique(fragments.corners)
     if smooth:
@@ -420,12 +420,12 @@ def lit_and_gradients(scene: Scene, smooth: bool, dtype=torch.float64) -> tuple[
 
 
 @each_scene
-@pytest.mark.parametrize("color", [None, (0.9, 0.5, 0.2)], ids=["its own colours", "one colour"])
+@pytest.mark.parametrize("color", [None, (0.9, 0.5, 0.2)], ids=["its own colors", "one color"])
 def test_flat_radiance_is_the_operators(scene, color):
     mesh = scene.mesh if color is None else Mesh.plain(scene.mesh.vertices, scene.mesh.faces, color)
     scene = replace(scene, mesh=mesh)
     settings = ImageSettings(scene.size, scene.samples)
-    [operator] = build_operators(mesh, [scene.camera], settings, BACKEND, dtype=torch.float64)
+    [operator] = build_operators(mesh, [scene.camera], settings, RASTERIZER, dtype=torch.float64)
     assert len(operator.transfer) == (3 if color is None and scene.samples > 1 else 1)
     lit, _, by_light, _ = lit_and_gradients(scene, smooth=False)
     light = draw(49, 3)
@@ -441,7 +441,7 @@ def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surfac
     fragments, light = scene.fragments, draw(49, 3)
     lit, *_ = lit_and_gradients(scene, smooth=True)
     right, up, back = scene.camera.axes()
-    across = fragments.positions().numpy() * scene.camera.field_of_view / 2
+    across = fragments.positions().numpy() * scene.camera.width / 2
     # The faces' planes are n · p = 1.
     normals = np.sign(scene.mesh.vertices[fragments.corners[fragments.face]].sum(axis=1))
     foot = across @ np.stack([right, up])

@@ -61,7 +61,7 @@ def test_a_solid_fills_about_the_unit_box(named):
     assert 0.8 < np.abs(mesh.vertices).max() < 1.05
 
 
-def test_colours_are_display_values_per_corner(named):
+def test_colors_are_display_values_per_corner(named):
     _, mesh = named
     assert mesh.corner_colors.dtype == np.float32 and mesh.corner_colors.shape == (len(mesh.faces), 3, 3)
     assert mesh.corner_colors.min() >= 0 and mesh.corner_colors.max() <= 1
@@ -83,7 +83,7 @@ def test_an_unknown_name_is_answered_with_the_nearest_and_all_known():
 
 
 def mean_hue(mesh):
-    """Degrees, of the mean colour."""
+    """Degrees, of the mean color."""
     mean = np.average(mesh.corner_colors.mean(axis=1), axis=0, weights=mesh.face_areas())
     return 360 * colorsys.rgb_to_hsv(*mean.tolist())[0]
 
@@ -96,7 +96,7 @@ def test_lemons_are_yellow_and_longer_than_wide_and_peaches_between_red_and_yell
     assert 1.15 * max(width, depth) < length < 1.6 * min(width, depth)
 
 
-def test_a_ball_is_a_sphere_of_one_colour_or_has_a_pale_seam_on_green():
+def test_a_ball_is_a_sphere_of_one_color_or_has_a_pale_seam_on_green():
     balls = [solid("ball", seed) for seed in range(20)]
     plain = [ball for ball in balls if ball.one_color]
     assert 4 < len(plain) < 16
@@ -132,11 +132,11 @@ class TestOrange:
 
     def test_every_normal_points_outward(self, seed):
         mesh = solid("orange", seed)
-        centres = mesh.vertices[mesh.faces].mean(axis=1)
-        outward = centres / np.linalg.norm(centres, axis=1, keepdims=True)
+        centers = mesh.vertices[mesh.faces].mean(axis=1)
+        outward = centers / np.linalg.norm(centers, axis=1, keepdims=True)
         assert (mesh.face_normals() * outward).sum(axis=1).min() > 0.85
 
-    def test_mean_colour_is_orange(self, seed):
+    def test_mean_color_is_orange(self, seed):
         mesh = solid("orange", seed)
         mean = np.average(mesh.corner_colors.mean(axis=1), axis=0, weights=mesh.face_areas())
         hue, saturation, value = colorsys.rgb_to_hsv(*mean.tolist())
@@ -145,8 +145,8 @@ class TestOrange:
     def test_the_navel_is_on_top_and_dark(self, seed):
         mesh = solid("orange", seed)
         brightness = mesh.corner_colors.mean(axis=(1, 2))
-        centres = mesh.vertices[mesh.faces].mean(axis=1)
-        near_top = (np.hypot(centres[:, 0], centres[:, 1]) < 0.08) & (centres[:, 2] > 0)
+        centers = mesh.vertices[mesh.faces].mean(axis=1)
+        near_top = (np.hypot(centers[:, 0], centers[:, 1]) < 0.08) & (centers[:, 2] > 0)
         assert brightness[near_top].max() < 0.8 * brightness.mean()
 
 

@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from renderer.albedo import surface_albedo
-from renderer.camera import OrthographicCamera, ring
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh, concatenate
+from renderer.rasterizer import choose
 from renderer.shading import radiance
 from renderer.shapes import solid
 from renderer.subdivision import refine, subdivide
-from renderer.visibility import choose
 
 EPS, EPS32 = np.finfo(np.float64).eps, np.finfo(np.float32).eps
-SNAP = 2**-9  # px: the rasteriser rounds corners to 1/256 px
+SNAP = 2**-9  # px: the rasterizer rounds corners to 1/256 px
 
 
 def plain(geometry: trimesh.Trimesh) -> Mesh:
@@ -41,7 +41,7 @@ def euler_number(mesh: Mesh) -> int:
 
 
 def height_field(cells: int = 16) -> Mesh:
-    """A rough surface over [-1, 1]², whose corners' x and y are multiples of 2 / cells; colours and uvs with seams."""
+    """A rough surface over [-1, 1]², whose corners' x and y are multiples of 2 / cells; colors and uvs with seams."""
     rng = np.random.default_rng(0)
     x, y = np.meshgrid(*[np.linspace(-1, 1, cells + 1)] * 2, indexing="ij")
     index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
@@ -127,7 +127,7 @@ def test_any_faces_keep_their_area_and_every_edge_its_number_of_faces(faces, see
     assert_array_equal(np.sort(around[1][1][outer]), np.sort(np.concatenate(expected)))
 
 
-def test_colours_and_uvs_are_the_faces_linear_functions_at_the_new_corners():
+def test_colors_and_uvs_are_the_faces_linear_functions_at_the_new_corners():
     """Values that are linear in a face's plane, another function for each face; rounded to float32 at each round."""
     rng = np.random.default_rng(1)
     slopes = rng.uniform(-0.2, 0.2, (len(SHEET.faces), 3, 5))
@@ -151,13 +151,13 @@ def test_the_fields_keep_their_types():
 
 
 def fragments_of(mesh: Mesh, camera: OrthographicCamera, size: int) -> Fragments:
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], ImageSettings(size, 4), choose("software"))
+    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], ImageSettings(size, 4), choose("numpy"))
     return fragments
 
 
-def test_a_image_is_unchanged_where_the_new_corners_lie_on_the_rasterisers_grid():
+def test_a_image_is_unchanged_where_the_new_corners_lie_on_the_rasterizers_grid():
     """Corners at whole samples before and after. In two rounds, uvs are off by EPS32, which is 8 of that in texels; so
-    is then the albedo, whose texels and colours differ by up to 1, and so are the radiances in their proportion."""
+    is then the albedo, whose texels and colors differ by up to 1, and so are the radiances in their proportion."""
     mesh, camera = height_field(), OrthographicCamera(0.0, 0.0, 2.0)
     finer = subdivide(mesh, 2000)
     before, after = (fragments_of(each, camera, 16) for each in (mesh, finer))
@@ -187,7 +187,7 @@ def test_a_sample_sees_the_same_face_unless_rounded_corners_moved_an_edge_over_i
     quarters = len(finer.faces) // len(mesh.faces)
     seen, near = [], []
     for each, parent in ((mesh, 1), (finer, quarters)):
-        fragments = fragments_of(each, ring(1, 2.5)[0], size)
+        fragments = fragments_of(each, orbit_cameras(1, 2.5)[0], size)
         ids = torch.full(((4 * size) ** 2,), -1)
         ids[fragments.sample] = fragments.faces[fragments.face] // parent
         samples_per_unit = 4 * size / 2

@@ -10,39 +10,39 @@ from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre, sph_harm_y
 
 from renderer.albedo import surface_albedo
-from renderer.basis import Harmonics
-from renderer.camera import OrthographicCamera, ring
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
-from renderer.harmonics import MAX_DEGREE, lambertian_factors, live_coefficients
 from renderer.image import ImageSettings
-from renderer.lights import ambient, directional
+from renderer.light.basis import Harmonics
+from renderer.light.harmonics import MAX_DEGREE, lambertian_factors, nonzero_coefficients
+from renderer.light.presets import ambient, directional
 from renderer.mesh import Mesh, concatenate
+from renderer.rasterizer import choose
 from renderer.shading import radiance as shade
-from renderer.transfer import Operator, build_operators
-from renderer.visibility import choose
+from renderer.transfer import TransferOperator, build_operators
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
-BACKEND = choose("software")
+RASTERIZER = choose("numpy")
 LAMBERTIAN = [math.pi, 2 * math.pi / 3, math.pi / 4, 0, -math.pi / 24, 0, math.pi / 64]
 ABOVE = OrthographicCamera(0, 0, 2.0)  # right is +y, up is -x
 CUBE = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
 
 
-def radiance(operator: Operator, light: torch.Tensor) -> np.ndarray:
+def radiance(operator: TransferOperator, light: torch.Tensor) -> np.ndarray:
     """(3, P) float64."""
-    live = light[live_coefficients(6)].double()
-    return torch.einsum("kc,ckp->cp", live, (operator.transfer * operator.albedo[:, None]).double()).numpy()
+    nonzero = light[nonzero_coefficients(6)].double()
+    return torch.einsum("kc,ckp->cp", nonzero, (operator.transfer * operator.albedo[:, None]).double()).numpy()
 
 
-def image_of(operator: Operator, light: torch.Tensor, size: int) -> np.ndarray:
+def image_of(operator: TransferOperator, light: torch.Tensor, size: int) -> np.ndarray:
     """(size, size, 3), black where nothing covers."""
     canvas = np.zeros((size * size, 3))
     canvas[operator.pixels] = radiance(operator, light).T
     return canvas.reshape(size, size, 3)
 
 
-def coverage_map(operator: Operator, size: int) -> np.ndarray:
+def coverage_map(operator: TransferOperator, size: int) -> np.ndarray:
     canvas = np.zeros(size * size)
     canvas[operator.pixels] = operator.coverage
     return canvas.reshape(size, size)
@@ -69,7 +69,7 @@ def sphere(subdivisions: int, color=(1.0, 1.0, 1.0)) -> Mesh:
 
 
 def patchwork() -> Mesh:
-    """A dented sphere: two textures and bare faces, vertex colours on all, UVs that wrap round."""
+    """A dented sphere: two textures and bare faces, vertex colors on all, UVs that wrap round."""
     rng = np.random.default_rng(0)
     mesh = sphere(2)
     mesh = replace(mesh, vertices=mesh.vertices * rng.uniform(0.7, 1.0, (len(mesh.vertices), 1)))
@@ -100,7 +100,7 @@ def scipy_irradiance(light: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def linear(color: np.ndarray, encoding: str) -> np.ndarray:
-    """A colour as authored to linear albedo (IEC 61966-2-1)."""
+    """A color as authored to linear albedo (IEC 61966-2-1)."""
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4) if encoding == "srgb" else color
 
 
@@ -127,7 +127,7 @@ def shade_slowly(mesh: Mesh, camera: OrthographicCamera, light: torch.Tensor, se
     """(size, size, 3) radiance and (size, size) coverage, sample by sample."""
     projected = camera.project(mesh.vertices)
     resolution = settings.size * settings.samples
-    ids = BACKEND.rasterise(projected[None], mesh.faces, resolution)[0]
+    ids = RASTERIZER.rasterize(projected[None], mesh.faces, resolution)[0]
     image, coverage = np.zeros((settings.size, settings.size, 3)), np.zeros((settings.size, settings.size))
     shades = {}
     for row, column in np.argwhere(ids >= 0):
@@ -150,7 +150,7 @@ def shade_slowly(mesh: Mesh, camera: OrthographicCamera, light: torch.Tensor, se
 def test_operators_are_what_shading_every_sample_gives(encoding):
     mesh, settings = patchwork(), ImageSettings(size=9, samples=3, encoding=encoding)
     cameras = [OrthographicCamera(0.4, 5.0, 1.7), OrthographicCamera(math.pi / 3, 0.0, 2.0)]
-    for camera, operator in zip(cameras, build_operators(mesh, cameras, settings, BACKEND), strict=True):
+    for camera, operator in zip(cameras, build_operators(mesh, cameras, settings, RASTERIZER), strict=True):
         for light in (random_light(0), random_light(1)):
             expected, coverage = shade_slowly(mesh, camera, light, settings)
             # The transfer is stored in float32, and 31 terms are summed.
@@ -160,7 +160,7 @@ def test_operators_are_what_shading_every_sample_gives(encoding):
 
 
 def test_pixels_are_in_order_and_coverage_is_positive_up_to_1():
-    (operator,) = build_operators(sphere(2), ring(1, 1.5), ImageSettings(size=8, samples=3), BACKEND)
+    (operator,) = build_operators(sphere(2), orbit_cameras(1, 1.5), ImageSettings(size=8, samples=3), RASTERIZER)
     assert operator.transfer.shape == (1, 31, len(operator.pixels))
     assert (operator.transfer.dtype, operator.coverage.dtype) == (torch.float32, torch.float32)
     assert (operator.pixels.diff() > 0).all()
@@ -170,7 +170,7 @@ def test_pixels_are_in_order_and_coverage_is_positive_up_to_1():
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 def test_white_under_white_ambient_light_is_pi_times_coverage(encoding):
     settings = ImageSettings(size=12, samples=4, encoding=encoding)
-    for operator in build_operators(sphere(2), ring(3, 2.0), settings, BACKEND):
+    for operator in build_operators(sphere(2), orbit_cameras(3, 2.0), settings, RASTERIZER):
         expected = math.pi * operator.coverage.double().numpy() * np.array([[0.5], [1.0], [2.0]])
         lit = radiance(operator, ambient(torch.tensor([0.5, 1.0, 2.0])))
         np.testing.assert_allclose(lit, expected, rtol=4 * EPS32)
@@ -178,10 +178,10 @@ def test_white_under_white_ambient_light_is_pi_times_coverage(encoding):
 
 @pytest.mark.parametrize("light_from", [(0.0, 0.0, 1.0), (0.8, 0.0, 0.6), (-0.48, 0.6, -0.64)])
 def test_a_sphere_under_directional_light_has_the_truncated_cosines_shading(light_from):
-    """Facets reach an angle ρ from their centre, so normals are off by at most ρ + ρ²; the series' slope is 1.02."""
+    """Facets reach an angle ρ from their center, so normals are off by at most ρ + ρ²; the series' slope is 1.02."""
     camera, size, samples = OrthographicCamera(1.1, 0.7, 2.0), 16, 4
     mesh = sphere(5)
-    (operator,) = build_operators(mesh, [camera], ImageSettings(size, samples), BACKEND)
+    (operator,) = build_operators(mesh, [camera], ImageSettings(size, samples), RASTERIZER)
     lit = image_of(operator, directional(torch.tensor(light_from), torch.ones(3)), size)
 
     steps = (np.arange(size * samples) + 0.5) / (size * samples) * 2 - 1
@@ -201,8 +201,8 @@ def test_a_sphere_under_directional_light_has_the_truncated_cosines_shading(ligh
 
 
 def test_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
-    """Half-width 5/8 at 8 pixels of 1/4: two pixels' worth and a half on either side of the centre."""
-    (operator,) = build_operators(square(0.625), [ABOVE], ImageSettings(size=8, samples=4), BACKEND)
+    """Half-width 5/8 at 8 pixels of 1/4: two pixels' worth and a half on either side of the center."""
+    (operator,) = build_operators(square(0.625), [ABOVE], ImageSettings(size=8, samples=4), RASTERIZER)
     along = [0, 0.5, 1, 1, 1, 1, 0.5, 0]
     np.testing.assert_array_equal(coverage_map(operator, 8), np.outer(along, along))
 
@@ -210,7 +210,7 @@ def test_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
 @pytest.mark.parametrize("turn", [0.1, 0.5, 1.2])
 def test_coverage_of_a_turned_square_adds_up_to_its_area(turn):
     """Each side, of length 1, is off by at most half a sample's width, 1/128, along its length."""
-    (operator,) = build_operators(square(0.5, turn), [ABOVE], ImageSettings(size=16, samples=8), BACKEND)
+    (operator,) = build_operators(square(0.5, turn), [ABOVE], ImageSettings(size=16, samples=8), RASTERIZER)
     area = float(operator.coverage.sum()) * (2 / 16) ** 2
     assert area == pytest.approx(1.0, abs=4 / 128)
 
@@ -219,15 +219,15 @@ def test_the_image_is_upright():
     """From θ = π/2 on the +x side, up is up and right is +y."""
     corners = [[0, 0.5, 0.5], [0, 1, 0.5], [0, 1, 1], [0, 0.5, 1]]
     mesh = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
-    (operator,) = build_operators(mesh, [OrthographicCamera(math.pi / 2, 0, 2.0)], ImageSettings(4, 2), BACKEND)
+    (operator,) = build_operators(mesh, [OrthographicCamera(math.pi / 2, 0, 2.0)], ImageSettings(4, 2), RASTERIZER)
     assert operator.pixels.tolist() == [3]
 
 
 def test_each_view_is_what_it_is_alone():
-    mesh, cameras, settings = patchwork(), ring(3, 2.0), ImageSettings(size=6, samples=2)
-    together = build_operators(mesh, cameras, settings, BACKEND)
+    mesh, cameras, settings = patchwork(), orbit_cameras(3, 2.0), ImageSettings(size=6, samples=2)
+    together = build_operators(mesh, cameras, settings, RASTERIZER)
     for camera, operator in zip(cameras, together, strict=True):
-        (alone,) = build_operators(mesh, [camera], settings, BACKEND)
+        (alone,) = build_operators(mesh, [camera], settings, RASTERIZER)
         for name in ("transfer", "coverage", "pixels"):
             torch.testing.assert_close(getattr(operator, name), getattr(alone, name), rtol=0, atol=0)
 
@@ -241,7 +241,7 @@ def test_winding_does_not_matter():
         corner_uvs=mesh.corner_uvs[:, ::-1],
     )
     for plain, turned in zip(
-        *(build_operators(m, ring(2, 2.0), settings, BACKEND) for m in (mesh, flipped)), strict=True
+        *(build_operators(m, orbit_cameras(2, 2.0), settings, RASTERIZER) for m in (mesh, flipped)), strict=True
     ):
         torch.testing.assert_close(turned.pixels, plain.pixels)
         torch.testing.assert_close(turned.coverage, plain.coverage, rtol=0, atol=0)
@@ -258,7 +258,7 @@ def test_faces_turned_away_do_not_shade():
     away = white.face_normals() @ camera.axes()[2] < 0
     assert 0 < away.sum() < len(away)
     painted = replace(white, corner_colors=np.where(away[:, None, None], 0.0, white.corner_colors).astype(np.float32))
-    (seen,), (same,) = (build_operators(mesh, [camera], settings, BACKEND) for mesh in (white, painted))
+    (seen,), (same,) = (build_operators(mesh, [camera], settings, RASTERIZER) for mesh in (white, painted))
     torch.testing.assert_close(same.transfer, seen.transfer, rtol=0, atol=0)
 
 
@@ -266,14 +266,16 @@ def test_hidden_faces_do_not_shade():
     """A red square just below a white one, listed first."""
     below = replace(square(0.5, color=(1.0, 0.0, 0.0)), vertices=square(0.5).vertices - [0, 0, 0.1])
     settings = ImageSettings(size=8, samples=2)
-    (both,) = build_operators(concatenate([below, square(0.5)]), [ABOVE], settings, BACKEND)
-    (alone,) = build_operators(square(0.5), [ABOVE], settings, BACKEND)
+    (both,) = build_operators(concatenate([below, square(0.5)]), [ABOVE], settings, RASTERIZER)
+    (alone,) = build_operators(square(0.5), [ABOVE], settings, RASTERIZER)
     torch.testing.assert_close(both.transfer, alone.transfer, rtol=0, atol=0)
 
 
 def test_gain_multiplies_the_radiance_and_leaves_the_coverage():
     mesh, settings = patchwork(), ImageSettings(size=6, samples=2, encoding="srgb")
-    (plain,), (bright,) = (build_operators(mesh, ring(1, 2.0), settings, BACKEND, gain) for gain in (1.0, 2.5))
+    (plain,), (bright,) = (
+        build_operators(mesh, orbit_cameras(1, 2.0), settings, RASTERIZER, albedo_scale) for albedo_scale in (1.0, 2.5)
+    )
     torch.testing.assert_close(bright.transfer, 2.5 * plain.transfer, rtol=2 * EPS32, atol=0)
     torch.testing.assert_close(bright.coverage, plain.coverage, rtol=0, atol=0)
 
@@ -286,18 +288,18 @@ def test_a_mesh_outside_the_image_leaves_an_empty_operator():
 
 def test_an_unknown_encoding_is_refused():
     with pytest.raises(InputError, match=r"renderer\.encoding=gamma"):
-        build_operators(square(0.5), [ABOVE], ImageSettings(size=4, samples=1, encoding="gamma"), BACKEND)
+        build_operators(square(0.5), [ABOVE], ImageSettings(size=4, samples=1, encoding="gamma"), RASTERIZER)
 
 
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
-@pytest.mark.parametrize("shape", [patchwork, lambda: sphere(2, (0.8, 0.4, 0.1))], ids=["patchwork", "one colour"])
+@pytest.mark.parametrize("shape", [patchwork, lambda: sphere(2, (0.8, 0.4, 0.1))], ids=["patchwork", "one color"])
 def test_smooth_operators_are_what_shading_with_vertex_normals_gives(shape, encoding):
-    mesh, light, cameras = shape(), draw(49, 3), ring(2, 2.2)
+    mesh, light, cameras = shape(), draw(49, 3), orbit_cameras(2, 2.2)
     settings = ImageSettings(12, samples=3, encoding=encoding, normals="smooth")
-    operators = build_operators(mesh, cameras, settings, BACKEND, dtype=torch.float64)
-    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, BACKEND, closed=mesh.closed)
+    operators = build_operators(mesh, cameras, settings, RASTERIZER, dtype=torch.float64)
+    views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, RASTERIZER, closed=mesh.closed)
     vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
-    flat = build_operators(mesh, cameras, replace(settings, normals="flat"), BACKEND, dtype=torch.float64)
+    flat = build_operators(mesh, cameras, replace(settings, normals="flat"), RASTERIZER, dtype=torch.float64)
     for operator, view, faceted in zip(operators, views, flat, strict=True):
         expected = shade(view, vertices, light, surface_albedo(mesh, view, encoding), smooth_faces=faces)
         # 31 coefficients of some 1, whose terms are added in another order.
@@ -314,22 +316,22 @@ def test_unknown_normals_are_refused():
 # ---------------------------------------------------------------------------- light to pixels and back
 
 LAYOUTS = {  # mesh, samples, channels of the transfer
-    "one colour": (sphere(1, (0.8, 0.4, 0.1)), 3, 1),
+    "one color": (sphere(1, (0.8, 0.4, 0.1)), 3, 1),
     "one sample per pixel": (patchwork(), 1, 1),
     "mixed albedos": (patchwork(), 3, 3),
 }
 
 
-def operator_of(layout: str, dtype=torch.float64) -> Operator:
+def operator_of(layout: str, dtype=torch.float64) -> TransferOperator:
     mesh, samples, channels = LAYOUTS[layout]
-    [operator] = build_operators(mesh, ring(1, 2.2), ImageSettings(6, samples), BACKEND, dtype=dtype)
+    [operator] = build_operators(mesh, orbit_cameras(1, 2.2), ImageSettings(6, samples), RASTERIZER, dtype=dtype)
     assert operator.transfer.shape == (channels, 31, len(operator.pixels)) and operator.transfer.dtype == dtype
     return operator
 
 
-def empty_operator() -> Operator:
+def empty_operator() -> TransferOperator:
     mesh = replace(square(0.1), vertices=square(0.1).vertices + np.array([0.8, 0, 0]))
-    [operator] = build_operators(mesh, [OrthographicCamera(0, 0, 0.5)], ImageSettings(size=4, samples=2), BACKEND)
+    [operator] = build_operators(mesh, [OrthographicCamera(0, 0, 0.5)], ImageSettings(size=4, samples=2), RASTERIZER)
     return operator
 
 
@@ -338,7 +340,7 @@ def test_operators_of_any_degree_are_scipys_harmonics(degree):
     box = trimesh.convex.convex_hull(CUBE)
     mesh = Mesh.plain(Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).apply(box.vertices), box.faces, (0.5, 1.0, 0.25))
     settings, camera = ImageSettings(size=4, samples=1), OrthographicCamera(1.0, 0.4, 1.5)
-    [operator] = build_operators(mesh, [camera], settings, BACKEND, basis=Harmonics(degree), dtype=torch.float64)
+    [operator] = build_operators(mesh, [camera], settings, RASTERIZER, basis=Harmonics(degree), dtype=torch.float64)
     light = draw((degree + 1) ** 2, 3)
     image, coverage = shade_slowly(mesh, camera, light, settings)
     found = np.zeros((16, 3))
@@ -355,7 +357,7 @@ def test_the_radiance_is_the_light_times_the_transfer_times_the_albedo(layout, b
     lights = draw(*batch, 49, 3)
     expected = torch.einsum(
         "...kc,ckp,cp->...cp",
-        lights[..., live_coefficients(6), :],
+        lights[..., nonzero_coefficients(6), :],
         operator.transfer.expand(3, -1, -1),
         operator.albedo,
     )
@@ -390,7 +392,7 @@ def test_lights_in_a_batch_are_alone_there(layout):
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_18_dead_coefficients_have_a_gradient_of_exactly_zero(layout):
     gradient = operator_of(layout).light_gradient(draw(5, 3, len(operator_of(layout).pixels)))
-    dead = torch.ones(49, dtype=torch.bool).index_fill(0, live_coefficients(6), False)
+    dead = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero_coefficients(6), False)
     assert dead.sum() == 18
     assert not gradient[:, dead].any() and gradient[:, ~dead].all()
 
@@ -413,13 +415,13 @@ def test_float32_operators_are_float64s_to_rounding(layout):
     short, full = operator_of(layout, torch.float32), operator_of(layout)
     light, upstream = draw(49, 3), draw(3, len(full.pixels), seed=1)
     size = torch.einsum(
-        "kc,ckp,cp->cp", light[live_coefficients(6)].abs(), full.transfer.abs().expand(3, -1, -1), full.albedo
+        "kc,ckp,cp->cp", light[nonzero_coefficients(6)].abs(), full.transfer.abs().expand(3, -1, -1), full.albedo
     )
     # Transfer, albedo, light and products round once each; the 31 terms are added up, in any order.
     error = (short.radiance(light.float()) - full.radiance(light)).abs()
     assert (error <= (4 + 31) * EPS32 / 2 * size).all()
     size = torch.einsum("cp,ckp,cp->kc", upstream.abs(), full.transfer.abs().expand(3, -1, -1), full.albedo)
-    error = (short.light_gradient(upstream.float()) - full.light_gradient(upstream)).abs()[live_coefficients(6)]
+    error = (short.light_gradient(upstream.float()) - full.light_gradient(upstream)).abs()[nonzero_coefficients(6)]
     assert (error <= (4 + len(full.pixels)) * EPS32 / 2 * size).all()
 
 
@@ -435,7 +437,7 @@ def test_both_layouts_give_the_same_radiance():
     mixed.corner_colors[0] = (0, 0, 1)
     settings = ImageSettings(8, 4)
     [one], [three] = (
-        build_operators(mesh, [ABOVE], settings, BACKEND, dtype=torch.float64)
+        build_operators(mesh, [ABOVE], settings, RASTERIZER, dtype=torch.float64)
         for mesh in (plain, concatenate([plain, mixed]))
     )
     assert (len(one.transfer), len(three.transfer)) == (1, 3)
@@ -455,9 +457,9 @@ def test_one_channel_is_taken_for_albedos_that_are_the_same_to_float32s_rounding
     colors = np.full((2, 3, 3), 0.75, dtype=np.float32)
     colors[1] += step * np.spacing(colors[1])
     mesh = replace(square(0.5), corner_colors=colors)
-    [operator] = build_operators(mesh, [ABOVE], ImageSettings(4, 4), BACKEND)
+    [operator] = build_operators(mesh, [ABOVE], ImageSettings(4, 4), RASTERIZER)
     assert len(operator.transfer) == channels
-    [exact] = build_operators(mesh, [ABOVE], ImageSettings(4, 4), BACKEND, dtype=torch.float64)
+    [exact] = build_operators(mesh, [ABOVE], ImageSettings(4, 4), RASTERIZER, dtype=torch.float64)
     light = random_light(0)
     torch.testing.assert_close(operator.radiance(light), exact.radiance(light), rtol=0, atol=16 * EPS32)
 
@@ -482,10 +484,10 @@ def test_no_lights_have_no_gradient(layout):
 @pytest.mark.parametrize("shape", [(36, 3), (64, 3), (49, 1), (49,), (3, 49), (2, 31, 3), (0, 3)])
 def test_lights_of_another_degree_are_refused(shape):
     with pytest.raises(InputError, match=rf"lights of shape {re.escape(str(shape))} .* degree 6"):
-        operator_of("one colour").radiance(torch.zeros(shape))
+        operator_of("one color").radiance(torch.zeros(shape))
 
 
 def test_all_of_an_operator_moves_to_another_device():
-    operator = operator_of("one colour")
+    operator = operator_of("one color")
     for name, value in vars(operator.to("meta")).items():
         assert value.is_meta if isinstance(value, torch.Tensor) else value == getattr(operator, name)

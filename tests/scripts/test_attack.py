@@ -9,14 +9,14 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
-from renderer.lights import load_light
+from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
 from train.command_line.entry_points import USER_ERROR
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
     f"classifier=run:{ROOT / 'pretrained' / 'none'}", "attack.force=true", "attack.max_steps=2", "device=cpu",
-    "renderer.visibility=software", "renderer.cache=null", "attack.allow_negative=true",
+    "renderer.rasterizer=numpy", "renderer.cache=null", "attack.allow_negative=true",
 ]  # fmt: skip
 
 
@@ -134,7 +134,7 @@ REFUSED = [
     (["attack=geometry", "transfer.meshes=[a.glb]"], "transfer.meshes: attack=geometry belongs to what was attacked"),
     (["attack=pixels", "transfer.azimuths=[3]"], "transfer.azimuths: attack=pixels belongs to what was attacked"),
     (["attack.sweep=[0.1,-1]"], "attack.sweep=-1.0 must be at least 1e-05"),
-    (["attack=lihgting"], "attack=lihgting is not known: choose from lighting, skylight, projector, lamps, places"),
+    (["attack=lihgting"], "attack=lihgting is not known: choose from lighting, skylight, projector, lamps, positions"),
     (["attack=null"], "attack=null is not known: choose from lighting"),
     (["attack=[]"], "attack: name what to change"),
     (["attack=lighting+skylight"], "attack: lighting and skylight both set the light: choose one of them"),
@@ -149,7 +149,7 @@ REFUSED = [
     (["reload=absent"], "absent/adversary.json does not exist: give a folder that an attack wrote"),
     (
         ["label=apple", "attack.force=false", "scene.search=0"],
-        "of solid:orange:0 are not recognised as 'apple' before any attack",
+        "of solid:orange:0 are not recognized as 'apple' before any attack",
     ),
 ]
 

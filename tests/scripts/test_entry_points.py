@@ -75,7 +75,7 @@ WRONG = [
     (["publish", "run=[a]", "out=out"], "run: "),
     (["fit_skylight", "zenith_degree=many", "out=a.safetensors"], "zenith_degree: "),
     (["fit_skylight", "out=photo.png"], "out=photo.png: name a .safetensors file"),
-    (["attack", f"scene.field_of_view={10**400}"], "scene.field_of_view: int too large to convert to float"),
+    (["attack", f"scene.width={10**400}"], "scene.width: int too large to convert to float"),
     (["attack", "target={a: 1}"], "target: give a class, least_likely, or a list of classes, one per view"),
     (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
     (["check_interruptions", "jobs=0", "out=a.md"], "jobs=0 must be at least 1"),
@@ -105,7 +105,7 @@ def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, ca
         raise AssertionError("the work was begun")
 
     for name in ("train.photographs.scoring.evaluate_photographs", "train.report.card.publish_run",
-                 "renderer.environment.to_map", "renderer.skylight.fit_polynomials"):  # fmt: skip
+                 "renderer.light.environment.to_map", "renderer.light.skylight.fit_polynomials"):  # fmt: skip
         monkeypatch.setattr(name, work)
     suffix = ".hdr" if command is EXPORT else ""
     assert call(*command, f"out={out}{suffix}") == USER_ERROR

@@ -78,9 +78,9 @@ def build():
 
 def test_any_network_of_ones_own_is_scored_at_its_size_and_on_its_classes(evaluate, tmp_path):
     (tmp_path / "own.py").write_text(OWN)
-    for name, colour in {"lime": (0, 255, 0), "orange": (255, 128, 0)}.items():
+    for name, color in {"lime": (0, 255, 0), "orange": (255, 128, 0)}.items():
         (tmp_path / "lit" / name).mkdir(parents=True)
-        Image.new("RGB", (40, 30), colour).save(tmp_path / "lit" / name / "one.png")
+        Image.new("RGB", (40, 30), color).save(tmp_path / "lit" / name / "one.png")
     assert evaluate("classifier=python:own:build", f"photos={tmp_path / 'lit'}") == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["size"], summary["recall"]["value"], summary["false_alarms"]["value"]) == (16, 1, 0)

@@ -50,7 +50,7 @@ def reproduce(tmp_path: Path, *arguments: str, **environment: str) -> tuple[int,
     return done.returncode, [json.loads(line) for line in lines], done.stderr.decode()
 
 
-GIVEN = {"DATA": "cifar100.npz", "MESHES": "[a.glb,{mesh:b.glb,gain:3.0}]", "PHOTOS": "photos"}
+GIVEN = {"DATA": "cifar100.npz", "MESHES": "[a.glb,{mesh:b.glb,albedo_scale:3.0}]", "PHOTOS": "photos"}
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_every_arm_that_is_reproduced_is_a_valid_run(tmp_path, machine):
         config = settings("train", train[3], f"augment={arm}", "seed=4", *train[6:])
         run = read_settings(ExperimentSettings, config)
         assert (run.augment.arm, run.seed, run.data.path) == (arm, 4, "cifar100.npz")
-        assert run.scene.meshes == ["a.glb", {"mesh": "b.glb", "gain": 3.0}] and run.evaluate.photos == "photos"
+        assert run.scene.meshes == ["a.glb", {"mesh": "b.glb", "albedo_scale": 3.0}] and run.evaluate.photos == "photos"
 
 
 @pytest.mark.parametrize(("experiment", "trainings"), [("harden", 4), ("best", 1)])

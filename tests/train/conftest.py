@@ -29,13 +29,13 @@ TINY = [
     "augment.attack.max_steps=3",
     "augment.attack.step_size=0.3",
     "scene.backgrounds=[0.2,0.8]",
-    "renderer.visibility=software",
+    "renderer.rasterizer=numpy",
     "renderer.samples=2",
     "evaluate.photos=null",
 ]
 
 
-def coloured_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
+def colored_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
     """Images (N, 3, 16, 16) uint8 whose channel `label` is somewhat brighter."""
     images = rng.integers(0, 200, (len(labels), 3, 16, 16))
     images[np.arange(len(labels)), labels] += 30
@@ -50,9 +50,9 @@ def tiny_npz(tmp_path_factory) -> Path:
     train, test = np.repeat(np.arange(3), 20), np.repeat(np.arange(3), 10)
     np.savez(
         path,
-        train_images=coloured_noise(rng, train),
+        train_images=colored_noise(rng, train),
         train_labels=train,
-        test_images=coloured_noise(rng, test),
+        test_images=colored_noise(rng, test),
         test_labels=test,
         classes=np.array(CLASSES),
     )

@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from augment import utils
-from train.distributed import SyncBatchNormCPU, any_process, process_group, replicated, summed, synchronise_norms
+from train.distributed import SyncBatchNormCPU, any_process, process_group, replicated, summed, synchronize_norms
 from train.experiment import load_data, run
 from train.fit import trainer
 from train.interruption import Interrupted
@@ -104,7 +104,7 @@ def steps(folder) -> list[dict]:
 
 
 def test_losses_gradients_and_statistics_are_those_of_one_process_to_rounding(steps):
-    """In float64, with dropout and batch normalisation over the whole batch."""
+    """In float64, with dropout and batch normalization over the whole batch."""
     one, *two = steps
     for found in two:
         torch.testing.assert_close(found["losses"], one["losses"], rtol=1e-12, atol=0)
@@ -136,7 +136,7 @@ def test_a_norm_of_any_options_becomes_one_over_all_processes(options):
     """With one process, it is what it was."""
     network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.BatchNorm2d(4, **options)).double()
     plain = copy.deepcopy(network)
-    synchronise_norms(network)
+    synchronize_norms(network)
     assert type(network[1]) is SyncBatchNormCPU
     for _ in range(2):
         torch.testing.assert_close(network(BATCH), plain(BATCH))

@@ -581,7 +581,7 @@ def log_of_a_scene(config, folder: Path, caplog) -> dict[str, str]:
     return {name: rest for name, _, rest in lines if name in ("operators", "skipped")}
 
 
-def test_the_log_says_what_is_shared_and_what_is_skipped(tiny, tmp_path, caplog, rasterised):
+def test_the_log_says_what_is_shared_and_what_is_skipped(tiny, tmp_path, caplog, rasterized):
     """A wall that hides another, both open, and a closed box, seen from the front and above; 1 view, 2 backgrounds.
 
     The wall covers 15 of the image's 16 rows, and the box no other. Unseen are 2 of the walls' 4 faces and 8 of the
@@ -594,23 +594,23 @@ def test_the_log_says_what_is_shared_and_what_is_skipped(tiny, tmp_path, caplog,
         mesh.export(tmp_path / f"{name}.ply")
     meshes = f"scene.meshes=[{tmp_path}/walls.ply, {{mesh: {tmp_path}/box.ply, label: pear}}]"
     skipped = (
-        "rasterisation in every epoch, 18 of 49 light coefficients, 6 % of the pixels (background), "
+        "rasterization in every epoch, 18 of 49 light coefficients, 6 % of the pixels (background), "
         "62 % of the faces (seen by no sample), back faces in 1 of 2 views (closed meshes)"
     )
     for cache, loaded, built in [(f"{tmp_path}/kept", 0, 2), (f"{tmp_path}/kept", 2, 0), ("null", 0, 2)]:
-        rasterised.clear()
+        rasterized.clear()
         log = log_of_a_scene(tiny(meshes, f"renderer.cache={cache}"), tmp_path / "run", caplog)
         shutil.rmtree(tmp_path / "run")
         operators = rf"2 views for 4 examples, {loaded} from the cache, {built} built \(\d\.\d\d s\)"
         assert re.fullmatch(operators, log["operators"]) and log["skipped"] == skipped
-        assert rasterised == [1] * built
+        assert rasterized == [1] * built
 
 
-def test_a_run_whose_operators_are_on_disk_rasterises_nothing_and_trains_the_same(tiny, tmp_path, rasterised):
+def test_a_run_whose_operators_are_on_disk_rasterizes_nothing_and_trains_the_same(tiny, tmp_path, rasterized):
     config = tiny(f"renderer.cache={tmp_path}/kept", "train.epochs=1")
     for name, calls in [("first", [1, 1]), ("second", [1, 1])]:
         run(config, load_data(config), tmp_path / name)
-        assert rasterised == calls
+        assert rasterized == calls
     assert_same_weights(tmp_path / "second" / checkpoint.LAST, tmp_path / "first" / checkpoint.LAST)
 
 
@@ -669,7 +669,7 @@ def test_a_cache_that_cannot_be_written_is_said_in_the_log_and_stops_no_run(tiny
             r"label of scene.meshes\[0\]: 'ornage' is not a class of the model: choose one, such as orange",
         ),
         (["renderer.samples=0"], "renderer.samples=0"),
-        (["renderer.visibility=opengll"], "opengll"),
+        (["renderer.rasterizer=opengll"], "opengll"),
         (["model.dropout=2"], "model.dropout=2"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["evaluate.photos=/no/such/folder"], "/no/such/folder does not exist"),

@@ -44,7 +44,7 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tiny, tmp_path):
 
 @pytest.mark.parametrize("averaging", [0.0, 0.9])
 def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, averaging):
-    """Steps that synchronise raise an error; phases and the ends of epochs may."""
+    """Steps that synchronize raise an error; phases and the ends of epochs may."""
     train = Trainer._train
 
     def watched(self, *arguments):

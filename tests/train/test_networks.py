@@ -57,15 +57,15 @@ def test_the_default_is_the_wide_residual_network_itself():
     assert torch.equal(built.eval()(images), own.eval()(images))
 
 
-def test_a_network_of_torchvision_is_torchvisions_behind_the_datas_normalisation():
+def test_a_network_of_torchvision_is_torchvisions_behind_the_datas_normalization():
     torch.manual_seed(0)
     built = build_network(CLASSES, 32, "torchvision:resnet18", MEAN, STD)
     torch.manual_seed(0)
     theirs = resnet18(num_classes=3)
     images = torch.rand(2, 3, 32, 32)
-    normalised = (images - torch.tensor(MEAN).view(3, 1, 1)) / torch.tensor(STD).view(3, 1, 1)
-    normalised = normalised.contiguous(memory_format=torch.channels_last)  # another layout rounds differently
-    assert torch.equal(built.eval()(images), theirs.eval()(normalised))
+    normalized = (images - torch.tensor(MEAN).view(3, 1, 1)) / torch.tensor(STD).view(3, 1, 1)
+    normalized = normalized.contiguous(memory_format=torch.channels_last)  # another layout rounds differently
+    assert torch.equal(built.eval()(images), theirs.eval()(normalized))
     assert all(parameter.requires_grad for parameter in built.parameters())
 
 

@@ -7,7 +7,7 @@ import torch
 
 from renderer.cache import TensorCache
 from renderer.errors import InputError
-from renderer.harmonics import irradiance_basis, live_coefficients
+from renderer.light.harmonics import irradiance_basis, nonzero_coefficients
 from train import rendered_shapes
 from train.photographs.folder import find_photographs, load_photographs
 from train.rendered_shapes import CLASSES, SOURCE, even_light, hard_light, load_shapes, write_held_out
@@ -130,7 +130,7 @@ def test_training_light_leaves_no_side_dark_and_held_out_light_does():
     shading = irradiance_basis(normals, 6).numpy()
     ratios = {}
     for light in (even_light, hard_light):
-        lights = torch.stack([light(back, draws) for _ in range(200)])[:, live_coefficients(6)].double().numpy()
+        lights = torch.stack([light(back, draws) for _ in range(200)])[:, nonzero_coefficients(6)].double().numpy()
         luminance = np.einsum("nk,lkc->ln", shading, lights)
         ratios[light] = luminance.min(1) / luminance.max(1)
     assert ratios[even_light].min() > 0.45 > 0.3 > ratios[hard_light].max()

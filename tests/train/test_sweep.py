@@ -104,7 +104,7 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
         (["launcher=joblib", "sweep=runs/x", "train.device=cpu", "seed=0", "train.resume=true"], "seed-0"),
         (["train.learning_rate=1e-3", "seed=-1"], "seed--1+train.learning_rate-1e-3"),
         (["data.path=/data/cifar100.npz"], "data.path-_data_cifar100.npz@"),
-        (["scene.meshes=[a.glb,{mesh:b.glb,gain:2}]"], "scene.meshes-a.glb_mesh_b.glb_gain_2_@"),
+        (["scene.meshes=[a.glb,{mesh:b.glb,albedo_scale:2}]"], "scene.meshes-a.glb_mesh_b.glb_gain_2_@"),
         (["label=Orange"], "label-Orange@"),
         (["+data.note=x"], "_data.note@"),
     ],

@@ -36,7 +36,7 @@ def test_wrn_16_4_for_100_classes_has_2_772_020_parameters():
     assert count_parameters(WideResNet(100)) == 2_772_020
 
 
-def test_convolutions_start_with_he_initialisation():
+def test_convolutions_start_with_he_initialization():
     torch.manual_seed(0)
     for name, module in WideResNet(100).named_modules():
         if isinstance(module, nn.Conv2d):
@@ -47,7 +47,7 @@ def test_convolutions_start_with_he_initialisation():
             assert abs(weight.mean()) < 5 * expected / math.sqrt(weight.numel()), name
 
 
-def test_images_are_normalised_inside():
+def test_images_are_normalized_inside():
     torch.manual_seed(0)
     mean, std = (0.2, 0.5, 0.7), (0.1, 0.2, 0.4)
     network = WideResNet(5, 10, 1, 0.0, mean, std).double().eval()

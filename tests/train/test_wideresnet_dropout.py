@@ -22,7 +22,7 @@ def test_values_are_dropped_or_scaled_so_that_their_mean_stays(layout, dtype):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_neighbours_are_dropped_independently(layout):
+def test_neighbors_are_dropped_independently(layout):
     torch.manual_seed(0)
     dropped = (Dropout(0.3)(torch.ones(8, 16, 64, 64).contiguous(memory_format=layout)) == 0).double() - 0.3
     for dim in range(4):

@@ -9,7 +9,7 @@ import torch
 
 from augment.attacks.evaluate import Sweep
 from train.photographs.shares import counted, share
-from train.report.plots import COLOURS, LINES, MARKERS
+from train.report.plots import COLORS, LINES, MARKERS
 from train.report.tables import aligned
 
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
@@ -19,7 +19,7 @@ ALL = "all"
 
 def curve(found: Mapping[str, Sweep]) -> list[dict[str, Any]]:
     """A record for each mesh, and where there are several for all of them, each method and radius: the share fooled of
-    what was recognised before, with its 95 % Wilson interval; radii by the name of what is attacked."""
+    what was recognized before, with its 95 % Wilson interval; radii by the name of what is attacked."""
     together = {}
     if len(found) > 1:
         pooled = (torch.cat([getattr(each, method) for each in found.values()], dim=1) for method in METHODS)
@@ -35,7 +35,7 @@ def curve(found: Mapping[str, Sweep]) -> list[dict[str, Any]]:
 def format_curve(sweep: Sweep) -> str:
     """One mesh's, a line per radius."""
     if not sweep.adversarial.numel():
-        return "nothing was recognised before, so that there is no success against radius"
+        return "nothing was recognized before, so that there is no success against radius"
     rows = [
         [_words(radii), *(counted(share(int(each.sum()), len(each))) for each in (adversarial, random))]
         for radii, adversarial, random in zip(sweep.radii, sweep.adversarial, sweep.random, strict=True)
@@ -61,12 +61,12 @@ def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: 
 
     figure = Figure(figsize=(5, 3.8), layout="constrained")
     panel, (first, *others) = figure.subplots(), norms
-    for (method, name), colour, line, marker in zip(METHODS.items(), COLOURS, LINES[1::-1], MARKERS, strict=False):
+    for (method, name), color, line, marker in zip(METHODS.items(), COLORS, LINES[1::-1], MARKERS, strict=False):
         own = [each for each in records if each["method"] == method]
         radii, value = [each[first] for each in own], [each["value"] for each in own]
-        panel.plot(radii, value, color=colour, linestyle=line, marker=marker, label=name)
+        panel.plot(radii, value, color=color, linestyle=line, marker=marker, label=name)
         panel.fill_between(
-            radii, [each["low"] for each in own], [each["high"] for each in own], color=colour, alpha=0.15
+            radii, [each["low"] for each in own], [each["high"] for each in own], color=color, alpha=0.15
         )
     panel.set(xscale="log", ylim=(-0.03, 1.03), ylabel="share fooled", xlabel=f"{norms[first]} radius of {first}")
     if others:
@@ -76,6 +76,6 @@ def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: 
     panel.set_xticks([], minor=True)
     panel.spines[["top", "right"]].set_visible(False)
     if records:
-        panel.set_title(f"{records[0]['n']} examples recognised before, 95 % intervals", fontsize=10)
+        panel.set_title(f"{records[0]['n']} examples recognized before, 95 % intervals", fontsize=10)
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(path, dpi=150)

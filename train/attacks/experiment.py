@@ -11,7 +11,7 @@ from augment.attacks.criteria import Criterion, LeastLikely, Misclassification, 
 from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
 from renderer.errors import InputError
-from renderer.visibility import choose
+from renderer.rasterizer import choose
 from train.attacks.search import scene_of, search
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 from train.settings import read_object
@@ -39,7 +39,7 @@ def attack_mesh(
 ) -> AttackResult:
     """Attack one mesh under the settings, on the classifier's device.
 
-    InputError also where the classifier does not recognise it to begin with.
+    InputError also where the classifier does not recognize it to begin with.
     """
     scene = scene_of(item, settings, classifier.size, device)
     wanted, force = criterion(settings.target), settings.attack.force
@@ -54,7 +54,7 @@ def attack_adversary(
         raise InputError(
             "reload: this adversary's pixels were changed, from which no attack goes on: leave attack= out"
         )
-    scene = adversary.scene(choose(settings.renderer.visibility), device)
+    scene = adversary.scene(choose(settings.renderer.rasterizer), device)
     return attack(classifier, scene, criterion(settings.target), settings.attack, seed=settings.seed, force=True)
 
 

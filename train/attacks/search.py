@@ -1,4 +1,4 @@
-"""The scene that an attack shows a mesh in, or another in which the classifier recognises it."""
+"""The scene that an attack shows a mesh in, or another in which the classifier recognizes it."""
 
 import math
 import shlex
@@ -15,13 +15,13 @@ from augment.classifiers import Classifier
 from augment.objects import ObjectSettings
 from augment.scene import Scene
 from augment.utils import generator
-from renderer.lights import PROBES, UNIFORM, load_light
+from renderer.light.presets import PROBES, UNIFORM, load_light
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
 
 POLAR, FIELD_OF_VIEW = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
 CLOSEST = 2.0  # world units from the middle of a mesh, which all of it is within
 LENS = 45.0  # degrees, of every other camera that is drawn where the scene is orthographic
-LIGHT_GREY = 0.9  # as things are shown in catalogues
+LIGHT_GRAY = 0.9  # as things are shown in catalogs
 EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)  # times the scene's own
 SURE = 0.5  # confidence, in every image, at which the search ends
 
@@ -43,9 +43,9 @@ def scene_of(item: ObjectSettings, settings: AttackExperimentSettings, size: int
 def search(
     item: ObjectSettings, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
 ) -> AttackSceneSettings:
-    """The settings as they are, where every image is recognised, or else the ones most surely recognised among
+    """The settings as they are, where every image is recognized, or else the ones most surely recognized among
     `_candidates`, each under the scene's light, the probes and uniform light at several exposures; the settings as they
-    are, where none is recognised. What a classifier hardly knows from anywhere may not be found."""
+    are, where none is recognized. What a classifier hardly knows from anywhere may not be found."""
     scene, draws = settings.scene, generator(settings.seed, item.mesh, "search")
     if _confidence(scene_of(item, settings, classifier.size, device), settings, classifier).item() > 0:
         return scene
@@ -60,20 +60,20 @@ def search(
 
 
 def _candidates(scene: AttackSceneSettings, draws: torch.Generator) -> Iterator[AttackSceneSettings]:
-    """The scene from `scene.search` cameras, the first of them its own, before its backgrounds and, in place of a grey
-    one, before light grey."""
+    """The scene from `scene.search` cameras, the first of them its own, before its backgrounds and, in place of a gray
+    one, before light gray."""
     for index in range(scene.search):
-        lens = LENS if scene.perspective is None and index % 2 else scene.perspective
-        camera = _drawn(replace(scene, perspective=lens), draws) if index else scene
+        lens = LENS if scene.fov is None and index % 2 else scene.fov
+        camera = _drawn(replace(scene, fov=lens), draws) if index else scene
         yield camera
         if len(scene.backgrounds) == 1 and not isinstance(scene.backgrounds[0], str):
-            yield replace(camera, backgrounds=[LIGHT_GREY])
+            yield replace(camera, backgrounds=[LIGHT_GRAY])
 
 
 def _brightest(
     item: ObjectSettings, settings: AttackExperimentSettings, classifier: Classifier, device: torch.device
 ) -> tuple[float, AttackSceneSettings]:
-    """Of lights and exposures, what is recognised most surely, with its confidence; 0 where none is."""
+    """Of lights and exposures, what is recognized most surely, with its confidence; 0 where none is."""
     scene = scene_of(item, settings, classifier.size, device)
     lights = list(product(dict.fromkeys([settings.scene.light, *PROBES, UNIFORM]), EXPOSURES))
     exposures = [settings.scene.exposure * factor for _, factor in lights]
@@ -101,19 +101,19 @@ def _drawn(scene: AttackSceneSettings, draws: torch.Generator) -> AttackSceneSet
     """The scene from another side and another distance, through the same lens."""
     polar, azimuth, field = torch.rand(3, generator=draws).tolist()
     least, most = FIELD_OF_VIEW
-    if scene.perspective is not None:
-        narrowest = 2 * CLOSEST * math.tan(math.radians(scene.perspective) / 2)
+    if scene.fov is not None:
+        narrowest = 2 * CLOSEST * math.tan(math.radians(scene.fov) / 2)
         least, most = max(least, narrowest), max(most, 2 * narrowest)
     return replace(
         scene,
         polar=round(POLAR[0] + (POLAR[1] - POLAR[0]) * polar, 1),
         azimuth=round(360 * azimuth, 1),
-        field_of_view=round(least + (most - least) * field, 2),
+        width=round(least + (most - least) * field, 2),
     )
 
 
 def overrides(found: AttackSceneSettings, scene: AttackSceneSettings) -> str:
     """What the command line would say to find this in the place of a scene."""
-    names = ("polar", "azimuth", "field_of_view", "perspective", "backgrounds", "light", "exposure")
+    names = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
     changed = (name for name in names if getattr(found, name) != getattr(scene, name))
     return " ".join(shlex.quote(f"scene.{name}={getattr(found, name)}") for name in changed)

@@ -16,7 +16,7 @@ LIT = 2.0  # power of the default lamps whose places alone are attacked
 
 @dataclass
 class AttackCommandSettings(AttackSettings):
-    """shared: the views share what is attacked. force: go on where nothing is recognised. checks: see `Checks`.
+    """shared: the views share what is attacked. force: go on where nothing is recognized. checks: see `Checks`.
 
     sweep: radii to draw success against; see `augment.attacks.evaluate`.
     verify: what renders the adversaries anew from their files, "reload" or "mitsuba" or both joined by +; or None.
@@ -45,8 +45,8 @@ class AttackCommandSettings(AttackSettings):
 
 @dataclass
 class AttackSceneSettings(SceneSettings):
-    """One view of a solid orange before grey, unless told otherwise. search: how many cameras to try where the
-    classifier does not recognise the mesh; see `train.attacks.search`."""
+    """One view of a solid orange before gray, unless told otherwise. search: how many cameras to try where the
+    classifier does not recognize the mesh; see `train.attacks.search`."""
 
     meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
     backgrounds: list[Any] = field(default_factory=lambda: [0.5])
@@ -103,5 +103,5 @@ class AttackExperimentSettings:
             self.scene.projector = ProjectorSettings()
         if self.attack.lamps is not None and self.scene.lamps is None:
             self.scene.lamps = LampsSettings()
-        if self.attack.places is not None and self.scene.lamps is None:
+        if self.attack.positions is not None and self.scene.lamps is None:
             self.scene.lamps = LampsSettings(start=LIT)

@@ -45,17 +45,17 @@ def _survival(rerender_check: RerenderCheck, success: Tensor) -> str:
 
 
 def _success(attacked: AttackResult) -> str:
-    """Among what was recognised before the attack, in examples and in views, with the 95 % Wilson interval."""
+    """Among what was recognized before the attack, in examples and in views, with the 95 % Wilson interval."""
     clean_correct = attacked.clean_correct
     found = share(int(attacked.success[clean_correct].sum()), int(clean_correct.sum()))
     if not found["n"]:
-        return f"none of {len(clean_correct)} examples was recognised before: there is nothing to count"
+        return f"none of {len(clean_correct)} examples was recognized before: there is nothing to count"
     text = "{hits} of {n} examples fooled [{low:.0%}, {high:.0%}]".format(**found)
     if attacked.success_in_views.shape[1] > 1:
         views = attacked.success_in_views[clean_correct]
         text += f", {int(views.sum())} of {views.numel()} views"
     wrong = int((~clean_correct).sum())
-    return text + (f"; {wrong} not recognised before, which do not count" if wrong else "")
+    return text + (f"; {wrong} not recognized before, which do not count" if wrong else "")
 
 
 def format_reloaded(adversary: Adversary, images: Tensor, logits: Tensor, classes: Sequence[str]) -> str:

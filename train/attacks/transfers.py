@@ -63,7 +63,7 @@ def format_transfers(found: Sequence[Transfer]) -> str:
         rows.append(
             [f"{each.kind} {each.name}", f"{found_here['n']} of {len(each.clean_correct)}", counted(found_here)]
         )
-    return aligned(["what fools, shown to", "recognised before", "success"], rows)
+    return aligned(["what fools, shown to", "recognized before", "success"], rows)
 
 
 def _share(found: Transfer) -> dict[str, Any]:

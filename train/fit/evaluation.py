@@ -1,4 +1,4 @@
-"""A network's loss and accuracy on labelled images."""
+"""A network's loss and accuracy on labeled images."""
 
 import torch
 import torch.nn.functional as F

@@ -1,4 +1,4 @@
-"""A network that learns, one step at a time: its optimiser, schedule, distortions and the average of its weights."""
+"""A network that learns, one step at a time: its optimizer, schedule, distortions and the average of its weights."""
 
 from collections.abc import Mapping
 from copy import deepcopy
@@ -32,7 +32,7 @@ class Learner:
         self._soup = Average(model) if settings.soup else None
         self._begun = deepcopy(model.state_dict()) if settings.soup else None
         teacher = deepcopy(model).eval().requires_grad_(False) if settings.distillation else None
-        replica = replicated(model)  # whose parameters the optimiser is to have
+        replica = replicated(model)  # whose parameters the optimizer is to have
         self.optimizer = torch.optim.SGD(
             model.parameters(),
             lr=settings.learning_rate,

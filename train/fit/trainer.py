@@ -25,7 +25,7 @@ from train.run_folder.logs import PHASES, Log, console
 
 
 class Trainer:
-    """One run: its network, optimiser, augmentation and folder. `fit` trains; everything else is its parts."""
+    """One run: its network, optimizer, augmentation and folder. `fit` trains; everything else is its parts."""
 
     def __init__(
         self,

@@ -15,9 +15,9 @@ from PIL import Image
 
 from augment.objects import load_object
 from augment.utils import progress, stream_seed
-from renderer.environment import read_panorama
 from renderer.errors import InputError
 from renderer.image import encode
+from renderer.light.environment import read_panorama
 from renderer.shapes import LOOK_ALIKES
 from train.command_line.outputs import writable_folder
 from train.laboratory.props import Part, split_parts
@@ -98,7 +98,7 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
         raise InputError(
             f"meshes[{index}]: the label {label!r} is no folder's name, where its photographs go: rename it"
         )
-    return Subject(label, named.mesh, split_parts(load_object(named).mesh, named.gain, named.mesh))
+    return Subject(label, named.mesh, split_parts(load_object(named).mesh, named.albedo_scale, named.mesh))
 
 
 def _label_of_solid(mesh: str) -> str:

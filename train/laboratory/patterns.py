@@ -1,7 +1,7 @@
-"""What the projector shows: families of patterns, each drawn at random in colour, scale, angle and place.
+"""What the projector shows: families of patterns, each drawn at random in color, scale, angle and place.
 
 Points are (..., 2) in the projector's image, which spans [-1, 1]; an object in its middle spans about [-0.3, 0.3]. A
-family gives each point a weight in [0, 1] between two colours of light, linear RGB with a largest channel of at most 1.
+family gives each point a weight in [0, 1] between two colors of light, linear RGB with a largest channel of at most 1.
 """
 
 import colorsys
@@ -14,25 +14,25 @@ import torch
 from renderer.image import decode
 
 RESOLUTION = 512  # pixels per side of a projected image
-TWO_COLOURED = ("gradient", "stripes", "checkers")  # the others have darkness beside their colour
+TWO_COLORED = ("gradient", "stripes", "checkers")  # the others have darkness beside their color
 
 
 def draw_pattern(family: str, rng: np.random.Generator, resolution: int = RESOLUTION) -> np.ndarray:
     """An image (resolution, resolution, 3) float32 of the family, linear RGB in [0, 1]."""
-    first, second = draw_colour(rng), draw_colour(rng) * rng.uniform() * (family in TWO_COLOURED)
+    first, second = draw_color(rng), draw_color(rng) * rng.uniform() * (family in TWO_COLORED)
     middles = (np.arange(resolution) + 0.5) / resolution * 2 - 1
     points = np.stack(np.meshgrid(middles, middles, indexing="xy"), axis=-1) @ _turn(rng.uniform(0, 2 * math.pi))
     weight = FAMILIES[family](points, rng)[..., None]
     return (second + weight * (first - second)).astype(np.float32)
 
 
-def draw_colour(rng: np.random.Generator) -> np.ndarray:
+def draw_color(rng: np.random.Generator) -> np.ndarray:
     """(3,) linear RGB, the largest channel 1: any hue, from white to pure by even steps of the sRGB values."""
     sent = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(), 1.0)
     return decode(torch.tensor(sent, dtype=torch.float64), "srgb").numpy()
 
 
-def solid_colour(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def solid_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """One everywhere."""
     return np.ones(points.shape[:-1])
 
@@ -61,15 +61,15 @@ def half(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def spots(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Discs of one size at random places, over about half of the image."""
     radius = rng.uniform(0.08, 0.25)
-    centres = rng.uniform(-1, 1, (round(2.8 / (math.pi * radius**2)), 2))
+    centers = rng.uniform(-1, 1, (round(2.8 / (math.pi * radius**2)), 2))
     lit = np.zeros(points.shape[:-1], dtype=bool)
-    for centre in centres:
-        lit |= ((points - centre) ** 2).sum(axis=-1) < radius**2
+    for center in centers:
+        lit |= ((points - center) ** 2).sum(axis=-1) < radius**2
     return lit.astype(float)
 
 
 FAMILIES: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
-    "solid": solid_colour,
+    "solid": solid_color,
     "gradient": gradient,
     "stripes": stripes,
     "checkers": checkers,

@@ -28,32 +28,32 @@ class Part:
     textured: bool
 
 
-def split_parts(mesh: Mesh, gain: float, name: str) -> list[Part]:
-    """The faces of each texture, with the albedo times `gain` and at most 1.
+def split_parts(mesh: Mesh, albedo_scale: float, name: str) -> list[Part]:
+    """The faces of each texture, with the albedo times `albedo_scale` and at most 1.
 
-    InputError, naming the mesh: a texture on corners of different colours.
+    InputError, naming the mesh: a texture on corners of different colors.
     """
-    return [_part(mesh, index, gain, name) for index in np.unique(mesh.texture_ids)]
+    return [_part(mesh, index, albedo_scale, name) for index in np.unique(mesh.texture_ids)]
 
 
-def _part(mesh: Mesh, texture: int, gain: float, name: str) -> Part:
+def _part(mesh: Mesh, texture: int, albedo_scale: float, name: str) -> Part:
     faces = mesh.texture_ids == texture
     colors = _linear(mesh.corner_colors[faces])
     if texture >= 0:
         if (colors != colors[0, 0]).any():
-            raise InputError(f"{name} has a texture and colours of its vertices, too: paint them into the texture")
+            raise InputError(f"{name} has a texture and colors of its vertices, too: paint them into the texture")
         colors = _linear(mesh.textures[texture] / 255) * colors[0, 0]
     return Part(
         positions=mesh.vertices[mesh.faces[faces]],
         normals=corner_normals(mesh)[faces],
         uvs=mesh.corner_uvs[faces] * [1, -1] + [0, 1],
-        albedo=np.clip(gain * colors, 0, 1).astype(np.float32),
+        albedo=np.clip(albedo_scale * colors, 0, 1).astype(np.float32),
         textured=bool(texture >= 0),
     )
 
 
 def corner_normals(mesh: Mesh) -> np.ndarray:
-    """(F, 3, 3) unit normals: the vertices', but a face's own where it meets its neighbours at a sharp edge."""
+    """(F, 3, 3) unit normals: the vertices', but a face's own where it meets its neighbors at a sharp edge."""
     smooth = vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)).numpy()[mesh.faces]
     flat = np.broadcast_to(mesh.face_normals()[:, None], smooth.shape)
     return np.where((smooth * flat).sum(axis=-1, keepdims=True) < SHARP, flat, smooth)

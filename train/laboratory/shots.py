@@ -1,6 +1,6 @@
 """What is drawn for a photograph, apart from its object: light, camera, pose and table.
 
-World units: a normalised mesh spans [-1, 1]; it stands on the table z = 0 about the origin. Light and albedo are linear
+World units: a normalized mesh spans [-1, 1]; it stands on the table z = 0 about the origin. Light and albedo are linear
 RGB; a radiance of 1 is white at an exposure of 1.
 """
 
@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from augment.utils import stream_seed
-from renderer.harmonics import equirectangular
-from train.laboratory.patterns import draw_colour, draw_pattern
+from renderer.light.harmonics import equirectangular
+from train.laboratory.patterns import draw_color, draw_pattern
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Shot:
     """One light, camera and pose, for whatever object.
 
     brightness: radiance of a white surface that faces the projector where its image is white, or that faces up under an
-    environment. pattern: the image (H, W, 3). environment: radiance (H, W, 3) laid out as in `renderer.environment`, in
+    environment. pattern: the image (H, W, 3). environment: radiance (H, W, 3) laid out as in `renderer.light.environment`, in
     place of projector and ambient. ambient: radiance from everywhere (3,). table: albedo (3,). projector, camera:
-    places (3,). centre, aim: the points (3,) that they look at. turn: the object's rotation (3, 3). scale: the object's
+    places (3,). center, aim: the points (3,) that they look at. turn: the object's rotation (3, 3). scale: the object's
     largest coordinate.
     """
 
@@ -35,7 +35,7 @@ class Shot:
     table: np.ndarray
     projector: np.ndarray
     camera: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     aim: np.ndarray
     turn: np.ndarray
     scale: float
@@ -82,17 +82,17 @@ def draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:
     """A shot under a pattern of the family. The projector stands on the camera's side, up to 70° off."""
     azimuth, half_width, scale = rng.uniform(0, 360), rng.uniform(1.2, 1.9), rng.uniform(0.75, 1)
     distance = half_width / math.tan(math.radians(FIELD_OF_VIEW / 2))
-    centre = np.array([0, 0, 0.8 * scale])
-    aim = centre + rng.uniform(-0.25, 0.25, 3)
+    center = np.array([0, 0, 0.8 * scale])
+    aim = center + rng.uniform(-0.25, 0.25, 3)
     return Shot(
         family=family,
         brightness=brightness,
         pattern=draw_pattern(family, rng),
-        ambient=rng.uniform(0.01, 0.06) * draw_colour(rng),
-        table=rng.uniform(0.04, 0.16) * draw_colour(rng),
-        projector=centre + _place(azimuth + rng.uniform(-70, 70), rng.uniform(25, 70), rng.uniform(5, 8)),
+        ambient=rng.uniform(0.01, 0.06) * draw_color(rng),
+        table=rng.uniform(0.04, 0.16) * draw_color(rng),
+        projector=center + _place(azimuth + rng.uniform(-70, 70), rng.uniform(25, 70), rng.uniform(5, 8)),
         camera=aim + _place(azimuth, rng.uniform(18, 60), distance),
-        centre=centre,
+        center=center,
         aim=aim,
         turn=_turn(2, rng.uniform(0, 360)) @ _turn(0, rng.uniform(0, 60)) @ _turn(2, rng.uniform(0, 360)),
         scale=scale,

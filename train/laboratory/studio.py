@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from renderer.files.mitsuba_scene import TO_Z_UP, mitsuba
+from renderer.io.mitsuba import TO_Z_UP, mitsuba
 from train.laboratory.props import Part
 from train.laboratory.shots import FIELD_OF_VIEW, Shot
 
@@ -53,10 +53,10 @@ def _lights(mi: ModuleType, shot: Shot) -> list[dict[str, Any]]:
 
 def _projector(mi: ModuleType, shot: Shot) -> dict[str, Any]:
     """Mitsuba's gives a white surface that faces it at distance 1 the radiance of its image."""
-    distance = float(np.linalg.norm(shot.projector - shot.centre))
+    distance = float(np.linalg.norm(shot.projector - shot.center))
     return {
         "type": "projector",
-        "to_world": mi.ScalarTransform4f().look_at(origin=list(shot.projector), target=list(shot.centre), up=[0, 0, 1]),
+        "to_world": mi.ScalarTransform4f().look_at(origin=list(shot.projector), target=list(shot.center), up=[0, 0, 1]),
         "fov": 2 * float(np.degrees(np.arctan(THROW / distance))),
         "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(shot.pattern), "raw": True},
         "scale": shot.brightness * distance**2,
@@ -74,7 +74,7 @@ def _object(mi: ModuleType, parts: Sequence[Part], shot: Shot) -> list[Any]:
 
 
 def _shape(mi: ModuleType, part: Part, positions: np.ndarray, normals: np.ndarray) -> Any:
-    """Every face gets corners of its own, as colours are kept."""
+    """Every face gets corners of its own, as colors are kept."""
     albedo: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_color"}
     if part.textured:
         albedo = {"type": "bitmap", "bitmap": mi.Bitmap(part.albedo), "raw": True}

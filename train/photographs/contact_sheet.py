@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from renderer.tiles import CAPTION_SIZE, GAP, INK, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
+from renderer.io.tiles import CAPTION_SIZE, GAP, INK, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
 from train.photographs.answers import Answer, outcomes
 
 TILES_PER_SECTION = 40
@@ -25,10 +25,10 @@ SECTION_WIDTH = COLUMNS * (CELL + GAP)
 
 @dataclass(frozen=True)
 class Section:
-    """Tiles under one title, all framed in one colour (any name or #rrggbb that Pillow knows)."""
+    """Tiles under one title, all framed in one color (any name or #rrggbb that Pillow knows)."""
 
     title: str
-    colour: str
+    color: str
     tiles: Sequence[Tile]
 
 
@@ -40,17 +40,17 @@ def choose_sections(answers: Sequence[Answer], images: torch.Tensor, label: str)
     mine = len(hits) + len(misses)
     others = len(answers) - mine
     return [
-        _section(f"{label}, recognised: {len(hits)} of {mine}", "#2e9e5b", hits, shown),
+        _section(f"{label}, recognized: {len(hits)} of {mine}", "#2e9e5b", hits, shown),
         _section(f"{label}, called something else: {len(misses)} of {mine}", "#d03b3b", misses, shown),
         _section(f"other things called {label}: {len(alarms)} of {others}", "#e8a317", alarms, shown),
     ]
 
 
-def _section(title: str, colour: str, answers: Sequence[Answer], shown: Mapping[PurePosixPath, np.ndarray]) -> Section:
+def _section(title: str, color: str, answers: Sequence[Answer], shown: Mapping[PurePosixPath, np.ndarray]) -> Section:
     if len(answers) > TILES_PER_SECTION:
         title += f" ({TILES_PER_SECTION} drawn evenly from the surest to the least sure)"
     drawn = evenly(answers, TILES_PER_SECTION)
-    return Section(title, colour, [Tile(shown[answer.photograph.path], caption(answer)) for answer in drawn])
+    return Section(title, color, [Tile(shown[answer.photograph.path], caption(answer)) for answer in drawn])
 
 
 def evenly(ordered: Sequence[Item], count: int) -> list[Item]:
@@ -85,7 +85,7 @@ def draw_contact_sheet(sections: Sequence[Section]) -> Image.Image:
 
 
 def _draw_section(section: Section) -> Image.Image:
-    tiles = [_framed(tile, section.colour).captioned() for tile in section.tiles]
+    tiles = [_framed(tile, section.color).captioned() for tile in section.tiles]
     row_height = max((tile.height for tile in tiles), default=0) + GAP
     rows = -(-len(tiles) // COLUMNS)
     image = Image.new("RGB", (SECTION_WIDTH, TITLE_HEIGHT + rows * row_height + GAP), PAPER)
@@ -96,9 +96,9 @@ def _draw_section(section: Section) -> Image.Image:
     return image
 
 
-def _framed(tile: Tile, colour: str) -> Tile:
+def _framed(tile: Tile, color: str) -> Tile:
     image = Image.fromarray(tile.image).resize((IMAGE, IMAGE), Image.Resampling.NEAREST)
-    return Tile(np.asarray(ImageOps.expand(image, FRAME, colour)), tuple(map(_shortened, tile.caption)))
+    return Tile(np.asarray(ImageOps.expand(image, FRAME, color)), tuple(map(_shortened, tile.caption)))
 
 
 def _shortened(text: str) -> str:

@@ -108,5 +108,5 @@ def find_figure(summary: dict[str, Any], name: str) -> dict[str, Any]:
 
 def figure_title(name: str, label: str) -> str:
     """What tables call a figure."""
-    titles = {"recall": f"{label} recognised", "false_alarms": f"others called {label}", "auc": "AUC"}
+    titles = {"recall": f"{label} recognized", "false_alarms": f"others called {label}", "auc": "AUC"}
     return titles.get(name) or f"recall at {float(name.rpartition('/')[2]):.0%} false alarms"

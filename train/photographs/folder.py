@@ -15,7 +15,7 @@ import torch
 from augment.classifiers.adapter import class_index, nearest
 from augment.utils import progress, require_memory
 from renderer.errors import InputError, require_file
-from renderer.files.image_files import read_square
+from renderer.io.images import read_square
 from train.run_folder.logs import console
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")

@@ -41,7 +41,7 @@ def draw_roc(rankings: Mapping[str, Ranking], label: str) -> "Figure":
         style = {"color": "black", "linewidth": 2.5, "zorder": 3} if source == OVERALL else {"linewidth": 1.5}
         alarms, recall, _ = ranking.curve()
         axes.plot(alarms, recall, label=f"{source or 'all'}: AUC {ranking.values()['auc']:.3f}", **style)
-    axes.set(xlabel=f"other things called {label}", ylabel=f"{label} recognised", xlim=(-0.01, 1), ylim=(0, 1.01))
+    axes.set(xlabel=f"other things called {label}", ylabel=f"{label} recognized", xlim=(-0.01, 1), ylim=(0, 1.01))
     axes.set_aspect("equal")
     if rankings:
         axes.legend(loc="lower right")  # where only a network worse than chance has a curve

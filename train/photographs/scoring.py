@@ -60,7 +60,7 @@ def evaluate_photographs(
     answers = rank_classes(photographs, logits, classes, label)
     pools = pool_answers(answers, label)
     others = [str(path) for path in left_out(folder)]
-    summary = _summarise(answers, pools, label, size, unreadable, others)
+    summary = _summarize(answers, pools, label, size, unreadable, others)
 
     out.mkdir(parents=True, exist_ok=True)
     write_answers(out / ANSWERS, answers, label)
@@ -73,7 +73,7 @@ def evaluate_photographs(
     return summary
 
 
-def _summarise(
+def _summarize(
     answers: Sequence[Answer],
     pools: Mapping[str, Pool],
     label: str,

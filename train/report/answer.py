@@ -32,7 +32,7 @@ def of_runs(arms: Arms, name: str) -> str:
 
 def _told(recall: Score | None, alarms: Score | None, auc: Score | None) -> str:
     parts = [
-        f"recognised {recall.value:.0%}" if recall else "",
+        f"recognized {recall.value:.0%}" if recall else "",
         f"{alarms.value:.1%} false alarms" if alarms else "",
         f"AUC {auc.value:.3f}" if auc else "",
     ]

@@ -13,7 +13,7 @@ from PIL import Image
 from augment.attacks.figure import read_figure
 from augment.attacks.files import LINES
 from renderer.errors import InputError, in_one_line
-from renderer.tiles import Tile
+from renderer.io.tiles import Tile
 from train.photographs.contact_sheet import evenly
 from train.report.blocks import Block, Code, Gallery, Illustration, Section
 from train.report.command import attack_command

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from train.networks import PYTHON, model_title
 from train.photographs.figures import figure_title
 from train.photographs.text import format_interval
-from train.report.summary import RunSummary, complete, summarise
+from train.report.summary import RunSummary, complete, summarize
 from train.report.tables import aligned
 from train.run_folder import checkpoint
 from train.run_folder.classifier import PUBLISHED, load_run, publish
@@ -34,7 +34,7 @@ RECIPE = (
 
 def publish_run(folder: Path, out: Path) -> None:
     """Write a finished run's selected network as half-precision safetensors, and a card beside it."""
-    run = summarise(folder)
+    run = summarize(folder)
     with complete(folder):
         card = _card(run, out.name)
     state = checkpoint.load(folder / checkpoint.BEST)
@@ -67,7 +67,7 @@ def _card(run: RunSummary, name: str) -> str:
         ("versions", ", ".join(f"{name} {version}" for name, version in config.versions.items())),
     ]
     title = f"# {architecture}, augment={run.arm}"
-    note = "Half-precision weights; images are RGB in [0, 1], normalised inside. Score photographs with"
+    note = "Half-precision weights; images are RGB in [0, 1], normalized inside. Score photographs with"
     command = f"`python scripts/evaluate_photos.py run=pretrained/{name} photos=...`."
     return f"{title}\n\n{note} {command}\n\n{aligned(['what', 'value'], rows)}\n"
 

@@ -9,7 +9,7 @@ from augment.attacks.files import LINES
 from augment.service import ARMS
 from renderer.errors import InputError
 from train.report.attacks import Attack, read_attack
-from train.report.summary import RunSummary, is_finished, summarise
+from train.report.summary import RunSummary, is_finished, summarize
 from train.run_folder import checkpoint
 from train.run_folder.files import CONFIG, FAILURE, state
 from train.run_folder.logs import METRICS, read_metrics
@@ -67,7 +67,7 @@ def _read(path: Path, found: Found) -> None:
     if (path / LINES).is_file():
         found.attacks.append(read_attack(path))
     elif is_finished(path):
-        found.runs.append(summarise(path))
+        found.runs.append(summarize(path))
     else:
         try:
             become = state(path)

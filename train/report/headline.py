@@ -9,7 +9,7 @@ from train.report.arms import Arms, Score
 from train.report.blocks import Illustration
 from train.report.images import turned
 from train.report.photographs import scored, scored_on, scores_of
-from train.report.plots import COLOURS
+from train.report.plots import COLORS
 from train.run_folder.attack_examples import Side
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _draw_title(figure: "SubFigure", text: str) -> None:
 
 
 def _draw_bar(axes: "Axes", row: int, score: Score) -> None:
-    axes.barh(row, score.value, 0.75, color=COLOURS[row % len(COLOURS)])
+    axes.barh(row, score.value, 0.75, color=COLORS[row % len(COLORS)])
     axes.hlines(row, score.low, score.high, color="0.1", linewidth=2)
     axes.annotate(f" {score.value:.2f}", (max(score.high, score.value), row), va="center")
 

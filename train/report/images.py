@@ -8,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from renderer.errors import InputError
-from renderer.files.image_files import read_square
+from renderer.io.images import read_square
 from train.photographs.answers import Answer, outcomes
 from train.photographs.contact_sheet import caption, evenly
 from train.report.blocks import Gallery, Illustration
@@ -92,7 +92,7 @@ def _sides(label: str, sides: Sequence[Side]) -> Iterator[Illustration]:
 
 def photographs(answers: Sequence[Answer], folder: Path, label: str, arm: str) -> Iterator[Gallery]:
     """Hits, misses and false alarms, with the network's answers."""
-    kinds = "recognised", "called something else", f"others called {label}"
+    kinds = "recognized", "called something else", f"others called {label}"
     for kind, group in zip(kinds, outcomes(answers, label), strict=True):
         tiles = [image for answer in evenly(group, TILES) for image in _photograph(answer, folder)]
         yield Gallery(f"{arm}: {kind}, {len(tiles)} of {len(group)}", tiles)

@@ -1,4 +1,4 @@
-"""Plots as SVG that can be read on light and on dark paper, in colours that colour-blind readers tell apart."""
+"""Plots as SVG that can be read on light and on dark paper, in colors that color-blind readers tell apart."""
 
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from train.report.arms import Score
 
 # Okabe and Ito 2008, without yellow, which white paper swallows; a line style and a marker tell the same.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINES, MARKERS = ("--", "-", ":", "-."), "osD^vP"
 SIZE = (4.4, 3.3)  # inches
 WIDTH = 440  # CSS pixels
-INK = "#123456"  # stands for the ink, which the reader's colour scheme decides
+INK = "#123456"  # stands for the ink, which the reader's color scheme decides
 STYLE = "<style>svg{color:#1a1a1a}@media (prefers-color-scheme:dark){svg{color:#e4e4e4}}</style>"
 RC = {
     "svg.fonttype": "none",
@@ -39,11 +39,11 @@ Series = Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]]  # by a
 
 def style(index: int) -> dict[str, Any]:
     """The look of an arm's line, by its place among the arms."""
-    return {"color": COLOURS[index % len(COLOURS)], "linestyle": LINES[index % len(LINES)]}
+    return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
 def curves(series: Series, title: str, xlabel: str, limits: tuple[float, float] | None = (0, 1)) -> Illustration | None:
-    """A line per seed, in the colour of its arm; None where there is nothing to draw."""
+    """A line per seed, in the color of its arm; None where there is nothing to draw."""
     drawn = {arm: [line for line in lines if len(line[0])] for arm, lines in series.items()}
     if not any(drawn.values()):
         return None
@@ -74,7 +74,7 @@ def roc(rankings: Mapping[str, Sequence[Ranking]], label: str, title: str) -> Il
             for number, ranking in enumerate(group):
                 alarms, recall, _ = ranking.curve()
                 axes.plot(alarms, recall, label=None if number else f"{arm}: AUC {told[arm]:.3f}", **style(index))
-        axes.set(xlabel=f"others called {label}", ylabel=f"{label} recognised", xlim=(-0.01, 1), ylim=(0, 1.01))
+        axes.set(xlabel=f"others called {label}", ylabel=f"{label} recognized", xlim=(-0.01, 1), ylim=(0, 1.01))
 
     return _figure(draw, title, f"{title}; AUC: {', '.join(f'{arm} {auc:.3f}' for arm, auc in told.items())}")
 
@@ -124,7 +124,7 @@ def _figure(draw: Callable[["Axes"], None], title: str, alt: str, height: float 
 
 
 def svg(figure: "Figure") -> bytes:
-    """A figure's SVG, transparent, in which INK is the colour scheme's."""
+    """A figure's SVG, transparent, in which INK is the color scheme's."""
     file = io.StringIO()
     figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     start, tag, rest = file.getvalue().partition("<defs>")

@@ -62,7 +62,7 @@ def is_finished(folder: Path) -> bool:
     return bool(lines) and "epoch" not in lines[-1]
 
 
-def summarise(folder: Path) -> RunSummary:
+def summarize(folder: Path) -> RunSummary:
     """Read a finished run; InputError for a folder that holds none, or whose files lack what the tables show."""
     if not is_finished(folder):
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")

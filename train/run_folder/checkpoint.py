@@ -14,7 +14,7 @@ from train.run_folder.files import write_whole
 
 LAST, PREVIOUS, BEST = "last.pt", "previous.pt", "best.pt"
 HASH = "sha256"
-VERSION = 2  # of what is stored as a network's architecture; 1 had neither size nor normalisation nor encoding
+VERSION = 2  # of what is stored as a network's architecture; 1 had neither size nor normalization nor encoding
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:

@@ -41,14 +41,14 @@ def load_weights(network: nn.Module, weights: Mapping[str, Tensor], path: Path) 
 def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
     """What is stored with the weights, so that a network can be used without its run's configuration.
 
-    shape: the network's own settings. Its normalisation, unless it is its own affair, is a part of it.
+    shape: the network's own settings. Its normalization, unless it is its own affair, is a part of it.
     """
     statistics = {name: getattr(network, name).flatten().tolist() for name in ("mean", "std") if hasattr(network, name)}
     return {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding, **shape, **statistics}
 
 
 def start_from(network: nn.Module, own: Mapping[str, Any], run: Path) -> None:
-    """Give the network the weights and the normalisation of another run's, which `load_selected` finds.
+    """Give the network the weights and the normalization of another run's, which `load_selected` finds.
 
     own: what is known of the network (see `describe`). InputError where the other has other classes, another size or
     shape.

@@ -93,7 +93,7 @@ def write_whole(path: Path, content: bytes | memoryview, previous: Path | None =
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the renaming last, where folders can be synchronised."""
+    """Make the renaming last, where folders can be synchronized."""
     if os.name == "posix":
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -15,13 +15,13 @@ from augment.attacks.parameters import PARAMETERS
 from augment.objects import SceneObject, on_ground, with_props
 from augment.scene import Example, Scene
 from renderer.errors import InputError
-from renderer.mesh import Mesh, normalise
+from renderer.mesh import Mesh, normalize
+from renderer.rasterizer import choose
 from renderer.shapes import solid
-from renderer.visibility import choose
 
-OTHER_LIGHTS = {"skylight", "projector", "lamps", "places"}
+OTHER_LIGHTS = {"skylight", "projector", "lamps", "positions"}
 CLASSES = ("orange", "lime", "sky")
-SOFTWARE = choose("software")
+SOFTWARE = choose("numpy")
 
 
 def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
@@ -34,7 +34,7 @@ def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
 
 
 def textured() -> Mesh:
-    """A pear with a texture on half of its faces, colours at the corners of the others."""
+    """A pear with a texture on half of its faces, colors at the corners of the others."""
     mesh, draws = solid("pear"), np.random.default_rng(0)
     ids = np.where(np.arange(len(mesh.faces)) % 2, 0, -1).astype(np.int32)
     return replace(
@@ -59,7 +59,7 @@ def adversary_of(done: augment.AttackResult) -> Adversary:
 def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, kinds, encoding):
     """And exactly but for rounding to float32 where no texture is painted."""
     scene = augment.build_scene(
-        [(textured(), "orange")], 24, views=2, shared=True, visibility="software", encoding=encoding, field_of_view=2.4
+        [(textured(), "orange")], 24, views=2, shared=True, rasterizer="numpy", encoding=encoding, width=2.4
     )
     done = attacked(kinds, scene)
     write_adversary(adversary_of(done), tmp_path)
@@ -73,8 +73,8 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
 def test_company_and_table_are_never_attacked_not_after_they_are_read_back_either(tmp_path):
     """With textures of their own: the faces of a file are ordered by texture, and its vertices by place."""
     beside = replace(textured(), vertices=0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3]))
-    item = on_ground(with_props(SceneObject("orange", normalise(textured())), [beside]), (0.4, 0.3, 0.2))
-    scene = augment.build_scene([("solid:apple", "orange")], 24, visibility="software", field_of_view=3.0)
+    item = on_ground(with_props(SceneObject("orange", normalize(textured())), [beside]), (0.4, 0.3, 0.2))
+    scene = augment.build_scene([("solid:apple", "orange")], 24, rasterizer="numpy", width=3.0)
     scene = replace(scene, objects=[item])
     painted = attacked({"albedo"}, scene).conditions.albedo[0]
     assert painted[item.own_faces].any() and not painted[~item.own_faces].any()
@@ -100,11 +100,11 @@ def points(item: SceneObject, own: bool) -> set[tuple[float, ...]]:
 @pytest.mark.parametrize("perspective", [None, 50.0])
 def test_exposure_gain_background_and_place_are_kept(tmp_path, perspective):
     """A row as training draws them: its own exposure, an image behind it, a camera that looks past the middle."""
-    scene = augment.build_scene([("solid:orange", "orange")], 16, visibility="software", perspective=perspective)
+    scene = augment.build_scene([("solid:orange", "orange")], 16, rasterizer="numpy", fov=perspective)
     backgrounds = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
     ((camera,),) = scene.cameras
-    row = Example(0, (replace(camera, right=0.3, up=-0.2, field_of_view=3.0),), 1, exposure=1.7)
-    objects = [replace(each, gain=0.6) for each in scene.objects]
+    row = Example(0, (replace(camera, right=0.3, up=-0.2, width=3.0),), 1, exposure=1.7)
+    objects = [replace(each, albedo_scale=0.6) for each in scene.objects]
     done = attacked({"albedo", "lighting"}, replace(scene, examples=[row], objects=objects, backgrounds=backgrounds))
     write_adversary(adversary_of(done), tmp_path)
     found = read_adversary(tmp_path)
@@ -114,7 +114,7 @@ def test_exposure_gain_background_and_place_are_kept(tmp_path, perspective):
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    scene = augment.build_scene([("solid:orange", "orange")], 8, visibility="software")
+    scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")
     write_adversary(adversary_of(attacked({"pixels"}, scene)), tmp_path)
     return tmp_path
 
@@ -146,31 +146,31 @@ DAMAGES = {
     "no description": (lambda folder: (folder / DESCRIPTION).unlink(), "does not exist: give a folder that an attack"),
     "no JSON": (lambda folder: (folder / DESCRIPTION).write_text("{"), "does not describe an adversary"),
     "a list": (lambda folder: (folder / DESCRIPTION).write_text("[]"), "does not describe an adversary"),
-    "a key less": (described(image={"size": 8, "colour": 1}), "does not describe an adversary"),
+    "a key less": (described(image={"size": 8, "color": 1}), "does not describe an adversary"),
     "no size": (described(image={"size": 0}), "must be at least 1"),
     "another size": (described(image={"size": 9}), "has shape"),
     "no cameras": (described(cameras=[]), "has no cameras"),
-    "a flat camera": (described(cameras=[{"polar": 0, "azimuth": 0, "field_of_view": 0}]), "field_of_view=0"),
+    "a flat camera": (described(cameras=[{"polar": 0, "azimuth": 0, "width": 0}]), "width=0"),
     "no faces of its own": (described(own_faces=0), "own_faces=0 must be at least 1"),
     "more than all faces": (described(own_faces=10**6), "own_faces=1000000 must be at least 1 and at most"),
     "no number of faces": (described(own_faces="all"), "does not describe an adversary"),
     "a camera at the origin": (
-        described(cameras=[{"polar": 0, "azimuth": 0, "field_of_view": 2, "distance": 0}]),
+        described(cameras=[{"polar": 0, "azimuth": 0, "width": 2, "distance": 0}]),
         "distance=0 must be at least",
     ),
-    "no gain": (described(gain=0), "gain=0.0 must be at least"),
+    "no gain": (described(albedo_scale=0), "albedo_scale=0.0 must be at least"),
     "no mesh": (described(mesh="absent.glb"), "absent.glb does not exist"),
     "no light": (described(light="absent.json"), "absent.json does not exist"),
     "a number for a name": (described(mesh=3), "3 does not exist"),
-    "too bright a background": (described(background=3), "give grey values"),
+    "too bright a background": (described(background=3), "give gray values"),
     "images cut short": (lambda folder: (folder / "after.npy").write_bytes(b"\\x93NUMPY"), "after.npy cannot be read"),
     "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy does not exist"),
     "a pipe for images": (piped("after.npy"), "after.npy is no file"),
-    "a gain of 10⁴⁰⁰": (described(gain=10**400), "does not describe an adversary"),
+    "a gain of 10⁴⁰⁰": (described(albedo_scale=10**400), "does not describe an adversary"),
     "infinitely many faces": (described(own_faces=float("inf")), "does not describe an adversary"),
-    "a list for a background": (described(background=[1]), r"adversary\.json: background=\[1\]: give grey values"),
+    "a list for a background": (described(background=[1]), r"adversary\.json: background=\[1\]: give gray values"),
     "a camera within the mesh": (
-        described(cameras=[{"polar": 0, "azimuth": 0, "field_of_view": 2, "distance": 0.5}]),
+        described(cameras=[{"polar": 0, "azimuth": 0, "width": 2, "distance": 0.5}]),
         r"adversary\.json: the mesh reaches to a camera at distance 0\.5",
     ),
     "images of 10 TB": (announced, "after.npy cannot be read"),

@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
 from augment.attacks.figure import SIDE, Panel, prediction_caption, read_figure, save_figure
-from renderer.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
+from renderer.io.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 
 PAPER = 255
 
@@ -51,7 +51,7 @@ def test_each_view_has_a_row_and_each_side_a_column_in_which_pixels_stay_as_they
             assert place(sheet, image) == [(top, left)]
 
 
-def test_the_difference_is_grey_where_there_is_none_and_reaches_white_or_black(tmp_path):
+def test_the_difference_is_gray_where_there_is_none_and_reaches_white_or_black(tmp_path):
     """One view changes by +0.2 in red at one pixel, the other by -0.1: a fifth of the range is the whole of it."""
     before = torch.full((2, 3, 4, 4), 0.5)
     after = before.clone()
@@ -68,7 +68,7 @@ def test_the_difference_is_grey_where_there_is_none_and_reaches_white_or_black(t
     assert places[0][0][1] == places[1][0][1] == MARGIN + 2 * (SIDE + GAP)
 
 
-def test_without_a_difference_all_of_it_is_grey(tmp_path):
+def test_without_a_difference_all_of_it_is_gray(tmp_path):
     shown = panel(1)
     sheet = draw(tmp_path / "report.png", shown, shown)
     assert len(place(sheet, torch.full((3, 32, 32), 128 / 255))) == 1

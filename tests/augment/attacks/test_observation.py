@@ -104,7 +104,7 @@ def test_settings_out_of_range_are_refused(key, value):
 def test_adversaries_exceed_the_margin_and_without_one_stop_at_the_border(rounded):
     """By the classifier's own logits on the images, rounded where they are to be."""
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES)
-    scene = augment.build_scene([("solid:orange", "orange")], 8, views=2, shared=True, visibility="software")
+    scene = augment.build_scene([("solid:orange", "orange")], 8, views=2, shared=True, rasterizer="numpy")
     for margin in (0.0, 2.0):
         settings = augment.AttackSettings(
             lighting=augment.StepSettings(step_size=0.02),
@@ -124,7 +124,7 @@ def test_adversaries_exceed_the_margin_and_without_one_stop_at_the_border(rounde
 def test_what_fools_is_kept_where_the_margin_is_out_of_reach():
     """Of those that fool, the one of the lowest cost; it fools though the last step may not."""
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES)
-    scene = augment.build_scene([("solid:orange", "orange")], 8, visibility="software")
+    scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")
     light = augment.StepSettings(step_size=0.05)
     first = augment.attack(
         classifier, scene, settings=augment.AttackSettings(lighting=light, allow_negative=True, max_steps=60)
@@ -138,7 +138,7 @@ def test_what_fools_is_kept_where_the_margin_is_out_of_reach():
 def test_expected_adversaries_survive_changes_that_others_do_not():
     """Noise and exposure of the classifier's own images, which are other ones than the attack's."""
     classifier = augment.Classifier(lambda images: 100 * images.mean((2, 3)), 8, CLASSES)
-    scene = augment.build_scene([("solid:orange", "orange")], 8, visibility="software")
+    scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")
     survived = []
     for draws in (0, 8):
         changes = EOTSettings(draws=draws, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)

@@ -8,25 +8,25 @@ import augment
 from augment.attacks.evaluate import Checks
 from augment.attacks.parameters import PARAMETERS
 from renderer.errors import InputError
+from renderer.light.nonnegative import project_nonnegative
 from renderer.mesh import Mesh, load_mesh
-from renderer.nonnegative import nearest_nonnegative
 from renderer.shapes import solid
 
-OTHER_LIGHTS = {"skylight", "projector", "lamps", "places"}
+OTHER_LIGHTS = {"skylight", "projector", "lamps", "positions"}
 CLASSES = ("orange", "lime", "sky", "night")
 SIGNED = augment.AttackSettings(lighting=augment.StepSettings(), allow_negative=True)
-SMALL = {"visibility": "software", "field_of_view": 2.4}
+SMALL = {"rasterizer": "numpy", "width": 2.4}
 
 
 @pytest.fixture
 def classifier() -> augment.Classifier:
     """Orange is red, lime is green, sky is blue, night is dark."""
 
-    def mean_colour(images: Tensor) -> Tensor:
+    def mean_color(images: Tensor) -> Tensor:
         means = 30 * images.mean((2, 3))
         return torch.cat([means, 12 - means.sum(1, keepdim=True)], dim=1)
 
-    return augment.Classifier(mean_colour, 8, CLASSES, "by_colour")
+    return augment.Classifier(mean_color, 8, CLASSES, "by_color")
 
 
 def test_several_meshes_and_classes_are_attacked_in_one_scene_each_away_from_its_own(classifier):
@@ -49,7 +49,7 @@ def test_shared_views_may_each_have_a_target(classifier, target):
 
 
 @pytest.mark.parametrize("transport", ["shadows", pytest.param("bounces:1", marks=pytest.mark.slow)])
-def test_what_is_judged_has_the_shadows_of_the_shape_and_the_colours_that_leave(classifier, tmp_path, transport):
+def test_what_is_judged_has_the_shadows_of_the_shape_and_the_colors_that_leave(classifier, tmp_path, transport):
     scene = augment.build_scene([("solid:cup:3", "orange")], 8, 2, shared=True, transport=transport, **SMALL)
     moved = {name: augment.StepSettings("linf", 0.05, "sign", 0.03) for name in ("geometry", "albedo")}
     settings = augment.AttackSettings(**moved, max_steps=2)
@@ -87,7 +87,7 @@ def test_whatever_is_attacked_the_light_is_one_that_something_can_emit_unless_an
     settings = augment.AttackSettings(**{kind: augment.StepSettings()}, allow_negative=allow_negative, max_steps=2)
     attacked = augment.attack(classifier, scene, settings=settings)
     lights = attacked.conditions.light
-    assert torch.equal(lights, nearest_nonnegative(scene.lights)) == physical
+    assert torch.equal(lights, project_nonnegative(scene.lights)) == physical
     assert torch.equal(lights, scene.lights) != physical
     images = [attacked.problem.images(values) for values in (attacked.problem.start, attacked.descent.values)]
     assert torch.equal(images[0], attacked.images_before) and torch.equal(images[1], attacked.images)
@@ -95,9 +95,9 @@ def test_whatever_is_attacked_the_light_is_one_that_something_can_emit_unless_an
     assert (tmp_path / "example_000" / "light.exr").is_file() == physical
 
 
-def test_what_is_not_recognised_or_no_class_is_refused_in_one_sentence(classifier):
+def test_what_is_not_recognized_or_no_class_is_refused_in_one_sentence(classifier):
     scene = augment.build_scene([("solid:orange", "lime")], 8, **SMALL)
-    with pytest.raises(InputError, match="1 of 1 images of solid:orange are not recognised as 'lime'"):
+    with pytest.raises(InputError, match="1 of 1 images of solid:orange are not recognized as 'lime'"):
         augment.attack(classifier, scene)
     assert augment.attack(classifier, scene, force=True).descent.success_before.all()
     with pytest.raises(InputError, match="'mango' is not a class of the model"):

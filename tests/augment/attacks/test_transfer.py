@@ -14,13 +14,13 @@ LIGHT = StepSettings(step_size=0.2)
 
 
 def network(classes: tuple[str, ...] = CLASSES, size: int = SIZE) -> augment.Classifier:
-    """The brightest channel of the mean colour, whatever the order of the classes."""
+    """The brightest channel of the mean color, whatever the order of the classes."""
     order = [CLASSES.index(name) for name in classes]
     return augment.Classifier(lambda images: 30 * images.mean((2, 3))[:, order], size, classes, f"{classes[0]}{size}")
 
 
 def attacked(criterion=None, **kinds: StepSettings) -> AttackResult:
-    """Of two views, each an example, before grey."""
+    """Of two views, each an example, before gray."""
     scene = augment.build_scene(
         [("solid:orange", "orange")], SIZE, 2, backgrounds=[0.4], light="st_peters", exposure=0.5
     )
@@ -69,10 +69,10 @@ def test_other_sides_and_other_meshes_are_those_of_a_scene_with_them():
     for found, shown in ((turned, replace(scene, examples=rows)), (other, apple)):
         logits = network()(shown.render(done.conditions, torch.arange(2))[:, 0])[:, None]
         torch.testing.assert_close(found.after, logits, rtol=0, atol=1e-4)
-    assert not other.clean_correct.any()  # a lime by its label, and none by its colour
+    assert not other.clean_correct.any()  # a lime by its label, and none by its color
 
 
-def test_only_what_was_recognised_and_then_fooled_is_shown():
+def test_only_what_was_recognized_and_then_fooled_is_shown():
     done = attacked(lighting=LIGHT)
     before = done.logits_before.clone()
     before[0] = -before[0]  # as if the first had been taken for something else

@@ -12,38 +12,38 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from renderer import reference
-from renderer.camera import OrthographicCamera, ring
+from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
-from renderer.harmonics import basis, live_coefficients, rotate
 from renderer.image import ImageSettings
-from renderer.lights import ambient, load_light
+from renderer.light.harmonics import basis, nonzero_coefficients, rotate
+from renderer.light.presets import ambient, load_light
 from renderer.mesh import Mesh, concatenate
-from renderer.rendering import operators, render
-from renderer.transfer import Operator, build_operators
+from renderer.rasterizer import choose
+from renderer.rendering import precompute_transfer, render
+from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import radiosity, rays
 from renderer.transport.rays import DIRECTIONS, sphere
-from renderer.visibility import choose
 
-BACKEND = choose("software")
+RASTERIZER = choose("numpy")
 ABOVE = OrthographicCamera(0, 0, 2.0)
 FLOAT32 = torch.finfo(torch.float32).eps
 QUADRATURE = 0.015  # of the brightest: what 512 directions misjudge of a shadowed pixel, root mean square
 
 
-def operator_of(mesh: Mesh, camera=ABOVE, transport="shadows", dtype=torch.float64, **settings) -> Operator:
+def operator_of(mesh: Mesh, camera=ABOVE, shadows=True, dtype=torch.float64, **settings) -> TransferOperator:
     chosen = ImageSettings(**{"size": 6, "samples": 1} | settings, transport=transport)
-    [operator] = build_operators(mesh, [camera], chosen, BACKEND, dtype=dtype)
+    [operator] = build_operators(mesh, [camera], chosen, RASTERIZER, dtype=dtype)
     return operator
 
 
-def all_rows(operator: Operator) -> torch.Tensor:
+def all_rows(operator: TransferOperator) -> torch.Tensor:
     """(C, 49, P) float64."""
     transfer = (operator.transfer * operator.albedo[:, None]).double()
     return transfer.new_zeros(3, 49, transfer.shape[2]).index_copy(1, operator.kept, transfer)
 
 
-def sky_share(operator: Operator) -> torch.Tensor:
+def sky_share(operator: TransferOperator) -> torch.Tensor:
     """(3, P), the radiance of white pixels under a white sky, over that under an open one."""
     return operator.radiance(ambient(torch.ones(3, dtype=torch.float64))) / operator.coverage / math.pi
 
@@ -90,12 +90,12 @@ def test_a_convex_mesh_keeps_the_operator_of_direct_light_to_the_bit(mesh, norma
     for transport in ("shadows", "bounces:2"):
         shaped = operator_of(mesh, camera, transport, normals=normals)
         assert torch.equal(shaped.transfer, direct.transfer)
-        assert torch.equal(shaped.kept, live_coefficients(6))
+        assert torch.equal(shaped.kept, nonzero_coefficients(6))
 
 
 def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monkeypatch):
     monkeypatch.setattr(rays, "COMPARISONS", 0)
-    assert torch.equal(operator_of(CONVEX["a ball"]).kept, live_coefficients(6))
+    assert torch.equal(operator_of(CONVEX["a ball"]).kept, nonzero_coefficients(6))
     assert len(operator_of(dented()).kept) == 49
 
 
@@ -130,7 +130,7 @@ def test_each_coefficient_is_that_of_the_slow_ray_caster(mesh, normals):
     """One sample per pixel looks in all directions, so that both add up the same rays."""
     camera = OrthographicCamera(0.8, 0.4, 2.1)
     settings = ImageSettings(6, 1, normals=normals)
-    [seen] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, BACKEND, mesh.closed)
+    [seen] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, RASTERIZER, mesh.closed)
     corners, directions = torch.from_numpy(mesh.vertices[mesh.faces]), sphere(DIRECTIONS)
     own = corners[seen.faces]
     planes = reference.unit(reference.doubled_area_vectors(own)) * seen.facing
@@ -152,7 +152,7 @@ def test_each_coefficient_is_that_of_the_slow_ray_caster(mesh, normals):
 
 @pytest.mark.parametrize("depth", [0.25, 0.5, 1.0])
 def test_the_middle_of_a_pit_sees_the_share_of_the_sky_that_a_square_has(depth):
-    """The configuration factor of a square parallel to a surface, over its middle (Howell's catalogue, B-3)."""
+    """The configuration factor of a square parallel to a surface, over its middle (Howell's catalog, B-3)."""
     side = 0.5 / depth
     far = math.hypot(1, side)
     share = 4 * side / (math.pi * far) * math.atan(side / far)
@@ -233,8 +233,8 @@ def test_an_unknown_transport_is_refused(unknown):
 
 @pytest.mark.parametrize("degree", [2, 6])
 def test_render_shows_the_operators_shadows_also_of_moved_vertices(degree):
-    cameras, light = ring(2, 2.2), load_light("grace").double()[: (degree + 1) ** 2]
-    shown = {"size": 12, "normals": "flat", "transport": "shadows", "visibility": "software"}
+    cameras, light = orbit_cameras(2, 2.2), load_light("grace").double()[: (degree + 1) ** 2]
+    shown = {"size": 12, "normals": "flat", "shadows": True, "rasterizer": "numpy"}
     stretched = replace(dented(), vertices=dented().vertices * [1.0, 0.5, 1.0])
     images = render(dented(), cameras, light, vertices=torch.from_numpy(stretched.vertices), **shown)
     expected = [
@@ -253,7 +253,7 @@ def test_render_differentiates_shadows_by_the_light_and_holds_them_by_the_vertic
             vertices=vertices,
             normals="flat",
             transport=transport,
-            visibility="software",
+            rasterizer="numpy",
         )
         return torch.autograd.grad(image.sum(), (light, vertices))
 

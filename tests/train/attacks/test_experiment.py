@@ -13,9 +13,9 @@ from augment.attacks.descent import descend_in_parts
 from augment.attacks.evaluate import Checks
 from augment.attacks.parameters import PARAMETERS
 from augment.classifiers import Classifier
-from renderer.camera import ring
+from renderer.camera import orbit_cameras
 from renderer.errors import InputError
-from renderer.lights import probe
+from renderer.light.presets import probe
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
@@ -27,7 +27,7 @@ CLASSES = ("orange", "lime", "sky", "night")
 SIZE = 8
 
 
-def mean_colour(images: Tensor) -> Tensor:
+def mean_color(images: Tensor) -> Tensor:
     """Orange is red, lime is green, sky is blue, night is dark."""
     means = 30 * images.mean((2, 3))
     return torch.cat([means, 12 - means.sum(1, keepdim=True)], dim=1)
@@ -37,20 +37,20 @@ def sky_in_the_dark(images: Tensor) -> Tensor:
     return 30 * images.mean((2, 3)) + 30 * (images[:, :1, 0, 0] < 0.1) * torch.tensor([0, 0, 1])
 
 
-def by_colour(classes: Sequence[str] = CLASSES) -> Classifier:
-    return Classifier(mean_colour, SIZE, classes, "by_colour")
+def by_color(classes: Sequence[str] = CLASSES) -> Classifier:
+    return Classifier(mean_color, SIZE, classes, "by_color")
 
 
 def configured(*overrides: str) -> AttackExperimentSettings:
     """The real configuration; arguments are further overrides."""
-    small = ["renderer.visibility=software", "renderer.cache=null", "attack.checks=false", "attack.max_steps=8"]
+    small = ["renderer.rasterizer=numpy", "renderer.cache=null", "attack.checks=false", "attack.max_steps=8"]
     small += ["attack.margin=0", "attack.rounded=false"]
     return read_settings(AttackExperimentSettings, composed("attack", [*small, *overrides]))
 
 
 STANDING = {  # the light of a kind that is placed in the scene, a little of it from the start
     "projector": "scene.projector={pixels: 4, pattern: 0.2}",
-    "lamps": "scene.lamps={places: [[2, 2, 2], [-2, 2, 2]], start: 0.5}",
+    "lamps": "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: 0.5}",
 }
 
 
@@ -62,7 +62,7 @@ def standing(kinds: str) -> list[str]:
 def attacked(*overrides: str, classifier: Classifier | None = None, device: torch.device = CPU) -> AttackResult:
     settings = configured(*overrides)
     (mesh,) = settings.scene.meshes
-    return attack_mesh(read_object(mesh, settings.label, 0), settings, classifier or by_colour(), device)
+    return attack_mesh(read_object(mesh, settings.label, 0), settings, classifier or by_color(), device)
 
 
 # ---------------------------------------------------------------------------------------- what is attacked
@@ -71,7 +71,7 @@ def attacked(*overrides: str, classifier: Classifier | None = None, device: torc
 @pytest.mark.parametrize("kinds", [*PARAMETERS, "lighting,geometry,pixels"])
 def test_every_kind_alone_and_with_others_lowers_the_cost_of_its_own_images(kinds):
     """The numbers are those of the images: the cost and the answers follow from the logits."""
-    more = ["attack.max_steps=3", "scene.backgrounds=[0.4,0.5]", "renderer.transport=direct", *standing(kinds)]
+    more = ["attack.max_steps=3", "scene.backgrounds=[0.4,0.5]", "renderer.shadows=false", *standing(kinds)]
     done = attacked(f"attack=[{kinds}]", *more)
     assert [kind.name for kind in done.problem.parameters] == kinds.split(",")
     assert done.images.shape == (2, 1, 3, SIZE, SIZE)
@@ -80,7 +80,7 @@ def test_every_kind_alone_and_with_others_lowers_the_cost_of_its_own_images(kind
         (done.images_before, done.logits_before, done.descent.cost_before),
         (done.images, done.logits, done.descent.cost),
     ]:
-        assert torch.equal(logits[:, 0], mean_colour(images[:, 0]))
+        assert torch.equal(logits[:, 0], mean_color(images[:, 0]))
         # Sums of 64 pixels in another order differ by rounding.
         torch.testing.assert_close(cost, adversarial_cost(logits[:, 0], done.goal.source[:, 0]), rtol=0, atol=1e-4)
     assert torch.equal(done.logits.argmax(2) != 0, done.descent.success[:, None])
@@ -103,9 +103,9 @@ def test_a_gpu_attacks_as_a_cpu_does_to_rounding(kinds):
 def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
     overrides = "scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "attack.allow_negative=true"
     done = attacked(*overrides, "attack.max_steps=0")
-    cameras = ring(3, 2.0, math.pi / 2)
+    cameras = orbit_cameras(3, 2.0, math.pi / 2)
     assert done.problem.scene.cameras == [(camera,) for camera in cameras for _ in range(2)]
-    assert done.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(grey)] * 3 for grey in [0.2, 0.6] * 3]
+    assert done.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(gray)] * 3 for gray in [0.2, 0.6] * 3]
     assert torch.equal(done.problem.scene.lights, probe("grace").expand(6, -1, -1))
 
 
@@ -119,7 +119,7 @@ def test_shared_views_are_one_example_with_one_light():
 
 def test_exposure_multiplies_the_light_and_gain_the_surface():
     brighter = attacked("attack.max_steps=0", "scene.exposure=1.5", "attack.force=true")
-    item = "scene.meshes=[{mesh: 'solid:orange:0', gain: 1.5}]"
+    item = "scene.meshes=[{mesh: 'solid:orange:0', albedo_scale: 1.5}]"
     whiter = attacked("attack.max_steps=0", item, "attack.force=true")
     torch.testing.assert_close(brighter.images_before, whiter.images_before, rtol=0, atol=1e-6)
     assert not torch.equal(brighter.images_before, attacked("attack.max_steps=0").images_before)
@@ -186,7 +186,7 @@ def test_a_target_is_reached():
 
 
 def test_a_class_whose_name_is_a_number_is_a_target():
-    done = attacked("target=7", "attack.max_steps=1", classifier=by_colour(("orange", "7", "8", "9")))
+    done = attacked("target=7", "attack.max_steps=1", classifier=by_color(("orange", "7", "8", "9")))
     assert done.goal.target.tolist() == [[1]]
 
 
@@ -214,8 +214,8 @@ REFUSED = [
     (["scene.backgrounds=[]"], r"scene.meshes and scene.backgrounds must not be empty"),
     (["seed=-1"], r"seed=-1 must be at least 0"),
     (["attack.max_steps=many"], r"attack.max_steps: Value 'many' of type 'str' could not be converted to Integer"),
-    (["label=mango"], r"classifier=by_colour: 'mango' is not a class of the model: choose one, such as "),
-    (["target=mango"], r"classifier=by_colour: 'mango' is not a class of the model: choose one, such as "),
+    (["label=mango"], r"classifier=by_color: 'mango' is not a class of the model: choose one, such as "),
+    (["target=mango"], r"classifier=by_color: 'mango' is not a class of the model: choose one, such as "),
     (["target=[lime,sky]"], r"target=\['lime', 'sky'\] names 2 classes for 1 views .*: give as many, and"),
     (["target=[lime,sky]", "scene.views=2"], r"names 2 classes for 1 views"),
     (["target=[lime]", "scene.views=2", "attack.shared=true"], r"names 1 classes for 2 views"),
@@ -240,8 +240,8 @@ def test_an_attack_on_nothing_is_refused():
 
 
 def test_a_mesh_may_name_its_own_class():
-    item = read_object({"mesh": "solid:orange:0", "label": "lime", "gain": 2.0}, "orange", 0)
-    assert (item.mesh, item.label, item.gain) == ("solid:orange:0", "lime", 2.0)
+    item = read_object({"mesh": "solid:orange:0", "label": "lime", "albedo_scale": 2.0}, "orange", 0)
+    assert (item.mesh, item.label, item.albedo_scale) == ("solid:orange:0", "lime", 2.0)
     assert read_object("solid:orange:0", "sky", 0).label == "sky"
 
 
@@ -256,7 +256,10 @@ BESIDE = [
     ([{"mesh": "solid:cup", "at": [1]}], r"props: solid:cup: at=\[1.0\] must be x and y"),
     ([{"mesh": "solid:cup", "at": [0, float("nan")]}], "props: solid:cup: at=nan must be at least -10"),
     ([{"mesh": "solid:cup", "at": [0, 1], "scale": 0}], "props: solid:cup: scale=0.0 must be at least 0.1"),
-    ([{"mesh": "solid:cup", "at": [0, 1], "gain": 2}], r"meshes\[3\].props\[0\].gain: Key 'gain' not in"),
+    (
+        [{"mesh": "solid:cup", "at": [0, 1], "albedo_scale": 2}],
+        r"meshes\[3\].props\[0\].albedo_scale: Key 'gain' not in",
+    ),
     (["solid:cup"], r"meshes\[3\].props: give a list of mappings"),
     ("solid:cup", r"meshes\[3\].props: give a list of mappings"),
     (None, r"meshes\[3\].props: give a list of mappings"),
@@ -269,7 +272,7 @@ def test_what_cannot_stand_beside_a_mesh_is_refused(props, message):
         read_object({"mesh": "solid:apple", "props": props}, "orange", 3)
 
 
-def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_forced():
+def test_a_mesh_that_is_not_recognized_is_refused_with_the_best_answers_unless_forced():
     """Of six classes the five best are told, best first, with their shares."""
     bias = torch.tensor([0.0, 5, 4, 3, 2, 1])
     deaf = Classifier(lambda images: images.sum() * 0 + bias.expand(len(images), -1), SIZE, ("orange", *"abcde"))
@@ -278,7 +281,7 @@ def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_f
     with pytest.raises(InputError) as refused:
         attacked("scene.views=2", classifier=deaf)
     assert str(refused.value) == (
-        f"2 of 2 images of solid:orange:0 are not recognised as 'orange' before any attack (the first: {best}): "
+        f"2 of 2 images of solid:orange:0 are not recognized as 'orange' before any attack (the first: {best}): "
         "change the scene, or set attack.force=true"
     )
     done = attacked("scene.views=2", "attack.force=true", "attack.max_steps=1", classifier=deaf)
@@ -289,12 +292,12 @@ def test_a_mesh_that_is_not_recognised_is_refused_with_the_best_answers_unless_f
     assert (found.success, found.random_search, set(found.success_by_steps.values())) == (0, 0, {0})
 
 
-def test_success_is_counted_among_what_was_recognised_before():
-    """Before the dark background the image is not recognised; wrong as it is, it is nothing that the attack did."""
+def test_success_is_counted_among_what_was_recognized_before():
+    """Before the dark background the image is not recognized; wrong as it is, it is nothing that the attack did."""
     dark = Classifier(sky_in_the_dark, SIZE, CLASSES[:3])
     done = attacked("scene.backgrounds=[0.5,0.0]", "attack.force=true", "attack.max_steps=30", classifier=dark)
     assert done.clean_correct.tolist() == [True, False] and done.success.tolist() == [True, True]
-    assert "1 of 1 examples fooled [21%, 100%]; 1 not recognised before, which do not count" in format_attack(
+    assert "1 of 1 examples fooled [21%, 100%]; 1 not recognized before, which do not count" in format_attack(
         "mesh", done, None
     )
 

@@ -12,10 +12,10 @@ from augment.attacks.attack import AttackResult
 from augment.attacks.figure import read_figure
 from augment.attacks.files import LINES, write_files
 from augment.classifiers import Classifier
-from renderer.environment import read_map, to_map
-from renderer.files.mesh_damage import mesh_damage
-from renderer.files.mitsuba_scene import mitsuba_map
-from renderer.lights import load_light
+from renderer.io.mesh_damage import mesh_damage
+from renderer.io.mitsuba import mitsuba_map
+from renderer.light.environment import read_map, to_map
+from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
@@ -27,15 +27,15 @@ CLASSES = ("orange", "lime", "sky")
 
 def attacked(*overrides: str) -> AttackResult:
     small = [
-        "renderer.visibility=software",
+        "renderer.rasterizer=numpy",
         "renderer.cache=null",
         "attack.max_steps=2",
         "attack.force=true",
         "attack.allow_negative=true",
     ]
     settings = read_settings(AttackExperimentSettings, composed("attack", [*small, *overrides]))
-    by_colour = Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES, "by_colour")
-    return attack_mesh(read_object("solid:orange:0", "orange", 0), settings, by_colour, torch.device("cpu"))
+    by_color = Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES, "by_color")
+    return attack_mesh(read_object("solid:orange:0", "orange", 0), settings, by_color, torch.device("cpu"))
 
 
 def written(done: AttackResult, folder: Path) -> list[dict]:

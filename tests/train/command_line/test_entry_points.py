@@ -30,7 +30,7 @@ from train.run_folder.files import locked
 ROOT = Path(__file__).parents[3]
 SMALL = [
     "model.depth=10", "model.width=1", "train.epochs=1", "train.precision=float32", "augment.examples=4",
-    "scene.backgrounds=[0,1]", "renderer.visibility=software", "renderer.samples=2",
+    "scene.backgrounds=[0,1]", "renderer.rasterizer=numpy", "renderer.samples=2",
 ]  # fmt: skip
 
 
@@ -360,8 +360,8 @@ def test_an_error_of_the_users_input_is_not_followed_by_suggestions(monkeypatch,
         ),
         (
             "scripts/attack.py",
-            ["scene.meshes=[~/a.glb,{mesh:/me/b.glb,gain:3}]"],
-            "attack.py 'scene.meshes=[a.glb,{mesh:b.glb,gain:3}]'",
+            ["scene.meshes=[~/a.glb,{mesh:/me/b.glb,albedo_scale:3}]"],
+            "attack.py 'scene.meshes=[a.glb,{mesh:b.glb,albedo_scale:3}]'",
         ),
         (
             "scripts/attack.py",

@@ -50,10 +50,10 @@ def test_every_image_is_distorted_by_draws_of_its_own_whatever_the_number_of_pro
     assert torch.equal(distortion(name, model, 0)(same[3:], LABELS[3:], 1), whole[3:])
 
 
-def test_colour_jitter_is_torchvisions(images, model):
-    """Brightness changes by at most 0.4 of itself: no value of a grey image leaves that range, but for contrast."""
-    grey = torch.full_like(images, 100)
-    found = distortion("color_jitter", model, 0)(grey, LABELS, 0)
+def test_color_jitter_is_torchvisions(images, model):
+    """Brightness changes by at most 0.4 of itself: no value of a gray image leaves that range, but for contrast."""
+    gray = torch.full_like(images, 100)
+    found = distortion("color_jitter", model, 0)(gray, LABELS, 0)
     assert found.min() >= 60 - 1 and found.max() <= 140 + 1
     assert isinstance(torchvision_transform("color_jitter"), v2.ColorJitter)
 

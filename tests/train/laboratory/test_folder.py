@@ -15,7 +15,7 @@ from train.photographs.folder import find_photographs, load_photographs
 
 pytest.importorskip("mitsuba")
 
-MESHES = ["solid:orange:7", {"mesh": "solid:orange:8", "gain": 0.5}, "solid:lemon:7", "solid:pear:7"]
+MESHES = ["solid:orange:7", {"mesh": "solid:orange:8", "albedo_scale": 0.5}, "solid:lemon:7", "solid:pear:7"]
 
 
 def settings(out: Path, **changes) -> LabSettings:

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from train.laboratory.patterns import FAMILIES, TWO_COLOURED, checkers, draw_colour, draw_pattern, ramp, spots, stripes
+from train.laboratory.patterns import FAMILIES, TWO_COLORED, checkers, draw_color, draw_pattern, ramp, spots, stripes
 
 SEEDS = range(8)
 each_seed = pytest.mark.parametrize("seed", SEEDS)
@@ -26,20 +26,20 @@ def test_an_image_is_linear_light_in_the_unit_range_and_follows_from_its_seed(fa
 
 
 @each_seed
-def test_a_colour_has_a_full_channel(seed):
-    assert draw_colour(np.random.default_rng(seed)).max() == 1
+def test_a_color_has_a_full_channel(seed):
+    assert draw_color(np.random.default_rng(seed)).max() == 1
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 @each_seed
-def test_a_family_mixes_two_colours_one_of_which_is_darkness_in_some(family, seed):
+def test_a_family_mixes_two_colors_one_of_which_is_darkness_in_some(family, seed):
     image = draw_pattern(family, np.random.default_rng(seed), 64).reshape(-1, 3)
     if family == "gradient":
         assert np.linalg.matrix_rank(image - image[0], tol=1e-3) == 1
     else:
-        colours = np.unique(image, axis=0)
-        assert len(colours) == (1 if family == "solid" else 2)
-        assert (colours.min(axis=0).max() == 0) == (family not in (*TWO_COLOURED, "solid"))
+        colors = np.unique(image, axis=0)
+        assert len(colors) == (1 if family == "solid" else 2)
+        assert (colors.min(axis=0).max() == 0) == (family not in (*TWO_COLORED, "solid"))
 
 
 @each_seed

@@ -39,12 +39,12 @@ def test_the_camera_looks_down_at_an_object_that_fits_its_view(shots):
         back = shot.camera - shot.aim
         assert 18 <= np.degrees(np.arcsin(back[2] / np.linalg.norm(back))) <= 60
         assert 1.2 <= np.linalg.norm(back) * np.tan(np.radians(FIELD_OF_VIEW / 2)) <= 1.9
-        assert np.abs(shot.aim - shot.centre).max() <= 0.25
+        assert np.abs(shot.aim - shot.center).max() <= 0.25
 
 
 def test_the_projector_stands_above_on_the_cameras_side(shots):
     for shot in shots:
-        towards, back = shot.projector - shot.centre, shot.camera - shot.aim
+        towards, back = shot.projector - shot.center, shot.camera - shot.aim
         assert towards[2] > 0
         across = towards[:2] @ back[:2] / np.linalg.norm(towards[:2]) / np.linalg.norm(back[:2])
         assert across >= np.cos(np.radians(70)) - 1e-9

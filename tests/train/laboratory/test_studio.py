@@ -19,10 +19,10 @@ pytest.importorskip("mitsuba")
 def frontal(**changes) -> Shot:
     """A camera and a projector in front of an upright object, in white light on a black table."""
     [shot] = draw_shots(1, ["solid"], (1, 1), seed=0)
-    centre, front = np.array([0, 0, 1.0]), np.array([0, -6.0, 1.0])
+    center, front = np.array([0, 0, 1.0]), np.array([0, -6.0, 1.0])
     plain = {
         "pattern": np.ones((4, 4, 3), np.float32), "ambient": np.zeros(3), "table": np.zeros(3), "projector": front,
-        "camera": front, "centre": centre, "aim": centre, "turn": np.eye(3), "scale": 1.0,
+        "camera": front, "center": center, "aim": center, "turn": np.eye(3), "scale": 1.0,
     }  # fmt: skip
     return replace(shot, **plain | changes)
 
@@ -57,7 +57,7 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
 
     rays = directions(shot, 8)
     places = shot.camera - rays * (shot.camera[2] / rays[..., 2:])
-    axis, ray = shot.centre - shot.projector, places - shot.projector
+    axis, ray = shot.center - shot.projector, places - shot.projector
     depth = ray @ axis / np.linalg.norm(axis)
     evenly = axis @ axis / depth**2 * (-ray[..., 2] / depth)
     lit = evenly[..., None] * shot.brightness * shot.pattern[0, 0] + shot.ambient
@@ -77,12 +77,12 @@ def test_a_texture_lies_upright_on_its_faces():
 
 def test_a_card_reflects_its_linear_albedo_times_the_gain_and_the_brightness():
     """Facing projector and camera, with its gloss: 4 % of the light times the GGX peak, 1 / (4 α²)."""
-    grey = np.full((4, 4, 3), 128, dtype=np.uint8)  # linear 0.216
+    gray = np.full((4, 4, 3), 128, dtype=np.uint8)  # linear 0.216
     gloss = 0.04 / (4 * ROUGHNESS**4)  # α is the roughness's square
-    for gain, brightness in [(1, 1), (2, 1), (1, 0.5)]:
+    for albedo_scale, brightness in [(1, 1), (2, 1), (1, 0.5)]:
         shot = frontal(brightness=brightness)
-        image = photograph(split_parts(card(grey), gain, "card"), shot, 8, 16, bounces=1, seed=0)
-        assert image[3:5, 3:5].mean() == pytest.approx((0.216 * gain + gloss) * brightness, rel=0.05)
+        image = photograph(split_parts(card(gray), albedo_scale, "card"), shot, 8, 16, bounces=1, seed=0)
+        assert image[3:5, 3:5].mean() == pytest.approx((0.216 * albedo_scale + gloss) * brightness, rel=0.05)
 
 
 def test_an_object_stands_on_the_table():
@@ -116,10 +116,10 @@ def test_parts_are_the_faces_of_each_texture_and_of_none():
     assert textured.textured and textured.albedo.tolist() == [[[0, 0, 1]]]
 
 
-def test_a_texture_and_colours_of_vertices_at_once_are_refused():
+def test_a_texture_and_colors_of_vertices_at_once_are_refused():
     mesh = card(np.zeros((1, 1, 3), dtype=np.uint8))
     mesh = replace(mesh, corner_colors=np.linspace(0, 1, 18, dtype=np.float32).reshape(2, 3, 3))
-    with pytest.raises(InputError, match=r"card.glb has a texture and colours of its vertices, too: paint them into"):
+    with pytest.raises(InputError, match=r"card.glb has a texture and colors of its vertices, too: paint them into"):
         split_parts(mesh, 1.0, "card.glb")
 
 

@@ -9,7 +9,7 @@ FRAMES = {"hits": (46, 158, 91), "misses": (208, 59, 59), "false alarms": (232, 
 
 def count_tiles(sheet: Image.Image) -> dict[str, int]:
     pixels = np.asarray(sheet)
-    areas = {name: int((pixels == colour).all(axis=2).sum()) for name, colour in FRAMES.items()}
+    areas = {name: int((pixels == color).all(axis=2).sum()) for name, color in FRAMES.items()}
     counts = {name: divmod(area, CELL**2 - IMAGE**2) for name, area in areas.items()}
     assert all(rest == 0 for _, rest in counts.values())
     return {name: count for name, (count, _) in counts.items()}

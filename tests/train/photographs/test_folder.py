@@ -22,8 +22,8 @@ def save(path: Path, pixels: np.ndarray | Image.Image, **options) -> Path:
     return path
 
 
-def plain(colour=(255, 128, 0), size=(32, 32)) -> Image.Image:
-    return Image.new("RGB", size, colour)
+def plain(color=(255, 128, 0), size=(32, 32)) -> Image.Image:
+    return Image.new("RGB", size, color)
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -217,7 +217,7 @@ def test_a_photos_csv_without_its_columns_is_refused_by_name(tmp_path, table):
         (("other_lemon/a.jpg",), ".", "other_lemon", "'other_lemon' is not a class"),
     ],
 )
-def test_what_cannot_be_labelled_is_refused_in_one_sentence(tmp_path, files, folder, label, message):
+def test_what_cannot_be_labeled_is_refused_in_one_sentence(tmp_path, files, folder, label, message):
     touch(tmp_path, *files)
     with pytest.raises(InputError, match=message) as caught:
         find_photographs(tmp_path / folder, CLASSES, label)
@@ -258,7 +258,7 @@ def test_every_exif_orientation_is_undone(tmp_path, orientation, sides, suffix):
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_only_the_central_square_is_kept(tmp_path, axis):
-    thirds = [np.broadcast_to(np.uint8(colour), (32, 32, 3)) for colour in ((255, 0, 0), (0, 200, 0), (0, 0, 255))]
+    thirds = [np.broadcast_to(np.uint8(color), (32, 32, 3)) for color in ((255, 0, 0), (0, 200, 0), (0, 0, 255))]
     path = save(tmp_path / "a.png", np.concatenate(thirds, axis=axis))
     np.testing.assert_array_equal(load_one(path), thirds[1])
 
@@ -272,7 +272,7 @@ def test_the_square_is_exactly_central_so_that_a_turned_image_loads_turned(tmp_p
 
 
 @pytest.mark.parametrize("side", [64, 100, 333])
-def test_detail_too_fine_to_show_reduces_to_grey(tmp_path, side):
+def test_detail_too_fine_to_show_reduces_to_gray(tmp_path, side):
     checkerboard = (np.indices((side, side)).sum(axis=0) % 2 * 255).astype(np.uint8)
     loaded = load_one(save(tmp_path / "a.png", checkerboard))
     assert np.abs(loaded - 127.5)[3:-3, 3:-3].max() <= 1.5  # rounded to 8 bits twice
@@ -286,12 +286,12 @@ def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
     with Image.open(path) as image:
         whole = save(tmp_path / "a.bmp", image.convert("RGB"))
     difference = np.abs(load_one(path) - load_one(whole))
-    # Halving an odd side rounds it up, which moves the centre by 1/100 of a final pixel.
+    # Halving an odd side rounds it up, which moves the center by 1/100 of a final pixel.
     assert difference.max() <= 8 and difference.mean() <= 1
 
 
-def with_alpha(mode: str, colour: tuple[int, ...]) -> Image.Image:
-    return Image.new(mode, (40, 40), colour)
+def with_alpha(mode: str, color: tuple[int, ...]) -> Image.Image:
+    return Image.new(mode, (40, 40), color)
 
 
 def palette() -> Image.Image:
@@ -303,15 +303,15 @@ def palette() -> Image.Image:
 @pytest.mark.parametrize(
     ("name", "image", "options", "expected"),
     [
-        ("grey.png", Image.new("L", (40, 40), 100), {}, (100, 100, 100)),
+        ("gray.png", Image.new("L", (40, 40), 100), {}, (100, 100, 100)),
         ("black-and-white.png", Image.new("1", (40, 40), 1), {}, (255, 255, 255)),
         ("palette.png", palette(), {}, (10, 200, 30)),
         ("palette.gif", palette(), {}, (10, 200, 30)),
         ("clear-palette.png", palette(), {"transparency": 1}, (255, 255, 255)),
         ("half-clear-palette.png", palette(), {"transparency": bytes([255, 51])}, (206, 244, 210)),
-        ("colour-key.png", plain((10, 20, 30)), {"transparency": (10, 20, 30)}, (255, 255, 255)),
+        ("color-key.png", plain((10, 20, 30)), {"transparency": (10, 20, 30)}, (255, 255, 255)),
         ("alpha.png", Image.new("RGBA", (40, 40), (255, 0, 0, 51)), {}, (255, 204, 204)),
-        ("grey-alpha.png", Image.new("LA", (40, 40), (0, 51)), {}, (204, 204, 204)),
+        ("gray-alpha.png", Image.new("LA", (40, 40), (0, 51)), {}, (204, 204, 204)),
         ("alpha.webp", Image.new("RGBA", (40, 40), (255, 0, 0, 0)), {"lossless": True}, (255, 255, 255)),
         ("cmyk.tif", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {}, (255, 0, 0)),
         ("cmyk.jpg", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {"quality": 100}, (255, 0, 0)),
@@ -328,14 +328,14 @@ def test_any_mode_becomes_rgb_over_white(tmp_path, name, image, options, expecte
 
 
 def test_images_come_as_bytes_in_the_order_asked_for(tmp_path):
-    colours = {"c.png": (255, 0, 0), "a.png": (0, 255, 0), "b.png": (0, 0, 255)}
-    for name, colour in colours.items():
-        save(tmp_path / name, plain(colour, (50, 40)))
-    photographs = [Photograph(PurePosixPath(name), "orange", None) for name in colours]
+    colors = {"c.png": (255, 0, 0), "a.png": (0, 255, 0), "b.png": (0, 0, 255)}
+    for name, color in colors.items():
+        save(tmp_path / name, plain(color, (50, 40)))
+    photographs = [Photograph(PurePosixPath(name), "orange", None) for name in colors]
     kept, images, unreadable = load_photographs(tmp_path, photographs, size=8)
     assert (kept, unreadable) == (photographs, [])
     assert images.dtype == torch.uint8 and images.shape == (3, 3, 8, 8) and images.is_contiguous()
-    assert [tuple(image[:, 4, 4].tolist()) for image in images] == list(colours.values())
+    assert [tuple(image[:, 4, 4].tolist()) for image in images] == list(colors.values())
 
 
 def truncated(path: Path) -> None:
@@ -387,7 +387,7 @@ def test_many_unreadable_images_are_counted_and_the_first_is_named(tmp_path, sma
 
 @pytest.mark.realdata
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
-def test_the_shared_photographs_are_found_labelled_and_loaded():
+def test_the_shared_photographs_are_found_labeled_and_loaded():
     with np.load(DATA / "cifar100.npz") as archive:
         classes = archive["classes"].tolist()
     found = find_photographs(DATA / "photos", classes, "orange")

@@ -39,7 +39,7 @@ def test_the_figure_has_a_line_per_source_with_its_auc_and_the_three_rates():
     rankings = {"": Ranking([1.0, 2.0], [0.0, 1.5]), "lab": Ranking([1.0], [0.0])}
     figure = draw_roc(rankings, "orange")
     (axes,) = figure.axes
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("other things called orange", "orange recognised")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("other things called orange", "orange recognized")
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["all: AUC 0.750", "lab: AUC 1.000"]
     assert [text.get_text() for text in axes.texts] == ["5%", "10%", "20%"]
     for line, ranking in zip(axes.lines[-2:], rankings.values(), strict=True):

@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 from renderer.errors import InputError
 from train.photographs.figures import FIGURES, figure_title
 from train.report.card import publish_run
-from train.report.summary import summarise
+from train.report.summary import summarize
 from train.run_folder import checkpoint
 from train.run_folder.checkpoint import BEST
 from train.run_folder.classifier import PUBLISHED, load_run
@@ -24,13 +24,13 @@ def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_ma
     card = (out / "README.md").read_text()
     (table,) = read_markdown(card).values()
     rows = dict(table[1:])
-    run = summarise(finished)
+    run = summarize(finished)
     assert rows["network"] == "WideResNet-10-1, dropout 0.3"
     assert rows["data"] == "tiny.npz, 10% of training for validation"
     assert rows["augmentation"] == "adversarial; renders each epoch: 4 renders of solid:orange:0, solid:orange:1"
     assert rows["test accuracy"] == f"{run.scores['test/accuracy']:.4f}"
     summary = json.loads((finished / "photographs" / "summary.json").read_text())
-    assert rows["photographs: orange recognised"] == wilson(summary["recall"]["hits"], summary["recall"]["n"])
+    assert rows["photographs: orange recognized"] == wilson(summary["recall"]["hits"], summary["recall"]["n"])
     auc = summary["auc"]
     assert rows["photographs: AUC"] == f"{auc['value']:.3f} [{auc['low']:.3f}, {auc['high']:.3f}]"
     assert [name for name in rows if name.startswith("photographs: ")] == [

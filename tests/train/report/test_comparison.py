@@ -8,11 +8,11 @@ from renderer.errors import InputError
 from train.photographs.answers import Answer, write_answers
 from train.photographs.folder import Photograph
 from train.report.comparison import format_comparison
-from train.report.summary import summarise
+from train.report.summary import summarize
 from train.report.write import write_report
 
 TITLES = [
-    "Photographs: orange recognised", "Photographs: others called orange", "Photographs: AUC",
+    "Photographs: orange recognized", "Photographs: others called orange", "Photographs: AUC",
     "Photographs: recall at 5% false alarms", "Photographs: recall at 10% false alarms",
     "Photographs: recall at 20% false alarms",
 ]  # fmt: skip
@@ -48,7 +48,7 @@ def scored_run(tmp_path, made_up_run):
 
 
 def compare(read_markdown, folders: list[Path], exclude=(), **keys) -> dict[str, list[list[str]]]:
-    return read_markdown(format_comparison([summarise(folder) for folder in folders], exclude, **keys))
+    return read_markdown(format_comparison([summarize(folder) for folder in folders], exclude, **keys))
 
 
 STUDIO_AND_WEB = {"studio": ([1, 1, 1, 1], []), "web": ([1, -1, -1, -1, -1], [-2, 3]), None: ([1, -1], [])}
@@ -66,10 +66,10 @@ def test_a_comparison_shows_every_source_and_pools_all_but_some(scored_run, made
         ["adversarial", "1", "0.7654", "2", "0.7500"],
         ["random", "0", "0.7654", "2", "0.7500"],
     ]
-    values = [[cell.partition(" ")[0] for cell in row] for row in tables["Photographs: orange recognised"][1:]]
-    assert tables["Photographs: orange recognised"][0] == ["source", "none, seed 0", "adversarial, seed 1"]
+    values = [[cell.partition(" ")[0] for cell in row] for row in tables["Photographs: orange recognized"][1:]]
+    assert tables["Photographs: orange recognized"][0] == ["source", "none, seed 0", "adversarial, seed 1"]
     assert values == [["studio", "1.000", "1.000"], ["web", "0.200", "0.600"], ["all", "0.286", "0.571"]]
-    assert tables["Photographs: orange recognised"][-1][0] == "all but studio"
+    assert tables["Photographs: orange recognized"][-1][0] == "all but studio"
     # the studio has nothing to rank oranges against
     ranked = tables["Photographs: AUC"][1:]
     assert [[cell.partition(" ")[0] for cell in row] for row in ranked] == [
@@ -80,12 +80,12 @@ def test_a_comparison_shows_every_source_and_pools_all_but_some(scored_run, made
 
 
 def test_without_exclusions_a_comparison_pools_all_photographs(scored_run, read_markdown):
-    table = compare(read_markdown, [scored_run("none", STUDIO_AND_WEB)])["Photographs: orange recognised"]
+    table = compare(read_markdown, [scored_run("none", STUDIO_AND_WEB)])["Photographs: orange recognized"]
     assert table[-1][0] == "all" and table[-1][1].startswith(f"{6 / 11:.3f} [")
 
 
 def test_a_mistyped_source_to_exclude_is_an_error(scored_run):
-    run = summarise(scored_run("none", STUDIO_AND_WEB))
+    run = summarize(scored_run("none", STUDIO_AND_WEB))
     with pytest.raises(InputError, match="exclude: no photograph is of source 'stdio'; the sources are studio, web"):
         format_comparison([run], ["stdio"])
 
@@ -108,7 +108,7 @@ def test_a_report_of_runs_scored_on_different_photographs_shows_each_and_says_so
     text = write_report(runs, tmp_path / "out").read_text()
     assert f"{runs[1]}/photographs has other photographs or sources than {runs[0]}/photographs" in text
     assert re.search(r'alt="ROC; AUC: none 0\.\d+, random 0\.\d+"', text)
-    assert re.search(r'alt="orange recognised, by source or pattern\. all: none 0\.55, random 0\.86', text)
+    assert re.search(r'alt="orange recognized, by source or pattern\. all: none 0\.55, random 0\.86', text)
 
 
 def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run, read_markdown):
@@ -129,7 +129,7 @@ def test_scores_of_another_class_are_refused(scored_run):
     with pytest.raises(
         InputError, match=r"photographs\.csv cannot be used: score the photographs again, with label=orange"
     ):
-        format_comparison([summarise(folder)], [])
+        format_comparison([summarize(folder)], [])
 
 
 def test_scores_from_before_the_ranking_are_compared_without_it(scored_run, read_markdown):
@@ -138,7 +138,7 @@ def test_scores_from_before_the_ranking_are_compared_without_it(scored_run, read
         table = folder / "photographs" / "photographs.csv"
         table.write_text("\n".join(line.rpartition(",")[0] for line in table.read_text().splitlines()) + "\n")
     tables = compare(read_markdown, folders)
-    assert len(tables["Photographs: orange recognised"]) == 4 and len(tables["Photographs: AUC"]) == 1
+    assert len(tables["Photographs: orange recognized"]) == 4 and len(tables["Photographs: AUC"]) == 1
     assert tables["random minus none, one seed"][-1][3:] == ["-"] * 4
 
 
@@ -173,7 +173,7 @@ def test_a_difference_is_that_of_the_means_over_seeds_with_the_interval_of_a_boo
     folders, oranges, others = arms
     tables = compare(read_markdown, folders)
     header, web, pooled = tables["random minus none, 3 seeds in pairs"]
-    assert header[:4] == ["source", "orange recognised", "others called orange", "AUC"]
+    assert header[:4] == ["source", "orange recognized", "others called orange", "AUC"]
     assert web[0] == "web" and pooled == ["all", *web[1:]]
 
     generator, drawn = np.random.default_rng(1), []

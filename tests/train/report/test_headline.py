@@ -9,14 +9,14 @@ from PIL import Image
 from augment.service import AttackExamples
 from train.photographs.shares import share
 from train.report.headline import headline
-from train.report.summary import RunSummary, summarise
+from train.report.summary import RunSummary, summarize
 from train.run_folder.attack_examples import write_attack_examples
 
 AUC = {"value": 0.9, "low": 0.8, "high": 1.0}
 
 
 def keep_specimens(folder: Path, epoch: int, before: list[float], after: list[float]) -> None:
-    """Two grey renders of orange that are called apple or orange, with these probabilities in turn."""
+    """Two gray renders of orange that are called apple or orange, with these probabilities in turn."""
     images, lights = torch.full((2, 2, 3, 8, 8), 0.5), torch.zeros(2, 2, 49, 3)
     answers = torch.tensor([before, after])[:, None].expand(2, 2, 2)
     (folder / "renders").mkdir(exist_ok=True)
@@ -34,7 +34,7 @@ def arm(made_up_run, tmp_path):
             scores = {"recall": share(hits, 10), "false_alarms": share(alarms, 10), "auc": AUC}
             folder, settings = tmp_path / f"{name}{seed}", [f"seed={seed}", "evaluate.photos=/data/a", *overrides]
             made_up_run(folder, name, {"photographs": scores}, *settings)
-            runs.append(summarise(folder))
+            runs.append(summarize(folder))
         return runs
 
     return make

@@ -2,10 +2,10 @@ import math
 
 from train.photographs.shares import share
 from train.report.overview import format_spread, format_table
-from train.report.summary import summarise
+from train.report.summary import summarize
 
 FIGURES = [
-    "orange recognised", "others called orange", "AUC",
+    "orange recognized", "others called orange", "AUC",
     "recall at 5% false alarms", "recall at 10% false alarms", "recall at 20% false alarms",
 ]  # fmt: skip
 
@@ -22,7 +22,7 @@ def scored(hits: int, n: int, auc: float | None = None) -> dict:
 def test_the_headline_tables_have_a_row_per_run_and_name_the_images(tmp_path, made_up_run, read_markdown, wilson):
     photographs = {"photographs": scored(3, 4, 0.75), "lab": scored(1, 4)}
     with_photographs = made_up_run(tmp_path / "a", "adversarial", photographs)
-    text = format_table([summarise(made_up_run(tmp_path / "b")), summarise(with_photographs)])
+    text = format_table([summarize(made_up_run(tmp_path / "b")), summarize(with_photographs)])
     ranked = "0.750 [0.625, 0.875]"
     assert read_markdown(text) == {
         "": [
@@ -46,7 +46,7 @@ def test_the_headline_tables_have_a_row_per_run_and_name_the_images(tmp_path, ma
 
 
 def test_a_run_without_photographs_has_one_table(tmp_path, made_up_run, read_markdown):
-    assert list(read_markdown(format_table([summarise(made_up_run(tmp_path / "a"))]))) == [""]
+    assert list(read_markdown(format_table([summarize(made_up_run(tmp_path / "a"))]))) == [""]
 
 
 def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_path, made_up_run, read_markdown):
@@ -54,7 +54,7 @@ def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_
     recalled = {"a": 2, "b": 4, "c": 9, "d": 5}
     settings = {"a": ["seed=0"], "b": ["seed=1"], "c": ["seed=2"], "d": ["seed=0", "train.epochs=9"]}
     runs = [
-        summarise(made_up_run(tmp_path / name, "random", {"lab": scored(hits, 10, hits / 10)}, *settings[name]))
+        summarize(made_up_run(tmp_path / name, "random", {"lab": scored(hits, 10, hits / 10)}, *settings[name]))
         for name, hits in recalled.items()
     ]
     for table in read_markdown(format_table(runs)).values():
@@ -83,7 +83,7 @@ def test_a_number_that_is_none_in_a_file_spreads_to_none(tmp_path, made_up_run):
     """JSON has no NaN and no infinity, but Python reads them."""
     recalled = [share(2, 10), share(2, 10) | {"value": math.nan}, share(2, 10) | {"value": math.inf}]
     runs = [
-        summarise(made_up_run(tmp_path / f"{seed}", "none", {"lab": {"recall": recall}}, f"seed={seed}"))
+        summarize(made_up_run(tmp_path / f"{seed}", "none", {"lab": {"recall": recall}}, f"seed={seed}"))
         for seed, recall in enumerate(recalled)
     ]
     assert "nan ± nan" in format_spread(runs[:2]) and "inf ± nan" in format_spread([runs[0], runs[2]])

@@ -1,11 +1,11 @@
 import pytest
 
 from renderer.errors import InputError
-from train.report.summary import summarise
+from train.report.summary import summarize
 
 
 def test_a_summary_has_the_mean_seconds_of_the_epochs_and_the_final_scores(tmp_path, made_up_run):
-    run = summarise(made_up_run(tmp_path / "run", "random", None, "seed=3"))
+    run = summarize(made_up_run(tmp_path / "run", "random", None, "seed=3"))
     assert (run.arm, run.config.seed, run.photographs) == ("random", 3, {})
     assert run.scores == {"test/accuracy": 0.76543, "test/accuracy_last": 0.75, "test/epoch": 2}
     assert run.seconds == {
@@ -19,7 +19,7 @@ def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
     if lines is not None:
         (tmp_path / "metrics.jsonl").write_text(lines)
     with pytest.raises(InputError, match=r"holds no finished run: let it finish, or resume it with train.resume=true"):
-        summarise(tmp_path)
+        summarize(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -38,4 +38,4 @@ def test_what_no_run_wrote_is_refused_before_any_table(made_up_run, tmp_path, fi
     assert old in text
     (folder / file).write_text(text.replace(old, new))
     with pytest.raises(InputError, match=rf"{folder}: .* is not as `python -m train` wrote it \(.*{reason}"):
-        summarise(folder)
+        summarize(folder)

@@ -17,7 +17,7 @@ from renderer.errors import InputError
 from train.command_line.configuration import composed
 from train.report import images, plots
 from train.report.command import training_command
-from train.report.summary import summarise
+from train.report.summary import summarize
 from train.report.write import report_of, write_report
 from train.run_folder.continuation import decisive_settings
 from train.run_folder.files import locked
@@ -103,7 +103,7 @@ def test_the_lights_that_fooled_are_shown(page):
     "overrides", [[], ["augment=none", "seed=3"], ["attack@augment.attack=[lighting,geometry]", "label=apple"]]
 )
 def test_the_command_makes_the_same_settings_again(tmp_path, made_up_run, overrides):
-    config = summarise(made_up_run(tmp_path / "run", "adversarial", None, *overrides)).config
+    config = summarize(made_up_run(tmp_path / "run", "adversarial", None, *overrides)).config
     words = shlex.split(training_command(config))[3:]
     again = composed("train", words)
     expected, found = ({**decisive_settings(each), "data.images": None} for each in (config, again))

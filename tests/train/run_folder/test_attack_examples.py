@@ -4,15 +4,15 @@ import pytest
 import torch
 
 from augment.service import SHOWN_EXAMPLES, AttackExamples
-from renderer.basis import HARMONICS, Sum
 from renderer.errors import InputError
 from renderer.image import to_bytes
-from renderer.light_sphere import light_sphere
-from renderer.projector import Projector
+from renderer.light.basis import HARMONICS, SumBasis
+from renderer.light.light_sphere import light_sphere
+from renderer.light.local import Projector
 from train.run_folder.attack_examples import LARGEST_SIDE, SPHERE, read_attack_examples, write_attack_examples
 
 CLASSES = ["apple", "orange"]
-BASIS = Sum((HARMONICS, Projector(pixels=2)))
+BASIS = SumBasis((HARMONICS, Projector(pixels=2)))
 
 
 def attack_examples(side: int, count: int = 2) -> AttackExamples:

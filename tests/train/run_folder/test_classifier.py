@@ -94,7 +94,7 @@ def test_the_published_networks_are_classifiers_of_cifar_100(arm):
 
 @pytest.mark.realdata
 @pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
-def test_the_published_base_recognises_most_oranges_in_rgb():
+def test_the_published_base_recognizes_most_oranges_in_rgb():
     """And hardly one with red and blue exchanged, unlike the networks that were hardened against light."""
     classifier = load_classifier(f"run:{PRETRAINED / 'none'}")
     paths = sorted((DATA / "photos" / "orange").iterdir())[::9]
@@ -182,7 +182,7 @@ def test_a_network_of_a_later_version_is_refused(network, tmp_path):
 # ---------------------------------------------------------------------------------------- starting from another run's
 
 
-def test_a_network_starts_with_the_weights_and_the_normalisation_of_another(network, tmp_path):
+def test_a_network_starts_with_the_weights_and_the_normalization_of_another(network, tmp_path):
     save(tmp_path / BEST, {"model": network.state_dict(), "architecture": description_of(network)})
     own = WideResNet(2, 10, 1, 0.3, mean=(0.5, 0.5, 0.5))
     start_from(own, description_of(own, dropout=0.3), tmp_path)

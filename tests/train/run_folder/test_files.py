@@ -14,7 +14,7 @@ from train.command_line.configuration import composed
 from train.report.card import publish_run
 from train.report.comparison import format_comparison
 from train.report.overview import format_table
-from train.report.summary import summarise
+from train.report.summary import summarize
 from train.run_folder.files import LOCK, read_config, read_numbers, sole_writer
 
 SCORES = {"test/accuracy": 0.5, "test/accuracy_last": 0.4, "test/epoch": 1}
@@ -65,7 +65,7 @@ def test_publishing_a_run_shows_no_variable_of_the_environment(run, tmp_path, mo
     (run / "config.yaml").write_text(text)
     publish_run(run, tmp_path / "out")
     card = (tmp_path / "out" / "README.md").read_text()
-    shown = card + format_table([summarise(run)]) + format_comparison([summarise(run)], [])
+    shown = card + format_table([summarize(run)]) + format_comparison([summarize(run)], [])
     assert "hunter2" not in shown and "${oc.env:SECRET}" in card
 
 
@@ -81,7 +81,7 @@ BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{
 )  # fmt: skip
 def test_a_damaged_configuration_is_one_sentence_that_names_it(run, tmp_path, content):
     (run / "config.yaml").write_bytes(content)
-    for command in (summarise, lambda folder: publish_run(folder, tmp_path / "out")):
+    for command in (summarize, lambda folder: publish_run(folder, tmp_path / "out")):
         with pytest.raises(
             InputError, match=rf"^{re.escape(str(run))}\S* .*config\.yaml|config\.yaml is damaged"
         ) as caught:
@@ -101,7 +101,7 @@ def test_a_damaged_configuration_is_one_sentence_that_names_it(run, tmp_path, co
 def test_damaged_metrics_are_one_sentence_that_names_them(run, content):
     (run / "metrics.jsonl").write_bytes(content)
     with pytest.raises(InputError, match=r"metrics\.jsonl") as caught:
-        summarise(run)
+        summarize(run)
     assert str(run) in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -116,5 +116,5 @@ def test_a_last_line_that_was_cut_short_is_no_damage(tmp_path):
 def test_a_damaged_summary_of_photographs_is_one_sentence_that_names_it(run, content):
     (run / "photographs" / "summary.json").write_bytes(content.encode("utf-8", "surrogatepass"))
     with pytest.raises(InputError, match=r"summary\.json") as caught:
-        summarise(run)
+        summarize(run)
     assert str(run) in str(caught.value) and "\n" not in str(caught.value)

@@ -92,7 +92,7 @@ def show_again(run: Path) -> None:
         ),
         pytest.param(
             edit_state(LAST, lambda state: next_float(state["optimizer"][0][0])),
-            "last.pt: optimizer", id="one bit of the optimiser",
+            "last.pt: optimizer", id="one bit of the optimizer",
         ),
         pytest.param(
             edit_state(BEST, lambda state: next_float(state["model"]["w"])),

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from renderer.errors import InputError
-from renderer.lights import load_light
+from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
 from train.studies.commands import Ending
 from train.studies.reliability.corpus import BESIDE, LIGHTS, MESHES, write_corpus

@@ -18,7 +18,7 @@ from augment.utils import Phases, rank, world_size
 from train.distributed import process_group
 from train.wideresnet import WideResNet
 
-GREYS = (0.0, 0.25, 0.5, 0.75, 1.0)
+GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
 SURE = 30.0  # the logit of the label: every attack takes all its steps
 
 
@@ -34,7 +34,7 @@ class Load:
 
     @property
     def views(self) -> int:
-        return self.renders // (self.meshes * len(GREYS))
+        return self.renders // (self.meshes * len(GRAYS))
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,7 @@ def _attack(rank: int, load: Load, port: int, costs: "SimpleQueue[Cost]") -> Non
 def _cost(load: Load) -> Cost:
     before, phases, start = _peak(), Phases(), time.process_time()
     meshes = [(f"solid:orange:{seed}", "orange") for seed in range(load.meshes)]
-    scene = build_scene(
-        meshes, load.size, load.views, backgrounds=GREYS, samples=2, normals="flat", visibility="software"
-    )
+    scene = build_scene(meshes, load.size, load.views, backgrounds=GRAYS, samples=2, normals="flat", rasterizer="numpy")
     kept = sum(stack.transfer.nbytes + stack.albedo.nbytes for stack in scene.stacks)
     built = time.process_time()
     labels = torch.zeros(len(scene), dtype=torch.int64)

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torchvision.models import resnet50
 
 from augment.build import build_scene
-from train.studies.growth.cost import GREYS
+from train.studies.growth.cost import GRAYS
 from train.studies.renderer_speed.measure import seconds
 
 IMAGES = 1_281_167  # of ImageNet's training set
@@ -27,15 +27,15 @@ class Parts:
 def measure_parts(rounds: int) -> Parts:
     """Medians, on one thread; the three take turns, so that a busy machine disturbs all alike."""
     network, images, labels = resnet50(), torch.rand(BATCH, 3, SIZE, SIZE), torch.zeros(BATCH, dtype=torch.int64)
-    optimiser = torch.optim.SGD(network.parameters(), lr=1e-3, momentum=0.9)
-    scene = build_scene([("solid:orange", "orange")], SIZE, 1, backgrounds=GREYS[:BATCH], visibility="software")
+    optimizer = torch.optim.SGD(network.parameters(), lr=1e-3, momentum=0.9)
+    scene = build_scene([("solid:orange", "orange")], SIZE, 1, backgrounds=GRAYS[:BATCH], rasterizer="numpy")
     everything, light = torch.arange(BATCH), scene.lights.clone().requires_grad_(True)
 
     def training() -> None:
         network.train()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         F.cross_entropy(network(images), labels).backward()
-        optimiser.step()
+        optimizer.step()
 
     def attack() -> None:
         network.eval()

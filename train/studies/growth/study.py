@@ -11,7 +11,7 @@ from train.command_line.entry_points import command_line
 from train.command_line.outputs import writable_file
 from train.report.tables import markdown
 from train.settings import MOST_IMAGES
-from train.studies.growth.cost import GREYS, Cost, Load, described, measure
+from train.studies.growth.cost import GRAYS, Cost, Load, described, measure
 from train.studies.growth.imagenet import IMAGES, SIZE, Parts, added_share, measure_parts
 from train.studies.page import filled, machine, wrapped, write_section
 
@@ -134,7 +134,7 @@ def on_paper(parts: Parts, operator: float, kept: float, rates: dict[str, int]) 
     for renders in ON_PAPER:
         ten, thirty = (added_share(parts, renders, steps) for steps in (10, 30))
         minutes = (f"{(1 + thirty) * IMAGES / rate / 60:.1f}" for rate in rates.values())
-        views = renders / len(GREYS)
+        views = renders / len(GRAYS)
         operators = f"{views * operator / 60:,.1f}", f"{views * kept / 1e9:,.1f}"
         rows.append((renders, f"+{ten:.2%}", f"+{thirty:.2%}", *minutes, *operators))
     header = ["renders per epoch", "10 steps", "30 steps", *(f"{name}, min" for name in rates)]

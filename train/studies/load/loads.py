@@ -13,14 +13,14 @@ TRAIN = BY_NAME["train data=npz"]
 
 
 def renders(folder: Path, count: int) -> list[str]:
-    """One mesh before twenty greys, of 32 pixels per side."""
-    greys = [round(number / 20, 2) for number in range(20)]
-    more = ["augment=adversarial", "data.size=32", f"augment.examples={count}", f"scene.backgrounds={greys}"]
+    """One mesh before twenty grays, of 32 pixels per side."""
+    grays = [round(number / 20, 2) for number in range(20)]
+    more = ["augment=adversarial", "data.size=32", f"augment.examples={count}", f"scene.backgrounds={grays}"]
     return BY_NAME["train data=folder"].command(*more, "scene.meshes=[mesh.obj]")
 
 
 def views(folder: Path, count: int) -> list[str]:
-    """One mesh before one grey, of 16 pixels per side."""
+    """One mesh before one gray, of 16 pixels per side."""
     return TRAIN.command(f"augment.examples={count}")
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from renderer.environment import to_map, write_map
-from renderer.files.light_files import save_light
-from renderer.files.mesh_export import export_mesh
-from renderer.lights import probe
+from renderer.io.export import export_mesh
+from renderer.io.lights import save_light
+from renderer.light.environment import to_map, write_map
+from renderer.light.presets import probe
 from renderer.shapes import solid
 
 LIGHTS = ("light.npy", "light.hdr", "light.exr", "light.json")
@@ -38,9 +38,9 @@ def write_inputs(folder: Path) -> None:
     trained, tested = np.repeat(np.arange(len(CLASSES)), 20), np.repeat(np.arange(len(CLASSES)), 10)
     np.savez(
         folder / "data.npz",
-        train_images=_coloured_noise(rng, trained),
+        train_images=_colored_noise(rng, trained),
         train_labels=trained,
-        test_images=_coloured_noise(rng, tested),
+        test_images=_colored_noise(rng, tested),
         test_labels=tested,
         classes=np.array(CLASSES),
     )
@@ -51,7 +51,7 @@ def write_inputs(folder: Path) -> None:
             Image.fromarray(pixels).save(folder / "photographs" / name / f"{number}.png")
 
 
-def _coloured_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
+def _colored_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
     """Images (N, 3, 16, 16) uint8 whose channel `label` is a little brighter, so that accuracies move for long."""
     images = rng.integers(0, 245, (len(labels), 3, 16, 16))
     images[np.arange(len(labels)), labels] += 10

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from train.studies.reliability.corpus import BESIDE, LIGHTS, MESHES, PUBLISHED, RUN
 
-RENDERER = ("renderer.visibility=software", "renderer.samples=1", "renderer.cache=cache")
+RENDERER = ("renderer.rasterizer=numpy", "renderer.samples=1", "renderer.cache=cache")
 TRAINING = (
     *("compare=[]", "data.validation=0.3", "model.depth=10", "model.width=1", "model.dropout=0", "train.epochs=1"),
     *("train.batch_size=16", "train.precision=float32", "train.device=cpu", "train.threads=1", "augment.examples=1"),

@@ -26,7 +26,7 @@ from train.studies.reliability.edits import (
     zip_bomb,
 )
 
-GREY = np.full((4, 8, 3), 0.5, dtype=np.float32)
+GRAY = np.full((4, 8, 3), 0.5, dtype=np.float32)
 BOMB = "a: &a [1, 1, 1]\n" + "".join(
     f"{next_}: &{next_} [{', '.join(9 * [f'*{name}'])}]\n" for name, next_ in zip("abcdefgh", "bcdefghi", strict=True)
 )
@@ -43,17 +43,17 @@ def _sized(channels: int, height: int, width: int) -> Edit:
 
 REFUSED: dict[str, dict[str, Edit]] = {
     ".npy": {
-        "complex": array(GREY.astype(complex)),
+        "complex": array(GRAY.astype(complex)),
         "text": array(np.array([["a"]])),
         "objects": array(np.array([[{}]], dtype=object)),
-        "no texel": array(GREY[:0]),
-        "two channels": array(GREY[..., :2]),
-        "no height": array(GREY[0]),
-        "NaN": array(GREY * np.nan),
-        "infinity": array(np.full_like(GREY, np.inf)),
+        "no texel": array(GRAY[:0]),
+        "two channels": array(GRAY[..., :2]),
+        "no height": array(GRAY[0]),
+        "NaN": array(GRAY * np.nan),
+        "infinity": array(np.full_like(GRAY, np.inf)),
         "1e300": array(np.full((4, 8, 3), 1e300)),
-        "black": array(GREY * 0),
-        "negative": array(-GREY),
+        "black": array(GRAY * 0),
+        "negative": array(-GRAY),
         "10 TB": npy_header("(1000000, 1000000, 3)"),
         "negative shape": npy_header("(-1, 8, 3)"),
         "code for a shape": npy_header("__import__('os').getcwd()"),
@@ -106,7 +106,7 @@ REFUSED: dict[str, dict[str, Edit]] = {
     ".mtl": {
         "no such texture": swapped("peel.png", "gone.png"),
         "a folder for a texture": swapped("peel.png", "photographs"),
-        "a colour of NaN": swapped("Kd 1 0.5 0", "Kd nan nan nan"),
+        "a color of NaN": swapped("Kd 1 0.5 0", "Kd nan nan nan"),
     },
     ".gltf": {
         "a list": content("[]"),
@@ -181,7 +181,7 @@ def _sixteen_bits(path: Path) -> None:
 
 
 EITHER: dict[str, dict[str, Edit]] = {  # odd, but what is meant may be clear
-    ".npy": {"one texel": array(GREY[:1, :1])},
+    ".npy": {"one texel": array(GRAY[:1, :1])},
     ".npz": {"labels of one class": arrays(train_labels=np.zeros(60, int))},
     "0.png": {
         "one pixel": image("RGB", (1, 1)),
@@ -195,9 +195,9 @@ EITHER: dict[str, dict[str, Edit]] = {  # odd, but what is meant may be clear
         "UTF-16": replaced(lambda whole: whole.decode().encode("utf-16")),
     },
     ".mtl": {
-        "a colour in words": swapped("Kd 1 0.5 0", "Kd red"),
-        "a colour of 1e30": swapped("Kd 1 0.5 0", "Kd 1e30 0 0"),
-        "a negative colour": swapped("Kd 1 0.5 0", "Kd -1 0 0"),
+        "a color in words": swapped("Kd 1 0.5 0", "Kd red"),
+        "a color of 1e30": swapped("Kd 1 0.5 0", "Kd 1e30 0 0"),
+        "a negative color": swapped("Kd 1 0.5 0", "Kd -1 0 0"),
     },
     ".gltf": {"a node in itself": in_json("nodes", 0, "children", value=[0])},
     ".pt": {"an unknown key": in_checkpoint("architecture", "unknown", value="x")},

@@ -5,7 +5,7 @@ from io import BytesIO
 
 import matplotlib.pyplot as plt
 import OpenImageIO  # noqa: F401
-import torch._inductor.config  # noqa: F401  # which the first optimiser of torch imports
+import torch._inductor.config  # noqa: F401  # which the first optimizer of torch imports
 from hydra import compose, initialize_config_module
 
 import train.attacks.experiment

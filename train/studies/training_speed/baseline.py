@@ -36,7 +36,7 @@ class Images(Dataset[tuple[Tensor, int]]):
 def build_loader(
     split: Split, batch_size: int, mean: Sequence[float], std: Sequence[float], workers: int, device: torch.device
 ) -> Batches:
-    """Shuffled batches of the split, cropped, flipped and normalised by torchvision, in `workers` processes."""
+    """Shuffled batches of the split, cropped, flipped and normalized by torchvision, in `workers` processes."""
     transform = transforms.Compose(
         [
             transforms.RandomCrop(split.images.shape[-1], padding=PADDING, padding_mode="reflect"),

@@ -1,0 +1,156 @@
+"""Meshes as files: .glb with colors, textures, normals and cameras, .ply with colors and normals."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from renderer.albedo import bilinear, mesh_textures
+from renderer.arguments import checked
+from renderer.camera import Camera, PerspectiveCamera
+from renderer.errors import InputError, require_choice
+from renderer.image import NORMALS, decode, encode
+from renderer.mesh import Y_UP_TO_Z_UP, Mesh
+from renderer.normals import vertex_normals
+
+if TYPE_CHECKING:
+    import trimesh  # takes half a second: imported where it is used
+
+# glTF's names for colors and normals after an underscore, under which trimesh writes any attribute.
+_COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
+
+
+@checked
+def export_mesh(
+    mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[Camera] = (), first: int | None = None
+) -> None:
+    """Write a mesh to a .glb or .ply file. A vertex whose corners differ in color, uv or normal is written for each.
+
+    .glb: `load_mesh` gives back the same surface, to float32: y up, linear colors, one part per texture; a diffuse
+    material that is seen from both sides. A mesh of several textures has its faces ordered by texture, the `first` so
+    many of them before the others.
+    normals: those that the renderer shades with, "smooth" or "flat". cameras: as nodes of a .glb, in order.
+    .ply: z up, colors of 8 bits. The format has no standard texture, so that vertices get their texel's color, times
+    their own in linear light: between them the texture is lost, unless the mesh is subdivided.
+    InputError where the suffix is another or the file cannot be written.
+    """
+    path = Path(path)
+    glb = partial(_glb, cameras=cameras, first=first)
+    writers: dict[str, Callable[[Mesh, np.ndarray], bytes]] = {".glb": glb, ".ply": _ply}
+    if path.suffix.lower() not in writers:
+        raise InputError(f"{path} is no name for a mesh to write: give one that ends in {', '.join(writers)}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(writers[path.suffix.lower()](mesh, corner_normals(mesh, normals)))
+    except OSError as error:
+        raise InputError(f"mesh {path} cannot be written: {error}") from error
+
+
+def corner_normals(mesh: Mesh, normals: str) -> np.ndarray:
+    """(F, 3, 3) float64 unit normals that the corners of faces are shaded with, "smooth" or "flat"; up where there is
+    none. InputError: another choice."""
+    require_choice("normals", normals, NORMALS)
+    flat = np.broadcast_to(mesh.face_normals()[:, None], (len(mesh.faces), 3, 3))
+    if normals == "smooth":
+        smooth = vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)).numpy()[mesh.faces]
+        flat = np.where(smooth.any(axis=-1, keepdims=True), smooth, flat)
+    return np.where(flat.any(axis=-1, keepdims=True), flat, [0.0, 0.0, 1.0])
+
+
+def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int | None) -> bytes:
+    import trimesh
+
+    later = np.arange(len(mesh.faces)) >= (len(mesh.faces) if first is None else first)
+    order = np.stack([later, mesh.texture_ids], axis=1)
+    parts = [_textured_part(mesh, normals, part[1], (order == part).all(1)) for part in np.unique(order, axis=0)]
+    finish = partial(_as_one_mesh, cameras=cameras)
+    return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=finish)
+
+
+def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int, here: np.ndarray) -> "trimesh.Trimesh":
+    """The faces (F,) bool that are `here`, of one texture or of none, y up."""
+    import trimesh
+    from trimesh.visual.material import PBRMaterial
+    from trimesh.visual.texture import TextureVisuals
+
+    corners = np.concatenate([mesh.corner_colors[here], mesh.corner_uvs[here], normals[here]], axis=-1)
+    ids, values, faces = _split(mesh.faces[here], corners)
+    colors, uvs, normals = values[:, :3], values[:, 3:5], values[:, 5:]
+    material = PBRMaterial(
+        name=f"texture {texture_id}",  # trimesh would take images of the same bytes and other sizes for one
+        baseColorTexture=Image.fromarray(mesh.textures[texture_id]) if texture_id >= 0 else None,
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        doubleSided=True,
+    )
+    return trimesh.Trimesh(
+        mesh.vertices[ids] @ Y_UP_TO_Z_UP[:3, :3],  # the inverse, since it multiplies rows
+        faces,
+        visual=TextureVisuals(uv=uvs, material=material),
+        vertex_attributes={
+            _COLOR: decode(torch.from_numpy(colors), "srgb").float().numpy(),
+            _NORMAL: (normals @ Y_UP_TO_Z_UP[:3, :3]).astype(np.float32),
+        },
+        process=False,
+    )
+
+
+def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
+    """One node with the parts as primitives, in order, and colors of full precision: trimesh's own have 8 bits, too
+    few for dark linear ones. A node for each camera."""
+    primitives = [primitive for mesh in tree["meshes"] for primitive in mesh["primitives"]]
+    for primitive in primitives:
+        primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_COLOR)
+        primitive["attributes"]["NORMAL"] = primitive["attributes"].pop(_NORMAL)
+    tree["meshes"], tree["nodes"] = [{"primitives": primitives}], [{"mesh": 0}]
+    if cameras:
+        tree["cameras"] = [_gltf_camera(camera) for camera in cameras]
+        tree["nodes"] += [_camera_node(camera, index) for index, camera in enumerate(cameras)]
+    tree["scenes"] = [{"nodes": list(range(len(tree["nodes"])))}]
+
+
+def _gltf_camera(camera: Camera) -> dict[str, Any]:
+    planes = {"znear": camera.near, "zfar": camera.far}
+    if isinstance(camera, PerspectiveCamera):
+        return {"type": "perspective", "perspective": {"yfov": camera.angle, "aspectRatio": 1.0, **planes}}
+    half = camera.width / 2
+    return {"type": "orthographic", "orthographic": {"xmag": half, "ymag": half, **planes}}
+
+
+def _camera_node(camera: Camera, index: int) -> dict[str, Any]:
+    """Where a camera stands, y up; it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
+    matrix = Y_UP_TO_Z_UP.T @ camera.pose()
+    return {"camera": index, "name": f"view {index}", "matrix": matrix.T.ravel().tolist()}
+
+
+def _ply(mesh: Mesh, normals: np.ndarray) -> bytes:
+    import trimesh
+
+    ids, values, faces = _split(mesh.faces, np.concatenate([_baked_colors(mesh), normals], axis=-1))
+    colors, normals = values[:, :3].astype(np.uint8), values[:, 3:]
+    part = trimesh.Trimesh(mesh.vertices[ids], faces, vertex_normals=normals, vertex_colors=colors, process=False)
+    return part.export(file_type="ply", vertex_normal=True)
+
+
+def _baked_colors(mesh: Mesh) -> np.ndarray:
+    """(F, 3, 3) uint8: corner color × texture at the corners, sRGB-encoded."""
+    linear = decode(torch.from_numpy(mesh.corner_colors), "srgb")
+    for index, texture in enumerate(mesh_textures(mesh, "srgb", linear)):
+        here = torch.from_numpy(mesh.texture_ids == index)
+        uvs = torch.from_numpy(mesh.corner_uvs)[here]
+        linear[here] *= bilinear(texture, uvs.flatten(0, 1).T).T.unflatten(0, (-1, 3))
+    return (encode(linear, "srgb") * 255).round().to(torch.uint8).numpy()
+
+
+def _split(faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One row for each vertex of faces (F, 3) and each of the values (F, 3, D) that its corners have.
+
+    Returns the vertices (N,), the values (N, D) and the faces in terms of these rows, by vertex.
+    """
+    rows = np.concatenate([faces[..., None], corners], axis=-1)  # float64, which holds either exactly
+    rows, index = np.unique(rows.reshape(-1, rows.shape[-1]), axis=0, return_inverse=True)
+    return rows[:, 0].astype(np.int64), rows[:, 1:], index.reshape(-1, 3)

@@ -1,0 +1,67 @@
+"""Image files, as a classifier sees them."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageOps
+from torch import Tensor
+
+from renderer.errors import InputError, require_file
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the final size
+
+
+def read_image(path: Path, size: int) -> Tensor:
+    """`read_square` as (3, size, size) float32 in [0, 1]. InputError where the file cannot be read."""
+    require_file(path, "give an image file")
+    try:
+        square = read_square(path, size)
+    except Exception as error:  # Pillow's decoders raise almost anything at a broken file
+        raise InputError(f"{path} cannot be read ({error}): give an image file") from error
+    return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
+
+
+def read_square(path: Path, size: int) -> np.ndarray:
+    """The center square of an image as (size, size, 3) uint8. Raises whatever Pillow does at a broken file."""
+    with Image.open(path) as image:
+        # A large JPEG is decoded at 1/2, 1/4 or 1/8 of its size, several times faster.
+        image.draft(None, (DECODED_SIZES * size, DECODED_SIZES * size))
+        upright = ImageOps.exif_transpose(image)
+    return np.asarray(ImageOps.fit(_over_white(upright), (size, size), Image.Resampling.LANCZOS))
+
+
+def eight_bits(image: Image.Image) -> Image.Image:
+    """The image with channels of 8 bits. ValueError where its white is unknown; whatever Pillow raises at damage."""
+    if image.mode == "F":
+        raise ValueError("floating-point pixels have no agreed white")
+    if image.mode.startswith("I"):  # 16 bits per pixel, which Pillow would clip rather than scale
+        return Image.fromarray(np.clip(np.asarray(image) // 256, 0, 255).astype(np.uint8))
+    image.load()
+    return image
+
+
+def _over_white(image: Image.Image) -> Image.Image:
+    image = eight_bits(image)
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+    return image.convert("RGB")
+
+
+"""Arrays of numbers as .npy files."""
+
+from pathlib import Path
+
+import numpy as np
+
+
+def read_numbers(path: Path) -> np.ndarray:
+    """A file's real numbers as float32; what is beyond is infinite. Reads no more than the file holds, whatever its
+    header announces. ValueError for what is empty or no real number; whatever NumPy raises at a damaged header."""
+    array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
+    if array.dtype.kind not in "fiu" or not array.size:
+        raise ValueError(f"it holds {array.dtype} of shape {array.shape}, not real numbers")
+    with np.errstate(over="ignore"):
+        return array.astype(np.float32)

@@ -1,0 +1,185 @@
+"""Environment maps: files (.npy, .hdr, .exr) in and out, and the map that a light's coefficients stand for.
+
+Maps are tensors (H, W, 3) of linear RGB radiance in the layout of `renderer.light.harmonics.equirectangular`: row 0 is up
+(+z), the middle column faces +x and azimuth grows to the left, as seen from inside.
+
+Blender's Environment Texture lies so too and needs no rotation. Mitsuba 3's `envmap` has y up and the middle column
+towards +z, as OpenEXR defines such maps: a `to_world` of the rows (0, 0, 1), (1, 0, 0), (0, 1, 0) brings it here. Both
+shade with albedo / π where this project leaves out the π: a strength of π gives the same image.
+"""
+
+import math
+import os
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer.errors import InputError, require_file
+from renderer.io.images import read_numbers
+from renderer.light.harmonics import basis, equirectangular
+
+SUFFIXES = (".npy", ".hdr", ".exr")
+FEWEST_ROWS = 8  # fewer give even radiance from everywhere a direction, by 16 % at 4: see `to_map`
+BLOCK = 2**12  # directions at a time: they stay in the cache
+LARGEST_MAP = 4096  # MB, which a damaged header may exceed
+
+
+def to_map(coefficients: Tensor, height: int) -> Tensor:
+    """Radiance (height, 2 · height, 3) float64 of a light's coefficients ((degree + 1)², 3), at the texels' centers.
+
+    Negative where the series rings. `renderer.light.harmonics.project` takes it back, off by its midpoint rule along z:
+    at degree 6 by up to 22.2 / height² of the coefficients' L2 norm (3.4e-4 at a height of 256).
+    """
+    return light_radiance(coefficients, equirectangular(height, 2 * height)[0])
+
+
+def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """Radiance (..., 3) of a light's coefficients ((degree + 1)², 3) from directions (..., 3), in their dtype."""
+    degree = math.isqrt(len(coefficients)) - 1
+    blocks = directions.flatten(0, -2).split(BLOCK)
+    radiance = torch.cat([basis(block, degree) @ coefficients.to(block) for block in blocks])
+    return radiance.unflatten(0, directions.shape[:-1])
+
+
+def negative_fraction(radiance: Tensor) -> float:
+    """The negative part of a map's radiance (H, W, 3), integrated over the sphere, as a share of its magnitude."""
+    _, solid_angles = equirectangular(*radiance.shape[:2])
+    power = radiance * solid_angles[..., None]
+    return float((-power).clamp(min=0).sum() / power.abs().sum().clamp(min=torch.finfo(power.dtype).tiny))
+
+
+def read_map(path: Path) -> Tensor:
+    """Radiance (H, W, 3) float32 of an .npy, .hdr or .exr file, taken as linear and in the file's own unit.
+
+    Alpha is dropped and gray repeated; an .npy array is (H, W, C) with 1, 3 or 4 channels. Of an .exr file with
+    layers, the unnamed one counts, or else the first that has red, green and blue.
+    InputError where the file is missing, unreadable, no such map, or holds NaN or infinity.
+    """
+    require_file(path, "give the path of an .npy, .hdr or .exr file")
+    texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
+    radiance = texels[..., _color_channels(path, names)]
+    if not np.isfinite(radiance).all():
+        raise InputError(f"environment map {path} holds NaN or infinity: give a map of finite radiance")
+    return torch.from_numpy(radiance)
+
+
+def read_panorama(path: Path) -> Tensor:
+    """`read_map` of a map that can be one of the whole sphere. InputError where its shape says that it is another kind,
+    a mirror ball's or a cube's, say, or where it is too small to be told from its midpoints."""
+    radiance = read_map(path)
+    height, width = radiance.shape[:2]
+    if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
+        raise InputError(
+            f"environment map {path} has {width} × {height} texels: give an equirectangular one, twice as wide as "
+            f"high, of {FEWEST_ROWS} rows or more"
+        )
+    return radiance
+
+
+def check_map_name(path: Path) -> None:
+    """InputError where the suffix is not one of `SUFFIXES`."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path} is no name for an environment map: give one that ends in {', '.join(SUFFIXES)}")
+
+
+def write_map(path: Path, radiance: Tensor) -> None:
+    """Write a map's radiance (H, W, 3) as float32 to an .npy or .exr file, or as RGBE to an .hdr file.
+
+    RGBE has no sign and one exponent for three channels: radiance below zero becomes zero (`negative_fraction` says how
+    much that is), the rest is off by up to 2⁻⁸ of its texel's largest channel. The other two keep negative radiance.
+    InputError where the suffix is another or the file cannot be written.
+    """
+    check_map_name(path)
+    suffix = path.suffix.lower()
+    radiance = radiance.detach().cpu().float()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if suffix == ".npy":
+            with path.open("wb") as file:  # given a path, NumPy appends .npy to .NPY
+                np.save(file, radiance.numpy())
+        else:
+            _write_image(path, _to_rgbe_precision(radiance) if suffix == ".hdr" else radiance)
+    except OSError as error:
+        raise InputError(f"environment map {path} cannot be written: {error}") from error
+
+
+def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    try:
+        array = read_numbers(path)
+    except Exception as error:  # Python's parser raises many kinds for a damaged header
+        raise InputError(f"environment map {path} is not a readable .npy file: {_first_line(str(error))}") from error
+    names = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(array.shape[-1] if array.ndim == 3 else 0)
+    if names is None:
+        raise InputError(
+            f"environment map {path} has shape {array.shape}: it must be (height, width, channels), 1, 3 or 4 channels"
+        )
+    return array, names
+
+
+def _read_image(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    openimageio = _openimageio(path)
+    file = openimageio.ImageInput.open(str(path))
+    if file is None:
+        raise InputError(f"environment map {path} is not a readable image: {_first_line(openimageio.geterror())}")
+    if file.format_name() not in ("hdr", "openexr"):
+        raise InputError(f"environment map {path} is a {file.format_name()} image: give an .hdr or .exr file")
+    spec = file.spec()
+    if spec.roi != spec.roi_full or spec.get_int_attribute("Orientation", 1) != 1:
+        raise InputError(f"environment map {path} is stored cropped or turned: save it whole, its top row first")
+    texels = file.read_image("float")
+    if texels is None:
+        raise InputError(f"environment map {path} is damaged: {_first_line(file.geterror())}")
+    return texels, spec.channelnames
+
+
+def _write_image(path: Path, radiance: Tensor) -> None:
+    openimageio = _openimageio(path)
+    height, width, channels = radiance.shape
+    file = openimageio.ImageOutput.create(str(path))
+    spec = openimageio.ImageSpec(width, height, channels, "float")
+    if not (file.open(str(path), spec) and file.write_image(radiance.contiguous().numpy()) and file.close()):
+        raise OSError(_first_line(file.geterror()))
+
+
+def _to_rgbe_precision(radiance: Tensor) -> Tensor:
+    """Radiance rounded to what RGBE holds: the library truncates, which darkens and tints the light."""
+    radiance = radiance.clamp(min=0)
+    _, exponent = torch.frexp(radiance.amax(dim=-1, keepdim=True))
+    unit = torch.ldexp(torch.ones_like(radiance[..., :1]), exponent - 8)
+    return (radiance / unit).round().clamp(max=255) * unit
+
+
+def _color_channels(path: Path, names: tuple[str, ...]) -> list[int]:
+    """Where red, green and blue lie; three times the same where all but alpha is one gray channel."""
+    split = [name.casefold().rpartition(".")[::2] for name in names]  # (layer, channel)
+    for layer, _ in split:  # the library puts the unnamed layer first
+        for colors in (("r", "g", "b"), ("red", "green", "blue")):
+            wanted = [(layer, color) for color in colors]
+            if set(wanted) <= set(split):
+                return [split.index(channel) for channel in wanted]
+    gray = [index for index, (_, channel) in enumerate(split) if channel not in ("a", "alpha")]
+    if len(gray) == 1:
+        return gray * 3
+    raise InputError(
+        f"environment map {path} has the channels {', '.join(names)}: it must have R, G and B, or one gray channel"
+    )
+
+
+def _openimageio(path: Path) -> ModuleType:
+    try:
+        import OpenImageIO
+    except ImportError as error:
+        raise InputError(f"environment map {path} needs OpenImageIO: pip install openimageio") from error
+    if os.fsencode(path) != str(path).encode(errors="replace"):
+        raise InputError(f"environment map {path} has a name that is not UTF-8, as OpenImageIO needs it: rename it")
+    OpenImageIO.attribute("threads", 1)  # no pool of threads beside torch's own
+    OpenImageIO.attribute("exr_threads", -1)
+    OpenImageIO.attribute("limits:imagesize_MB", LARGEST_MAP)
+    return OpenImageIO
+
+
+def _first_line(message: str) -> str:
+    return message.partition("\n")[0]

@@ -1,0 +1,313 @@
+"""Real spherical harmonics as polynomials in (x, y, z), and their use for diffuse shading.
+
+Index l² + l + m, m = -l..l. No Condon-Shortley sign: Y₁ = √(3/4π) (y, z, x). The polynomial form has no polar
+angles, so it stays exact at the poles, where the paper's (appendix B.1) derivatives are not finite.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from renderer.errors import InputError, require_finite
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float64, Int
+
+MAX_DEGREE = 20
+Constant = TypeVar("Constant")
+
+
+def per_degree(function: Callable[..., Constant]) -> Callable[..., Constant]:
+    """Computed once per degree (and dtype and device), and usable in training even if first asked for in inference
+    mode."""
+    return cache(torch.inference_mode(False)(function))
+
+
+def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
+    """The degree of a light's coefficients. InputError: no degree has that many."""
+    degree = math.isqrt(len(light)) - 1 if light.ndim == 2 else -1
+    if degree < 0 or light.shape != ((degree + 1) ** 2, 3):
+        raise InputError(f"light has shape {tuple(light.shape)}: give ((degree + 1)², 3) coefficients")
+    return degree
+
+
+def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch coefficients"]:
+    """Real spherical harmonics of directions. Differentiable, by `basis_gradient`.
+
+    directions: finite and of any length, since only the direction counts; a zero vector, which has none, gives finite
+    values and a gradient of zero.
+    Returns (degree + 1)² values each in the same dtype, computed in float64 and rounded once. InputError: NaN.
+    Source: the Legendre recurrences of the paper's appendix B.1 with sin^m θ taken out of P_l^m and put into
+    Re and Im of (x + iy)^m.
+    """
+    _check_degree(degree)
+    require_finite(directions=directions)
+    return _Basis.apply(directions, degree)
+
+
+def basis_gradient(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch coefficients 3"]:
+    """∂Y/∂n for vectors n of any length: tangent to the sphere, as in the paper's appendix D, divided by |n|; finite at
+    the poles, zero for a zero vector.
+
+    Source: r^l Y_lm is a polynomial whose derivatives lie in band l - 1 (`gradient_matrices`); the radial part,
+    l Y_lm n, is taken off.
+    """
+    _check_degree(degree)
+    require_finite(directions=directions)
+    tangential, length = _tangential_gradient(directions, degree)
+    return _over(tangential, length[..., None, None], directions.dtype)
+
+
+def _tangential_gradient(directions: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """(∂Y/∂n at |n| = 1 (..., (degree + 1)², 3), the lengths (...)), float64."""
+    unit, length = unit_vectors(directions.double().movedim(-1, 0))
+    values = torch.stack(select_rows(unit, range((degree + 1) ** 2)), dim=-1)
+    solid = torch.einsum("...j,djk->...kd", values, gradient_matrices(degree).to(values))
+    radial = (values * bands(degree).to(values))[..., None] * unit.movedim(0, -1)[..., None, :]
+    return solid - radial, length
+
+
+def _over(gradient: Tensor, length: Tensor, dtype: torch.dtype) -> Tensor:
+    """A gradient divided by a length: zero at length zero, and the dtype's largest number where it would overflow."""
+    largest = torch.finfo(dtype).max
+    return (gradient / torch.where(length > 0, length, torch.inf)).clamp(-largest, largest).to(dtype)
+
+
+class _Basis(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, directions: Tensor, degree: int) -> Tensor:
+        ctx.save_for_backward(directions)
+        ctx.degree = degree
+        unit, _ = unit_vectors(directions.double().movedim(-1, 0))
+        return torch.stack(select_rows(unit, range((degree + 1) ** 2)), dim=-1).to(directions.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+        (directions,) = ctx.saved_tensors
+        tangential, length = _tangential_gradient(directions, ctx.degree)
+        summed = torch.einsum("...k,...kd->...d", upstream.double(), tangential)
+        return _over(summed, length[..., None], directions.dtype), None
+
+
+def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
+    """The harmonics with these indices, (...) each, of unit vectors (3, ...): `basis` for inner loops, unchecked."""
+    x, y, z = unit
+    wanted, rows = dict.fromkeys(indices), {}
+    degree = math.isqrt(max(wanted, default=0))
+    cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # Re and Im of (x + iy)^m, times √2 where m > 0
+    for m in range(degree + 1):
+        for l, legendre in zip(range(m, degree + 1), _legendre(z, m, degree), strict=True):
+            for index, circular in ((l * l + l - m, sine), (l * l + l + m, cosine)):
+                if index in wanted:
+                    rows[index] = circular * legendre
+        if m == 0:
+            cosine = cosine * math.sqrt(2)
+        cosine, sine = (torch.addcmul(x * cosine, y, sine, value=-1), torch.addcmul(x * sine, y, cosine))
+    return [rows[index] for index in wanted]
+
+
+def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:
+    """Orthonormal associated Legendre functions over sin^m θ, for l = m..degree, as polynomials in z."""
+    start = math.sqrt(math.prod((2 * k + 1) / (2 * k) for k in range(1, m + 1)) / (4 * math.pi))
+    before, value = torch.zeros_like(z), torch.full_like(z, start)
+    yield value
+    for l in range(m + 1, degree + 1):
+        a = math.sqrt((4 * l * l - 1) / (l * l - m * m))
+        b = math.sqrt(((l - 1) ** 2 - m * m) / (4 * (l - 1) ** 2 - 1))
+        before, value = value, torch.addcmul(before * (-a * b), z, value, value=a)
+        yield value
+
+
+@per_degree
+def gradient_matrices(degree: int) -> Tensor:
+    """(3, (degree + 1)², (degree + 1)²) float64: ∂(r^l Y_k)/∂x_d = Σ_j r^(l-1) Y_j [d, j, k], for k in band l.
+
+    Source: the ladder operators of solid harmonics, in real form and without the Condon-Shortley sign.
+    """
+    matrices = torch.zeros(3, (degree + 1) ** 2, (degree + 1) ** 2, dtype=torch.float64)
+    for l in range(1, degree + 1):
+        below, norm = (l - 1) * l, (2 * l + 1) / (2 * l - 1)  # `below`: the index of m = 0 in band l - 1
+        for m in range(l + 1):
+            down = math.sqrt(norm * (l + m) * (l + m - 1)) / 2 * (math.sqrt(2) if m == 1 else 1)
+            up = math.sqrt(norm * (l - m) * (l - m - 1)) / 2 * (math.sqrt(2) if m == 0 else 1)
+            cosine, sine = l * l + l + m, l * l + l - m
+            if m < l:
+                matrices[2, below + m, cosine] = matrices[2, below - m, sine] = math.sqrt(norm * (l * l - m * m))
+            if m + 1 < l:
+                matrices[0, below + m + 1, cosine] = matrices[1, below - m - 1, cosine] = -up
+            if m + 1 < l and m > 0:
+                matrices[0, below - m - 1, sine], matrices[1, below + m + 1, sine] = -up, up
+            if m > 0:
+                matrices[0, below + m - 1, cosine] = matrices[1, below + m - 1, sine] = down
+            if m > 1:
+                matrices[0, below - m + 1, sine], matrices[1, below - m + 1, cosine] = down, -down
+    return matrices
+
+
+@per_degree
+def homogeneous_gradients(degree: int) -> Tensor:
+    """(3, (degree + 1)², (degree + 1)²) float64: ∂(r^degree Y_k)/∂x_d = Σ_j r^(degree - 1) Y_j [d, j, k], for k in the
+    bands of the degree's parity, which r^degree makes homogeneous polynomials.
+
+    The gradient's product with x is `degree` times such a polynomial (Euler), so that one sum over j gives both.
+    Source: of x_d Y_k, the part in band l - 1 is ∂(r^l Y_k)/∂x_d / (2l + 1), and by symmetry the one in band l + 1 is
+    the transposed.
+    """
+    solid, l = gradient_matrices(degree), bands(degree)
+    down = solid / (2 * l + 1)
+    return solid + (degree - l) * (down + down.mT)
+
+
+@per_degree
+def monomial_coefficients(degree: int) -> Tensor:
+    """(J, (degree + 1)²) float64: r^degree Y_k = Σ_j [j, k] × `monomials` j, for k in the bands of the degree's parity.
+
+    Each by derivatives: that of x^a y^b z^c is ∂^degree / (∂x^a ∂y^b ∂z^c) / (a! b! c!).
+    """
+    if degree == 0:
+        return torch.full((1, 1), 1 / math.sqrt(4 * math.pi), dtype=torch.float64)
+    below = monomial_coefficients(degree - 1)
+    along_x, along_y, along_z = below @ homogeneous_gradients(degree)[:, : below.shape[1]]
+    powers = torch.tensor([a or b or degree for a in range(degree, -1, -1) for b in range(degree - a, -1, -1)])
+    return torch.cat([along_x, along_y[-degree:], along_z[-1:]]) / powers[:, None]  # in the order of `monomials`
+
+
+def monomials(vectors: Tensor, degree: int) -> Tensor:
+    """((degree + 1)(degree + 2) / 2, N): x^a y^b z^c with a + b + c = degree, from x^degree to z^degree, of (3, N)."""
+    x, y, z = vectors
+    products = torch.ones_like(vectors[:1])
+    for power in range(1, degree + 1):
+        before, count = products, len(products)
+        products = vectors.new_empty(count + power + 1, vectors.shape[1])
+        torch.mul(before, x, out=products[:count])
+        torch.mul(before[count - power :], y, out=products[count:-1])  # those without x
+        torch.mul(before[-1], z, out=products[-1])
+    return products
+
+
+def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """(unit vectors (3, ...), lengths (...)) of vectors (3, ...); a zero vector stays zero.
+
+    Nothing under- or overflows on the way. Components come first, since rows are what a processor adds fastest.
+    """
+    largest = vectors.abs().amax(0)
+    scaled = vectors / largest.masked_fill(largest == 0, 1)
+    norm = scaled.square().sum(0).sqrt()  # at least 1, unless the vector is zero
+    return scaled / norm.clamp(min=1), norm * largest
+
+
+@per_degree
+def bands(degree: int) -> Int[Tensor, " coefficients"]:
+    """The band l of each coefficient."""
+    return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
+
+
+@per_degree
+def lambertian_factors(degree: int) -> Float64[Tensor, " bands"]:
+    """What a diffuse surface keeps of each of degree + 1 bands: irradiance = Σ A_l U_lm Y_lm(n).
+
+    A_l = π, 2π/3, π/4, 0, -π/24, 0, π/64, ...: the clamped cosine (Ramamoorthi and Hanrahan 2001, equation 8).
+    """
+    _check_degree(degree)
+    factors = torch.zeros(degree + 1, dtype=torch.float64)
+    factors[:2] = torch.tensor([math.pi, 2 * math.pi / 3], dtype=torch.float64)[: degree + 1]
+    for l in range(2, degree + 1, 2):
+        ratio = math.comb(l, l // 2) / 2.0**l
+        factors[l] = 2 * math.pi * (-1) ** (l // 2 - 1) / ((l + 2) * (l - 1)) * ratio
+    return factors
+
+
+@per_degree
+def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
+    """Indices of the coefficients that can reach a diffuse surface: 31 of the 49 at degree 6."""
+    return torch.nonzero(lambertian_factors(degree)[bands(degree)]).squeeze(1)
+
+
+def irradiance_basis(normals: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch K"]:
+    """A_l Y_lm(n) of the K live coefficients: irradiance at unit normals per unit coefficient."""
+    nonzero = nonzero_coefficients(degree)
+    factors = lambertian_factors(degree)[bands(degree)[nonzero]].to(normals)
+    return basis(normals, degree)[..., nonzero.to(normals.device)] * factors
+
+
+def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:
+    """Directions and weights that integrate polynomials of this degree exactly over the sphere.
+
+    Gauss-Legendre in z and equal steps in azimuth; the weights sum to 4π.
+    """
+    z, weight = np.polynomial.legendre.leggauss(degree // 2 + 1)
+    azimuth = 2 * np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)
+    radius = np.sqrt(1 - z**2)[:, None]
+    grid = [radius * np.cos(azimuth), radius * np.sin(azimuth), np.broadcast_to(z[:, None], (len(z), len(azimuth)))]
+    weights = np.repeat(weight * 2 * np.pi / len(azimuth), len(azimuth))
+    return torch.from_numpy(np.stack(grid, -1).reshape(-1, 3)), torch.from_numpy(weights)
+
+
+def equirectangular(
+    height: int, width: int
+) -> tuple[Float64[Tensor, "height width 3"], Float64[Tensor, "height width"]]:
+    """Directions and solid angles of an environment map's texels.
+
+    Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
+    """
+    edges = torch.cos(math.pi * torch.arange(height + 1, dtype=torch.float64) / height)
+    z = (edges[:-1] + edges[1:]) / 2  # the mean of z over a row's solid angle
+    azimuth = math.pi - 2 * math.pi * (torch.arange(width, dtype=torch.float64) + 0.5) / width
+    radius = (1 - z**2).sqrt()[:, None]
+    directions = [radius * azimuth.cos(), radius * azimuth.sin(), z[:, None].expand(height, width)]
+    solid_angles = (edges[:-1] - edges[1:]) * (2 * math.pi / width)
+    return torch.stack(directions, dim=-1), solid_angles[:, None].expand(height, width)
+
+
+def project(
+    radiance: Callable[[Tensor], Tensor] | Float[Tensor, "height width channels"],
+    degree: int,
+    quadrature_degree: int = 128,
+) -> Float64[Tensor, "coefficients channels"]:
+    """Coefficients of light on the sphere.
+
+    radiance: a function of directions (N, 3) float64 → (N, channels), integrated by `quadrature`, exactly where it is a
+    polynomial of degree `quadrature_degree - degree`; or an environment map laid out by `equirectangular`.
+    """
+    if not callable(radiance):
+        return _project_map(torch.as_tensor(radiance), degree)
+    directions, weights = quadrature(quadrature_degree)
+    values = radiance(directions).to(torch.float64)
+    require_finite(radiance=values)
+    return basis(directions, degree).T @ (weights[:, None] * values)
+
+
+def _project_map(radiance: Tensor, degree: int) -> Tensor:
+    require_finite(radiance=radiance)
+    grid = zip(*equirectangular(*radiance.shape[:2]), radiance, strict=True)  # by rows: maps may have 10⁸ texels
+    return sum(basis(row, degree).T @ (weights[:, None] * texels.to(row)) for row, weights, texels in grid)
+
+
+def rotate(
+    coefficients: Float[Tensor, "coefficients channels"], rotation: Float[Tensor, "3 3"]
+) -> Float[Tensor, "coefficients channels"]:
+    """Coefficients of the light turned by a rotation: u'(ω) = u(Rᵀω).
+
+    rotation: orthonormal. Exact: the integrand is a polynomial.
+    InputError: NaN.
+    """
+    require_finite(coefficients=coefficients, rotation=rotation)
+    degree = math.isqrt(len(coefficients)) - 1
+    turned = project(
+        lambda directions: basis(directions @ rotation.to(directions), degree) @ coefficients.to(directions),
+        degree,
+        quadrature_degree=2 * degree,
+    )
+    return turned.to(coefficients)
+
+
+def _check_degree(degree: int) -> None:
+    if not 0 <= degree <= MAX_DEGREE:
+        raise InputError(f"harmonics of degree {degree}: give a degree of 0 to {MAX_DEGREE}")

@@ -1,0 +1,159 @@
+"""Lamps at given positions: points, or discs that throw soft shadows."""
+
+import math
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from renderer.errors import FACTOR, InputError, require_range
+from renderer.light.basis import Basis, LightPaths, LocalBasis, SumBasis, parts_of
+
+SHARES, RAYS = 4, 8  # neighboring samples look at other points of a disc, in turns of so many, at so many each
+
+
+@dataclass(frozen=True)
+class Lamps(LocalBasis):
+    """A coefficient for each of the places (x, y, z): the irradiance head on at distance 1, from which it falls with
+    the square. power: the largest; the least is 0.
+
+    radius: of discs that face the origin and shine to the front as diffuse surfaces do, so that off their axis it is
+    less by the cosine; the coefficient is that of a point as bright from afar. 0: points, which shine all around.
+    InputError: no place, or one on the origin.
+    """
+
+    positions: tuple[tuple[float, float, float], ...]
+    power: float = 10.0
+    radius: float = 0.0
+
+    name = "lamps"
+
+    def __post_init__(self) -> None:
+        if not self.positions or not all(len(place) == 3 and any(place) for place in self.positions):
+            raise InputError(
+                f"lamps.positions={self.positions}: give [x, y, z] of at least one lamp, none at the origin"
+            )
+        for value in chain(*self.positions):
+            require_range("a coordinate of lamps.positions", value, -FACTOR, FACTOR)
+        require_range("lamps.power", self.power, 1 / FACTOR, FACTOR)
+        require_range("lamps.radius", self.radius, 0, FACTOR)
+
+    def __str__(self) -> str:
+        return f"{len(self.positions)} {self.name}"
+
+    @property
+    def size(self) -> int:
+        return len(self.positions)
+
+    def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
+        """positions: (L, 3) of the lamps, in place of their own; the irradiance is differentiable in them, too."""
+        positions = points.new_tensor(self.positions) if positions is None else positions
+        sources = self._discs(positions) if self.radius else positions[None, :, None]
+        share = torch.arange(len(points), device=points.device) % len(sources)
+        with torch.no_grad():
+            toward = sources[share] - points[:, None, None]
+            received = self._irradiance(toward, normals[:, None, None], positions[:, None])
+            point, lamp, ray = torch.nonzero(received > 0, as_tuple=True)
+        source = sources[share[point], lamp, ray]
+        received = self._irradiance(source - points[point], normals[point], positions[lamp])
+        return LightPaths(point, lamp, source, received / sources.shape[2])
+
+    def _discs(self, positions: Tensor) -> Tensor:
+        """(SHARES, L, RAYS, 3) points, each of which stands for as much of its disc: Vogel's spiral (1979), in each
+        share turned and a little farther out."""
+        share, ray = torch.meshgrid(torch.arange(SHARES), torch.arange(RAYS), indexing="ij")
+        distance = self.radius * ((ray + (share + 0.5) / SHARES) / RAYS).sqrt()
+        angle = ray * math.pi * (3 - math.sqrt(5)) + share * 2 * math.pi / SHARES
+        across = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2).to(positions)
+        return positions[:, None] + torch.einsum("sra,laj->slrj", across, _axes_across(F.normalize(positions, dim=1)))
+
+    def _irradiance(self, toward: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
+        """(...) at surfaces of unit normals (..., 3) from power 1 that is `toward` (..., 3) from there, of lamps at
+        places (..., 3); not above 0 behind a surface or a disc."""
+        squared = toward.square().sum(-1)
+        received = (toward * normals).sum(-1) / squared**1.5
+        if not self.radius:
+            return received
+        return received * ((toward * F.normalize(positions, dim=-1)).sum(-1) / squared.sqrt()).clamp(min=0)
+
+
+def _axes_across(back: Tensor) -> Tensor:
+    """(L, 2, 3) at right angles to unit vectors (L, 3) and to each other (Duff et al. 2017), smooth but where a disc is
+    halfway to straight below."""
+    x, y, z = back.unbind(1)
+    sign = torch.where(z < -0.5, -1.0, 1.0).to(back)
+    share = -1 / (sign + z)
+    first = torch.stack([1 + sign * x * x * share, sign * x * y * share, -sign * x], dim=1)
+    return torch.stack([first, torch.stack([x * y * share, sign + y * y * share, -y], dim=1)], dim=1)
+
+
+def moved(basis: Basis, positions: Tensor) -> Basis:
+    """The basis with its lamps at places (L, 3)."""
+    points = tuple(map(tuple, positions.tolist()))
+    parts = [replace(part, positions=points) if isinstance(part, Lamps) else part for _, part in parts_of(basis)]
+    return SumBasis(tuple(parts)) if isinstance(basis, SumBasis) else parts[0]
+
+
+"""A projector: a pattern of pixels thrown from a place onto what is there."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from renderer.camera import OrthographicCamera
+from renderer.errors import FACTOR, require_range
+from renderer.light.basis import LightPaths, LocalBasis
+
+LARGEST = 256  # pixels per side
+
+
+@dataclass(frozen=True)
+class Projector(LocalBasis):
+    """Patterns of pixels² coefficients, row by row from the top left, as a screen shows them.
+
+    It stands at polar angle θ off +z and azimuth φ off +x, in radians, `distance` from the origin, which it aims at;
+    fov: the angle between opposite sides, in radians. A coefficient of 1 makes a white surface at the origin
+    that faces it as bright as radiance 1; it falls with the square of the distance, and on a flat screen it is even, as
+    projectors are made. power: the largest coefficient; the least is 0. InputError: settings out of range.
+    """
+
+    pixels: int = 16
+    polar: float = math.pi / 3
+    azimuth: float = 0.5
+    distance: float = 4.0
+    fov: float = math.radians(30)
+    power: float = 1.0
+
+    name = "projector"
+
+    def __post_init__(self) -> None:
+        require_range("projector.pixels", self.pixels, 1, LARGEST)
+        require_range("projector.distance", self.distance, 2, FACTOR)
+        require_range("projector.fov", self.fov, 1e-3, 3)
+        require_range("projector.power", self.power, 1 / FACTOR, FACTOR)
+
+    def __str__(self) -> str:
+        return f"a {self.name} of {self.pixels}² pixels"
+
+    @property
+    def size(self) -> int:
+        return self.pixels**2
+
+    def connect(self, points: Tensor, normals: Tensor) -> LightPaths:
+        """One pixel reaches a point."""
+        axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
+        place = self.distance * axes[2]
+        right, up, back = ((points - place) @ axes.T).unbind(1)
+        depth, edge = -back, math.tan(self.fov / 2)
+        column = ((1 + right / (depth * edge)) / 2 * self.pixels).floor()
+        row = ((1 - up / (depth * edge)) / 2 * self.pixels).floor()
+        cosine = ((place - points) * normals).sum(1) / depth  # over that of the angle from the axis
+        within = (row >= 0) & (row < self.pixels) & (column >= 0) & (column < self.pixels)
+        (point,) = torch.nonzero(within & (depth > 0) & (cosine > 0), as_tuple=True)
+        function = (row * self.pixels + column)[point].long()
+        irradiance = (cosine * (self.distance / depth) ** 2)[point]
+        return LightPaths(point, function, place.expand(len(point), 3), irradiance)

@@ -1,0 +1,118 @@
+"""Distant light as coefficients (49, 3): named probes, files and random perturbations. Linear RGB radiance.
+
+Coefficients live in world axes (z up) and follow the index of `renderer.light.harmonics`.
+"""
+
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from renderer.arguments import checked
+from renderer.errors import FACTOR, InputError, require_bounded
+from renderer.io.lights import read_light
+from renderer.light.basis import HARMONICS, Harmonics
+from renderer.light.environment import SUFFIXES, read_panorama
+from renderer.light.harmonics import basis, nonzero_coefficients, project, rotate
+from renderer.mesh import Y_UP_TO_Z_UP
+from renderer.transfer import COEFFICIENTS, DEGREE
+
+# Ramamoorthi and Hanrahan 2001, "An Efficient Representation for Irradiance Environment Maps", figure 2: RGB rows
+# L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22 in the probes' own axes, whose y is up.
+_PUBLISHED_PROBES = {
+    "grace": [
+        (0.79, 0.44, 0.54), (0.39, 0.35, 0.60), (-0.34, -0.18, -0.27), (-0.29, -0.06, 0.01), (-0.11, -0.05, -0.12),
+        (-0.26, -0.22, -0.47), (-0.16, -0.09, -0.15), (0.56, 0.21, 0.14), (0.21, -0.05, -0.30),
+    ],
+    "eucalyptus": [
+        (0.38, 0.43, 0.45), (0.29, 0.36, 0.41), (0.04, 0.03, 0.01), (-0.10, -0.10, -0.09), (-0.06, -0.06, -0.04),
+        (0.01, -0.01, -0.05), (-0.09, -0.13, -0.15), (-0.06, -0.05, -0.04), (0.02, 0.00, -0.05),
+    ],
+    "st_peters": [
+        (0.36, 0.26, 0.23), (0.18, 0.14, 0.13), (-0.02, -0.01, 0.00), (0.03, 0.02, 0.01), (0.02, 0.01, 0.00),
+        (-0.05, -0.03, -0.01), (-0.09, -0.08, -0.07), (0.01, 0.00, 0.00), (-0.08, -0.03, 0.00),
+    ],
+}  # fmt: skip
+PROBES, UNIFORM = tuple(_PUBLISHED_PROBES), "uniform"
+
+
+@checked
+def load_light(light: str) -> Tensor:
+    """Coefficients (49, 3) float32 of a named probe, of `uniform` light, in which a surface shows its albedo, of an
+    environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as `renderer.save_light` writes it).
+
+    A map is scaled to the mean luminance of the grace probe, since maps come in any unit, and may be negative in
+    places, as series are that were written as a map; coefficients stay as they are.
+    InputError for an unknown name, a missing file or one that holds no light.
+    """
+    suffix = Path(light).suffix.lower()
+    if light in _PUBLISHED_PROBES:
+        return probe(light)
+    if light == UNIFORM:
+        return ambient(torch.full((3,), 1 / math.pi))
+    if suffix == ".json":
+        found, coefficients = read_light(Path(light), Harmonics)
+        if found != HARMONICS:
+            raise InputError(f"light {light} is of {found}: give one of {HARMONICS}")
+        return coefficients
+    if suffix in SUFFIXES:
+        return _read_light_map(Path(light)).float()
+    raise InputError(
+        f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or the path of an environment map "
+        f"({', '.join(SUFFIXES)}) or of coefficients (.json)"
+    )
+
+
+def probe(name: str) -> Tensor:
+    """Coefficients (49, 3) float32 of a published probe, turned upright; bands 3 to 6 are zero."""
+    published = torch.tensor(_PUBLISHED_PROBES[name], dtype=torch.float64)
+    coefficients = torch.zeros(COEFFICIENTS, 3)
+    coefficients[:9] = rotate(published, torch.from_numpy(Y_UP_TO_Z_UP[:3, :3])).float()
+    return coefficients
+
+
+def ambient(color: Tensor) -> Tensor:
+    """Coefficients (49, 3) of the same radiance (3,) from everywhere: irradiance π × color."""
+    require_bounded(color=color)
+    coefficients = torch.zeros(COEFFICIENTS, 3, dtype=color.dtype)
+    coefficients[0] = math.sqrt(4 * math.pi) * color
+    return coefficients
+
+
+def directional(direction: Tensor, color: Tensor) -> Tensor:
+    """Coefficients (49, 3) of parallel light from a unit direction (3,), of irradiance color (3,) where it meets a
+    surface head on. Truncated at degree 6, the irradiance is off by up to 0.043 of it."""
+    require_bounded(color=color)
+    return basis(direction, DEGREE)[:, None] * color
+
+
+def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, generator: torch.Generator) -> Tensor:
+    """Random lights (count, 49, 3) around one light (49, 3).
+
+    Uniform in ±amplitude on every coefficient (the paper's random arm: 0.5). With a radius, the live coefficients'
+    perturbation is scaled to that L2 norm and the dead ones, which reach no pixel, stay.
+    """
+    require_bounded(light=light)
+    offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
+    if radius is not None:
+        nonzero = torch.zeros(COEFFICIENTS, 1).index_fill_(0, nonzero_coefficients(DEGREE), 1.0)
+        offsets = offsets * nonzero
+        offsets = offsets * (radius / offsets.flatten(1).norm(dim=1).clamp(min=1e-12))[:, None, None]
+    return light + offsets.to(light)
+
+
+def mean_luminance(coefficients: Tensor) -> float:
+    return float(coefficients[0].cpu().double() @ torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64))
+
+
+def _read_light_map(path: Path) -> Tensor:
+    """Coefficients (49, 3) float64 of a map, at the grace probe's mean luminance."""
+    coefficients = project(read_panorama(path), DEGREE)
+    luminance = mean_luminance(coefficients)
+    if not luminance > 0:
+        raise InputError(f"environment map {path} has a mean luminance of {luminance:g}: give a map with light in it")
+    scaled = coefficients * (mean_luminance(probe("grace")) / luminance)
+    if not (scaled.abs() <= FACTOR).all():
+        raise InputError(f"environment map {path} is nearly as negative as it is bright: give a map with light in it")
+    return scaled

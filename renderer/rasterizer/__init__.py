@@ -1,0 +1,81 @@
+"""Which face covers each sample: three back ends, OpenGL, NumPy and numba, under one contract.
+
+rasterize(points, faces, resolution, closed) -> ids
+
+points      (N, V, 3) float64, the vertices as N views project them: x right, y up, both in [-1, 1] across
+            a square image; z is depth, smaller is nearer, and surface outside [-1, 1) is clipped
+faces       (F, 3) integer; drawn from both sides unless closed
+resolution  samples per side R; sample (i, j) sits at x = (2j + 1)/R - 1, y = 1 - (2i + 1)/R
+closed      promises a watertight mesh within the range of depths, its faces counter-clockwise seen from outside, and
+            leaves out the faces that wind clockwise in the image: the same samples are covered, with the same ids
+            but where a face turned away is as near as the nearest within rounding, as along outlines
+ids         (N, R, R) int32, row 0 at the top: the nearest face's index, the lower one where depths tie, or -1
+
+All snap vertices to 1/256 of a sample, so faces that share an edge cover each sample once. NumPy and numba agree to the
+bit; OpenGL rounds depths otherwise.
+"""
+
+import re
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+
+from renderer.errors import InputError, require_choice
+from renderer.rasterizer import opengl
+
+NAMES = ("auto", "opengl", "numba", "numpy")
+SPAN = 2**21  # samples; vertices outside are pulled in, so that fixed-point edge functions fit in int64
+_SOFTWARE_OPENGL = re.compile("llvmpipe|softpipe|swrast|swiftshader|software rasterizer", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Rasterizer:
+    """One way to rasterize. `name` is its module, `description` names it, and the device, for the line logged at the
+    start."""
+
+    name: str
+    description: str
+
+    def rasterize(self, points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool = False) -> np.ndarray:
+        """Ids (N, R, R) int32 by the module's contract. ValueError: points that are not finite."""
+        if not np.isfinite(points).all():
+            raise ValueError("points hold NaN or infinity")
+        reach = SPAN / resolution
+        module = import_module(f"renderer.rasterizer.{self.name}")
+        return module.rasterize(np.clip(points, -reach, reach), faces, resolution, closed)
+
+
+def choose(rasterizer: str = "auto") -> Rasterizer:
+    """Settle on a back end, once at the start.
+
+    "auto" takes OpenGL where a GPU drives it, else compiled where numba is installed, else software. InputError:
+    unknown name, "opengl" on a machine that cannot, or "numba" without numba.
+    """
+    require_choice("renderer.rasterizer", rasterizer, NAMES)
+    if rasterizer == "numpy":
+        return Rasterizer("numpy", "numpy")
+    if rasterizer == "numba":
+        return _compiled()
+    try:
+        device = opengl.device()
+    except InputError as error:
+        if rasterizer == "opengl":
+            raise
+        return _on_cpu(str(error))
+    if rasterizer == "auto" and _SOFTWARE_OPENGL.search(device):
+        return _on_cpu("no GPU drives OpenGL")
+    return Rasterizer("opengl", f"opengl ({device})")
+
+
+def _on_cpu(reason: str) -> Rasterizer:
+    try:
+        return _compiled()
+    except InputError:
+        return Rasterizer("numpy", f"numpy ({reason})")
+
+
+def _compiled() -> Rasterizer:
+    from renderer.rasterizer import numba as compiled  # numba takes half a second to import
+
+    return Rasterizer("numba", f"numba ( {compiled.VERSION})")

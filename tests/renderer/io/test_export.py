@@ -1,0 +1,406 @@
+"""Exported meshes: read back, read by trimesh alone, and the bytes of a .glb taken apart by hand."""
+
+import json
+import math
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
+
+from renderer.albedo import surface_albedo
+from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
+from renderer.errors import InputError
+from renderer.fragments import build_fragments
+from renderer.image import ImageSettings
+from renderer.io.export import export_mesh
+from renderer.mesh import Mesh, concatenate, load_mesh, normalize
+from renderer.rasterizer import choose
+from renderer.shading import radiance
+from renderer.shapes import solid
+from renderer.subdivision import subdivide
+
+DATA = Path(__file__).parents[2].parent / "shared" / "data"
+EPS32 = np.finfo(np.float32).eps
+GLTF_TYPES = {5125: "<u4", 5126: "<f4"}
+GLTF_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def painted(mesh: Mesh, textures: int, seed: int = 0) -> Mesh:
+    """A color and a uv for each corner, so that every edge is a seam, and textures of different sizes by face."""
+    rng = np.random.default_rng(seed)
+    count = len(mesh.faces)
+    ids = np.sort(rng.integers(-1, textures, count)).astype(np.int32)
+    uvs = rng.uniform(-1, 2, (count, 3, 2)).astype(np.float32)
+    return replace(
+        mesh,
+        corner_colors=rng.random((count, 3, 3), dtype=np.float32),
+        corner_uvs=np.where((ids < 0)[:, None, None], 0, uvs),
+        texture_ids=ids,
+        textures=tuple(rng.integers(0, 256, (8, 4 + i, 3), dtype=np.uint8) for i in range(textures)),
+    )
+
+
+def box() -> Mesh:
+    geometry = trimesh.creation.box((1, 2, 3))
+    return Mesh.plain(geometry.vertices + np.array([0, 0, 0.25]), geometry.faces)
+
+
+def with_a_seam() -> Mesh:
+    """A smooth ball whose uvs, and whose colors at the bottom, end at an edge."""
+    ball = trimesh.creation.uv_sphere(count=[8, 12])
+    mesh = Mesh.plain(ball.vertices, ball.faces, np.random.default_rng(1).random(ball.vertices.shape))
+    azimuth = np.arctan2(ball.vertices[:, 1], ball.vertices[:, 0])[ball.faces] / (2 * np.pi)
+    azimuth = np.where(np.ptp(azimuth, axis=1, keepdims=True) > 0.5, azimuth % 1, azimuth)
+    uvs = np.stack([azimuth, ball.vertices[:, 2][ball.faces] / 2 + 0.5], axis=-1).astype(np.float32)
+    texture = np.random.default_rng(2).integers(0, 256, (16, 32, 3), dtype=np.uint8)
+    ids = np.zeros(len(ball.faces), dtype=np.int32)
+    return replace(mesh, corner_uvs=uvs, texture_ids=ids, textures=(texture,))
+
+
+MESHES = {
+    "one color": box(),
+    "smooth colors": solid("orange"),
+    "colors with edges": solid("bottle"),
+    "two parts": solid("cup"),
+    "a seam": with_a_seam(),
+    "seams everywhere": painted(box(), 1),
+    "several textures and none": painted(solid("pear"), 3),
+    "more textures than ten": painted(solid("pear"), 12),
+}
+every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
+
+
+def corners(mesh: Mesh) -> np.ndarray:
+    return mesh.vertices[mesh.faces]
+
+
+def assert_same_surface(found: Mesh, mesh: Mesh) -> None:
+    """Positions are rounded to float32 once; so are colors, in linear light, where sRGB's curve only makes their
+    relative error smaller, and encoded ones, once more; v is stored as 1 - v, which is at most 2 here."""
+    assert_array_equal(corners(found), corners(mesh).astype(np.float32))
+    assert_allclose(found.corner_colors, mesh.corner_colors, rtol=2 * EPS32, atol=0)
+    assert_allclose(found.corner_uvs, mesh.corner_uvs, rtol=0, atol=2 * EPS32)
+    assert_array_equal(found.texture_ids, mesh.texture_ids)
+    assert len(found.textures) == len(mesh.textures)
+    for texture, expected in zip(found.textures, mesh.textures, strict=True):
+        assert_array_equal(texture, expected)
+
+
+def image_of(mesh: Mesh) -> torch.Tensor:
+    """Radiance of a view, smooth vertex normals and all."""
+    [fragments] = build_fragments(
+        mesh.vertices, mesh.faces, orbit_cameras(1, 4.0)[0:1], ImageSettings(24, 2), choose("numpy"), mesh.closed
+    )
+    light = torch.randn(49, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    albedo = surface_albedo(mesh, fragments, "linear")
+    return radiance(fragments, torch.from_numpy(mesh.vertices), light, albedo, torch.from_numpy(mesh.faces))
+
+
+# ---------------------------------------------------------------------------------------- .glb
+
+
+@every_mesh
+def test_a_glb_gives_back_the_same_surface(tmp_path, mesh):
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    found = load_mesh(tmp_path / "mesh.glb")
+    assert_same_surface(found, mesh)
+    assert len(found.vertices) == len(mesh.vertices) and found.closed is mesh.closed
+
+
+@every_mesh
+def test_a_glb_gives_back_the_same_image(tmp_path, mesh):
+    """Of the mesh whose positions are float32 already, so that the same samples see the same faces. Texture
+    coordinates are off by 2 EPS32, which is 64 of it in texels."""
+    mesh = replace(mesh, vertices=mesh.vertices.astype(np.float32).astype(np.float64))
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    before, after = image_of(mesh), image_of(load_mesh(tmp_path / "mesh.glb"))
+    torch.testing.assert_close(after, before, rtol=0, atol=2 * 64 * EPS32 * float(before.abs().max()))
+
+
+def read_glb(path: Path) -> list[dict]:
+    """The primitives of a .glb: their attributes and indices as arrays, the material and the image's bytes."""
+    blob = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack("<4sII I4s", blob[:20])
+    assert (magic, version, length, kind) == (b"glTF", 2, len(blob), b"JSON")
+    tree, binary = json.loads(blob[20 : 20 + size]), blob[28 + size :]
+
+    def view(index: int) -> bytes:
+        start = tree["bufferViews"][index].get("byteOffset", 0)
+        return binary[start : start + tree["bufferViews"][index]["byteLength"]]
+
+    def accessor(index: int) -> np.ndarray:
+        entry = tree["accessors"][index]
+        values = np.frombuffer(
+            view(entry["bufferView"]), GLTF_TYPES[entry["componentType"]], offset=entry.get("byteOffset", 0)
+        )
+        return values.reshape(entry["count"], GLTF_WIDTHS[entry["type"]])
+
+    assert (tree["scene"], tree["scenes"], tree["nodes"]) == (0, [{"nodes": [0]}], [{"mesh": 0}])
+    [mesh] = tree["meshes"]
+    return [
+        {name: accessor(index) for name, index in primitive["attributes"].items()}
+        | {
+            "indices": accessor(primitive["indices"]).reshape(-1, 3),
+            "material": tree["materials"][primitive["material"]],
+        }
+        for primitive in mesh["primitives"]
+    ]
+
+
+def test_a_glb_holds_y_up_positions_linear_colors_and_uvs_from_the_top(tmp_path):
+    mesh = painted(box(), 1)
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    parts = read_glb(tmp_path / "mesh.glb")
+    plain = mesh.texture_ids < 0
+    assert len(parts) == 2 and plain.any() and not plain.all()
+    for part, here in zip(parts, (plain, ~plain), strict=True):
+        assert set(part) == {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0", "indices", "material"}
+        x, y, z = np.moveaxis(corners(mesh)[here], -1, 0)
+        assert_array_equal(part["POSITION"][part["indices"]], np.stack([x, z, -y], axis=-1).astype(np.float32))
+        colors = linear(mesh.corner_colors[here].astype(np.float64))
+        assert_allclose(part["COLOR_0"][part["indices"]], colors, rtol=EPS32, atol=0)
+    u, v = np.moveaxis(mesh.corner_uvs[~plain], -1, 0)
+    assert_allclose(parts[1]["TEXCOORD_0"][parts[1]["indices"]], np.stack([u, 1 - v], -1), rtol=0, atol=EPS32)
+    assert [
+        set(part["material"]["pbrMetallicRoughness"]) - {"metallicFactor", "roughnessFactor"} for part in parts
+    ] == [
+        set(),
+        {"baseColorTexture"},
+    ]
+    for part in parts:
+        assert part["material"]["doubleSided"] is True
+        assert part["material"]["pbrMetallicRoughness"]["metallicFactor"] == 0
+        assert part["material"]["pbrMetallicRoughness"]["roughnessFactor"] == 1
+
+
+@pytest.mark.parametrize("normals", ["smooth", "flat"])
+def test_a_glb_has_the_normals_that_the_renderer_shades_with(tmp_path, normals):
+    """Flat ones by the cross product; smooth ones the area-weighted sum of those around the vertex."""
+    mesh = solid("pear")
+    export_mesh(mesh, tmp_path / "mesh.glb", normals)
+    [part] = read_glb(tmp_path / "mesh.glb")
+    a, b, c = np.moveaxis(corners(mesh), 1, 0)
+    expected = np.cross(b - a, c - a)[:, None].repeat(3, axis=1)
+    if normals == "smooth":
+        sums = np.zeros_like(mesh.vertices)
+        np.add.at(sums, mesh.faces, expected)
+        expected = sums[mesh.faces]
+    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+    x, y, z = np.moveaxis(part["NORMAL"][part["indices"]], -1, 0)
+    assert_allclose(np.stack([x, -z, y], axis=-1), expected, rtol=0, atol=4 * EPS32)
+
+
+def test_a_glbs_cameras_see_what_ours_see(tmp_path):
+    """A point through the node's matrix, turned from y up, lands where `project` puts it."""
+    place = {"polar": 2.0, "azimuth": 1.0, "width": 2.5, "right": 0.3, "up": -0.2}
+    close = [PerspectiveCamera(**place, distance=distance) for distance in (1.2, 3.0)]
+    cameras = [*orbit_cameras(2, 3.0, 1.0, 0.4), OrthographicCamera(**place), *close]
+    export_mesh(box(), tmp_path / "mesh.glb", cameras=cameras)
+    blob = (tmp_path / "mesh.glb").read_bytes()
+    tree = json.loads(blob[20 : 20 + struct.unpack("<I", blob[12:16])[0]])
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, size=(20, 3))
+    x, y, z = points.T
+    nodes = [tree["nodes"][index] for index in tree["scenes"][0]["nodes"][1:]]
+    assert len(nodes) == len(cameras)
+    for camera, node in zip(cameras, nodes, strict=True):
+        pose, lens = np.reshape(node["matrix"], (4, 4)).T, tree["cameras"][node["camera"]]
+        clipped = gltf_projection(lens) @ np.linalg.inv(pose) @ np.stack([x, z, -y, np.ones(20)])
+        assert_allclose((clipped[:3] / clipped[3]).T, camera.project(points), atol=1e-12)
+
+
+def gltf_projection(lens: dict) -> np.ndarray:
+    """The matrix of a camera by the specification (glTF 2.0, 3.10.3)."""
+    kind = lens[lens["type"]]
+    near, far = kind["znear"], kind["zfar"]
+    if lens["type"] == "orthographic":
+        depth = [0, 0, 2 / (near - far), (far + near) / (near - far)]
+        return np.array([[1 / kind["xmag"], 0, 0, 0], [0, 1 / kind["ymag"], 0, 0], depth, [0, 0, 0, 1]])
+    tangent = math.tan(kind["yfov"] / 2)
+    depth = [0, 0, (far + near) / (near - far), 2 * far * near / (near - far)]
+    return np.array([[1 / (kind["aspectRatio"] * tangent), 0, 0, 0], [0, 1 / tangent, 0, 0], depth, [0, 0, -1, 0]])
+
+
+@every_mesh
+def test_a_vertex_is_written_once_for_each_of_its_looks(tmp_path, mesh):
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    faces = zip(mesh.faces.tolist(), mesh.texture_ids.tolist(), mesh.corner_colors, mesh.corner_uvs, strict=True)
+    looks = {
+        (vertex, texture, *color, *uv)
+        for face, texture, colors, uvs in faces
+        for vertex, color, uv in zip(face, colors.tolist(), uvs.tolist(), strict=True)
+    }
+    assert sum(len(part["POSITION"]) for part in read_glb(tmp_path / "mesh.glb")) == len(looks)
+
+
+def test_trimesh_reads_a_glb_whole_and_closed(tmp_path):
+    mesh = with_a_seam()
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    found = trimesh.load(tmp_path / "mesh.glb", force="mesh")
+    found.merge_vertices(merge_tex=True, merge_norm=True)
+    assert found.is_watertight and found.is_winding_consistent
+    assert found.volume == pytest.approx(np.linalg.det(corners(mesh)).sum() / 6, rel=1e-6)
+    assert_array_equal(np.asarray(found.visual.material.baseColorTexture.convert("RGB")), mesh.textures[0])
+
+
+def test_dark_colors_are_kept(tmp_path):
+    """All of 8 bits, and those around the ends of sRGB's linear part."""
+    levels = np.concatenate([np.arange(256) / 255, np.linspace(0.04, 0.041, 41), [1e-3, 1e-5, 1e-20]])
+    points = np.random.default_rng(0).random((len(levels), 3))
+    faces = np.arange(len(levels) // 3 * 3).reshape(-1, 3)
+    export_mesh(Mesh.plain(points, faces, levels[:, None]), tmp_path / "mesh.glb")
+    found = load_mesh(tmp_path / "mesh.glb").corner_colors
+    # The two parts of the standard's curve meet 1e-7 apart.
+    assert_allclose(found, levels[faces][..., None].repeat(3, -1), rtol=2 * EPS32, atol=1e-7)
+
+
+def test_images_of_the_same_bytes_and_other_sizes_are_kept_apart(tmp_path):
+    mesh = painted(box(), 2)
+    texture = mesh.textures[0]
+    mesh = replace(mesh, textures=(texture, texture.reshape(texture.shape[1], texture.shape[0], 3)))
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    assert_same_surface(load_mesh(tmp_path / "mesh.glb"), mesh)
+
+
+def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(tmp_path):
+    mesh = painted(box(), 1)
+    mesh = replace(mesh, texture_ids=np.arange(12, dtype=np.int32) % 2 * 2, textures=painted(box(), 3).textures)
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    found = load_mesh(tmp_path / "mesh.glb")
+    assert_array_equal(corners(found), corners(mesh)[[0, 2, 4, 6, 8, 10, 1, 3, 5, 7, 9, 11]])
+    assert_array_equal(found.texture_ids, [0] * 6 + [1] * 6)
+    for texture, index in zip(found.textures, (0, 2), strict=True):
+        assert_array_equal(texture, mesh.textures[index])
+
+
+def test_what_was_exported_can_be_exported_again(tmp_path):
+    export_mesh(painted(solid("pear"), 2), tmp_path / "once.glb")
+    export_mesh(load_mesh(tmp_path / "once.glb"), tmp_path / "again.glb")
+    assert_same_surface(load_mesh(tmp_path / "again.glb"), load_mesh(tmp_path / "once.glb"))
+
+
+# ---------------------------------------------------------------------------------------- .ply
+
+
+@pytest.mark.parametrize("name", ["orange", "bottle", "cup", "table"])
+def test_a_ply_gives_back_the_shape_and_colors_of_eight_bits(tmp_path, name):
+    mesh = solid(name)
+    export_mesh(mesh, tmp_path / "mesh.ply")
+    found = load_mesh(tmp_path / "mesh.ply")
+    assert_array_equal(corners(found), corners(mesh).astype(np.float32))
+    assert_allclose(found.corner_colors, mesh.corner_colors, rtol=0, atol=0.5 / 255 + 2 * EPS32)
+    assert found.closed is mesh.closed
+
+
+def test_trimesh_reads_a_ply_of_smooth_colors_vertex_for_vertex(tmp_path):
+    mesh = solid("orange")
+    export_mesh(mesh, tmp_path / "mesh.ply")
+    found = trimesh.load(tmp_path / "mesh.ply", process=False)
+    assert_array_equal(found.vertices, mesh.vertices.astype(np.float32))
+    assert_array_equal(found.faces, mesh.faces)
+    assert found.is_watertight
+
+
+PAIR = np.array([[[0, 50, 100], [200, 250, 30]]], dtype=np.uint8)  # two texels side by side
+MEAN = srgb(linear(PAIR[0] / 255).mean(axis=0))
+
+
+@pytest.mark.parametrize(
+    ("uv", "texel"),
+    [
+        ((0.25, 0.5), PAIR[0, 0] / 255),
+        ((0.75, 0.5), PAIR[0, 1] / 255),
+        ((0.25, 0.1), PAIR[0, 0] / 255),
+        ((0.5, 0.9), MEAN),
+        ((0.0, 0.0), MEAN),
+        ((1.0, 1.0), MEAN),
+        ((-0.75, 3.5), PAIR[0, 0] / 255),
+        ((2.75, -1.0), PAIR[0, 1] / 255),
+        ((0.375, 0.5), srgb(linear(PAIR[0] / 255).T @ [0.75, 0.25])),
+    ],
+)
+@pytest.mark.parametrize("color", [(1.0, 1.0, 1.0), (0.5, 0.2, 0.9)])
+def test_a_plys_vertices_have_their_texels_color_times_their_own_in_linear_light(tmp_path, uv, texel, color):
+    """Texel centers lie at half-integers, and the texture repeats."""
+    mesh = replace(
+        Mesh.plain(np.eye(3), [[0, 1, 2]], color),
+        corner_uvs=np.full((1, 3, 2), uv, dtype=np.float32),
+        texture_ids=np.zeros(1, dtype=np.int32),
+        textures=(PAIR,),
+    )
+    export_mesh(mesh, tmp_path / "mesh.ply")
+    expected = srgb(linear(texel) * linear(np.array(color)))
+    assert_allclose(load_mesh(tmp_path / "mesh.ply").corner_colors[0], expected[None].repeat(3, 0), atol=0.51 / 255)
+
+
+def test_a_plys_rows_of_a_texture_run_from_the_top(tmp_path):
+    column = PAIR.swapaxes(0, 1)
+    mesh = replace(painted(box(), 0), textures=(column,), texture_ids=np.zeros(12, dtype=np.int32))
+    mesh = replace(mesh, corner_colors=np.ones((12, 3, 3), dtype=np.float32))
+    mesh = replace(mesh, corner_uvs=np.tile(np.float32([[0.3, 0.75], [0.9, 0.25], [0.1, 0.5]]), (12, 1, 1)))
+    export_mesh(mesh, tmp_path / "mesh.ply")
+    expected = np.stack([PAIR[0, 0] / 255, PAIR[0, 1] / 255, MEAN])
+    assert_allclose(load_mesh(tmp_path / "mesh.ply").corner_colors, expected[None].repeat(12, 0), atol=0.51 / 255)
+
+
+def test_a_plys_faces_keep_their_order_whatever_their_textures(tmp_path):
+    mesh = concatenate([painted(box(), 2), box(), painted(box(), 1)])
+    export_mesh(mesh, tmp_path / "mesh.ply")
+    assert_array_equal(corners(load_mesh(tmp_path / "mesh.ply")), corners(mesh).astype(np.float32))
+
+
+# ---------------------------------------------------------------------------------------- paths
+
+
+@pytest.mark.parametrize("name", ["mesh.obj", "mesh", "mesh.GLB.txt"])
+def test_another_suffix_is_refused(tmp_path, name):
+    with pytest.raises(InputError, match=r"is no name for a mesh to write: give one that ends in \.glb, \.ply"):
+        export_mesh(box(), tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".ply"])
+def test_a_place_that_cannot_be_written_is_refused(tmp_path, suffix):
+    (tmp_path / f"mesh{suffix}").mkdir()
+    with pytest.raises(InputError, match=f"mesh{suffix} cannot be written: "):
+        export_mesh(box(), tmp_path / f"mesh{suffix}")
+
+
+@pytest.mark.parametrize("name", ["mesh.GLB", "mesh.PLY"])
+def test_a_new_folder_is_made_and_the_suffixs_case_does_not_matter(tmp_path, name):
+    export_mesh(box(), str(tmp_path / "new" / name))
+    assert_array_equal(corners(load_mesh(tmp_path / "new" / name)), corners(box()))
+
+
+# ---------------------------------------------------------------------------------------- the project's own meshes
+
+
+@pytest.mark.realdata
+@pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
+@pytest.mark.parametrize("name", ["orange_studio", "orange_sketchfab", "orange_leaf"])
+def test_the_shared_oranges_come_back_subdivided_and_deformed(tmp_path, name):
+    mesh = subdivide(normalize(load_mesh(DATA / "meshes" / f"{name}.glb")), 10_000)
+    vertices = mesh.vertices + np.random.default_rng(0).normal(0, 1e-3, mesh.vertices.shape)
+    mesh = replace(mesh, vertices=vertices)
+    assert len(vertices) > 10_000 and mesh.closed
+    export_mesh(mesh, tmp_path / "mesh.glb")
+    found = load_mesh(tmp_path / "mesh.glb")
+    assert_same_surface(found, mesh)
+    assert found.closed
+    export_mesh(mesh, tmp_path / "mesh.ply")
+    baked = load_mesh(tmp_path / "mesh.ply")
+    assert_array_equal(corners(baked), corners(found))
+    red, green, blue = np.average(baked.corner_colors.mean(axis=1), axis=0, weights=baked.face_areas())
+    assert red > 1.2 * green > 1.2 * 1.2 * blue

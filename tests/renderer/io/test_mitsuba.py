@@ -1,0 +1,123 @@
+"""A scene's files, rendered by Mitsuba, against our image of the same."""
+
+import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from renderer.camera import OrthographicCamera, PerspectiveCamera
+from renderer.errors import InputError
+from renderer.image import ImageSettings
+from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
+from renderer.light.environment import write_map
+from renderer.light.harmonics import basis, unit_vectors
+from renderer.light.presets import load_light
+from renderer.mesh import Mesh, normalize
+from renderer.rasterizer import choose
+from renderer.transfer import build_operators
+
+pytest.importorskip("mitsuba")
+CAMERAS = [
+    OrthographicCamera(1.0, 2.2, 2.3),
+    OrthographicCamera(2.3, 5.1, 2.7, right=0.2, up=-0.1),
+    PerspectiveCamera(1.4, 0.3, 2.7, right=0.2, up=-0.1, distance=2.2),
+]
+
+
+def ball() -> Mesh:
+    """Smooth, with a texture on the upper half under colors of its own, and colors at the corners below."""
+    sphere, draws = trimesh.creation.icosphere(subdivisions=3), np.random.default_rng(0)
+    mesh = Mesh.plain(sphere.vertices, sphere.faces, draws.uniform(0.2, 1, sphere.vertices.shape))
+    above = sphere.vertices[sphere.faces].mean(axis=1)[:, 2] > 0
+    uvs = (sphere.vertices[:, :2] / 2 + 0.5)[sphere.faces].astype(np.float32)
+    return replace(
+        mesh,
+        corner_uvs=uvs,
+        corner_colors=np.where(above[:, None, None], [0.9, 0.8, 0.6], mesh.corner_colors).astype(np.float32),
+        texture_ids=np.where(above, 0, -1).astype(np.int32),
+        textures=(draws.integers(0, 256, (9, 6, 3), dtype=np.uint8),),
+    )
+
+
+def test_a_map_for_mitsuba_is_the_light_in_every_direction(tmp_path):
+    """But for the interpolation between texels."""
+    light, settings = load_light("grace").double(), ImageSettings(8)
+    write_mitsuba_scene(tmp_path, normalize(ball()), 1.0, CAMERAS, settings, "light.exr")
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 128))
+    directions = unit_vectors(torch.randn(3, 50, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))[0].T
+    with mitsuba() as mi:
+        sky, seen = mi.load_file(str(tmp_path / SCENE)).environment(), []
+        for direction in directions.tolist():
+            interaction = mi.SurfaceInteraction3f()
+            interaction.wi = [-each for each in direction]
+            seen.append(np.array(sky.eval(interaction)))
+    expected = math.pi * basis(directions, 6) @ light
+    torch.testing.assert_close(torch.from_numpy(np.array(seen)).double(), expected, rtol=0, atol=4e-4 * expected.max())
+
+
+@pytest.mark.parametrize(("encoding", "normals"), [("linear", "smooth"), ("srgb", "flat")])
+def test_the_files_look_in_mitsuba_as_the_scene_does_here(tmp_path, encoding, normals):
+    """Inside the outline, on average to half of a 255th and in root mean square to a 200th, which is Mitsuba's noise at
+    the texels' edges. The probe is positive all round."""
+    mesh, light, settings = normalize(ball()), load_light("st_peters"), ImageSettings(24, 8, encoding, normals)
+    write_mitsuba_scene(tmp_path / "mitsuba", mesh, 2.0, CAMERAS, settings, "../light.exr")
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
+    theirs = render_mitsuba_scene(tmp_path / "mitsuba" / SCENE, len(CAMERAS)).double()
+    for operator, seen in zip(build_operators(mesh, CAMERAS, settings, choose("numpy"), 2.0), theirs, strict=True):
+        ours = torch.zeros(4, 24 * 24, dtype=torch.float64)
+        ours[:3, operator.pixels], ours[3, operator.pixels] = (
+            operator.radiance(light).double(),
+            operator.coverage.double(),
+        )
+        off, inside = ours.view(4, 24, 24) - seen, (ours[3].view(24, 24) == 1) & (seen[3] == 1)
+        assert inside.sum() > 100 and off[3].abs().max() < 1 / 8
+        assert off[:3, inside].mean().abs() < 0.5 / 255 and off[:3, inside].square().mean().sqrt() < 0.005
+
+
+@pytest.mark.parametrize("transport", ["shadows", "bounces:2"])
+def test_a_bowl_is_as_dark_or_bright_within_as_its_transport_says(tmp_path, transport):
+    """To the quadrature of a pixel's rays, and far from what direct light makes of it."""
+    shell = trimesh.creation.icosphere(subdivisions=3)
+    lower = shell.vertices[shell.faces].mean(axis=1)[:, 2] < 0
+    bowl, settings = Mesh.plain(shell.vertices, shell.faces[lower], (0.8, 0.7, 0.5)), ImageSettings(24, 4)
+    camera, light = OrthographicCamera(0.3, 0.0, 2.2), load_light("st_peters")
+    write_mitsuba_scene(tmp_path, bowl, 1.0, [camera], replace(settings, transport=transport), "light.exr")
+    write_map(tmp_path / "light.exr", mitsuba_map(light, 128))
+    theirs = render_mitsuba_scene(tmp_path / SCENE, 1)[0].flatten(1)
+    for chosen, close in ((transport, True), ("direct", False)):
+        [operator] = build_operators(bowl, [camera], replace(settings, transport=chosen), choose("numpy"))
+        inside = (operator.coverage == 1) & (theirs[3, operator.pixels] == 1)
+        off = (operator.radiance(light) - theirs[:3, operator.pixels])[:, inside]
+        assert (off.square().mean().sqrt() < 0.02 * theirs[:3].max()) == close
+
+
+def test_a_file_that_mitsuba_refuses_is_named_in_one_sentence(tmp_path):
+    (tmp_path / SCENE).write_text("<scene version='3.0.0'><shape type='ply'/></scene>")
+    with pytest.raises(InputError, match=SCENE) as refused:
+        render_mitsuba_scene(tmp_path / SCENE, 1)
+    assert "\n" not in str(refused.value)
+
+
+ON_ONE_CORE = """
+import os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from pathlib import Path
+from renderer.io.mitsuba import render_mitsuba_scene
+print(tuple(render_mitsuba_scene(Path(sys.argv[1]), 1).shape))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+def test_a_scene_is_rendered_on_a_single_core_too(tmp_path):
+    """Mitsuba then has one thread, which would wait for its own reader of .exr."""
+    write_mitsuba_scene(tmp_path, ball(), 1.0, [OrthographicCamera(1.0, 0.0, 2.0)], ImageSettings(8), "light.exr")
+    write_map(tmp_path / "light.exr", torch.ones(8, 16, 3))
+    command = [sys.executable, "-c", ON_ONE_CORE, str(tmp_path / SCENE)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "(1, 4, 8, 8)\n"), done.stderr

@@ -1,0 +1,494 @@
+import io
+import math
+import os
+import re
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO
+import pytest
+import torch
+from numpy.polynomial import Legendre, Polynomial
+from PIL import Image
+
+from renderer.errors import InputError
+from renderer.io.lights import save_light
+from renderer.light.environment import SUFFIXES, negative_fraction, read_map, to_map, write_map
+from renderer.light.harmonics import basis, equirectangular, project
+from renderer.light.presets import load_light, mean_luminance, probe
+from renderer.transfer import DEGREE
+
+ROOT = Path(__file__).parents[2]
+HDRI = ROOT.parent / "shared" / "data" / "hdri"
+EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+RGBE = 2.0**-8  # of a texel's largest channel, which is at least 128 units of its exponent: half a unit
+
+
+def draws(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def random_map(height: int = 16, width: int = 32) -> torch.Tensor:
+    """Radiance over six orders of magnitude, half a magnitude between the channels of a texel, some channels zero."""
+    magnitude = torch.rand(height, width, 1, generator=draws(1)) * 6 - 3
+    radiance = 10 ** (magnitude + 0.5 * torch.randn(height, width, 3, generator=draws(2)))
+    return radiance * (torch.rand(height, width, 3, generator=draws(3)) > 0.1)
+
+
+def random_light(degree: int = 6) -> torch.Tensor:
+    return torch.randn((degree + 1) ** 2, 3, dtype=torch.float64, generator=draws(4))
+
+
+# ---------------------------------------------------------------------------------------- coefficients to maps
+
+
+def midpoint_constant(degree: int) -> float:
+    """Largest error of coefficients through a map, in 1 / height² of their L2 norm, as the height grows.
+
+    The midpoint rule along z is off by Σ Δz³ f'' / 24 and Δz = π sin θ / height; zonal harmonics have it worst.
+    """
+    zonal = [math.sqrt((2 * l + 1) / 2) * Legendre.basis(l).convert(kind=Polynomial) for l in range(degree + 1)]
+    errors = np.empty((degree + 1, degree + 1))
+    for i, first in enumerate(zonal):
+        for j, second in enumerate(zonal):
+            integral = (Polynomial([1, 0, -1]) * (first * second).deriv(2)).integ()
+            errors[i, j] = math.pi**2 / 24 * (integral(1) - integral(-1))
+    return np.linalg.norm(errors, 2)
+
+
+def test_the_documented_quadrature_error_is_the_midpoint_rules():
+    assert midpoint_constant(6) == pytest.approx(22.2, abs=0.05)
+
+
+@pytest.mark.parametrize("degree", [0, 2, 6])
+@pytest.mark.parametrize("height", [32, 64, 256])
+def test_a_light_comes_back_from_its_map_within_the_quadrature_error(degree, height):
+    light = random_light(degree)
+    radiance = to_map(light, height)
+    assert radiance.shape == (height, 2 * height, 3) and radiance.dtype == torch.float64
+    error = (project(radiance, degree) - light).norm(dim=0) / light.norm(dim=0)
+    # The next term of the midpoint rule has the sign that makes the error smaller; 2 H² texels are summed.
+    assert (error <= midpoint_constant(degree) / height**2 + 2 * height**2 * EPS).all()
+
+
+def test_the_worst_light_comes_back_with_the_documented_error():
+    height = 64
+    returned = project(to_map(torch.eye(49, dtype=torch.float64), height), 6) - torch.eye(49, dtype=torch.float64)
+    worst = torch.linalg.matrix_norm(returned, 2) * height**2
+    assert 0.99 * midpoint_constant(6) < worst < midpoint_constant(6)
+
+
+def test_texels_hold_the_radiance_of_their_directions():
+    light, height = random_light(), 8
+    directions, _ = equirectangular(height, 2 * height)
+    expected = basis(directions, 6) @ light
+    torch.testing.assert_close(to_map(light.float(), height), expected, rtol=0, atol=49 * 4 * EPS32)
+
+
+@pytest.mark.parametrize(
+    ("above", "below", "share"), [(3.0, -1.0, 0.25), (1.0, 0.5, 0.0), (-1.0, -1.0, 1.0), (0.0, 0.0, 0.0)]
+)
+def test_the_negative_share_is_of_the_magnitude_over_the_sphere(above, below, share):
+    radiance = torch.full((10, 7, 3), below)
+    radiance[:5] = above
+    assert negative_fraction(radiance) == pytest.approx(share, abs=210 * EPS)
+
+
+# ---------------------------------------------------------------------------------------- files
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".exr", ".NPY", ".EXR"])
+def test_arrays_and_exr_keep_float32_to_the_bit_and_its_sign(tmp_path, suffix):
+    radiance = random_map() - 0.1
+    path = tmp_path / f"map{suffix}"
+    write_map(path, radiance)
+    read = read_map(path)
+    assert read.dtype == torch.float32 and [file.name for file in tmp_path.iterdir()] == [path.name]
+    torch.testing.assert_close(read, radiance, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".HDR"])
+def test_hdr_keeps_2_to_the_minus_8_of_the_largest_channel_without_bias(tmp_path, suffix):
+    path, radiance = tmp_path / f"map{suffix}", random_map(64, 128)
+    write_map(path, radiance)
+    error = (read_map(path) - radiance) / radiance.amax(dim=-1, keepdim=True).clamp(min=1e-6)
+    assert error.abs().max() <= RGBE
+    assert error.abs().max() > RGBE / 2  # the bound is reached
+    assert (read_map(path)[radiance == 0] == 0).all()
+    # Five standard errors of the mean of errors uniform in half a unit; truncation would be off by RGBE / 2 or so.
+    assert error.mean().abs() < 5 * RGBE / math.sqrt(3 * error.numel())
+
+
+@pytest.mark.parametrize("largest", [1.0, 0.998, 0.9981, 0.9999, 0.5, 1e-30, 1e30, 0.0])
+def test_hdr_keeps_its_precision_where_rounding_would_need_another_exponent(tmp_path, largest):
+    path, radiance = tmp_path / "map.hdr", largest * torch.linspace(0, 1, 513)[None, :, None].repeat(1, 1, 3)
+    radiance[..., 0] = largest
+    write_map(path, radiance)
+    assert ((read_map(path) - radiance).abs() <= RGBE * largest).all()
+
+
+def test_hdr_stores_negative_radiance_as_zero(tmp_path):
+    radiance = random_map() - 1
+    for name, values in (("signed.hdr", radiance), ("clamped.hdr", radiance.clamp(min=0))):
+        write_map(tmp_path / name, values)
+    assert (tmp_path / "signed.hdr").read_bytes() == (tmp_path / "clamped.hdr").read_bytes()
+
+
+def test_writing_makes_the_folder_and_takes_what_autograd_made(tmp_path):
+    light = random_light().requires_grad_()
+    write_map(tmp_path / "new" / "map.exr", to_map(light, 4))
+    torch.testing.assert_close(read_map(tmp_path / "new" / "map.exr"), to_map(light.detach(), 4).float())
+
+
+# ------------------------------------------------------------------- the formats as others read and write them
+
+
+HDR_HEADER = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 3\n"
+HDR_TEXELS = [
+    [(128, 64, 32, 129), (200, 0, 1, 128), (0, 0, 0, 0)],
+    [(255, 255, 128, 136), (130, 7, 9, 118), (1, 2, 192, 140)],
+]
+
+
+def decoded(texels: list[list[tuple[int, ...]]]) -> torch.Tensor:
+    """Radiance = mantissa · 2^(exponent - 136), and black where the exponent is 0."""
+    return torch.tensor([[[m * 2.0 ** (t[3] - 136) for m in t[:3]] for t in row] for row in texels])
+
+
+def test_a_radiance_file_written_byte_by_byte_is_read(tmp_path):
+    path = tmp_path / "map.hdr"
+    path.write_bytes(HDR_HEADER + b"".join(bytes(texel) for row in HDR_TEXELS for texel in row))
+    torch.testing.assert_close(read_map(path), decoded(HDR_TEXELS), rtol=0, atol=0)
+
+
+def test_a_radiance_file_holds_the_bytes_that_the_format_defines(tmp_path):
+    """Lines of fewer than 8 texels are stored plainly."""
+    path = tmp_path / "map.hdr"
+    write_map(path, decoded(HDR_TEXELS))
+    header, texels = path.read_bytes().split(b"-Y 2 +X 3\n")
+    assert header.startswith(b"#?RADIANCE\n") and b"FORMAT=32-bit_rle_rgbe\n\n" in header
+    assert list(struct.iter_unpack("4B", texels)) == [*HDR_TEXELS[0], *HDR_TEXELS[1]]
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".hdr"])
+def test_mitsuba_sees_each_texel_where_the_conventions_put_it(tmp_path, suffix):
+    """With the documented `to_world`. Mitsuba has its first and last row at the poles, so its rows are apart by a
+    little more; at its texels' centers, where it does not interpolate, it shows them as written."""
+    mitsuba, drjit = pytest.importorskip("mitsuba"), pytest.importorskip("drjit")
+    mitsuba.set_variant("scalar_rgb")
+    drjit.set_thread_count(2)  # with the one that it starts on one core, it waits for its reader of .exr forever
+    height, width = 8, 16
+    radiance = 1 + torch.rand(height, width, 3, generator=draws(5))
+    write_map(tmp_path / f"map{suffix}", radiance)
+    to_world = mitsuba.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    light = {"type": "envmap", "filename": str(tmp_path / f"map{suffix}"), "to_world": to_world}
+    emitter = mitsuba.load_dict({"type": "scene", "light": light}).environment()
+    interaction, seen = mitsuba.SurfaceInteraction3f(), torch.empty(height - 2, width, 3)  # at a pole columns meet
+    for row, column in np.ndindex(height - 2, width):
+        polar, azimuth = math.pi * (row + 1) / (height - 1), math.pi - 2 * math.pi * (column + 0.5) / width
+        ring = math.sin(polar)
+        direction = [ring * math.cos(azimuth), ring * math.sin(azimuth), math.cos(polar)]
+        interaction.wi = mitsuba.Vector3f([-component for component in direction])
+        seen[row, column] = torch.tensor(list(emitter.eval(interaction)))
+    # Interpolation with a texel's weight of float32 rounding, in units of 16 columns, beside the format's own.
+    tolerance = 16 * 8 * EPS32 + (2 * RGBE if suffix == ".hdr" else 0)
+    torch.testing.assert_close(seen, radiance[1:-1], rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(
+    ("row", "column", "direction"),
+    [(0, None, [0, 0, 1]), (-1, None, [0, 0, -1]), (8, 16, [1, 0, 0]), (8, 8, [0, 1, 0]), (8, 24, [0, -1, 0])],
+    ids=["top row", "bottom row", "middle column", "first quarter", "last quarter"],
+)
+def test_a_files_rows_and_columns_face_as_the_conventions_say(tmp_path, suffix, row, column, direction):
+    radiance = torch.zeros(16, 32, 3)
+    if column is None:
+        radiance[row] = 1.0
+    else:
+        radiance[row - 1 : row + 1, column - 1 : column + 1] = 1.0
+    path = tmp_path / f"map{suffix}"
+    write_map(path, radiance)
+    y, z, x = project(read_map(path), DEGREE)[1:4, 0]
+    found = torch.stack([x, y, z])
+    torch.testing.assert_close(found / found.norm(), torch.tensor(direction).double(), rtol=0, atol=64 * EPS)
+
+
+# ---------------------------------------------------------------------------------------- channels
+
+
+def write_exr(path: Path, texels: np.ndarray, names: tuple[str, ...], kind: str = "float", **attributes) -> None:
+    height, width, channels = texels.shape
+    spec = OpenImageIO.ImageSpec(width, height, channels, kind)
+    spec.channelnames = names
+    for name, value in attributes.items():
+        if hasattr(spec, name):
+            setattr(spec, name, value)
+        else:
+            spec.attribute(name, value)
+    file = OpenImageIO.ImageOutput.create(str(path))
+    assert file.open(str(path), spec) and file.write_image(texels.astype(np.float32)) and file.close()
+
+
+def numbered(channels: int) -> np.ndarray:
+    """(2, 4, C), all values different, exact as half floats; channel c in [c, c + 1)."""
+    return np.arange(channels) + np.arange(8).reshape(2, 4, 1) / 8
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("R", "G", "B"), [0, 1, 2]),
+        (("B", "G", "R"), [2, 1, 0]),
+        (("A", "B", "G", "R"), [3, 2, 1]),
+        (("r", "g", "b", "a"), [0, 1, 2]),
+        (("Red", "Green", "Blue"), [0, 1, 2]),
+        (("R", "G", "B", "A", "Z"), [0, 1, 2]),
+        (("Y",), [0, 0, 0]),
+        (("Y", "A"), [0, 0, 0]),
+        (("sky.R", "sky.G", "sky.B", "sky.A"), [0, 1, 2]),
+        (("spec.R", "spec.G", "spec.B", "R", "G", "B"), [3, 4, 5]),
+        (("View.Depth.Z", "View.Combined.R", "View.Combined.G", "View.Combined.B"), [1, 2, 3]),
+    ],
+    ids=lambda values: "-".join(map(str, values)),
+)
+@pytest.mark.parametrize("kind", ["float", "half"])
+def test_the_color_channels_of_an_exr_file_are_found_by_name(tmp_path, names, expected, kind):
+    texels, path = numbered(len(names)), tmp_path / "map.exr"
+    write_exr(path, texels, names, kind)
+    np.testing.assert_array_equal(read_map(path), texels[..., expected])
+
+
+@pytest.mark.parametrize(("channels", "expected"), [(1, [0, 0, 0]), (3, [0, 1, 2]), (4, [0, 1, 2])])
+def test_an_arrays_gray_is_repeated_and_its_alpha_dropped(tmp_path, channels, expected):
+    np.save(tmp_path / "map.npy", numbered(channels))
+    np.testing.assert_array_equal(read_map(tmp_path / "map.npy"), numbered(channels)[..., expected])
+
+
+@pytest.mark.parametrize("names", [("X", "Y", "Z"), ("R", "G"), ("a.R", "b.G", "c.B"), ("A",)], ids="-".join)
+def test_an_exr_file_without_colors_is_refused(tmp_path, names):
+    write_exr(tmp_path / "map.exr", numbered(len(names)), names)
+    with pytest.raises(InputError, match="it must have R, G and B, or one gray channel"):
+        read_map(tmp_path / "map.exr")
+
+
+# ---------------------------------------------------------------------------------------- what is refused
+
+
+def archive() -> bytes:
+    file = io.BytesIO()
+    np.savez(file, radiance=numbered(3))
+    return file.getvalue()
+
+
+def array(values: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, values)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(
+    "damage",
+    [lambda c: b"", lambda c: b"P6 none at all", lambda c: c[: len(c) // 2], lambda c: c[:-8]],
+    ids=["empty", "foreign", "half", "end missing"],
+)
+def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, suffix, damage, capfd):
+    path = tmp_path / f"map{suffix}"
+    write_map(path, random_map())
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(InputError, match=r"is not a readable|is damaged") as caught:
+        read_map(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def announcing(shape: str) -> bytes:
+    """An array of 96 numbers under a header of the same length that tells of another shape."""
+    content = array(np.ones((4, 8, 3)))
+    header = content[10:128].decode().replace("(4, 8, 3)", shape).rstrip()
+    return content[:10] + header.ljust(117).encode() + b"\n" + content[128:]
+
+
+NOT_READABLE = "is not a readable .npy file: "
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        pytest.param(archive(), NOT_READABLE, id="npz"),
+        pytest.param(array(np.array([None, "pickled"], dtype=object)), NOT_READABLE, id="pickled"),
+        pytest.param(array(np.array([["text"] * 3] * 4)), NOT_READABLE, id="text"),
+        pytest.param(array(np.ones((4, 8, 3), dtype=complex)), NOT_READABLE, id="complex"),
+        pytest.param(array(np.ones((0, 8, 3))), NOT_READABLE, id="empty"),
+        pytest.param(announcing("(4e9, 8, 3)"), NOT_READABLE, id="no whole number"),
+        pytest.param(announcing("(-4, 8, 3)"), NOT_READABLE, id="negative"),
+        pytest.param(announcing("(4000000, 800000, 3)"), NOT_READABLE, id="77 TB"),
+        pytest.param(announcing("(" * 60), NOT_READABLE, id="brackets"),
+        pytest.param(array(np.full((4, 8, 3), 1e300)), "holds NaN or infinity", id="beyond float32"),
+        pytest.param(array(np.ones((4, 8))), "has shape (4, 8): it must be (height, width, channels)", id="2 axes"),
+        pytest.param(array(np.ones((49, 3))), "has shape (49, 3): it must be", id="coefficients"),
+        pytest.param(array(np.ones((4, 8, 2))), "has shape (4, 8, 2): it must be", id="2 channels"),
+        pytest.param(array(np.ones((1, 4, 8, 3))), "has shape (1, 4, 8, 3): it must be", id="4 axes"),
+    ],
+)
+def test_an_array_that_is_no_map_is_refused(tmp_path, content, message):
+    (tmp_path / "map.npy").write_bytes(content)
+    with pytest.raises(InputError, match=re.escape(message)):
+        read_map(tmp_path / "map.npy")
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".exr"])
+def test_a_name_that_is_not_utf_8_is_refused(tmp_path, suffix):
+    path = tmp_path / os.fsdecode(b"a\xffb" + suffix.encode())
+    path.touch()
+    for use in (read_map, lambda path: write_map(path, random_map())):
+        with pytest.raises(InputError, match="has a name that is not UTF-8, as OpenImageIO needs it: rename it"):
+            use(path)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_missing_file_is_refused(tmp_path, suffix):
+    with pytest.raises(InputError, match=r"does not exist: give the path of an \.npy, \.hdr or \.exr file"):
+        read_map(tmp_path / f"map{suffix}")
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("suffix", [".npy", ".exr"])
+def test_a_map_that_is_not_finite_is_refused(tmp_path, suffix, value):
+    radiance = random_map()
+    radiance[3, 4, 1] = value
+    write_map(tmp_path / f"map{suffix}", radiance)
+    with pytest.raises(InputError, match="holds NaN or infinity: give a map of finite radiance"):
+        read_map(tmp_path / f"map{suffix}")
+
+
+@pytest.mark.parametrize("attributes", [{"x": 1, "full_width": 8}, {"Orientation": 4}], ids=["cropped", "turned"])
+def test_an_exr_file_that_is_not_the_whole_upright_image_is_refused(tmp_path, attributes):
+    write_exr(tmp_path / "map.exr", numbered(3), ("R", "G", "B"), **attributes)
+    with pytest.raises(InputError, match="is stored cropped or turned: save it whole, its top row first"):
+        read_map(tmp_path / "map.exr")
+
+
+def test_a_radiance_file_with_its_bottom_row_first_is_refused(tmp_path):
+    (tmp_path / "map.hdr").write_bytes(HDR_HEADER.replace(b"-Y", b"+Y") + bytes(24))
+    with pytest.raises(InputError, match="is stored cropped or turned"):
+        read_map(tmp_path / "map.hdr")
+
+
+def test_a_display_image_under_a_maps_name_is_refused(tmp_path):
+    Image.new("RGB", (4, 2)).save(tmp_path / "map.hdr", format="PNG")
+    with pytest.raises(InputError, match=r"is a png image: give an \.hdr or \.exr file"):
+        read_map(tmp_path / "map.hdr")
+
+
+@pytest.mark.parametrize("name", ["map.png", "map", "map.json"])
+def test_writing_under_another_suffix_is_refused(tmp_path, name):
+    with pytest.raises(InputError, match=re.escape("give one that ends in .npy, .hdr, .exr")):
+        write_map(tmp_path / name, random_map())
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_place_that_cannot_be_written_is_refused(tmp_path, suffix):
+    (tmp_path / f"map{suffix}").mkdir()
+    with pytest.raises(InputError, match=r"cannot be written: .+"):
+        write_map(tmp_path / f"map{suffix}", random_map())
+
+
+def test_without_openimageio_arrays_still_work_and_images_name_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
+    write_map(tmp_path / "map.npy", random_map())
+    assert read_map(tmp_path / "map.npy").shape == (16, 32, 3)
+    for suffix in (".hdr", ".exr"):
+        path = tmp_path / f"map{suffix}"
+        with pytest.raises(InputError, match="pip install openimageio"):
+            write_map(path, random_map())
+        path.touch()
+        with pytest.raises(InputError, match="pip install openimageio"):
+            read_map(path)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (4, 8), (8, 8), (1, 5000), (16, 8), (48, 64)])
+def test_a_map_of_few_texels_or_of_another_kind_is_refused(tmp_path, size):
+    """Of few rows, even radiance from everywhere would be light with a direction; a mirror ball's map is square."""
+    np.save(tmp_path / "map.npy", np.ones((*size, 3)))
+    with pytest.raises(InputError, match=rf"map\.npy has {size[1]} × {size[0]} texels: give an equirectangular one"):
+        load_light(str(tmp_path / "map.npy"))
+
+
+def test_the_same_radiance_from_everywhere_is_one_coefficient_from_eight_rows_on(tmp_path):
+    np.save(tmp_path / "map.npy", np.ones((8, 16, 3)))
+    light = load_light(str(tmp_path / "map.npy"))
+    assert float(light[0].min()) == pytest.approx(mean_luminance(probe("grace")), rel=1e-6)
+    assert float(light[1:].abs().max()) < 0.05 * float(light[0].min())
+
+
+# ---------------------------------------------------------------------------------------- the script
+
+
+@pytest.fixture
+def export(call, capsys):
+    """`python scripts/export_light.py ...`: its exit status, output and errors."""
+    return lambda *arguments: (call("export_light", *arguments), *capsys.readouterr())
+
+
+@pytest.mark.parametrize(("suffix", "fate"), [(".hdr", "stored as 0"), (".exr", "kept"), (".npy", "kept")])
+def test_the_script_writes_a_probes_map_and_says_what_is_negative(tmp_path, export, suffix, fate):
+    out = tmp_path / f"grace{suffix}"
+    radiance = to_map(probe("grace"), 32)
+    status, output, errors = export("light=grace", f"out={out}", "height=32")
+    assert (status, errors) == (0, "") and output.count("\n") == 1
+    assert output.startswith(f"{out}: 64 × 32 texels, radiance {radiance.min():.3g} to {radiance.max():.3g}; ")
+    assert output.endswith(f"{negative_fraction(radiance):.2%} of it is negative and {fate}\n")
+    expected = radiance.clamp(min=0) if suffix == ".hdr" else radiance
+    torch.testing.assert_close(read_map(out).double(), expected, rtol=EPS32, atol=RGBE * float(radiance.max()))
+
+
+def test_the_script_takes_coefficients_as_they_are(tmp_path, export):
+    light = random_light().float()
+    save_light(tmp_path / "light.json", light)
+    assert export(f"light={tmp_path / 'light.json'}", f"out={tmp_path / 'map.npy'}", "height=16")[0] == 0
+    torch.testing.assert_close(read_map(tmp_path / "map.npy"), to_map(light, 16).float(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["light=graze", "out=x.hdr"], "light 'graze' is not known: choose grace"),
+        (["light=grace", "out=x.png"], "out: x.png is no name for an environment map"),
+        (["light=grace", "out=x.hdr", "height=0"], "height=0 must be at least 1 and at most 8192"),
+        (
+            ["light=grace", "out=x.hdr", "height=2.5"],
+            "height: Value '2.5' of type 'float' could not be converted to Integer",
+        ),
+        (["light=grace"], "out is not set"),
+    ],
+)
+def test_the_scripts_mistakes_are_one_line(export, monkeypatch, tmp_path, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    status, output, errors = export(*arguments)
+    assert (status, output) == (2, "") and errors.count("\n") == 1
+    assert errors.startswith(f"error: {message}")
+
+
+# ---------------------------------------------------------------------------------------- real maps
+
+
+@pytest.mark.realdata
+@pytest.mark.skipif(not HDRI.is_dir(), reason="needs ../shared/data")
+@pytest.mark.parametrize("name", ["city", "forest", "night", "studio"])
+def test_the_shared_maps_keep_their_light_as_hdr_and_exr(tmp_path, name):
+    """RGBE is off by 2⁻⁸ of each texel's largest channel, and |Y_lm| ≤ √((2l + 1) / 4π)."""
+    radiance = read_map(HDRI / f"{name}.npy")
+    for suffix in (".hdr", ".exr"):
+        write_map(tmp_path / f"map{suffix}", radiance)
+    torch.testing.assert_close(read_map(tmp_path / "map.exr"), radiance, rtol=0, atol=0)
+    light, returned = project(radiance, DEGREE), project(read_map(tmp_path / "map.hdr"), DEGREE)
+    flux = (radiance.amax(dim=-1) * equirectangular(*radiance.shape[:2])[1]).sum()
+    bands = torch.arange(49).sqrt().floor()
+    bound = RGBE * flux * ((2 * bands + 1) / (4 * math.pi)).sqrt()
+    assert ((returned - light).abs() <= bound[:, None]).all()
+    scaled = load_light(str(tmp_path / "map.hdr")) - load_light(str(HDRI / f"{name}.npy"))
+    assert scaled.norm() < RGBE * load_light("grace").norm()

@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy import optimize
+from torch import Tensor
+
+from renderer.light.convex import Ball
+from renderer.light.harmonics import basis, project
+from renderer.light.nonnegative import TOLERANCE, project_nonnegative
+from renderer.light.presets import PROBES, ambient, load_light
+
+ORDERS = {"linf": torch.inf, "l2": 2}
+DENSE = torch.from_numpy(np.array(trimesh.creation.icosphere(subdivisions=6).vertices))  # 40,962 directions
+
+
+def random_lights(count: int, amplitude: float) -> Tensor:
+    draws = torch.Generator().manual_seed(round(100 * amplitude))
+    offsets = torch.randn(count, 49, 3, generator=draws, dtype=torch.float64)
+    return load_light("grace").double() + amplitude * offsets
+
+
+def lowest(lights: Tensor) -> float:
+    """The least radiance in any direction over the largest of the same channel."""
+    degree = round(lights.shape[-2] ** 0.5) - 1
+    radiance = torch.einsum("dk,...kc->...dc", basis(DENSE, degree), lights.double())
+    return float((radiance.amin(-2) / radiance.abs().amax(-2).clamp(min=1e-300)).min())
+
+
+def test_in_degree_1_it_is_the_projection_into_a_second_order_cone():
+    """a + b·ω is nowhere negative where |b| ≤ a, whose projection has a closed form (Boyd and Vandenberghe, 8.1.1);
+    Y₁ is √3 times as steep as Y₀ is high."""
+    draws = torch.Generator().manual_seed(0)
+    lights = torch.randn(10, 4, 3, generator=draws, dtype=torch.float64)
+    slope = torch.tensor(3.0, dtype=torch.float64).sqrt()
+    height, tilt = lights[:, 0], lights[:, 1:].norm(dim=1)
+    on_cone = (height + slope * tilt / 3).clamp(min=0) * 3 / 4  # along (1, 1/√3), that of height a and tilt a / √3
+    inside = slope * tilt <= height
+    expected = lights.clone()
+    expected[:, 0] = torch.where(inside, height, on_cone)
+    expected[:, 1:] *= torch.where(inside, 1.0, on_cone / slope / tilt)[:, None]
+    nearest = project_nonnegative(lights)
+    torch.testing.assert_close(nearest, expected, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(("norm", "radius"), [("linf", None), ("linf", 0.1), ("l2", 0.3)])
+def test_no_light_that_is_nowhere_negative_on_a_grid_is_nearer_as_scipy_finds_it(norm, radius):
+    """A grid's program lacks the directions between, so that its light is nearer, by the grid's width squared."""
+    wanted = random_lights(1, 0.1)[0, :, 0]
+    center = project_nonnegative(load_light("grace").double())[:, 0]
+    nearest = project_nonnegative(wanted[None, :, None], radius and Ball(center[None, :, None], radius, norm))[0]
+    grid = basis(torch.from_numpy(np.array(trimesh.creation.icosphere(subdivisions=3).vertices)), 6).numpy()
+    c = center.numpy()
+    bright = {"type": "ineq", "fun": lambda x: grid @ x, "jac": lambda x: grid}
+    ball = {"type": "ineq", "fun": lambda x: radius**2 - ((x - c) ** 2).sum(), "jac": lambda x: 2 * (c - x)}
+    found = optimize.minimize(
+        lambda x: ((x - wanted.numpy()) ** 2).sum(),
+        nearest[:, 0].numpy(),
+        jac=lambda x: 2 * (x - wanted.numpy()),
+        bounds=[(value - radius, value + radius) for value in c] if radius and norm == "linf" else None,
+        constraints=[bright, ball] if norm == "l2" else bright,
+        method="SLSQP",
+        options={"ftol": 1e-12},
+    )
+    assert found.success
+    distance, bound = float((nearest[:, 0] - wanted).norm()), found.fun**0.5
+    assert bound - 1e-5 <= distance <= 1.03 * bound
+
+
+def test_what_is_added_is_light_and_is_added_where_there_is_none():
+    """The conditions of optimality (Moreau): the change is non-negative light at points, each where the radiance is
+    zero; on a grid of such points it is reached as nearly as the grid is fine."""
+    wanted = random_lights(4, 0.3)
+    nearest = project_nonnegative(wanted)
+    change = nearest - wanted
+    assert ((change * nearest).sum(1).abs() <= 1e-4 * change.norm(dim=1) * nearest.norm(dim=1)).all()
+    harmonics = basis(DENSE, 6)
+    for before, added in zip(nearest.mT.flatten(0, 1), change.mT.flatten(0, 1), strict=True):
+        dark = harmonics[harmonics @ before < 1e-3 * (harmonics @ before).max()]
+        _, residual = optimize.nnls(dark.T.numpy(), added.numpy())
+        assert residual <= 1e-3 * added.norm()
+
+
+@pytest.mark.parametrize(("norm", "radius"), [("linf", None), ("linf", 0.1), ("l2", 0.01), ("l2", 1.0), ("l2", 100.0)])
+@pytest.mark.parametrize("amplitude", [0.02, 0.3, 3.0])
+def test_radiance_is_nowhere_negative(amplitude, norm, radius):
+    wanted = random_lights(5, amplitude)
+    center = project_nonnegative(load_light("grace").double()).expand_as(wanted)
+    nearest = project_nonnegative(wanted, radius and Ball(center, radius, norm))
+    assert lowest(nearest) >= -TOLERANCE
+    assert not radius or ((nearest - center).flatten(1).norm(ORDERS[norm], dim=1) <= radius * (1 + 1e-12)).all()
+
+
+def test_light_that_was_in_order_stays_to_the_bit():
+    lights = load_light("grace").repeat(2, 1, 1)
+    lights[1, :, 1] = ambient(torch.ones(3))[:, 1]
+    nearest = project_nonnegative(lights)
+    assert nearest.dtype == torch.float32 and torch.equal(nearest[1, :, 1], lights[1, :, 1])
+    assert not torch.equal(nearest[0], lights[0])
+    assert torch.equal(project_nonnegative(nearest), nearest)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e5])
+def test_it_scales_with_the_light(scale):
+    light = random_lights(1, 0.1)[0]
+    nearest = project_nonnegative(light)
+    torch.testing.assert_close(project_nonnegative(scale * light), scale * nearest, rtol=1e-4, atol=0)
+
+
+def test_no_light_and_light_taken_away_everywhere_are_dark():
+    dark = torch.zeros(49, 3)
+    assert torch.equal(project_nonnegative(dark), dark)
+    torch.testing.assert_close(project_nonnegative(ambient(-torch.ones(3))), dark, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("radius", [0.3, 0.6, 3.0])
+def test_in_a_sphere_it_is_what_is_nearest_to_a_place_on_the_way_as_far_as_the_sphere_goes(radius):
+    """x is nearest to v in the sphere about c if it is nearest to c + (v - c) / (1 + λ) without it; what is added to
+    that is orthogonal to x, so that x·(v - x) = λ x·(x - c)."""
+    wanted = random_lights(3, 0.1)
+    center = project_nonnegative(load_light("grace").double()).expand_as(wanted)
+    nearest = project_nonnegative(wanted, Ball(center, radius, "l2"))
+    distance = (nearest - center).flatten(1).norm(dim=1)
+    assert (distance <= radius * (1 + 1e-12)).all() and (radius > 1 or (distance >= radius * (1 - 1e-6)).all())
+    products = [(nearest * offset).sum((1, 2), keepdim=True) for offset in (wanted - nearest, nearest - center)]
+    multiplier = (products[0] / products[1]).clamp(min=0)
+    expected = project_nonnegative(center + (wanted - center) / (1 + multiplier))
+    assert ((nearest - expected).flatten(1).norm(dim=1) <= 0.01 * distance).all()  # dips within the tolerance are left
+
+
+@pytest.mark.parametrize("name", PROBES)
+def test_published_probes_are_near_to_what_something_can_emit(name):
+    light = load_light(name)
+    nearest = project_nonnegative(light)
+    assert lowest(nearest) >= -TOLERANCE
+    assert (nearest - light).norm() <= 0.15 * light.norm()
+
+
+def test_a_light_that_touches_zero_along_circles_stays():
+    squared = project(lambda directions: (directions[:, :1] ** 3 + directions[:, 1:2] ** 3) ** 2 * torch.ones(3), 6)
+    torch.testing.assert_close(project_nonnegative(squared), squared, rtol=0, atol=1e-12)

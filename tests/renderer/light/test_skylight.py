@@ -1,0 +1,378 @@
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from scipy.integrate import cubature
+from scipy.spatial.transform import Rotation
+
+from renderer.errors import InputError
+from renderer.light.harmonics import basis, rotate
+from renderer.light.skylight import coefficients, coefficients_by_quadrature, fit_error, fit_polynomials, radiance
+
+ROOT = Path(__file__).parents[2]
+FIT = ROOT / "renderer" / "skylight_fit.safetensors"
+EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+HORIZON = math.pi / 2
+LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
+RGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+SKIES = [(0.0, 0.0, 2.0), (0.4, 5.0, 2.2), (0.9, -2.0, 3.0), (1.2, 0.7, 6.0), (1.5, 100.0, 4.0), (HORIZON, 0.7, 10.0)]
+PATHS = [coefficients, coefficients_by_quadrature]
+
+
+def published_sky(directions: np.ndarray, sun_zenith: float, sun_azimuth: float, t: float) -> np.ndarray:
+    """XYZ (N, 3) in kcd/m² as the formulas of Preetham et al., appendix A.2, are printed, in angles."""
+    zenith, azimuth = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
+    cosine = np.sin(zenith) * np.sin(sun_zenith) * np.cos(azimuth - sun_azimuth) + np.cos(zenith) * np.cos(sun_zenith)
+    gamma = np.arccos(np.clip(cosine, -1, 1))
+
+    def distribution(a, b, c, d, e):
+        def perez(theta, angle):
+            return (1 + a * np.exp(b / np.cos(theta))) * (1 + c * np.exp(d * angle) + e * np.cos(angle) ** 2)
+
+        return perez(zenith, gamma) / perez(0, sun_zenith)
+
+    def chromaticity(squared, linear, constant):
+        return (
+            t**2 * np.polyval(squared, sun_zenith)
+            + t * np.polyval(linear, sun_zenith)
+            + np.polyval(constant, sun_zenith)
+        )
+
+    chi = (4 / 9 - t / 120) * (np.pi - 2 * sun_zenith)
+    luminance = ((4.0453 * t - 4.9710) * np.tan(chi) - 0.2155 * t + 2.4192) * distribution(
+        0.1787 * t - 1.4630, -0.3554 * t + 0.4275, -0.0227 * t + 5.3251, 0.1206 * t - 2.5771, -0.0670 * t + 0.3703
+    )
+    x = chromaticity(
+        [0.00166, -0.00375, 0.00209, 0], [-0.02903, 0.06377, -0.03202, 0.00394], [0.11693, -0.21196, 0.06052, 0.25886]
+    ) * distribution(
+        -0.0193 * t - 0.2592, -0.0665 * t + 0.0008, -0.0004 * t + 0.2125, -0.0641 * t - 0.8989, -0.0033 * t + 0.0452
+    )
+    y = chromaticity(
+        [0.00275, -0.00610, 0.00317, 0], [-0.04214, 0.08970, -0.04153, 0.00516], [0.15346, -0.26756, 0.06670, 0.26688]
+    ) * distribution(
+        -0.0167 * t - 0.2608, -0.0950 * t + 0.0092, -0.0079 * t + 0.2102, -0.0441 * t - 1.6537, -0.0109 * t + 0.0529
+    )
+    return np.stack([x / y * luminance, luminance, (1 - x - y) / y * luminance], axis=1)
+
+
+def polar(zenith, azimuth) -> np.ndarray:
+    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1)
+
+
+def random_sky_directions(count: int, seed: int = 0) -> torch.Tensor:
+    vectors = np.random.default_rng(seed).normal(size=(count, 3))
+    vectors[:, 2] = np.abs(vectors[:, 2])
+    return torch.from_numpy(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def parameters(*values: float, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
+    return tuple(torch.tensor(value, dtype=dtype, requires_grad=True) for value in values)
+
+
+def projected_gradient(function, *values: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """A random projection of what the function returns, and its three derivatives by autograd, (3,)."""
+    values = parameters(*values)
+    result = projection(function(*values))
+    return result.detach(), torch.stack(torch.autograd.grad(result, values))
+
+
+def projection(light: torch.Tensor) -> torch.Tensor:
+    """Of unit length, so that bounds on the coefficients' norm hold for it."""
+    weights = torch.from_numpy(np.random.default_rng(0).normal(size=light.shape))
+    return (weights * light).sum() / weights.norm()
+
+
+def relative(error: torch.Tensor, to: torch.Tensor) -> float:
+    return float(error.norm() / to.norm())
+
+
+# --------------------------------------------------------------------------------------------- radiance
+
+
+@pytest.mark.parametrize("sky", SKIES)
+def test_radiance_is_the_published_formula(sky):
+    directions = random_sky_directions(300)
+    xyz = radiance(directions, *sky).numpy() @ RGB_TO_XYZ.T
+    # An arccosine near the sun loses half the digits: 1e-8 of the angle, times a slope of about 2.
+    np.testing.assert_allclose(xyz, published_sky(directions.numpy(), *sky), rtol=1e-10, atol=1e-7)
+
+
+def test_rgb_has_rec_709_primaries_and_a_d65_white():
+    """The matrix that the primaries' chromaticities make, against the standard's four digits of its inverse."""
+    chromaticities = np.array([[0.64, 0.33], [0.30, 0.60], [0.15, 0.06]])
+    columns = np.stack([[x / y, 1, (1 - x - y) / y] for x, y in chromaticities], axis=1)
+    x, y = 0.3127, 0.3290
+    to_xyz = columns * np.linalg.solve(columns, [x / y, 1, (1 - x - y) / y])
+    directions = random_sky_directions(100)
+    expected = published_sky(directions.numpy(), 0.9, 0.0, 3.0) @ np.linalg.inv(to_xyz).T
+    # Half a unit in the fourth digit, times the inverse's largest row of 3.2 + 1.5 + 0.5.
+    np.testing.assert_allclose(radiance(directions, 0.9, 0.0, 3.0), expected, rtol=0, atol=2.6e-4 * expected.max())
+
+
+@pytest.mark.parametrize("turbidity", [2.0, 5.0, 10.0])
+def test_overhead_the_sky_has_the_published_zenith_values(turbidity):
+    """Which collapse to these where the sun is on the horizon (luminance) or overhead (chromaticity)."""
+    overhead = torch.tensor([[0.0, 0.0, 1.0]])
+    luminance = radiance(overhead, HORIZON, 1.0, turbidity)[0] @ LUMINANCE
+    assert float(luminance) == pytest.approx(2.4192 - 0.2155 * turbidity, rel=1e-14)
+    xyz = RGB_TO_XYZ @ radiance(overhead, 0.0, 1.0, turbidity)[0].numpy()
+    expected = [0.25886 + 0.00394 * turbidity, 0.26688 + 0.00516 * turbidity]
+    np.testing.assert_allclose(xyz[:2] / xyz.sum(), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("sky", SKIES)
+def test_the_ground_is_black_and_the_horizon_finite(sky):
+    level = torch.tensor([[1.0, 0, 0], [0, 1.0, -0.0], [0.6, -0.8, 0]], dtype=torch.float64, requires_grad=True)
+    values = parameters(*sky)
+    horizon = radiance(level, *values)
+    assert horizon.isfinite().all()
+    slightly_up = torch.nn.functional.normalize(level.detach() + torch.tensor([0, 0, 1e-9]), dim=1)
+    torch.testing.assert_close(horizon, radiance(slightly_up, *values), rtol=1e-7, atol=1e-8)
+    assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(horizon.sum(), (level, *values)))
+    ground = random_sky_directions(50) * torch.tensor([1, 1, -1])
+    assert (radiance(ground, *sky) == 0).all()
+
+
+@pytest.mark.parametrize("zenith", [0.0, 0.5, 1.0, 1.4, HORIZON])
+@pytest.mark.parametrize("turbidity", [2.5, 4.0, 10.0])
+def test_the_sky_is_brightest_at_the_sun(zenith, turbidity):
+    """Not in the clearest air, where the model brightens towards the horizon faster than it darkens off the sun."""
+    steps = np.random.default_rng(0).normal(size=(500, 3)) * np.geomspace(1e-4, 3, 500)[:, None]
+    around = polar(zenith, 2.0) + steps
+    around = torch.from_numpy(around / np.linalg.norm(around, axis=1, keepdims=True))
+    sun = torch.from_numpy(polar(zenith, 2.0))[None]
+    assert (
+        radiance(around, zenith, 2.0, turbidity) @ LUMINANCE < radiance(sun, zenith, 2.0, turbidity) @ LUMINANCE
+    ).all()
+
+
+def test_a_clear_sky_is_blue_away_from_the_sun_and_a_low_sun_is_red():
+    opposite, sun = (torch.from_numpy(polar(zenith, azimuth))[None] for zenith, azimuth in [(0.9, math.pi), (1.5, 0)])
+    red, green, blue = radiance(opposite, 0.9, 0.0, 2.5)[0]
+    assert blue > 2 * red and blue > green > red
+    red, green, blue = radiance(sun, 1.5, 0.0, 4.0)[0]
+    assert red > green > blue
+
+
+@pytest.mark.parametrize("sky", [(0.3, 0.0, 2.1), (1.0, 2.0, 5.0), (1.5, -1.0, 9.0)])
+def test_radiance_has_the_derivatives_of_finite_differences(sky):
+    directions = random_sky_directions(5).requires_grad_(True)
+    assert torch.autograd.gradcheck(radiance, (directions, *parameters(*sky)))
+
+
+@pytest.mark.parametrize("zenith", [0.3, 1.2])
+def test_at_the_sun_the_gradient_is_the_mean_of_those_around_it(zenith):
+    def at(tilt: float, turn: float) -> torch.Tensor:
+        """The derivatives (3,) of the luminance next to the sun."""
+        direction = torch.from_numpy(polar(zenith + tilt, 0.5 + turn / math.sin(zenith)))[None]
+        sky = parameters(zenith, 0.5, 3.0)
+        return torch.stack(torch.autograd.grad((radiance(direction, *sky) @ LUMINANCE).sum(), sky))
+
+    step = 1e-6
+    around = torch.stack([at(step, 0), at(-step, 0), at(0, step), at(0, -step)])
+    # The gradients around differ by some hundred per radian.
+    torch.testing.assert_close(at(0.0, 0.0), around.mean(0), rtol=1e-5, atol=1e-3)
+    assert (around[0] - around[1]).abs().max() > 1
+
+
+# ------------------------------------------------------------------------------------------- quadrature
+
+
+@pytest.mark.parametrize("sky", SKIES)
+def test_quadrature_agrees_with_adaptive_cubature_of_the_published_formula(sky):
+    zenith, azimuth, turbidity = sky
+
+    def integrand(angles: np.ndarray) -> np.ndarray:
+        directions = polar(angles[:, 0], angles[:, 1])
+        sky_radiance = published_sky(directions, zenith, azimuth, turbidity) @ np.linalg.inv(RGB_TO_XYZ).T
+        harmonics = basis(torch.from_numpy(directions), 6).numpy() * np.sin(angles[:, :1])
+        return (harmonics[:, :, None] * sky_radiance[:, None, :]).reshape(len(angles), -1)
+
+    middle = [(zenith, azimuth)] if 0 < zenith < HORIZON else []  # the cusp
+    limits = [0, azimuth - math.pi], [HORIZON, azimuth + math.pi]
+    result = cubature(integrand, *limits, rule="gk21", rtol=1e-6, atol=1e-6, points=middle)
+    exact = torch.from_numpy(result.estimate.reshape(49, 3))
+    assert relative(coefficients_by_quadrature(*sky) - exact, exact) < 2e-8
+
+
+@pytest.mark.parametrize("sky", SKIES)
+@pytest.mark.parametrize(("nodes", "bound"), [(24, 1e-5), (48, 2e-8)])
+def test_quadrature_converges_as_documented(sky, nodes, bound):
+    exact = coefficients_by_quadrature(*sky, nodes=96)
+    assert relative(coefficients_by_quadrature(*sky, nodes=nodes) - exact, exact) < bound
+
+
+def test_lower_degrees_are_the_first_coefficients():
+    whole, part = (coefficients_by_quadrature(0.9, 0.3, 3.0, degree=degree, nodes=12) for degree in (6, 2))
+    torch.testing.assert_close(part, whole[:9], rtol=0, atol=1e-12)
+
+
+# -------------------------------------------------------------------------------------------------- fit
+
+
+def test_the_fit_is_off_by_at_most_7e_5_of_the_norm():
+    assert fit_error(load_file(FIT)["fit"], 25, torch.Generator().manual_seed(1)) < 7e-5
+
+
+@pytest.mark.parametrize("zenith", [0.0, HORIZON])
+@pytest.mark.parametrize("turbidity", [2.0, 10.0])
+def test_the_fit_is_off_by_at_most_4e_4_of_the_norm_at_the_corners_of_the_domain(zenith, turbidity):
+    exact = coefficients_by_quadrature(zenith, 1.0, turbidity)
+    assert relative(coefficients(zenith, 1.0, turbidity) - exact, exact) < 4e-4
+
+
+@pytest.mark.parametrize("sky", [(0.3, 0.0, 2.5), (0.7, 1.0, 3.5), (1.1, 4.0, 7.0), (1.5, 2.0, 9.5)])
+def test_the_fit_has_the_derivatives_of_the_quadrature(sky):
+    """Central differences of which, with a step of 1e-4, are off by 1e-6."""
+    fitted = torch.autograd.functional.jacobian(coefficients, parameters(*sky))
+    for parameter, bound in enumerate([1e-3, 1e-3, 5e-3]):
+        below, above = (
+            coefficients_by_quadrature(*(p + h * (k == parameter) for k, p in enumerate(sky)), nodes=24)
+            for h in (-1e-4, 1e-4)
+        )
+        exact = (above - below) / 2e-4
+        assert relative(fitted[parameter] - exact, exact) < bound
+
+
+def test_a_refit_is_the_committed_fit():
+    """The first Chebyshev coefficients do not depend on the degree: what aliases at these points is beyond 11."""
+    committed, refit = load_file(FIT)["fit"], fit_polynomials(6, 4, nodes=16)
+    # Quadratures of 16 nodes are off by up to 1e-4 of the norm, 140.
+    torch.testing.assert_close(committed[:7, :5].double(), refit, rtol=0, atol=1e-2)
+    assert committed.shape == (14, 12, 28, 3) and committed.dtype == torch.float32
+
+
+@pytest.mark.slow
+def test_the_script_makes_the_committed_fit(tmp_path):
+    command = [sys.executable, "scripts/fit_skylight.py", f"out={tmp_path}/fit.safetensors", "held_out=20"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    printed = subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True, text=True).stdout
+    assert float(re.search(r"off by up to (\S+)", printed)[1]) < 7e-5
+    torch.testing.assert_close(load_file(tmp_path / "fit.safetensors"), load_file(FIT), rtol=0, atol=140 * EPS32)
+
+
+def test_with_the_sun_at_azimuth_0_the_sines_vanish():
+    sines = [l * l + l - m for l in range(7) for m in range(1, l + 1)]
+    assert (coefficients(0.9, 0.0, 3.0)[sines] == 0).all()
+    assert coefficients_by_quadrature(0.9, 0.0, 3.0)[sines].abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("function", PATHS)
+@pytest.mark.parametrize("azimuth", [0.5, -2.0, 9.0])
+def test_the_azimuth_turns_the_light_as_a_rotation_does(function, azimuth):
+    """By +φ: the paper prints -φ. 100 roundings of a norm of about 60."""
+    rotation = torch.from_numpy(Rotation.from_euler("z", azimuth).as_matrix())
+    at_zero = function(0.8, 0.0, 3.0)
+    torch.testing.assert_close(function(0.8, azimuth, 3.0), rotate(at_zero, rotation), rtol=0, atol=6000 * EPS)
+    sun_and_opposite = torch.from_numpy(np.stack([polar(0.8, azimuth), polar(0.8, azimuth + math.pi)]))
+    brightness = basis(sun_and_opposite, 6) @ function(0.8, azimuth, 3.0) @ LUMINANCE
+    assert brightness[0] > 1.5 * brightness[1]
+
+
+# ------------------------------------------------------------------------------------------ both paths
+
+
+@pytest.mark.parametrize("function", PATHS)
+@pytest.mark.parametrize(
+    "sky", [(1e-4, 0.0, 2.5), (1e-4, 2.0, 9.9), (0.7, 0.0, 3.0), (1.2, 4.0, 6.0), (HORIZON - 1e-4, 0.0, 4.0)]
+)
+def test_gradients_are_those_of_finite_differences(function, sky):
+    """The quadrature's own error is 1e-6 and less in these differences."""
+    assert torch.autograd.gradcheck(lambda *p: projection(function(*p)), parameters(*sky), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("function", PATHS)
+@pytest.mark.parametrize(("zenith", "step"), [(0.0, 1e-4), (HORIZON, -1e-4)])
+def test_gradients_at_the_ends_of_the_domain_are_one_sided_differences(function, zenith, step):
+    for turbidity, turbidity_step in [(2.0, 1e-4), (10.0, -1e-4)]:
+        sky = (zenith, 0.0, turbidity)
+        value, gradient = projected_gradient(function, *sky)
+        for parameter, h in [(0, step), (2, turbidity_step)]:
+            once, twice = (
+                projection(function(*(p + i * h * (k == parameter) for k, p in enumerate(sky)))) for i in (1, 2)
+            )
+            # The truncation is h² times a third derivative, which on the horizon grows with log h.
+            assert float(gradient[parameter]) == pytest.approx(float(-3 * value + 4 * once - twice) / (2 * h), rel=1e-4)
+
+
+@pytest.mark.parametrize("function", PATHS)
+def test_overhead_the_suns_azimuth_does_not_matter(function):
+    _, gradient = projected_gradient(function, 0.0, 1.0, 4.0)
+    # Within the fit's error of 7e-5, times orders m of up to 6.
+    assert gradient[1].abs() < 6 * 7e-5 * function(0.0, 1.0, 4.0).norm()
+
+
+@pytest.mark.parametrize("function", [*PATHS, lambda *sky: radiance(random_sky_directions(3), *sky)])
+@pytest.mark.parametrize(
+    ("sky", "message"),
+    [
+        ((0.5, 0.0, 1.99), "turbidity=1.99 is outside the sky model's domain: give 2 to 10"),
+        ((0.5, 0.0, 10.1), "turbidity=10.1 is"),
+        ((0.5, 0.0, math.nan), "turbidity=nan is"),
+        ((-0.01, 0.0, 3.0), "zenith=-0.01 is outside the sky model's domain: give 0 to π/2, with the sun above"),
+        ((1.6, 0.0, 3.0), "zenith=1.6 is"),
+        ((math.nan, 0.0, 3.0), "zenith=nan is"),
+        ((math.inf, 0.0, 3.0), "zenith=inf is"),
+        ((0.5, math.nan, 3.0), "azimuth holds NaN"),
+        ((0.5, -math.inf, 3.0), "azimuth holds NaN"),
+    ],
+)
+def test_what_is_outside_the_domain_is_refused_by_name(function, sky, message):
+    for values in (sky, parameters(*sky)):
+        with pytest.raises(InputError, match=re.escape(message)):
+            function(*values)
+
+
+def test_one_sky_of_a_batch_outside_the_domain_is_named():
+    with pytest.raises(InputError, match="turbidity=12 is outside"):
+        coefficients(torch.zeros(4), torch.zeros(4), torch.tensor([2.0, 12.0, 10.0, 14.0]))
+
+
+@pytest.mark.parametrize("function", PATHS)
+def test_the_ends_of_the_domain_are_inside_also_as_rounded_to_float32(function):
+    for zenith, turbidity in [(0.0, 2.0), (HORIZON, 10.0)]:
+        values = parameters(zenith, 0.0, turbidity, dtype=torch.float32)
+        assert torch.isfinite(function(*values)).all()
+
+
+# -------------------------------------------------------------------------------------- dtypes, batches
+
+
+def test_float32_is_float64_to_a_few_roundings():
+    """A rounding in each of the 14 + 12 steps of the recurrences, and one of the parameters."""
+    skies = torch.rand(3, 200, generator=torch.Generator().manual_seed(0)) * torch.tensor([[1.57], [6.0], [8.0]])
+    skies[2] += 2
+    single, double = coefficients(*skies), coefficients(*skies.double())
+    assert single.dtype == torch.float32
+    error = (single - double).flatten(1).norm(dim=1) / double.flatten(1).norm(dim=1)
+    assert error.max() < 26 * EPS32
+
+
+def test_a_batch_is_its_skies_one_by_one():
+    zenith, azimuth, turbidity = torch.tensor([[0.2], [1.1]]), torch.tensor(0.4), torch.tensor([2.0, 3.0, 9.0])
+    batch = coefficients(zenith, azimuth, turbidity)
+    assert batch.shape == (2, 3, 49, 3)
+    for i, j in np.ndindex(2, 3):
+        torch.testing.assert_close(batch[i, j], coefficients(zenith[i, 0], azimuth, turbidity[j]), rtol=0, atol=1e-4)
+    assert coefficients(torch.zeros(0), azimuth, 3.0).shape == (0, 49, 3)
+
+
+def test_gradients_of_a_batch_have_the_parameters_shapes():
+    batch = (torch.tensor([[0.2], [1.1]]), torch.tensor(0.4), torch.tensor([2.5, 3.0, 9.0]))
+    batch = tuple(value.double().requires_grad_(True) for value in batch)
+    assert torch.autograd.gradcheck(lambda *p: coefficients(*p).sum((-1, -2)), batch)
+
+
+def test_numbers_may_stand_beside_tensors():
+    azimuth = torch.tensor([0.3, 0.4])
+    tensors = coefficients(torch.tensor(0.5), azimuth, torch.tensor(3.0))
+    for turbidity in (3, 3.0, torch.tensor(3)):
+        torch.testing.assert_close(coefficients(0.5, azimuth, turbidity), tensors, rtol=0, atol=0)
+    assert tensors.dtype == torch.float32 and coefficients(0.5, 0, 3).dtype == torch.float64

@@ -1,0 +1,654 @@
+"""All rasterizers against one contract, a brute-force oracle and each other."""
+
+import errno
+import math
+import subprocess
+import sys
+import threading
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
+from ctypes.util import find_library
+from fractions import Fraction
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+
+import moderngl
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import Delaunay
+from scipy.spatial.transform import Rotation
+
+from renderer import rasterizer as rasterizer
+from renderer.camera import OrthographicCamera
+from renderer.errors import InputError
+from renderer.rasterizer import SPAN, Rasterizer, choose, opengl, software
+
+needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
+needs_numba = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
+SNAP = 1 / 256  # of a sample: no corner moves further than that
+FAR = 2**24 - 1  # depth is a 24-bit key
+DEPTH_STEP = 2.0**-22  # of z in [-1, 1]: a 24-bit step is half that, and OpenGL interpolates in float32
+
+
+COMPILED = pytest.param("numba", marks=needs_numba)
+
+
+@pytest.fixture(params=["numpy", COMPILED, pytest.param("opengl", marks=needs_egl)])
+def rasterizer(request) -> Rasterizer:
+    return choose(request.param)
+
+
+def triangle(*corners) -> tuple[np.ndarray, np.ndarray]:
+    """One view of one triangle or more, three corners each."""
+    return np.array([corners], dtype=np.float64), np.arange(len(corners)).reshape(-1, 3)
+
+
+def rectangle(left, right, bottom, top, z) -> list:
+    """Two triangles."""
+    a, b, c, d = [left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]
+    return [a, b, c, a, c, d]
+
+
+def random_triangles(seed: int, count: int, reach: float = 1, depth: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
+    """One view of triangles with corners at |x|, |y| < reach and |z| < depth."""
+    points = np.random.default_rng(seed).uniform(-1, 1, (1, count * 3, 3)) * [reach, reach, depth]
+    return points, np.arange(count * 3).reshape(-1, 3)
+
+
+def sample_centers(resolution: int) -> np.ndarray:
+    """(R, R, 2) x and y of every sample, by the contract."""
+    steps = (2 * np.arange(resolution) + 1) / resolution - 1
+    return np.stack(np.meshgrid(steps, -steps), axis=-1)
+
+
+def planes(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F, 3) a, b, c of z = a·x + b·y + c for one view's faces."""
+    corners = points[faces]
+    ones = np.ones((*corners.shape[:2], 1))
+    return np.linalg.solve(np.concatenate([corners[..., :2], ones], axis=2), corners[..., 2:])[..., 0]
+
+
+def depth_tolerance(slopes: np.ndarray, resolution: int) -> np.ndarray:
+    """What snapping and quantization may do to the depth on planes with such a, b (..., 2)."""
+    return np.linalg.norm(slopes, axis=-1) * 2 * SNAP * 2 / resolution + DEPTH_STEP
+
+
+def turned(mesh: trimesh.Trimesh, views: int) -> tuple[np.ndarray, np.ndarray]:
+    """Random views of a mesh with faces counter-clockwise outward, mirrored as by a camera: depth runs away from it."""
+    turns = Rotation.random(views, rng=np.random.default_rng(3)).as_matrix()
+    return np.einsum("nij,vj->nvi", turns, mesh.vertices) * [1, 1, -1], mesh.faces
+
+
+def rotated_spheres(views: int, subdivisions: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    return turned(trimesh.creation.icosphere(subdivisions, radius=0.9), views)
+
+
+def snapped(points: np.ndarray, resolution: int) -> list[tuple[int, int]]:
+    """x right, y down from the top left of (V, 2) in 1/256 sample; float32 before and after one multiply-add."""
+    half = Fraction(resolution, 2)
+
+    def snap(value: float) -> int:
+        return round(float(np.float32(float(half + half * Fraction(value)))) / SNAP)
+
+    return [(snap(x), snap(-y)) for x, y in points.astype(np.float32).tolist()]
+
+
+def doubled_area(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> int:
+    """Positive where a, b and c run clockwise, since y runs down."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def reference(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+    """(R, R) ids of one view (V, 3) by the contract's words: in Python's integers, each sample of each face in turn.
+
+    A sample is inside if every edge function is positive there or, where one is 0, a little to the right or, where it
+    stays 0, a little below. Depth is in float64, on the plane from the corner with the least index.
+    """
+    points = np.clip(points, -SPAN / resolution, SPAN / resolution)
+    places, depths = snapped(points[:, :2], resolution), ((points[:, 2] + 1) / 2 * FAR).tolist()
+    ids, nearest = np.full((resolution, resolution), -1), np.full((resolution, resolution), FAR)
+    for index, face in enumerate(faces.tolist()):
+        if closed and doubled_area(*(places[corner] for corner in face)) > 0:
+            continue
+        (a, b, c), (depth_a, depth_b, depth_c) = (
+            [each[corner] for corner in sorted(face)] for each in (places, depths)
+        )
+        area = doubled_area(a, b, c)
+        sides = [(b, c), (c, a), (a, b)] if area > 0 else [(c, b), (a, c), (b, a)]
+        (bx, by), (cx, cy) = ((corner[0] - a[0], corner[1] - a[1]) for corner in (b, c))
+        b_rise, c_rise, scale = depth_b - depth_a, depth_c - depth_a, 256 / area if area else 0
+        by_column, by_row = (b_rise * cy - c_rise * by) * scale, (c_rise * bx - b_rise * cx) * scale
+        for row, column in np.ndindex(ids.shape):
+            sample = (column * 256 + 128, row * 256 + 128)
+            edges = [doubled_area(p, q, sample) for p, q in sides]
+            slopes = [(p[1] - q[1], q[0] - p[0]) for p, q in sides]
+            if area and all((edge, *slope) > (0, 0, 0) for edge, slope in zip(edges, slopes, strict=True)):
+                right, down = ((place - corner) / 256 for place, corner in zip(sample, a, strict=True))
+                depth = round((depth_a + down * by_row) + right * by_column)
+                if 0 <= depth < nearest[row, column]:
+                    ids[row, column], nearest[row, column] = index, depth
+    return ids
+
+
+@st.composite
+def scenes(draw) -> tuple[np.ndarray, np.ndarray, int]:
+    """Few corners for many faces: shared edges, duplicates, no area, slivers; tiny, huge and off-screen faces."""
+    resolution = draw(st.sampled_from([1, 2, 7, 33]))
+    center_or_border = st.integers(-resolution, 3 * resolution).map(lambda index: index / resolution - 1)
+    a_little_off = st.integers(-3, 3).map(lambda steps: steps * SNAP / resolution)
+    far_away = st.sampled_from([-1e300, -1e4, -20.0, 20.0, 1e4, 1e300])
+    coordinate = st.one_of(
+        center_or_border, st.builds(float.__add__, center_or_border, a_little_off), st.floats(-1.5, 1.5), far_away
+    )
+    any_depth = st.one_of(st.integers(-5, 5).map(lambda index: index / 4), st.floats(-1.1, 1.1), far_away)
+    depth_within_rounding = st.integers(-8, 8).map(lambda steps: steps / FAR / 4)
+    depth = draw(st.sampled_from([any_depth, depth_within_rounding]))
+    points = draw(st.lists(st.tuples(coordinate, coordinate, depth), min_size=3, max_size=9))
+    corner = st.integers(0, len(points) - 1)
+    faces = draw(st.lists(st.tuples(corner, corner, corner), min_size=1, max_size=12))
+    return np.array([points]), np.array(faces), resolution
+
+
+def test_row_0_is_the_top_and_x_runs_right(rasterizer):
+    upper_left, right = rectangle(-1, 0, 0, 1, 0), rectangle(0, 1, -1, 1, 0)
+    ids = rasterizer.rasterize(*triangle(*upper_left, *right), 4)
+    assert ids.dtype == np.int32
+    expected = [[0, 0, 1, 1], [0, 0, 1, 1], [-1, -1, 1, 1], [-1, -1, 1, 1]]
+    np.testing.assert_array_equal(np.where(ids[0] < 0, -1, ids[0] // 2), expected)
+
+
+def test_samples_sit_at_pixel_centers(rasterizer):
+    """A rectangle that ends just beyond, or just before, the centers of columns 1 and 6 and rows 2 and 5."""
+    inside, outside = np.zeros((8, 8), bool), np.zeros((8, 8), bool)
+    inside[2:6, 1:7] = outside[3:5, 2:6] = True
+    for nudge, expected in ((0.01, inside), (-0.01, outside)):
+        x, y = 5 / 8 + nudge, 3 / 8 + nudge
+        ids = rasterizer.rasterize(*triangle(*rectangle(-x, x, -y, y, 0)), 8)
+        np.testing.assert_array_equal(ids[0] >= 0, expected)
+
+
+def test_ids_equal_a_brute_force_oracle_away_from_edges_and_depth_ties(rasterizer):
+    resolution = 40
+    points, faces = random_triangles(seed=1, count=30, reach=1.3)
+    centers = sample_centers(resolution)
+    corners = points[0][faces]
+
+    a, b = corners[:, :, :2], np.roll(corners, -1, axis=1)[:, :, :2]  # (F, 3 edges, 2)
+    to_sample = centers[:, :, None, None] - a  # (R, R, F, 3, 2)
+    along = ((to_sample * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1)).clip(0, 1)
+    edge_distance = np.linalg.norm(to_sample - along[..., None] * (b - a), axis=-1).min(axis=-1)
+    sides = (b - a)[..., 0] * to_sample[..., 1] - (b - a)[..., 1] * to_sample[..., 0]
+    covered = (sides > 0).all(axis=-1) | (sides < 0).all(axis=-1)
+
+    plane = planes(points[0], faces)
+    depth = np.where(covered, centers @ plane[:, :2].T + plane[:, 2], np.inf)
+    expected = np.where(covered.any(axis=-1), depth.argmin(axis=-1), -1)
+
+    margin = depth_tolerance(plane[:, :2], resolution)
+    rivals = depth - margin < (depth + margin).min(axis=-1, keepdims=True)
+    clear = (edge_distance > 2 * SNAP * 2 / resolution).all(axis=-1) & (rivals.sum(axis=-1) <= 1)
+    assert clear.mean() > 0.7
+    np.testing.assert_array_equal(rasterizer.rasterize(points, faces, resolution)[0][clear], expected[clear])
+
+
+def test_shared_edges_are_covered_exactly_once(rasterizer):
+    """A triangulated square, with vertices and edges on sample centers and between; a view for each triangle."""
+    rng = np.random.default_rng(0)
+    lattice = rng.integers(-16, 17, (25, 2)) / 16
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    xy = np.concatenate([square, lattice, rng.uniform(-1, 1, (15, 2))])
+    corners = xy[Delaunay(xy).simplices]
+    points = np.concatenate([corners, np.zeros((len(corners), 3, 1))], axis=2)
+    covered = rasterizer.rasterize(points, np.array([[0, 1, 2]]), 16) >= 0
+    np.testing.assert_array_equal(covered.sum(axis=0), 1)
+
+
+def test_a_sample_on_an_edge_belongs_to_the_face_on_its_right_or_below(rasterizer):
+    """A rectangle between the centers of columns 1 and 4 and of rows 2 and 5: the top-left rule."""
+    left, right, top, bottom = -5 / 8, 1 / 8, 3 / 8, -3 / 8
+    ids = rasterizer.rasterize(*triangle(*rectangle(left, right, bottom, top, 0)), 8)
+    expected = np.zeros((8, 8), bool)
+    expected[2:5, 1:4] = True
+    np.testing.assert_array_equal(ids[0] >= 0, expected)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [0, 2, 1]], ids=["counter-clockwise", "clockwise"])
+def test_faces_are_drawn_from_both_sides(rasterizer, order):
+    points, _ = triangle([-1, -1, 0], [3, -1, 0], [-1, 3, 0])
+    assert (rasterizer.rasterize(points, np.array([order]), 5) == 0).all()
+
+
+@pytest.mark.parametrize(("order", "expected"), [([0, 1, 2], 0), ([0, 2, 1], -1)])
+def test_of_a_closed_mesh_counter_clockwise_faces_are_drawn(rasterizer, order, expected):
+    points, _ = triangle([-1, -1, 0], [3, -1, 0], [-1, 3, 0])
+    assert (rasterizer.rasterize(points, np.array([order]), 5, closed=True) == expected).all()
+
+
+@pytest.mark.parametrize(("first", "second", "winner"), [(-0.5, 0.5, 0), (0.5, -0.5, 1)])
+def test_the_nearer_face_wins_in_either_order(rasterizer, first, second, winner):
+    points, faces = triangle(*rectangle(-1, 1, -1, 1, first), *rectangle(-1, 1, -1, 1, second))
+    np.testing.assert_array_equal(rasterizer.rasterize(points, faces, 9)[0] // 2, winner)
+
+
+def test_intersecting_faces_hide_each_other_along_their_line(rasterizer):
+    slope = [[-1, -1, -0.5], [1, -1, 0.5], [1, 1, 0.5], [-1, -1, -0.5], [1, 1, 0.5], [-1, 1, -0.5]]
+    ids = rasterizer.rasterize(*triangle(*rectangle(-1, 1, -1, 1, 0), *slope), 8)[0]
+    np.testing.assert_array_equal(ids // 2, np.broadcast_to(np.arange(8) < 4, (8, 8)))
+
+
+@pytest.mark.parametrize("turn", range(3))
+def test_the_lower_index_wins_ties_between_duplicate_faces(rasterizer, turn):
+    points, faces = random_triangles(seed=2, count=1)
+    duplicates = np.concatenate([faces, np.roll(faces, turn, axis=1), faces[:, ::-1]])
+    ids = rasterizer.rasterize(points, duplicates, 32)
+    assert set(np.unique(ids)) == {-1, 0}
+
+
+@pytest.mark.parametrize("turn", range(3))
+def test_the_lower_index_wins_ties_between_duplicate_faces_of_a_closed_mesh(rasterizer, turn):
+    points, face = triangle([-0.9, -0.7, 0.3], [0.8, -0.5, -0.4], [0.1, 0.9, 0.7])
+    duplicates = np.concatenate([face[:, ::-1], np.roll(face, turn, axis=1), face, np.roll(face, 1, axis=1)])
+    assert set(np.unique(rasterizer.rasterize(points, duplicates, 32, closed=True))) == {-1, 1}
+
+
+def test_the_lower_index_wins_ties_within_a_plane(rasterizer):
+    points, faces = random_triangles(seed=3, count=12, depth=0)
+    together = rasterizer.rasterize(points, faces, 32)[0]
+    alone = np.stack([rasterizer.rasterize(points, face[None], 32)[0] >= 0 for face in faces])
+    np.testing.assert_array_equal(together, np.where(alone.any(axis=0), alone.argmax(axis=0), -1))
+
+
+@pytest.mark.parametrize("z", [-1.0, 0.99999])
+def test_faces_at_the_ends_of_the_depth_range_are_drawn(rasterizer, z):
+    assert (rasterizer.rasterize(*triangle(*rectangle(-1, 1, -1, 1, z)), 8) >= 0).all()
+
+
+@pytest.mark.parametrize("z", [-1.00001, 1.0, 1.00001, 50.0, -1e9])
+def test_faces_out_of_the_depth_range_are_not_drawn(rasterizer, z):
+    assert (rasterizer.rasterize(*triangle(*rectangle(-1, 1, -1, 1, z)), 8) == -1).all()
+
+
+def test_a_face_across_the_depth_range_is_clipped_to_it(rasterizer):
+    """z = 2x, so that what lies in |x| < 1/2 is in range."""
+    ids = rasterizer.rasterize(*triangle([-1, -1, -2], [1, -1, 2], [1, 1, 2], [-1, -1, -2], [1, 1, 2], [-1, 1, -2]), 8)
+    np.testing.assert_array_equal(ids[0] >= 0, np.broadcast_to([0, 0, 1, 1, 1, 1, 0, 0], (8, 8)))
+
+
+@pytest.mark.parametrize("shift", [(2.5, 0, 0), (-2.5, 0, 0), (0, 2.5, 0), (0, -2.5, 0), (1e12, 1e300, 0)])
+def test_faces_beside_the_image_leave_it_empty(rasterizer, shift):
+    points, faces = rotated_spheres(views=1)
+    assert (rasterizer.rasterize(points * 0.5 + shift, faces, 16) == -1).all()
+
+
+@pytest.mark.parametrize("size", [2, 100, 1e4])
+def test_a_face_larger_than_the_image_covers_it_all(rasterizer, size):
+    points, faces = triangle([-size, -size, 0], [3 * size, -size, 0], [-size, 3 * size, 0])
+    assert (rasterizer.rasterize(points, faces, 16) == 0).all()
+
+
+def test_zero_area_faces_are_not_drawn(rasterizer):
+    """A point and a segment on sample centers of a 4×4 image."""
+    center = [0.25, 0.25, 0]
+    ids = rasterizer.rasterize(*triangle(center, center, center, [-0.75, 0.25, 0], center, [0.75, 0.25, 0]), 4)
+    assert (ids == -1).all()
+
+
+def test_every_view_is_drawn_as_if_alone(rasterizer):
+    points, faces = rotated_spheres(views=3)
+    alone = [rasterizer.rasterize(view[None], faces, 32)[0] for view in points]
+    np.testing.assert_array_equal(rasterizer.rasterize(points, faces, 32), alone)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_points_that_are_not_finite_are_refused(rasterizer, value):
+    points, faces = triangle([0, 0, 0], [1, 0, 0], [0, value, 0])
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        rasterizer.rasterize(points, faces, 4)
+
+
+BOX = trimesh.creation.box(bounds=[[-0.6, -0.4, -0.2], [0.4, 0.6, 0.2]])
+BUMP = trimesh.creation.box(bounds=[[0.4, 0.0, 0.0], [0.8, 0.4, 0.4]])  # on the +x side, higher than the box
+# Rows of 10×10 samples, 0.2 apart from -0.9 to 0.9. X is the side towards +x, x the one towards -x, B the bump.
+IMAGES = {
+    "+x, right +y, up +z": (90, 0, {3: ".....BB...", 4: "...XXBBX..", 5: "...XXXXX.."}),
+    "-x, right -y, up +z": (90, 180, {3: "...BB.....", 4: "..xxxxx...", 5: "..xxxxx..."}),
+    "+y, right -x, up +z": (90, 90, {3: ".BB.......", 4: ".BBYYYYY..", 5: "...YYYYY.."}),
+    "-y, right +x, up +z": (90, -90, {3: ".......BB.", 4: "..yyyyyBB.", 5: "..yyyyy..."}),
+    "+z, right +y, up -x": (0, 0, dict.fromkeys(range(2, 7), "...ZZZZZ..") | dict.fromkeys((7, 8), ".....BB...")),
+    "-z, right +y, up +x": (180, 0, dict.fromkeys((1, 2), ".....BB...") | dict.fromkeys(range(3, 8), "...zzzzz..")),
+    "+x above, right +y, up (-1/2, 0, √3/2)": (
+        60, 0, {3: "...ZZZZZ..", 4: "...ZZBBZ..", 5: "...XXBBX..", 6: "...XXBBX.."},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize(("polar", "azimuth", "rows"), IMAGES.values(), ids=IMAGES)
+def test_a_labeled_box_with_a_bump_looks_from_each_side_as_drawn_by_hand(rasterizer, closed, polar, azimuth, rows):
+    labels = ["xyzXYZ"[axis] for axis in np.argmax(np.hstack([-BOX.face_normals, BOX.face_normals]), axis=1)]
+    labels = np.array([*labels, *"B" * len(BUMP.faces), "."])  # an id of -1 takes the last
+    mesh = trimesh.util.concatenate([BOX, BUMP])
+    camera = OrthographicCamera(math.radians(polar), math.radians(azimuth), width=2.0)
+    ids = rasterizer.rasterize(camera.project(mesh.vertices)[None], mesh.faces, 10, closed)[0]
+    image = ["".join(row) for row in labels[ids]]
+    assert image == [rows.get(row, "." * 10) for row in range(10)]
+
+
+on_the_cpu = pytest.mark.parametrize("name", ["numpy", COMPILED])
+
+
+@on_the_cpu
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(scene=scenes(), closed=st.booleans())
+def test_the_cpu_equals_the_reference_on_any_triangles(name, scene, closed):
+    points, faces, resolution = scene
+    ids = Rasterizer(name, "").rasterize(points, faces, resolution, closed)
+    np.testing.assert_array_equal(ids[0], reference(points[0], faces, resolution, closed))
+
+
+@on_the_cpu
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize("resolution", [1, 2, 7, 33])
+def test_the_cpu_equals_the_reference_on_spheres(name, resolution, closed):
+    points, faces = rotated_spheres(views=1, subdivisions=1)
+    ids = choose(name).rasterize(points, faces, resolution, closed)
+    np.testing.assert_array_equal(ids[0], reference(points[0], faces, resolution, closed))
+
+
+@on_the_cpu
+def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides(name):
+    """Huge faces, whose edge functions have more than 53 bits, at a depth halfway between two keys."""
+    points, faces = random_triangles(seed=5, count=40, reach=1e5, depth=0)
+    faces = np.concatenate([faces, np.roll(faces, 1, axis=1)[::-1]])
+    ids = choose(name).rasterize(points, faces, 16)
+    np.testing.assert_array_equal(ids[0], reference(points[0], faces, 16, closed=False))
+
+
+@pytest.mark.parametrize(("parts", "faces_at_a_time"), [(1, 100), (7, 3), (100, 1)])
+def test_software_draws_the_same_however_little_at_a_time(monkeypatch, parts, faces_at_a_time):
+    points, faces = random_triangles(seed=4, count=40, reach=1.3)
+    at_once = choose("numpy").rasterize(points, faces, 16)
+    monkeypatch.setattr(software, "PARTS", parts)
+    monkeypatch.setattr(software, "FACES", faces_at_a_time)
+    np.testing.assert_array_equal(choose("numpy").rasterize(points, faces, 16), at_once)
+
+
+@needs_numba
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    shape=st.tuples(st.integers(0, 3), st.integers(1, 60), st.integers(0, 500)),
+    resolution=st.integers(1, 300),
+    lattice=st.sampled_from([None, 2, 16, 150]),
+    scales=st.tuples(*[st.sampled_from([0, 1e-6, 1e-2, 1, 1.5, 30, 1e5, 1e300])] * 3),
+    order=st.sampled_from("CF"),
+    closed=st.booleans(),
+)
+def test_compiled_equals_software_to_the_bit(seed, shape, resolution, lattice, scales, order, closed):
+    """Soups of triangles in several views: huge, thin, degenerate, on samples, out of range, as near as one another."""
+    views, vertices, faces = shape
+    rng = np.random.default_rng(seed)
+    points = np.asarray(rng.uniform(-1, 1, (views, vertices, 3)), order=order)
+    if lattice:
+        points = np.round(points * lattice) / lattice
+    points, triangles = points * scales, np.asarray(rng.integers(0, vertices, (faces, 3)), order=order)
+    compiled, plain = (choose(name).rasterize(points, triangles, resolution, closed) for name in ("numba", "numpy"))
+    assert compiled.dtype == plain.dtype
+    np.testing.assert_array_equal(compiled, plain)
+
+
+@needs_numba
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize("resolution", [32, 224, 1000])
+def test_compiled_equals_software_to_the_bit_on_solids(resolution, closed):
+    for mesh in (trimesh.creation.icosphere(5), trimesh.creation.torus(0.6, 0.3), trimesh.creation.box([1.9, 0.01, 1])):
+        points, faces = turned(mesh, views=2)
+        compiled, plain = (choose(name).rasterize(points, faces, resolution, closed) for name in ("numba", "numpy"))
+        np.testing.assert_array_equal(compiled, plain)
+
+
+@needs_numba
+def test_compiled_draws_in_many_threads_at_once():
+    points, faces = rotated_spheres(views=8)
+    rasterizer = choose("numba")
+    with ThreadPoolExecutor(8) as pool:
+        drawn = list(pool.map(lambda view: rasterizer.rasterize(view[None], faces, 100)[0], points))
+    np.testing.assert_array_equal(drawn, choose("numpy").rasterize(points, faces, 100))
+
+
+@needs_numba
+@pytest.mark.parametrize("corner", [-1, 3])
+def test_compiled_reads_no_memory_that_is_not_the_points(corner):
+    with pytest.raises(IndexError, match="not among the 3"):
+        choose("numba").rasterize(np.zeros((1, 3, 3)), np.array([[0, 1, corner]]), 4)
+
+
+@needs_numba
+def test_what_cannot_be_kept_is_compiled_all_the_same(monkeypatch):
+    from renderer.rasterizer import numba as compiled
+
+    def njit(types, cache=False):
+        if cache:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return lambda function: (types, function)
+
+    monkeypatch.setattr(compiled, "_njit", njit)
+    assert compiled._compiled(len) == (compiled.TYPES, len)
+
+
+def outline_distance(mesh: trimesh.Trimesh, corners: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """(S,) from samples (S, 2) to the nearest edge between a face towards the camera and one that is not."""
+    (ax, ay), (bx, by), (cx, cy) = np.moveaxis(corners[mesh.faces, :2], 0, -1)
+    towards = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) > 0
+    outline = mesh.face_adjacency_edges[np.diff(towards[mesh.face_adjacency], axis=1)[:, 0]]
+    start, end = np.moveaxis(corners[outline, :2], 1, 0)
+    to_sample, along = samples[:, None] - start, end - start
+    share = ((to_sample * along).sum(-1) / (along**2).sum(-1)).clip(0, 1)
+    return np.linalg.norm(to_sample - share[..., None] * along, axis=-1).min(axis=1)
+
+
+def distances_of_changed_ids(
+    rasterizer: Rasterizer, mesh: trimesh.Trimesh, points: np.ndarray, resolution: int
+) -> np.ndarray:
+    """(S,) in samples, from the outline to where `closed` changes the id; that it changes no coverage is checked."""
+    both = rasterizer.rasterize(points, mesh.faces, resolution)
+    front = rasterizer.rasterize(points, mesh.faces, resolution, closed=True)
+    np.testing.assert_array_equal(front >= 0, both >= 0)
+    row, column = np.nonzero(front[0] != both[0])
+    return outline_distance(mesh, points[0], sample_centers(resolution)[row, column]) * resolution / 2
+
+
+@pytest.mark.parametrize("resolution", [17, 224])
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.creation.icosphere(subdivisions=4, radius=0.9),
+        trimesh.creation.torus(0.6, 0.3, major_sections=60, minor_sections=30),
+    ],
+    ids=["sphere", "torus"],
+)
+def test_culling_a_closed_mesh_changes_ids_only_within_rounding_of_an_outline(rasterizer, mesh, resolution):
+    points, _ = turned(mesh, views=1)
+    assert (distances_of_changed_ids(rasterizer, mesh, points, resolution) <= SNAP).all()
+
+
+def test_culling_a_closed_mesh_changes_ids_where_front_and_back_meet_on_a_sample(rasterizer):
+    """A convex solid whose vertices, and some points of its outline, are sample centers of an image of 17×17."""
+    mesh = trimesh.convex.convex_hull(np.random.default_rng(6).integers(-3, 4, (40, 3)) * 4 / 17)
+    distances = distances_of_changed_ids(rasterizer, mesh, mesh.vertices[None] * [1, 1, -1], 17)
+    assert len(distances) > 0
+    np.testing.assert_allclose(distances, 0, atol=17 * np.finfo(float).eps)
+
+
+@needs_egl
+@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize("resolution", [32, 224, 333])
+def test_the_back_ends_agree_on_spheres(resolution, closed):
+    """Coverage exactly; ids but for the rounding of depths, in 1 of 100,000 samples or fewer."""
+    points, faces = rotated_spheres(views=4)
+    gpu, cpu = (choose(name).rasterize(points, faces, resolution, closed) for name in ("opengl", "numpy"))
+    np.testing.assert_array_equal(gpu >= 0, cpu >= 0)
+    assert (gpu != cpu).mean() < 2e-5
+
+
+@needs_egl
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(1, 40),
+    resolution=st.integers(1, 70),
+    lattice=st.sampled_from([None, 4, 64]),
+    closed=st.booleans(),
+)
+def test_the_back_ends_agree_on_any_triangles(seed, count, resolution, lattice, closed):
+    """Coverage exactly; ids wherever the two faces' depths are not equal within rounding.
+
+    Inside the image, since Mesa's rasterizer cuts triangles at its border and snaps the new corners.
+    """
+    points, faces = random_triangles(seed, count)
+    if lattice:
+        points[..., :2] = np.round(points[..., :2] * lattice) / lattice
+    gpu, cpu = (choose(name).rasterize(points, faces, resolution, closed)[0] for name in ("opengl", "numpy"))
+    np.testing.assert_array_equal(gpu >= 0, cpu >= 0)
+    row, column = np.nonzero(gpu != cpu)
+    rivals = np.stack([gpu[row, column], cpu[row, column]], axis=1)
+    plane = planes(points[0], faces[rivals].reshape(-1, 3)).reshape(-1, 2, 3)
+    depth = (plane[..., :2] * sample_centers(resolution)[row, column][:, None]).sum(-1) + plane[..., 2]
+    tolerance = depth_tolerance(plane[..., :2], resolution).sum(axis=1)
+    assert (np.abs(depth[:, 0] - depth[:, 1]) <= tolerance).all()
+
+
+@needs_egl
+def test_torch_optimizers_work_after_opengl():
+    """They load Triton, whose LLVM must not meet Mesa's already there; in a process of its own, since that crashes."""
+    script = (
+        "from renderer import visibility; import torch; visibility.choose('opengl'); "
+        "torch.optim.SGD([torch.zeros(1, requires_grad=True)])"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2])
+
+
+@needs_egl
+def test_opengl_draws_in_another_thread():
+    points, faces = rotated_spheres(views=1)
+    rasterizer, drawn = choose("opengl"), []
+    thread = threading.Thread(target=lambda: drawn.append(rasterizer.rasterize(points, faces, 32)))
+    thread.start()
+    thread.join()
+    np.testing.assert_array_equal(drawn[0], rasterizer.rasterize(points, faces, 32))
+
+
+def test_a_face_of_a_million_samples_takes_bounded_memory():
+    """Less than a candidate (face, sample) list of it would take: 5 int64 numbers each."""
+    points, faces = triangle(*rectangle(-1, 1, -1, 1, 0))
+    tracemalloc.start()
+    ids = choose("numpy").rasterize(points, faces, 1024)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert (ids >= 0).all()
+    assert peak < 1024**2 * 5 * 8
+
+
+def test_a_million_faces_take_bounded_memory():
+    """Less than the faces themselves."""
+    points, _ = triangle([-1, -1, 0], [3, -1, 0], [-1, 3, 0])
+    faces = np.tile([0, 1, 2], (2**20, 1))
+    tracemalloc.start()
+    ids = choose("numpy").rasterize(points, faces, 1)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert ids.item() == 0
+    assert peak < faces.nbytes
+
+
+@pytest.fixture
+def no_numba(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.delitem(sys.modules, "renderer.rasterizer.numba", raising=False)
+    monkeypatch.delattr(rasterizer, "numba", raising=False)
+
+
+@pytest.mark.parametrize(
+    ("asked", "device", "name", "description"),
+    [
+        ("auto", "NVIDIA H200/PCIe/SSE2", "opengl", "opengl (NVIDIA H200/PCIe/SSE2)"),
+        ("auto", "llvmpipe (LLVM 15.0.6, 256 bits)", "numpy", "numpy (no GPU drives OpenGL)"),
+        ("auto", "softpipe", "numpy", "numpy (no GPU drives OpenGL)"),
+        ("auto", "Google SwiftShader", "numpy", "numpy (no GPU drives OpenGL)"),
+        ("opengl", "llvmpipe", "opengl", "opengl (llvmpipe)"),
+        ("numpy", "NVIDIA H200/PCIe/SSE2", "numpy", "numpy"),
+    ],
+)
+def test_opengl_is_chosen_where_a_gpu_drives_it(no_numba, monkeypatch, asked, device, name, description):
+    monkeypatch.setattr(opengl, "device", lambda: device)
+    assert choose(asked) == Rasterizer(name, description)
+
+
+@needs_numba
+@pytest.mark.parametrize("device", ["llvmpipe", None])
+def test_compiled_is_chosen_where_no_gpu_drives_opengl_and_numba_is_installed(monkeypatch, device):
+    def find():
+        if device is None:
+            raise InputError("no EGL device")
+        return device
+
+    monkeypatch.setattr(opengl, "device", find)
+    assert choose("auto") == choose("numba") == Rasterizer("numba", f"numba ( {version('numba')})")
+
+
+def test_without_numba_compiled_is_refused(no_numba):
+    with pytest.raises(InputError, match=r"numba does not start .*: pip install numba, or renderer\.rasterizer=numpy"):
+        choose("numba")
+
+
+@pytest.fixture
+def no_egl(monkeypatch):
+    def fail(**_):
+        raise Exception("(detect) libEGL not loaded")
+
+    monkeypatch.setattr(moderngl, "create_context", fail)
+
+
+def test_without_egl_and_numba_auto_takes_software_and_says_why(no_egl, no_numba):
+    rasterizer = choose("auto")
+    assert rasterizer.name == "numpy"
+    assert rasterizer.description.startswith("numpy (no EGL device")
+
+
+def test_without_egl_opengl_is_refused(no_egl):
+    with pytest.raises(InputError, match=r"apt install libegl1 libgl1, or renderer\.rasterizer=numpy"):
+        choose("opengl")
+
+
+def test_a_driver_that_goes_away_while_it_draws_is_one_sentence_and_its_context_is_released(monkeypatch):
+    released = []
+
+    class Context:
+        def release(self):
+            released.append(self)
+
+    def fail(*_, **__):
+        raise moderngl.Error("cannot create buffer")
+
+    monkeypatch.setattr(moderngl, "create_context", lambda **_: Context())
+    monkeypatch.setattr(opengl, "_check", lambda context: None)
+    monkeypatch.setattr(opengl, "_draw", fail)
+    with pytest.raises(InputError, match=r"driver failed \(cannot create buffer\): set renderer.rasterizer=numpy"):
+        opengl.rasterize(np.zeros((1, 3, 3)), np.array([[0, 1, 2]]), 4, closed=False)
+    assert len(released) == 1
+
+
+def test_an_unknown_back_end_is_refused():
+    with pytest.raises(InputError, match=r"\.rasterizer=vulkan: choose one of auto, opengl, numba, numpy"):
+        choose("vulkan")
+
+
+@needs_egl
+def test_a_driver_that_renders_wrong_ids_is_refused(monkeypatch):
+    monkeypatch.setattr(opengl, "VERTEX_SHADER", opengl.VERTEX_SHADER.replace("gl_VertexID / 3", "0"))
+    with pytest.raises(InputError, match=r"wrong face ids: set renderer\.rasterizer=numpy"):
+        choose("opengl")

@@ -1,0 +1,305 @@
+"""Light from places against Mitsuba 3's projector, point and area emitters, on convex and concave meshes."""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from renderer.albedo import surface_albedo
+from renderer.camera import OrthographicCamera
+from renderer.fragments import build_fragments
+from renderer.image import ImageSettings
+from renderer.io.mitsuba import mitsuba
+from renderer.light.basis import HARMONICS, LocalBasis, SumBasis
+from renderer.light.convex import Ball
+from renderer.light.local import Lamps, Projector, moved
+from renderer.mesh import Mesh, concatenate
+from renderer.rasterizer import choose
+from renderer.transfer import TransferOperator, build_operators
+from renderer.transport import local as sparse
+from renderer.transport.local import lit, local_radiance
+from renderer.transport.rays import Rays
+from renderer.transport.surface import Surface
+
+CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
+PROJECTOR = Projector(pixels=7, polar=0.5, azimuth=1.6, distance=3.0, fov=math.radians(35))
+LAMPS = Lamps(((1.5, 1.0, 1.0), (-0.5, -1.5, 1.6), (0.0, 1.5, -1.2)))
+DISCS = replace(LAMPS, radius=0.3)
+SIZE, SAMPLES = 24, 16
+
+
+def ball(subdivisions: int = 2) -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.9)
+    return Mesh.plain(sphere.vertices, sphere.faces, (0.9, 0.5, 0.2))
+
+
+def ball_on_a_table() -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.45)
+    plate = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], (0.3, 0.6, 0.9))
+    return concatenate([Mesh.plain(sphere.vertices + np.array([0, 0, 0.45]), sphere.faces, (0.9, 0.5, 0.2)), plate])
+
+
+def operator(mesh: Mesh, basis: LocalBasis, size: int = SIZE, samples: int = SAMPLES, **settings) -> TransferOperator:
+    images = ImageSettings(size, samples, **settings)
+    return build_operators(mesh, [CAMERA], images, choose("numpy"), basis=basis, dtype=torch.float64)[0]
+
+
+def canvas(built: TransferOperator, light: torch.Tensor) -> np.ndarray:
+    """(size, size, 3) linear radiance."""
+    whole = torch.zeros(3, built.settings.size**2, dtype=torch.float64)
+    whole[:, built.pixels] = built.radiance(light)
+    return whole.view(3, built.settings.size, -1).permute(1, 2, 0).numpy()
+
+
+def mitsuba_image(mesh: Mesh, basis: LocalBasis, light: torch.Tensor) -> np.ndarray:
+    """(SIZE, SIZE, 3): 1,024 rays spread over each pixel, so that nothing but edges is noisy."""
+    pytest.importorskip("mitsuba")
+    with mitsuba() as mi:
+        rest = {
+            "type": "scene",
+            "integrator": {"type": "direct", "hide_emitters": True},
+            "sensor": mitsuba_sensor(mi),
+            **mitsuba_parts(mi, mesh),
+        }
+        lights = mitsuba_lights(mi, basis, light)  # one by one, since Mitsuba draws one of several
+        return sum(np.array(mi.render(mi.load_dict(rest | {"light": each})), dtype=float) for each in lights)
+
+
+def look_at(mi, camera: OrthographicCamera, distance: float):
+    _, up, back = camera.axes()
+    return mi.ScalarTransform4f().look_at(origin=list(distance * back), target=[0, 0, 0], up=list(up))
+
+
+def mitsuba_sensor(mi) -> dict:
+    half = CAMERA.width / 2
+    return {
+        "type": "orthographic",
+        "to_world": look_at(mi, CAMERA, 4) @ mi.ScalarTransform4f().scale([half, half, 1]),
+        "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
+        "sampler": {"type": "multijitter", "sample_count": 1024},
+    }
+
+
+def mitsuba_parts(mi, mesh: Mesh) -> dict:
+    """A shape per color."""
+    parts = {}
+    for index, color in enumerate(np.unique(mesh.corner_colors[:, 0], axis=0)):
+        here = (mesh.corner_colors[:, 0] == color).all(axis=1)
+        corners = mesh.vertices[mesh.faces[here]].astype(np.float32)
+        properties = mi.Properties()
+        properties["face_normals"] = True
+        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": color.tolist()}}
+        properties["bsdf"] = mi.load_dict({"type": "twosided", "material": diffuse})
+        part = mi.Mesh(f"part_{index}", 3 * len(corners), len(corners), props=properties)
+        buffers = mi.traverse(part)
+        buffers["faces"] = np.arange(3 * len(corners), dtype=np.uint32)
+        buffers["vertex_positions"] = corners.ravel()
+        buffers.update()
+        parts[f"part_{index}"] = part
+    return parts
+
+
+def mitsuba_lights(mi, basis: LocalBasis, light: torch.Tensor) -> list[dict]:
+    if isinstance(basis, Projector):
+        pattern = mi.Bitmap(light.view(basis.pixels, basis.pixels, 3).numpy().astype(np.float32))
+        sharp = {"type": "bitmap", "bitmap": pattern, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
+        return [
+            {
+                "type": "projector",
+                "irradiance": sharp,
+                "fov": math.degrees(basis.fov),
+                "scale": basis.distance**2,
+                "to_world": look_at(mi, OrthographicCamera(basis.polar, basis.azimuth, 1.0), basis.distance),
+            }
+        ]
+    if basis.radius:
+        size = mi.ScalarTransform4f().scale([basis.radius, basis.radius, 1])
+        return [
+            {
+                "type": "disk",
+                "to_world": mi.ScalarTransform4f().look_at(origin=list(place), target=[0, 0, 0], up=[0.3, 0.2, 1])
+                @ size,
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+            }
+            for place, radiance in zip(basis.positions, (light / basis.radius**2).tolist(), strict=True)
+        ]
+    return [
+        {"type": "point", "position": list(place), "intensity": {"type": "rgb", "value": power}}
+        for place, power in zip(basis.positions, (math.pi * light).tolist(), strict=True)  # we leave out 1/π
+    ]
+
+
+@pytest.mark.parametrize(
+    ("basis", "solid"),
+    [
+        *((basis, solid) for basis in (PROJECTOR, LAMPS) for solid in (ball, ball_on_a_table)),
+        (DISCS, ball_on_a_table),
+    ],
+    ids=lambda each: getattr(each, "name", None),
+)
+def test_images_and_gradients_are_mitsubas(solid, basis):
+    """Direct light of a point has no noise but where edges of pattern, shadow and outline cross a pixel: most pixels
+    are equal to float32's digits of the rays, and the others on average. That of discs has little at 1,024 rays.
+
+    The gradient of a sum over the image weighted at random is the image of one function each, since all is linear:
+    here by differences of Mitsuba's images in a few directions.
+    """
+    draws = torch.Generator().manual_seed(1)
+    light = 2 * torch.rand(basis.size, 3, generator=draws, dtype=torch.float64)
+    built = operator(solid(), basis)
+    ours, theirs = canvas(built, light), mitsuba_image(solid(), basis, light)
+    error = np.abs(ours - theirs)
+    assert theirs.max() > 0.1 and (theirs.max(axis=2) == 0).mean() > 0.1
+    assert np.median(error[theirs > 0]) < 1e-3 * theirs.max()
+    assert np.sqrt((error**2).mean()) < 0.01 * theirs.max()
+    assert abs((ours - theirs).mean()) < 2e-3 * theirs.mean()
+
+    weights = torch.rand(3, len(built.pixels), generator=draws, dtype=torch.float64)
+    gradient = built.light_gradient(weights)
+    direction = torch.rand(basis.size, 3, generator=draws, dtype=torch.float64)
+    change = torch.from_numpy(mitsuba_image(solid(), basis, light + direction) - theirs).flatten(0, 1)[built.pixels].T
+    torch.testing.assert_close((gradient * direction).sum(), (weights * change).sum(), rtol=5e-3, atol=0)
+
+
+def test_a_screen_at_the_origin_shows_the_pattern_upright_and_as_bright():
+    """Thrown along the camera's view, each pixel of a white screen is one of the pattern's."""
+    straight = Projector(4, CAMERA.polar, CAMERA.azimuth, 3.0, 2 * math.atan(CAMERA.width / 2 / 3.0))
+    right, up, _ = CAMERA.axes()
+    corners = 3 * np.array([-right - up, right - up, right + up, up - right])
+    screen = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
+    pattern = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    shown = canvas(operator(screen, straight, size=4, samples=3), pattern.flatten(0, 1))
+    np.testing.assert_allclose(shown, pattern.numpy(), rtol=1e-12)
+
+
+def test_pixels_that_reach_nothing_are_left_out_and_have_a_gradient_of_zero():
+    wide = Projector(16, PROJECTOR.polar, PROJECTOR.azimuth, 3.0, 1.5)
+    built = operator(ball(), wide, samples=2)
+    reaching = built.kept
+    assert 0 < len(reaching) < wide.size / 2
+    gradient = built.light_gradient(torch.ones(3, len(built.pixels), dtype=torch.float64))
+    assert torch.equal(gradient.any(1).nonzero().squeeze(1), reaching) and (gradient >= 0).all()
+
+
+@pytest.mark.parametrize("basis", [PROJECTOR, LAMPS], ids=["projector", "lamps"])
+def test_nothing_emits_less_than_nothing_or_more_than_its_power(basis):
+    light = torch.tensor([-1.0, 0.5, 99.0]).expand(1, basis.size, 3)
+    expected = torch.tensor([0.0, 0.5, basis.power]).expand_as(light)
+    assert torch.equal(basis.project_nonnegative(light), expected)
+    within = Ball(torch.full_like(light, 0.2), 0.1, "linf")
+    assert torch.equal(basis.project_nonnegative(light, within), torch.tensor([0.1, 0.3, 0.3]).expand_as(light))
+
+
+def moved_image(
+    mesh: Mesh,
+    positions: torch.Tensor,
+    powers: torch.Tensor,
+    size: int = SIZE,
+    samples: int = SAMPLES,
+    basis: Lamps = LAMPS,
+) -> tuple[TransferOperator, torch.Tensor]:
+    """The operator of the lamps, and (3, P) of its pixels under these at other places."""
+    settings = ImageSettings(size, samples)
+    (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=mesh.closed)
+    surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
+    reach = lit(Rays(mesh), surface, basis.connect(surface.points, surface.normals, positions))
+    return operator(mesh, basis, size, samples), local_radiance(view, albedo, reach, powers)
+
+
+@pytest.mark.parametrize("basis", [LAMPS, DISCS], ids=["lamps", "discs"])
+def test_lamps_that_are_moved_shine_and_throw_shadows_as_lamps_that_stand_there(basis):
+    there = torch.tensor([[2.0, -1.0, 1.5], [-0.4, 1.7, 2.5]], dtype=torch.float64)
+    powers = torch.rand(2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    shown = partial(moved_image, ball_on_a_table(), samples=4, basis=basis)
+    _, seen = shown(there, powers)
+    standing = operator(ball_on_a_table(), moved(basis, there), samples=4)
+    torch.testing.assert_close(seen, standing.radiance(powers), rtol=1e-12, atol=1e-14)
+    _, alone = shown(there[:1], powers[:1])
+    assert (alone == 0).any() and alone.max() > 0.02
+
+
+@pytest.mark.parametrize("basis", [LAMPS, DISCS], ids=["lamps", "discs"])
+def test_the_derivative_by_places_and_powers_is_that_of_finite_differences_where_no_shadow_moves(basis):
+    positions = torch.tensor(LAMPS.positions, dtype=torch.float64, requires_grad=True)
+    powers = torch.rand(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True)
+    small = partial(moved_image, ball(), size=6, samples=2, basis=basis)
+    assert torch.autograd.gradcheck(lambda *given: small(*given)[1], (positions, powers), eps=1e-7)
+
+
+@pytest.mark.parametrize(("basis", "normals"), [(PROJECTOR, "flat"), (LAMPS, "smooth"), (DISCS, "flat")])
+def test_the_derivative_by_vertices_and_albedo_is_that_of_finite_differences_where_visibility_is_held(basis, normals):
+    mesh, settings = ball(1), ImageSettings(5, 2, normals=normals)
+    (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=True)
+    powers = torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rays = Rays(mesh)
+
+    def seen(vertices: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
+        surface = Surface.of(mesh, view, settings, vertices)
+        return local_radiance(view, albedo, lit(rays, surface, basis.connect(surface.points, surface.normals)), powers)
+
+    vertices = torch.from_numpy(mesh.vertices).requires_grad_()
+    albedo = surface_albedo(mesh, view, settings.encoding).contiguous().requires_grad_()
+    assert torch.autograd.gradcheck(seen, (vertices, albedo), eps=1e-7)
+    (gradient,) = torch.autograd.grad(seen(vertices, albedo).sum(), vertices)
+    assert gradient.abs().max() > 1e-3
+
+
+def test_the_derivative_by_places_is_mitsubas():
+    """On a ball, which no shadow of its own falls on; by central differences of Mitsuba's images."""
+    draws = torch.Generator().manual_seed(1)
+    positions = torch.tensor(LAMPS.positions, dtype=torch.float64, requires_grad=True)
+    powers, way = (torch.rand(3, 3, generator=draws, dtype=torch.float64) for _ in range(2))
+    built, seen = moved_image(ball(), positions, powers)
+    weights = torch.rand(seen.shape, generator=draws, dtype=torch.float64)
+    (gradient,) = torch.autograd.grad((weights * seen).sum(), positions)
+    ends = [mitsuba_image(ball(), moved(LAMPS, positions.detach() + step * way), powers) for step in (0.02, -0.02)]
+    change = torch.from_numpy((ends[0] - ends[1]) / 0.04).flatten(0, 1)[built.pixels].T
+    slopes = gradient * way  # which nearly cancel
+    torch.testing.assert_close(slopes.sum(), (weights * change).sum(), rtol=0, atol=1e-3 * float(slopes.abs().sum()))
+
+
+def test_a_small_disc_is_a_point_but_for_the_cosine_off_its_axis_and_dark_behind():
+    draws = torch.Generator().manual_seed(0)
+    points, normals = torch.randn(2, 500, 3, generator=draws, dtype=torch.float64)
+    normals /= normals.norm(dim=1, keepdim=True)
+    place = torch.tensor([0.5, -0.3, 0.8], dtype=torch.float64)
+    received = []
+    for radius in (0.0, 1e-7):
+        reach = Lamps((tuple(place.tolist()),), radius=radius).connect(points, normals)
+        received.append(torch.zeros(500, dtype=torch.float64).index_add(0, reach.point, reach.irradiance))
+    toward = place - points
+    cosine = (toward @ place / place.norm() / toward.norm(dim=1)).clamp(min=0)
+    assert 50 < (cosine == 0).sum() < 450
+    torch.testing.assert_close(received[1], received[0] * cosine, rtol=1e-5, atol=1e-6)
+
+
+def test_what_lies_behind_a_lamp_is_not_in_its_way():
+    """Halfway between two screens, of which the camera sees the lower one through a gap."""
+    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    vertices = np.concatenate([square, square * [0.2, 0.2, 0] + [0, 0, 1.0]])
+    screens = Mesh.plain(vertices, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    lamp = Lamps(((0.0, 0.0, 0.5),))
+    shown = canvas(operator(screens, lamp, size=5, samples=1), torch.ones(1, 3, dtype=torch.float64))
+    assert shown.max() == pytest.approx(4.0, rel=0.2)  # 1 / 0.5², and less away from below the lamp
+
+
+@pytest.mark.parametrize("several", [(), (2,), (2, 3)], ids=str)
+@pytest.mark.parametrize("solid", [ball, ball_on_a_table])
+def test_what_is_little_is_multiplied_one_by_one_to_the_same_sums(monkeypatch, several, solid):
+    """In harmonics and a projector at once, of one color and of two."""
+    both, mesh = SumBasis((HARMONICS, Projector(16, 0.5, 1.6, 3.0, 0.8))), solid()
+    monkeypatch.setattr(sparse, "SMALL", 0)
+    few = operator(mesh, both, samples=2)
+    monkeypatch.setattr(sparse, "SPARSE", 0)
+    whole = operator(mesh, both, samples=2)
+    assert few.sparse is not None and whole.sparse is None and len(few.kept) == len(HARMONICS.nonzero)
+    assert 50 * len(few.sparse.function) < whole.transfer[0, len(few.kept) :].numel()
+    draws = torch.Generator().manual_seed(0)
+    lights = torch.rand(*several, both.size, 3, generator=draws, dtype=torch.float64)
+    torch.testing.assert_close(few.radiance(lights), whole.radiance(lights), rtol=1e-13, atol=1e-13)
+    upstream = torch.randn(*several, 3, len(few.pixels), generator=draws, dtype=torch.float64)
+    torch.testing.assert_close(few.light_gradient(upstream), whole.light_gradient(upstream), rtol=1e-12, atol=1e-12)
