@@ -110,7 +110,8 @@ def build_scene(
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
-    transport: str = "direct",
+    shadows: bool = False,
+    bounces: int = 0,
     rasterizer: str | Rasterizer = "auto",
     operators: OperatorCache | None = None,
     device: torch.device | str = "cpu",
@@ -122,11 +123,12 @@ def build_scene(
     light: coefficients or what `renderer.load_light` takes; exposure multiplies it. projector, lamps: that shine as
     well. ground: the color of a table under each mesh (`on_ground`). polar: degrees off +z; azimuth: of the first
     view, off +x. width: width of the image in world units. fov: degrees between its sides, None of an
-    orthographic camera. vertices: subdivide until there are more. samples, encoding, normals, transport, rasterizer:
-    as for `renderer.render`, or a rasterizer that was chosen. operators: where rendered views are kept.
+    orthographic camera. vertices: subdivide until there are more. samples, encoding, normals, shadows,
+    bounces, rasterizer: as for `renderer.render`, or a rasterizer that was chosen. operators: where rendered views are
+    kept.
     InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
     """
-    settings, device = ImageSettings(size, samples, encoding, normals, transport), as_device(device)
+    settings, device = ImageSettings(size, samples, encoding, normals, shadows, bounces), as_device(device)
     require_range("exposure", exposure, 0, FACTOR)
     sky = (load_light(light) if isinstance(light, str) else light) * exposure
     basis, lights = with_local_lights(sky, [each.build() for each in (projector, lamps) if each is not None])

@@ -61,7 +61,7 @@ class PropSettings(MeshSettings):
 class ObjectSettings(MeshSettings):
     """One object of a scene, with the keys of `MeshSettings`.
 
-    label: the name of its class. albedo_scale: multiplies the albedo. props: meshes that are in the image, too, and cast and
+    label: the name of its class. albedo_scale: of its albedo. props: meshes that are in the image, too, and cast and
     receive its shadows, but are never attacked.
 
     >>> load_object(ObjectSettings("solid:orange", label="orange")).label
@@ -74,7 +74,7 @@ class ObjectSettings(MeshSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range(f"{self.mesh}: gain", self.albedo_scale, 1 / FACTOR, FACTOR)
+        require_range(f"{self.mesh}: albedo_scale", self.albedo_scale, 1 / FACTOR, FACTOR)
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def with_props(item: SceneObject, props: Sequence[Mesh]) -> SceneObject:
 def on_ground(item: SceneObject, color: Sequence[float] | None) -> SceneObject:
     """The object on a square table, as one mesh; color: RGB, sRGB-encoded in [0, 1], or None for no table.
 
-    The object's gain multiplies the table's albedo, too. InputError: not a color.
+    The table's albedo is scaled, too. InputError: not a color.
     """
     if color is None:
         return item
@@ -177,7 +177,7 @@ def _load(item: MeshSettings) -> Mesh:
     if item.color is None:
         return mesh
     if mesh.textures or (mesh.corner_colors != 1).any():
-        raise InputError(f"{item.mesh} brings colors of its own: leave color out; gain brightens or dims them")
+        raise InputError(f"{item.mesh} brings colors of its own: leave color out; albedo_scale brightens or dims them")
     return Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
 
 

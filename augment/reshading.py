@@ -189,14 +189,14 @@ class Reshading:
         mesh, albedo_scale = self._objects[number].mesh, self._objects[number].albedo_scale
         placed: Callable[[], LocalLightView]
         if vertices is None:
-            vertices, positions = self.vertices[number], mesh.vertices
+            vertices, shape = self.vertices[number], mesh.vertices
             fragments, albedo = self.own(number, camera)
             placed = partial(self.placed_view, number, camera)
         else:
-            positions = vertices.detach().cpu().double().numpy()
-            fragments, albedo = self._seen(number, camera, positions)
+            shape = vertices.detach().cpu().double().numpy()
+            fragments, albedo = self._seen(number, camera, shape)
             # once, where lights stand in the scene: a mesh is checked as it is made, and a step's is used by them alone
-            placed = cache(partial(self._moved_view, mesh, positions, fragments, vertices))
+            placed = cache(partial(self._moved_view, mesh, shape, fragments, vertices))
         if added is not None:
             albedo = painted_albedo(mesh, fragments, self._settings.encoding, albedo_scale, added)
         smooth_faces = self._faces[number] if self._settings.normals == "smooth" else None
@@ -207,8 +207,8 @@ class Reshading:
                 seen.append(placed().radiance(part, albedo, own, positions))
                 continue
             seen.append(radiance(fragments, vertices, own, albedo, smooth_faces))
-            if self._settings.transport != "direct":
-                frozen = self._frozen(example, number, camera, positions)
+            if self._settings.global_illumination:
+                frozen = self._frozen(example, number, camera, shape)
                 seen.append(frozen.radiance(camera, fragments, albedo, own))
         return fragments, reduce(torch.add, seen)
 

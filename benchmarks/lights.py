@@ -33,7 +33,7 @@ from torch import Tensor
 
 from augment.reshading import FrozenTransport
 from benchmarks.common import append_json, machine, medians, relative_error, seconds
-from renderer import shading, sparse
+from renderer import shading
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.fragments import build_fragments
@@ -48,12 +48,13 @@ from renderer.rasterizer import choose
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
 from renderer.transfer import TransferOperator, build_operators
+from renderer.transport import local as sparse
 from renderer.transport import radiosity, rays
 from renderer.transport.local import lit, local_radiance
 from renderer.transport.surface import Surface
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
-LIGHT_PATHS = ("direct", "shadows", "bounces:3")
+LIGHT_PATHS = {"direct": {}, "shadows": {"shadows": True}, "bounces:3": {"bounces": 3}}
 VIEWS, SEEDS = 20, 8  # SEEDS: Mitsuba's images, whose spread tells its noise
 CONVERGED, FINEST = (2**14, 2**13, 2**8), 16  # rays per pixel, patches and their rays; samples per side of a pixel
 RAYS, SAMPLES, REFERENCE = (64, 128, 256, 512, 1024, 2048), (2, 4, 8, 16), 64
@@ -74,7 +75,7 @@ Row = dict[str, Any]
 def operator(
     mesh: Mesh, size: int, transport: str = "direct", samples: int = 8, camera: OrthographicCamera = CAMERA, **more: Any
 ) -> TransferOperator:
-    settings = ImageSettings(size, samples, transport=transport)
+    settings = ImageSettings(size, samples, **LIGHT_PATHS[transport])
     return build_operators(mesh, [camera], settings, choose("numpy"), **more)[0]
 
 
@@ -138,7 +139,7 @@ def cost(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
         built = {(paths, size): operator(mesh, size, paths) for paths in LIGHT_PATHS for size in sizes}
         times = medians({key: partial(light_step, each, light) for key, each in built.items()}, rounds)
         for paths, size in built:
-            settings = ImageSettings(size, transport=paths)
+            settings = ImageSettings(size, **LIGHT_PATHS[paths])
             build = partial(build_operators, mesh, orbit_cameras(VIEWS, 2.2), settings, choose("numpy"))
             channels, coefficients = built[paths, size].transfer.shape[:2]
             yield {
@@ -151,7 +152,7 @@ def cost(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
 
 def rays_and_samples(cup: Mesh, size: int, rounds: int) -> Iterator[Row]:
     light = load_light("grace")
-    for paths in LIGHT_PATHS[1:]:
+    for paths in [*LIGHT_PATHS][1:]:
         with quadrature(*CONVERGED):
             exact = image_and_gradient(operator(cup, size, paths, FINEST), light)
         rows, calls = {}, {}
@@ -279,7 +280,7 @@ def hard_meshes() -> dict[str, Mesh]:
 
 
 def beside_mitsuba(size: int, meshes: Sequence[str] | None = None) -> Iterator[Row]:
-    for (name, mesh), paths in product(hard_meshes().items(), LIGHT_PATHS[1:]):
+    for (name, mesh), paths in product(hard_meshes().items(), [*LIGHT_PATHS][1:]):
         if meshes is None or name in meshes:
             yield {"table": "mitsuba", "mesh": name, "light_paths": paths, "size": size} | differences(
                 mesh, size, paths
@@ -317,7 +318,7 @@ def st_peters() -> tuple[Tensor, Tensor]:
 def mitsuba_scene(mesh: Mesh, size: int, paths: str, variant: str) -> Iterator[tuple[Any, Any]]:
     """(the module, the scene)"""
     with TemporaryDirectory() as folder, mitsuba(variant) as module:
-        settings = ImageSettings(size, transport=paths)
+        settings = ImageSettings(size, **LIGHT_PATHS[paths])
         write_mitsuba_scene(Path(folder), mesh, 1.0, [CAMERA], settings, "light.exr")
         write_map(Path(folder, "light.exr"), st_peters()[1].detach())
         yield module, module.load_file(str(Path(folder, SCENE)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
 
 ENCODINGS = ("linear", "srgb")
 NORMALS = ("flat", "smooth")
-TRANSPORTS = ("direct", "shadows")  # and bounces:N
 MOST_BOUNCES = 100
 LARGEST_SIZE = 4096  # pixels per side
 MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
@@ -27,17 +25,18 @@ FINEST = 64  # samples per pixel side: the share of a pixel that is covered is t
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """Image size in pixels, samples per pixel side, encoding, a normal per face or interpolated vertex normals, and
-    what the mesh does to its own light: nothing, shadows, or bounces:N as well.
+    """Image size in pixels, samples per pixel side, encoding, a normal per face or interpolated vertex normals.
 
-    InputError: none or too many of the first two, an unknown choice.
+    shadows: of the mesh on itself. bounces: how often light goes on from one surface to another, which includes
+    shadows. InputError: a number out of range, an unknown choice.
     """
 
     size: int = 32
     samples: int = 8
     encoding: str = "linear"
     normals: str = "flat"
-    transport: str = "direct"
+    shadows: bool = False
+    bounces: int = 0
 
     def __post_init__(self) -> None:
         require_fields(self)
@@ -50,20 +49,12 @@ class ImageSettings:
             )
         require_choice("renderer.encoding", self.encoding, ENCODINGS)
         require_choice("renderer.normals", self.normals, NORMALS)
-        bounces(self.transport)
+        require_range("renderer.bounces", self.bounces, 0, MOST_BOUNCES)
 
-
-def bounces(transport: str) -> int:
-    """How often light goes on from one surface to another: N of "bounces:N", else 0. InputError: an unknown choice."""
-    if transport in TRANSPORTS:
-        return 0
-    name, _, count = transport.partition(":")
-    if name == "bounces" and re.fullmatch("[0-9]{1,3}", count) and 1 <= int(count) <= MOST_BOUNCES:
-        return int(count)
-    raise InputError(
-        f"renderer.transport={transport}: choose one of {', '.join(TRANSPORTS)}, or bounces:N with N from 1 to "
-        f"{MOST_BOUNCES}"
-    )
+    @property
+    def global_illumination(self) -> bool:
+        """Whether a mesh changes its own light, by shadows or bounces."""
+        return self.shadows or self.bounces > 0
 
 
 def tonemap(
@@ -123,7 +114,7 @@ def background_term(coverage: Tensor, background: Tensor, encoding: str = "linea
 
 
 def tonemap_composite(composite: Tensor, encoding: str = "linear") -> Tensor:
-    """`tonemap`, given the sum of radiance and what is `background_term` it."""
+    """`tonemap`, given the sum of radiance and `background_term`."""
     return encode(clamp(composite), encoding)
 
 

@@ -10,14 +10,17 @@ def attach(
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package whose names come from modules below it.
 
-    A name must not be that of a module of the package, which importing the module would put in its place.
+    A module's own name stands for the module, unless it has such an attribute. No other name may be that of a module
+    directly in the package, which importing the module would put in its place.
     """
     home = {name: module for module, names in modules.items() for name in names}
 
     def getattribute(name: str) -> object:
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(f"{package}.{home[name]}"), name)
+        module = import_module(f"{package}.{home[name]}")
+        itself = (module,) if home[name].rpartition(".")[2] == name else ()
+        value = getattr(module, name, *itself)
         setattr(sys.modules[package], name, value)
         return value
 

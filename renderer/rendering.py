@@ -45,7 +45,8 @@ def render(
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
-    transport: str = "direct",
+    shadows: bool = False,
+    bounces: int = 0,
     rasterizer: str = "auto",
 ) -> Float[Tensor, "V 3 size size"]:
     """Images in [0, 1] of a mesh from V cameras; differentiable in light, vertices and albedo.
@@ -53,13 +54,14 @@ def render(
     light: (degree + 1)² coefficients (`load_light`), whose dtype and device the images have. background: see
     `renderer.image.as_background`; one for all views or an image for each. vertices: in place of the mesh's; the
     gradient holds fixed which face covers each sample. albedo: linear, in place of the mesh's colors per face, or in
-    place of the texture of a mesh that has one. gain multiplies the albedo. samples: per pixel
-    side. encoding: linear or srgb. normals: flat or smooth. transport: direct; shadows, that a mesh casts on itself; or
-    bounces:N, with light that its own colors send on N times; the gradient by vertices and albedo holds both fixed.
+    place of the texture of a mesh that has one. albedo_scale multiplies the albedo. samples: per pixel
+    side. encoding: linear or srgb. normals: flat or smooth. shadows: that the mesh casts on
+    itself. bounces: with shadows and light that its own colors send on so many times; the gradient by vertices and
+    albedo holds both fixed.
     rasterizer: auto, opengl, numba or numpy.
     InputError: NaN, shapes that do not fit, unknown choices.
     """
-    settings = ImageSettings(size, samples, encoding, normals, transport)
+    settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
     if vertices is not None and vertices.shape != mesh.vertices.shape:
         given = tuple(vertices.shape)
@@ -93,14 +95,15 @@ def precompute_transfer(
     samples: int = 2,
     encoding: str = "linear",
     normals: str = "smooth",
-    transport: str = "direct",
+    shadows: bool = False,
+    bounces: int = 0,
     rasterizer: str = "auto",
 ) -> list[TransferOperator]:
     """One operator per camera: images and gradients under any number of lights without another look at the mesh.
 
     `operator.image(light, background)` is the image that `render` makes, to rounding. Keywords as there.
     """
-    settings = ImageSettings(size, samples, encoding, normals, transport)
+    settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
     return build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale)
 

@@ -7,18 +7,21 @@ RGB in [0, 1], sRGB-encoded.
 """
 
 import colorsys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from renderer.arguments import checked
 from renderer.errors import InputError, require_range
 from renderer.mesh import Mesh, concatenate
-from renderer.shapes import arc, bump, choose, loft, mix, paint, revolve, ripples, sphere, surface_of_cells
 
 STALK = (0.36, 0.27, 0.15)
 LEAF_GREEN = (0.25, 0.42, 0.12)
+SEGMENTS = 48  # faces around an axis of revolution
+STEP = 0.1  # longest edge along a profile, in world units
 
 
 @checked
@@ -267,20 +270,6 @@ SOLIDS: dict[str, Callable[[np.random.Generator], Mesh]] = {
 LOOK_ALIKES: dict[str, Callable[[np.random.Generator], Mesh]] = {
     make.__name__: make for make in (lemon, peach, ball, fruit)
 }
-
-
-"""What procedural solids are made with: surfaces of revolution and of cells, waves, colors."""
-
-from collections.abc import Sequence
-from dataclasses import replace
-
-import numpy as np
-from numpy.typing import ArrayLike
-
-from renderer.mesh import Mesh
-
-SEGMENTS = 48  # faces around an axis of revolution
-STEP = 0.1  # longest edge along a profile, in world units
 
 
 def sphere(subdivisions: int = 4) -> tuple[np.ndarray, np.ndarray]:

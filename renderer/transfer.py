@@ -2,7 +2,7 @@
 
 Before clamping, every pixel of a diffuse mesh is linear in the lighting coefficients U (the paper's appendix B.2):
 radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do shadows
-and bounces (`renderer.transport`).
+and bounces (package `renderer.transport`).
 """
 
 from __future__ import annotations
@@ -188,8 +188,8 @@ def build_operators(
 ) -> list[TransferOperator]:
     """One operator per camera, for lights of one basis; computed in float64 and stored in `dtype`.
 
-    gain multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side that the
-    camera sees, with normals as the settings say. InputError: `renderer.transport`.
+    albedo_scale multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side
+    that the camera sees, with normals as the settings say. InputError: bounces of local lights.
     """
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
     builder = OperatorBuilder(mesh, settings, albedo_scale, basis, dtype)

@@ -24,7 +24,7 @@ MANY = [
     *(torch.zeros(49, 3, dtype=torch.int64), torch.zeros(49, 3, dtype=torch.complex64)),
 ]
 RESULTS = {"InputError", "TransferOperator"}  # which nobody makes; their methods are below
-SMALL = {"samples": 1, "encoding": "linear", "normals": "smooth", "shadows": False, "rasterizer": "numpy"}
+SMALL = {"samples": 1, "encoding": "linear", "normals": "smooth", "shadows": False, "bounces": 0, "rasterizer": "numpy"}
 ARRAYS = ("vertices", "faces", "corner_colors", "corner_uvs", "texture_ids", "textures")
 CAMERA = {"polar": 1.0, "azimuth": 0.0, "width": 2.0, "right": 0.0, "up": 0.0, "reach": 2.0}
 
@@ -43,8 +43,10 @@ def doors() -> dict[str, tuple[Callable[..., object], dict[str, Any]]]:
     return {
         "render": (renderer.render, {"mesh": mesh, "cameras": cameras, "light": light, "size": 8, "background": 0.5}
                    | {"vertices": None, "albedo": None, "albedo_scale": 1.0} | SMALL),
-        "operators": (renderer.precompute_transfer, {"mesh": mesh, "cameras": cameras, "size": 8, "albedo_scale": 1.0} | SMALL),
-        "ring": (renderer.orbit_cameras, {"views": 2, "width": 2.0, "polar": 1.0, "azimuth": 0.0, "fov": None}),
+        "precompute_transfer": (renderer.precompute_transfer,
+                                {"mesh": mesh, "cameras": cameras, "size": 8, "albedo_scale": 1.0} | SMALL),
+        "orbit_cameras": (renderer.orbit_cameras,
+                          {"views": 2, "width": 2.0, "polar": 1.0, "azimuth": 0.0, "fov": None}),
         "OrthographicCamera": (renderer.OrthographicCamera, CAMERA),
         "PerspectiveCamera": (renderer.PerspectiveCamera, CAMERA | {"distance": 4.0}),
         "ImageSettings": (renderer.ImageSettings, fields(image)),

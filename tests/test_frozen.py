@@ -39,7 +39,7 @@ from renderer.light.skylight import coefficients as skylight
 
 RECORDS = Path(__file__).with_name("frozen.json")
 LIBRARIES = ("torch", "numpy", "scipy", "embreex", "pillow")
-SOFTWARE = {"rasterizer": "numpy"}  # the same on every machine; "compiled" has a case of its own
+SOFTWARE = {"rasterizer": "numpy"}  # the same on every machine; "numba" has a case of its own
 SIZE = 24
 
 ABOVE = renderer.OrthographicCamera(math.pi / 3, 0.4, 2.2)
@@ -62,7 +62,7 @@ RENDERS = {
     "smooth_gradients": ("peach:0", NEAR, "eucalyptus", {"encoding": "srgb"}, ("light", "vertices", "albedo")),
     "bounces_gradients": ("lamp:0", ABOVE, "uniform", {"bounces": 1}, ("light", "vertices", "albedo")),
 }
-# name: (mesh, cameras, keywords of `operators`)
+# name: (mesh, cameras, keywords of `precompute_transfer`)
 OPERATORS = {
     "one_color": ("ball:0", ABOVE, {"normals": "flat"}),
     "colors": ("orange:3", RING, {"encoding": "srgb", "albedo_scale": 1.3, "samples": 3}),
@@ -78,7 +78,7 @@ DISCS = augment.LampsSettings([[2.0, 1.0, 2.0], [0.5, -2.0, 2.5]], power=8.0, ra
 # name: (meshes, views, keywords of `build_scene`)
 SCENES = {
     "grid": ([("solid:orange:0", "orange"), ("solid:apple:0", "apple")], 2, {"backgrounds": [0.2, 0.8]}),
-    "props": ([AMONG_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "shadows": True, "perspective": 40.0}),
+    "props": ([AMONG_PROPS], 2, {"ground": [0.6, 0.5, 0.4], "shadows": True, "fov": 40.0}),
     "projector": ([("solid:mushroom:0", "orange")], 1, {"projector": PROJECTOR, "encoding": "srgb"}),
     "lamps": ([("solid:cup:2", "orange")], 2, {"lamps": DISCS, "shared": True, "ground": [0.5, 0.5, 0.5]}),
     "all_lights": ([AMONG_PROPS], 1, {"lamps": LAMPS, "projector": PROJECTOR, "shadows": True}),
@@ -99,11 +99,11 @@ ATTACKS = {
     "skylight": ({"skylight": Sky(zenith=30.0, step_size=0.3)}, {"normals": "smooth"}, {}, None),
     "projector": ({"projector": Step(step_size=1.0)}, {"projector": PROJECTOR, "encoding": "srgb"}, {}, None),
     "lamps": ({"lamps": Step(step_size=2.0)}, {"lamps": LAMPS, "shadows": True}, {}, None),
-    "places": ({"places": Step("l2", 1.0, step_size=0.3)}, {"lamps": DISCS}, {}, None),
+    "places": ({"positions": Step("l2", 1.0, step_size=0.3)}, {"lamps": DISCS}, {}, None),
     "geometry": (SHAPE, {"normals": "smooth", "shadows": True}, {"shorten": True}, None),
     "albedo": (COLOR, {"shadows": True, "ground": [0.5, 0.4, 0.3]}, {}, None),
     "pixels": ({"pixels": Step("linf", 0.03, "sign", 0.01)}, {}, {}, augment.LeastLikely()),
-    "shared_views": (BOTH, {"views": 3, "shared": True, "perspective": 35.0}, {"shorten": True}, None),
+    "shared_views": (BOTH, {"views": 3, "shared": True, "fov": 35.0}, {"shorten": True}, None),
     "targeted": ({"lighting": Step(step="raw", step_size=0.5)}, {"views": 2}, {}, augment.Targeted("pear")),
     "expectation": ({"lighting": Step("linf", 0.1, "sign", 0.04)}, {"backgrounds": [0.1, 0.9]}, DRAWS, None),
 }

@@ -100,7 +100,7 @@ class RendererSettings:
     """rasterizer: auto, opengl, numba or numpy. samples per pixel side. encoding: linear or srgb. normals: flat
     or smooth.
 
-    transport: direct, shadows or bounces:N; see `renderer.render`. cache: the folder of what is rendered once, auto or
+    shadows, bounces: see `renderer.render`. cache: the folder of what is rendered once, auto or
     None; see `renderer.cache.cache_folder`.
     """
 
@@ -108,13 +108,14 @@ class RendererSettings:
     samples: int = 8
     encoding: str = "linear"
     normals: str = "flat"
-    transport: str = "direct"
+    shadows: bool = False
+    bounces: int = 0
     cache: str | None = "auto"
 
     @property
     def choices(self) -> dict[str, Any]:
         """Arguments of `augment.build_scene`."""
-        drawn = {name: getattr(self, name) for name in ("samples", "encoding", "normals", "transport")}
+        drawn = {name: getattr(self, name) for name in ("samples", "encoding", "normals", "shadows", "bounces")}
         return {**drawn, "rasterizer": choose(self.rasterizer), "operators": OperatorCache(cache_folder(self.cache))}
 
 

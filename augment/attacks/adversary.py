@@ -163,7 +163,7 @@ def read_adversary(folder: Path) -> Adversary:
         raise InputError(f"{path}: {error}") from error
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
         raise InputError(f"{path} does not describe an adversary ({error}): write it again") from error
-    require_range(f"{path}: gain", albedo_scale, 1 / FACTOR, FACTOR)
+    require_range(f"{path}: albedo_scale", albedo_scale, 1 / FACTOR, FACTOR)
     if not cameras:
         raise InputError(f"{path} has no cameras: write it again")
     shape = (len(cameras), 3, settings.size, settings.size)

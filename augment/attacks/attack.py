@@ -230,7 +230,7 @@ def attack(
 def _with_own_transport(problem: AttackProblem, result: DescentResult) -> Tensor:
     """`AttackResult.images` of a result."""
     scene, after = problem.scene, problem.conditions(result.values, problem.everything)
-    if scene.settings.transport == "direct" or (after.vertices is None and after.albedo is None):
+    if not scene.settings.global_illumination or (after.vertices is None and after.albedo is None):
         return result.images
     left = (Adversary.of(scene, example, after, each, each) for example, each in enumerate(result.images))
     return torch.stack([each.render(scene.rasterizer) for each in left]).to(result.images)

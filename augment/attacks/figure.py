@@ -25,7 +25,7 @@ class Panel:
     """What one side of an attack, initial or adversarial, shows in V views.
 
     images: (V, 3, H, W) RGB in [0, 1]. captions: V times lines of text, as `prediction_caption` gives them, the first
-    in ink and the others faint. spheres: (V, 3, S, S) in [0, 1], each view's light (`renderer.light.light_sphere`), or None.
+    in ink and the others faint. spheres: (V, 3, S, S) in [0, 1], each view's light (`light_sphere`), or None.
     """
 
     images: Tensor

@@ -41,7 +41,9 @@ def parser(study: str | None, description: str | None) -> argparse.ArgumentParse
     if study is not None:
         options.set_defaults(study=study)
     options.add_argument("--out", type=Path, required=True, help="JSON lines are appended to this file")
-    options.add_argument("--meshes", nargs="+", required=True, help="files, solid:NAME:SEED or {mesh, label, gain}")
+    options.add_argument(
+        "--meshes", nargs="+", required=True, help="files, solid:NAME:SEED or {mesh, label, albedo_scale}"
+    )
     options.add_argument("--label", default="orange", help="class that meshes without a label show")
     options.add_argument("--classifier", default="efficientnet_lite0", help="the attacked network, also run:FOLDER")
     options.add_argument("--weights", help="its file of weights, where it brings none")

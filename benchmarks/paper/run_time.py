@@ -23,7 +23,7 @@ from augment.objects import SceneObject
 from augment.utils import Phases, generator
 from benchmarks.common import seconds
 from benchmarks.paper import common
-from renderer import ImageSettings, load_light, ring
+from renderer import ImageSettings, load_light, orbit_cameras
 from renderer.errors import FACTOR
 from renderer.rasterizer import choose
 from train.run_folder.classifier import load_classifier

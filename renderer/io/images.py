@@ -1,4 +1,4 @@
-"""Image files, as a classifier sees them."""
+"""Image files, as a classifier sees them, and arrays of numbers as .npy files."""
 
 from pathlib import Path
 
@@ -48,13 +48,6 @@ def _over_white(image: Image.Image) -> Image.Image:
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
     return image.convert("RGB")
-
-
-"""Arrays of numbers as .npy files."""
-
-from pathlib import Path
-
-import numpy as np
 
 
 def read_numbers(path: Path) -> np.ndarray:

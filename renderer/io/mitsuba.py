@@ -1,6 +1,6 @@
 """Views of a mesh as a Mitsuba 3 scene in files: scene.xml, .ply parts with their normals, and their textures.
 
-Light from an environment map, with shadows always and with the bounces of `ImageSettings.transport`: under "direct",
+Light from an environment map, with shadows always and with the bounces of `ImageSettings`: without shadows,
 what a concave mesh throws on itself is dark there, and lit here. Mitsuba's diffuse surfaces reflect albedo / π of the
 irradiance, ours all of it: the map's scale makes up for that, and for the albedo's gain, which only a bounce would have
 more than once. Its radiance is premultiplied with alpha, as ours with the coverage.
@@ -19,7 +19,7 @@ from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.image import ImageSettings, bounces, decode
+from renderer.image import ImageSettings, decode
 from renderer.io.export import corner_normals
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import EnvironmentBasis, LocalBasis
@@ -29,7 +29,7 @@ from renderer.light.local import Lamps, Projector
 from renderer.mesh import Mesh
 
 SCENE, PATTERN = "scene.xml", "pattern.exr"
-TEMPLATE = Path(__file__).with_name("mitsuba_scene.xml.jinja")
+TEMPLATE = Path(__file__).with_name("mitsuba.xml.jinja")
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
 VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
 DIFFERENTIABLE = "llvm_ad_rgb"
@@ -56,7 +56,7 @@ def write_mitsuba_scene(
         TEMPLATE.read_text("utf-8"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     scene = template.render(
-        bounces=bounces(settings.transport),
+        bounces=settings.bounces,
         light=light,
         scale=math.pi * albedo_scale,
         to_z_up=" ".join(str(entry) for row in TO_Z_UP for entry in row),

@@ -41,11 +41,11 @@ class EnvironmentBasis(LightBasis):
     @property
     @abstractmethod
     def nonzero(self) -> Tensor:
-        """(K,) ascending indices of those that reach a diffuse surface under an open sky; see `TransferOperator.kept`."""
+        """(K,) ascending indices of those that reach a diffuse surface under an open sky."""
 
     @abstractmethod
     def irradiance(self, normals: Tensor) -> Tensor:
-        """(N, K) at unit normals (N, 3), per unit of each live coefficient."""
+        """(N, K) at unit normals (N, 3), per unit of each nonzero coefficient."""
 
     @abstractmethod
     def radiance(self, directions: Tensor) -> Tensor:
@@ -120,7 +120,7 @@ def parts_of(basis: Basis) -> list[tuple[slice, EnvironmentBasis | LocalBasis]]:
 
 @dataclass(frozen=True)
 class Harmonics(EnvironmentBasis):
-    """Distant light as real spherical harmonics. Any coefficients render, negative radiance included (the paper's);
+    """Environment light as real spherical harmonics. Any coefficients render, negative radiance included (the paper's);
     only such exist whose radiance is nowhere negative."""
 
     degree: int = 6

@@ -1,7 +1,7 @@
 """Environment maps: files (.npy, .hdr, .exr) in and out, and the map that a light's coefficients stand for.
 
-Maps are tensors (H, W, 3) of linear RGB radiance in the layout of `renderer.light.harmonics.equirectangular`: row 0 is up
-(+z), the middle column faces +x and azimuth grows to the left, as seen from inside.
+Maps are tensors (H, W, 3) of linear RGB radiance in the layout of `harmonics.equirectangular`: row 0 is up (+z), the
+middle column faces +x and azimuth grows to the left, as seen from inside.
 
 Blender's Environment Texture lies so too and needs no rotation. Mitsuba 3's `envmap` has y up and the middle column
 towards +z, as OpenEXR defines such maps: a `to_world` of the rows (0, 0, 1), (1, 0, 0), (0, 1, 0) brings it here. Both

@@ -1,4 +1,4 @@
-"""Lamps at given positions: points, or discs that throw soft shadows."""
+"""Local lights: lamps (points, or discs that throw soft shadows) and a projector of pixel patterns."""
 
 import math
 from dataclasses import dataclass, replace
@@ -8,10 +8,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from renderer.camera import OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.light.basis import Basis, LightPaths, LocalBasis, SumBasis, parts_of
 
 SHARES, RAYS = 4, 8  # neighboring samples look at other points of a disc, in turns of so many, at so many each
+LARGEST = 256  # pixels per side of a projector
 
 
 @dataclass(frozen=True)
@@ -94,21 +96,6 @@ def moved(basis: Basis, positions: Tensor) -> Basis:
     points = tuple(map(tuple, positions.tolist()))
     parts = [replace(part, positions=points) if isinstance(part, Lamps) else part for _, part in parts_of(basis)]
     return SumBasis(tuple(parts)) if isinstance(basis, SumBasis) else parts[0]
-
-
-"""A projector: a pattern of pixels thrown from a place onto what is there."""
-
-import math
-from dataclasses import dataclass
-
-import torch
-from torch import Tensor
-
-from renderer.camera import OrthographicCamera
-from renderer.errors import FACTOR, require_range
-from renderer.light.basis import LightPaths, LocalBasis
-
-LARGEST = 256  # pixels per side
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Three scalars: the sun's zenith angle and azimuth, in radians and world axes, and the turbidity of the air. The sun's
 disc itself is not part of the sky. Radiance is linear Rec. 709 RGB in kcd/m²: (1, 1, 1) is white of 1000 cd/m². The
-mean luminance over the sphere of a clear day's sky is about 5, where that of `renderer.light.presets`' probes is about 0.1.
+mean luminance over the sphere of a clear day's sky is about 5, where that of the probes in `presets` is about 0.1.
 
 `coefficients_by_quadrature` is the reference and `coefficients` the fast path: polynomials, made by
 scripts/fit_skylight.py and turned to the sun's azimuth (the paper's appendix "Differentiating Skylight Parameters",

@@ -1,4 +1,4 @@
-"""Which face covers each sample: three back ends, OpenGL, NumPy and numba, under one contract.
+"""Which face covers each sample: by OpenGL, NumPy or numba, under one contract.
 
 rasterize(points, faces, resolution, closed) -> ids
 
@@ -47,9 +47,9 @@ class Rasterizer:
 
 
 def choose(rasterizer: str = "auto") -> Rasterizer:
-    """Settle on a back end, once at the start.
+    """Settle on a rasterizer, once at the start.
 
-    "auto" takes OpenGL where a GPU drives it, else compiled where numba is installed, else software. InputError:
+    "auto" takes OpenGL where a GPU drives it, else numba where it is installed, else numpy. InputError:
     unknown name, "opengl" on a machine that cannot, or "numba" without numba.
     """
     require_choice("renderer.rasterizer", rasterizer, NAMES)
@@ -78,4 +78,4 @@ def _on_cpu(reason: str) -> Rasterizer:
 def _compiled() -> Rasterizer:
     from renderer.rasterizer import numba as compiled  # numba takes half a second to import
 
-    return Rasterizer("numba", f"numba ( {compiled.VERSION})")
+    return Rasterizer("numba", f"numba ({compiled.VERSION})")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.image import ImageSettings, bounces
+from renderer.image import ImageSettings
 from renderer.light.basis import Basis, EnvironmentBasis, LocalBasis, parts_of
 from renderer.mesh import Mesh
 from renderer.transport import rays
@@ -24,12 +24,11 @@ class Transport:
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: EnvironmentBasis):
-        """gain multiplies the albedo of what sends light."""
-        count = bounces(settings.transport)
-        patches = Patches.of(mesh) if count else None
+        """albedo_scale multiplies the albedo of what sends light."""
+        patches = Patches.of(mesh) if settings.bounces else None
         self.rays = Rays(patches.pieces if patches else mesh)
         self._radiosity = (
-            Radiosity(patches, self.rays, settings.encoding, albedo_scale, basis, count) if patches else None
+            Radiosity(patches, self.rays, settings.encoding, albedo_scale, basis, settings.bounces) if patches else None
         )
         self._directions = sphere(rays.DIRECTIONS)
         self._sky = basis.radiance(self._directions)
@@ -67,6 +66,6 @@ def build_transport(mesh: Mesh, settings: ImageSettings, albedo_scale: float, ba
     places: that throws shadows anyway. InputError: bounces of such light."""
     parts = [part for _, part in parts_of(basis)]
     distant = [part for part in parts if not isinstance(part, LocalBasis)]
-    if len(distant) < len(parts) and bounces(settings.transport):
-        raise InputError(f"renderer.transport={settings.transport}: light of {basis} does not bounce; set shadows")
-    return Transport(mesh, settings, albedo_scale, distant[0]) if distant and settings.transport != "direct" else None
+    if len(distant) < len(parts) and settings.bounces:
+        raise InputError(f"renderer.bounces={settings.bounces}: light of {basis} does not bounce; set renderer.shadows")
+    return Transport(mesh, settings, albedo_scale, distant[0]) if distant and settings.global_illumination else None

@@ -95,7 +95,7 @@ class Radiosity:
     def __init__(
         self, patches: Patches, rays: Rays, encoding: str, albedo_scale: float, basis: EnvironmentBasis, bounces: int
     ):
-        """rays: among the patches' pieces. gain multiplies the mesh's albedo."""
+        """rays: among the patches' pieces. albedo_scale multiplies the mesh's albedo."""
         self.patches = patches
         albedo = patches.mean(surface_albedo(patches.pieces, patches.view, encoding)) * albedo_scale
         self.colors = bool((albedo != albedo[:, :1]).any())

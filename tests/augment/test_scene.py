@@ -456,9 +456,11 @@ def test_a_scene_of_shadowed_and_open_meshes_shows_each_as_its_operator_does():
     torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=100 * EPS32)
 
 
-@pytest.mark.parametrize("transport", ["shadows", "bounces:2"])
-def test_where_no_vertex_or_color_has_moved_yet_shadows_are_those_of_the_operators(transport):
-    scene = built([ObjectSettings("solid:cup", "cup")], orbit_cameras(2, 2), replace(SETTINGS, transport=transport))
+@pytest.mark.parametrize("bounces", [0, 2])
+def test_where_no_vertex_or_color_has_moved_yet_shadows_are_those_of_the_operators(bounces):
+    scene = built(
+        [ObjectSettings("solid:cup", "cup")], orbit_cameras(2, 2), replace(SETTINGS, shadows=True, bounces=bounces)
+    )
     examples, lights = torch.arange(len(scene)), random_lights(len(scene))
     mesh = scene.mesh(0)
     still = replace(scene.conditions(examples), light=lights)
@@ -475,12 +477,12 @@ def test_a_table_is_shadowed_by_the_object_on_it_and_returns_light_of_its_own_co
     """Green, mostly to the object; where the sky alone lights it, nothing changes."""
     seen = {"size": 16, "views": 1, "light": "st_peters", "exposure": 0.2, "backgrounds": [0.0], "width": 3.0}
 
-    def image(transport: str, ground: list[float] | None = (0.1, 0.8, 0.1)) -> torch.Tensor:
-        fixed = {"transport": transport, "ground": ground, "rasterizer": "numpy"}
+    def image(shadows: bool, bounces: int = 0, ground: list[float] | None = (0.1, 0.8, 0.1)) -> torch.Tensor:
+        fixed = {"shadows": shadows, "bounces": bounces, "ground": ground, "rasterizer": "numpy"}
         scene = build_scene([("solid:orange", "orange")], **seen | fixed)
         return render(scene, scene.lights)[0]
 
-    alone, open_sky, shadowed, lit = (image("direct", None), *map(image, ("direct", "shadows", "bounces:2")))
+    alone, open_sky, shadowed, lit = (image(False, ground=None), image(False), image(True), image(True, 2))
     object_, table = alone.sum(0) > 0, (alone.sum(0) == 0) & (open_sky.sum(0) > 0)
     kept = (shadowed / open_sky)[1, table]
     assert kept.min() < 0.3 and kept.max() > 0.8

@@ -127,7 +127,7 @@ def test_mitsubas_image_is_in_the_place_of_ours(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("paths", lights.LIGHT_PATHS[1:])
+@pytest.mark.parametrize("paths", [*lights.LIGHT_PATHS][1:])
 @pytest.mark.parametrize("mesh", ["convex: a ball", "open: half a ball", "rugged: a dented ball"])
 def test_images_and_gradients_by_the_light_go_to_mitsubas_noise(mesh, paths):
     """Which is itself known from eight renders to a fifth or so; a convex mesh has nothing to converge."""

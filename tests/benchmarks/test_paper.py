@@ -12,7 +12,7 @@ from augment import AttackSettings, Classifier, StepSettings, attack
 from augment.objects import SceneObject
 from augment.utils import generator
 from benchmarks.paper import common, norm_balls, rendering_quality, run_time, survival, table, transfer
-from renderer import InputError, OrthographicCamera, ring
+from renderer import InputError, OrthographicCamera, orbit_cameras
 from renderer.mesh import Mesh
 
 SIZE = 12

@@ -384,7 +384,7 @@ def by_transport(setup: Setup, bounces: int = 0, dtype: torch.dtype = torch.floa
     """`by_operator` with shadows or bounces and one sample per pixel, which then casts all rays. The reference takes
     the rays, their origins and the patches from the renderer."""
     mesh, kind = setup.mesh, "bounces" if bounces else "shadows"
-    settings = replace(setup.settings, samples=1, transport=f"bounces:{bounces}" if bounces else "shadows")
+    settings = replace(setup.settings, samples=1, shadows=True, bounces=bounces)
     setup = replace(setup, settings=settings)
     view, directions = setup.view(), extended(rays.sphere(rays.DIRECTIONS).numpy())
     points = ray_origins(Surface.of(mesh, setup.fragments(), settings), rays.Rays(mesh))

@@ -19,7 +19,8 @@ from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.image import ImageSettings
 from renderer.light.basis import Harmonics
 from renderer.mesh import Mesh, normalize
-from renderer.rasterizer import Rasterizer, choose, software
+from renderer.rasterizer import Rasterizer, choose
+from renderer.rasterizer import numpy as numpy_rasterizer
 from renderer.shapes import solid
 from renderer.transfer import TransferOperator, build_operators
 
@@ -146,18 +147,18 @@ CHANGES = {
     "the size": {"settings": replace(SETTINGS, size=9)},
     "the samples": {"settings": replace(SETTINGS, samples=3)},
     "the encoding": {"settings": replace(SETTINGS, encoding="srgb")},
-    "the transport": {"settings": replace(SETTINGS, shadows=True)},
-    "the gain": {"albedo_scale": 1.1},
+    "the shadows": {"settings": replace(SETTINGS, shadows=True)},
+    "the albedo scale": {"albedo_scale": 1.1},
     "the basis": {"basis": Harmonics(2)},
     "the dtype": {"dtype": torch.float64},
-    "the back end": {"rasterizer": Rasterizer("other", RASTERIZER.description)},
+    "the rasterizer": {"rasterizer": Rasterizer("other", RASTERIZER.description)},
     "the renderer's code": {"code": "other"},
 }
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "renderer.rasterizer.other", software)
+    monkeypatch.setitem(sys.modules, "renderer.rasterizer.other", numpy_rasterizer)
 
     def built(
         mesh=TEXTURED, camera=CAMERA, settings=SETTINGS, rasterizer=RASTERIZER, code=cache_module.RENDERER, **options
@@ -212,10 +213,10 @@ def test_any_change_of_the_sources_is_another_key(tmp_path):
     shutil.copytree(Path(cache_module.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     assert source_key(package) == cache_module.RENDERER
     keys = {source_key(package)}
-    module = package / "rasterizer" / "software.py"
+    module = package / "rasterizer" / "numpy.py"
     module.write_text(module.read_text() + "\n")
     keys.add(source_key(package))
-    module.rename(package / "software.py")
+    module.rename(package / "numpy.py")
     keys.add(source_key(package))
     (package / "new.py").touch()
     keys.add(source_key(package))

@@ -61,7 +61,7 @@ BOUNDED = [  # what is multiplied with each other
     ("light", GOOD["light"], lambda x: lit(None, "light", x)),
     ("albedo", GOOD["albedo"], lambda x: lit(None, "albedo", x)),
     ("albedo", GOOD["albedo"], lambda x: lit(FACES, "albedo", x)),
-    ("albedo_scale", torch.ones(1), lambda x: build_operators(MESH, [CAMERA], SETTINGS, RASTERIZER, albedo_scale=x.item())),
+    ("albedo_scale", torch.ones(1), lambda x: build_operators(MESH, [CAMERA], SETTINGS, RASTERIZER, x.item())),
     ("lights", torch.ones(2, 49, 3), OPERATOR.radiance),
     ("radiance_gradient", torch.ones(2, 3, 4), OPERATOR.light_gradient),
     ("radiance", torch.ones(3, 4), lambda x: tonemap(x, torch.ones(1, 4), torch.ones(3, 1))),

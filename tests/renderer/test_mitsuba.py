@@ -139,9 +139,9 @@ each_case = pytest.mark.parametrize(
 # ---------------------------------------------------------------------------- images
 
 
-def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, shadows=False) -> np.ndarray:
+def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, **settings) -> np.ndarray:
     """(size, size, 4): radiance and coverage."""
-    settings = ImageSettings(size, samples, transport=transport)
+    settings = ImageSettings(size, samples, **settings)
     [operator] = build_operators(mesh, [camera], settings, choose("numpy"))
     canvas = np.zeros((size * size, 4))
     canvas[operator.pixels, :3] = operator.radiance(torch.from_numpy(LIGHT)).T
@@ -282,8 +282,8 @@ def test_shadows_and_bounces_are_mitsubas_within_its_noise(solid, view, bounces,
     theirs, noise = mitsuba_image(solid, view, 32, 128, bounces)
     inside, brightest = theirs[..., 3] == 1, theirs[..., :3].max()
     ours, less = (
-        our_image(solid(), VIEWS[view], 32, 8, chosen)
-        for chosen in ((f"bounces:{bounces}", "shadows") if bounces else ("shadows", "direct"))
+        our_image(solid(), VIEWS[view], 32, 8, **chosen)
+        for chosen in (({"bounces": bounces}, {"shadows": True}) if bounces else ({"shadows": True}, {}))
     )
     error, without, noise = (values[inside, :3] / brightest for values in (ours - theirs, less - theirs, noise))
     assert (error**2).mean() < 0.005**2 + (noise**2).mean()

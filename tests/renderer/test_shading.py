@@ -300,7 +300,7 @@ class Image:
 
     def clamped(self, *inputs) -> torch.Tensor:
         lit, *around = self.parts(*inputs)[1]
-        return clamped(lit + behind(*around))
+        return clamped(lit + background_term(*around))
 
 
 def slope(function, inputs, steps, length: float = 1e-5) -> torch.Tensor:

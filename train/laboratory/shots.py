@@ -22,10 +22,10 @@ class Shot:
     """One light, camera and pose, for whatever object.
 
     brightness: radiance of a white surface that faces the projector where its image is white, or that faces up under an
-    environment. pattern: the image (H, W, 3). environment: radiance (H, W, 3) laid out as in `renderer.light.environment`, in
-    place of projector and ambient. ambient: radiance from everywhere (3,). table: albedo (3,). projector, camera:
-    places (3,). center, aim: the points (3,) that they look at. turn: the object's rotation (3, 3). scale: the object's
-    largest coordinate.
+    environment. pattern: the image (H, W, 3). environment: radiance (H, W, 3) laid out as in
+    `renderer.light.environment`, in place of projector and ambient. ambient: radiance from everywhere (3,). table:
+    albedo (3,). projector, camera: places (3,). center, aim: the points (3,) that they look at. turn: the object's
+    rotation (3, 3). scale: the object's largest coordinate.
     """
 
     family: str

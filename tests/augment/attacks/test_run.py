@@ -48,9 +48,9 @@ def test_shared_views_may_each_have_a_target(classifier, target):
     assert attacked.goal.target.tolist() == [[CLASSES.index(name) for name in names]]
 
 
-@pytest.mark.parametrize("transport", ["shadows", pytest.param("bounces:1", marks=pytest.mark.slow)])
-def test_what_is_judged_has_the_shadows_of_the_shape_and_the_colors_that_leave(classifier, tmp_path, transport):
-    scene = augment.build_scene([("solid:cup:3", "orange")], 8, 2, shared=True, transport=transport, **SMALL)
+@pytest.mark.parametrize("bounces", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_what_is_judged_has_the_shadows_of_the_shape_and_the_colors_that_leave(classifier, tmp_path, bounces):
+    scene = augment.build_scene([("solid:cup:3", "orange")], 8, 2, shared=True, shadows=True, bounces=bounces, **SMALL)
     moved = {name: augment.StepSettings("linf", 0.05, "sign", 0.03) for name in ("geometry", "albedo")}
     settings = augment.AttackSettings(**moved, max_steps=2)
     attacked = augment.attack(classifier, scene, settings=settings, force=True)

@@ -24,7 +24,7 @@ from renderer.shading import radiance
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
+DATA = Path(__file__).parents[3].parent / "shared" / "data"
 EPS32 = np.finfo(np.float32).eps
 GLTF_TYPES = {5125: "<u4", 5126: "<f4"}
 GLTF_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}

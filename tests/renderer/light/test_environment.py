@@ -20,7 +20,7 @@ from renderer.light.harmonics import basis, equirectangular, project
 from renderer.light.presets import load_light, mean_luminance, probe
 from renderer.transfer import DEGREE
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 HDRI = ROOT.parent / "shared" / "data" / "hdri"
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 RGBE = 2.0**-8  # of a texel's largest channel, which is at least 128 units of its exponent: half a unit

@@ -26,7 +26,7 @@ from renderer.mesh import Mesh
 from renderer.rendering import render
 from renderer.transfer import DEGREE
 
-HDRI = Path(__file__).parents[3] / "shared" / "data" / "hdri"
+HDRI = Path(__file__).parents[4] / "shared" / "data" / "hdri"
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 UP, DOWN = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)

@@ -16,8 +16,8 @@ from renderer.errors import InputError
 from renderer.light.harmonics import basis, rotate
 from renderer.light.skylight import coefficients, coefficients_by_quadrature, fit_error, fit_polynomials, radiance
 
-ROOT = Path(__file__).parents[2]
-FIT = ROOT / "renderer" / "skylight_fit.safetensors"
+ROOT = Path(__file__).parents[3]
+FIT = ROOT / "renderer" / "light" / "skylight_fit.safetensors"
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 HORIZON = math.pi / 2
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)

@@ -22,10 +22,11 @@ from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from renderer import rasterizer as rasterizer
+from renderer import rasterizer as rasterizers
 from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
-from renderer.rasterizer import SPAN, Rasterizer, choose, opengl, software
+from renderer.rasterizer import SPAN, Rasterizer, choose, opengl
+from renderer.rasterizer import numpy as numpy_rasterizer
 
 needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
 needs_numba = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
@@ -372,8 +373,8 @@ def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides(name
 def test_software_draws_the_same_however_little_at_a_time(monkeypatch, parts, faces_at_a_time):
     points, faces = random_triangles(seed=4, count=40, reach=1.3)
     at_once = choose("numpy").rasterize(points, faces, 16)
-    monkeypatch.setattr(software, "PARTS", parts)
-    monkeypatch.setattr(software, "FACES", faces_at_a_time)
+    monkeypatch.setattr(numpy_rasterizer, "PARTS", parts)
+    monkeypatch.setattr(numpy_rasterizer, "FACES", faces_at_a_time)
     np.testing.assert_array_equal(choose("numpy").rasterize(points, faces, 16), at_once)
 
 
@@ -388,7 +389,7 @@ def test_software_draws_the_same_however_little_at_a_time(monkeypatch, parts, fa
     order=st.sampled_from("CF"),
     closed=st.booleans(),
 )
-def test_compiled_equals_software_to_the_bit(seed, shape, resolution, lattice, scales, order, closed):
+def test_numba_equals_numpy_to_the_bit(seed, shape, resolution, lattice, scales, order, closed):
     """Soups of triangles in several views: huge, thin, degenerate, on samples, out of range, as near as one another."""
     views, vertices, faces = shape
     rng = np.random.default_rng(seed)
@@ -404,7 +405,7 @@ def test_compiled_equals_software_to_the_bit(seed, shape, resolution, lattice, s
 @needs_numba
 @pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
 @pytest.mark.parametrize("resolution", [32, 224, 1000])
-def test_compiled_equals_software_to_the_bit_on_solids(resolution, closed):
+def test_numba_equals_numpy_to_the_bit_on_solids(resolution, closed):
     for mesh in (trimesh.creation.icosphere(5), trimesh.creation.torus(0.6, 0.3), trimesh.creation.box([1.9, 0.01, 1])):
         points, faces = turned(mesh, views=2)
         compiled, plain = (choose(name).rasterize(points, faces, resolution, closed) for name in ("numba", "numpy"))
@@ -412,7 +413,7 @@ def test_compiled_equals_software_to_the_bit_on_solids(resolution, closed):
 
 
 @needs_numba
-def test_compiled_draws_in_many_threads_at_once():
+def test_numba_draws_in_many_threads_at_once():
     points, faces = rotated_spheres(views=8)
     rasterizer = choose("numba")
     with ThreadPoolExecutor(8) as pool:
@@ -422,7 +423,7 @@ def test_compiled_draws_in_many_threads_at_once():
 
 @needs_numba
 @pytest.mark.parametrize("corner", [-1, 3])
-def test_compiled_reads_no_memory_that_is_not_the_points(corner):
+def test_numba_reads_no_memory_that_is_not_the_points(corner):
     with pytest.raises(IndexError, match="not among the 3"):
         choose("numba").rasterize(np.zeros((1, 3, 3)), np.array([[0, 1, corner]]), 4)
 
@@ -526,10 +527,10 @@ def test_the_back_ends_agree_on_any_triangles(seed, count, resolution, lattice, 
 def test_torch_optimizers_work_after_opengl():
     """They load Triton, whose LLVM must not meet Mesa's already there; in a process of its own, since that crashes."""
     script = (
-        "from renderer import visibility; import torch; visibility.choose('opengl'); "
+        "from renderer import rasterizer; import torch; rasterizer.choose('opengl'); "
         "torch.optim.SGD([torch.zeros(1, requires_grad=True)])"
     )
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2])
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[3])
 
 
 @needs_egl
@@ -569,7 +570,7 @@ def test_a_million_faces_take_bounded_memory():
 def no_numba(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
     monkeypatch.delitem(sys.modules, "renderer.rasterizer.numba", raising=False)
-    monkeypatch.delattr(rasterizer, "numba", raising=False)
+    monkeypatch.delattr(rasterizers, "numba", raising=False)
 
 
 @pytest.mark.parametrize(
@@ -590,17 +591,17 @@ def test_opengl_is_chosen_where_a_gpu_drives_it(no_numba, monkeypatch, asked, de
 
 @needs_numba
 @pytest.mark.parametrize("device", ["llvmpipe", None])
-def test_compiled_is_chosen_where_no_gpu_drives_opengl_and_numba_is_installed(monkeypatch, device):
+def test_numba_is_chosen_where_no_gpu_drives_opengl_and_numba_is_installed(monkeypatch, device):
     def find():
         if device is None:
             raise InputError("no EGL device")
         return device
 
     monkeypatch.setattr(opengl, "device", find)
-    assert choose("auto") == choose("numba") == Rasterizer("numba", f"numba ( {version('numba')})")
+    assert choose("auto") == choose("numba") == Rasterizer("numba", f"numba ({version('numba')})")
 
 
-def test_without_numba_compiled_is_refused(no_numba):
+def test_without_numba_it_is_refused(no_numba):
     with pytest.raises(InputError, match=r"numba does not start .*: pip install numba, or renderer\.rasterizer=numpy"):
         choose("numba")
 

@@ -31,8 +31,8 @@ FLOAT32 = torch.finfo(torch.float32).eps
 QUADRATURE = 0.015  # of the brightest: what 512 directions misjudge of a shadowed pixel, root mean square
 
 
-def operator_of(mesh: Mesh, camera=ABOVE, shadows=True, dtype=torch.float64, **settings) -> TransferOperator:
-    chosen = ImageSettings(**{"size": 6, "samples": 1} | settings, transport=transport)
+def operator_of(mesh: Mesh, camera=ABOVE, dtype=torch.float64, **settings) -> TransferOperator:
+    chosen = ImageSettings(**{"size": 6, "samples": 1, "shadows": True} | settings)
     [operator] = build_operators(mesh, [camera], chosen, RASTERIZER, dtype=dtype)
     return operator
 
@@ -86,9 +86,9 @@ CONVEX = {
 @pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
 def test_a_convex_mesh_keeps_the_operator_of_direct_light_to_the_bit(mesh, normals):
     camera = OrthographicCamera(1.0, 0.3, 2.2)
-    direct = operator_of(mesh, camera, "direct", normals=normals)
-    for transport in ("shadows", "bounces:2"):
-        shaped = operator_of(mesh, camera, transport, normals=normals)
+    direct = operator_of(mesh, camera, shadows=False, normals=normals)
+    for bounces in (0, 2):
+        shaped = operator_of(mesh, camera, bounces=bounces, normals=normals)
         assert torch.equal(shaped.transfer, direct.transfer)
         assert torch.equal(shaped.kept, nonzero_coefficients(6))
 
@@ -99,13 +99,13 @@ def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monke
     assert len(operator_of(dented()).kept) == 49
 
 
-@pytest.mark.parametrize("transport", ["shadows", "bounces:1"])
-def test_a_mesh_outside_the_image_has_no_pixels_and_faces_without_area_do_no_harm(transport, monkeypatch):
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_a_mesh_outside_the_image_has_no_pixels_and_faces_without_area_do_no_harm(bounces, monkeypatch):
     monkeypatch.setattr(radiosity, "PATCHES", 2**7)
     outside = OrthographicCamera(0, 0, 1.0, right=20.0)
-    assert not operator_of(dented(), outside, transport).transfer.numel()
+    assert not operator_of(dented(), outside, bounces=bounces).transfer.numel()
     thin = replace(parts(), faces=np.concatenate([parts().faces[:-1], [[0, 0, 1]]]))
-    assert operator_of(thin, transport=transport).transfer.isfinite().all()
+    assert operator_of(thin, bounces=bounces).transfer.isfinite().all()
 
 
 def blocked(points: torch.Tensor, directions: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
@@ -144,7 +144,7 @@ def test_each_coefficient_is_that_of_the_slow_ray_caster(mesh, normals):
     cosine[planes[seen.face] @ directions.T <= 0] = 0
     lost = torch.where(blocked(at, directions, corners), cosine, 0) @ basis(directions, 6)
 
-    direct, shadowed = (operator_of(mesh, camera, t, normals=normals) for t in ("direct", "shadows"))
+    direct, shadowed = (operator_of(mesh, camera, shadows=t, normals=normals) for t in (False, True))
     expected = all_rows(direct) - direct.albedo[:, None] * lost.T * 4 * math.pi / DIRECTIONS
     assert lost.any()
     torch.testing.assert_close(all_rows(shadowed), expected, rtol=0, atol=1e-12)
@@ -178,7 +178,7 @@ def white(mesh: Mesh) -> Mesh:
 def test_a_white_mesh_in_a_white_furnace_brightens_with_each_bounce_until_it_cannot_be_seen(mesh, monkeypatch):
     """All light is kept, and what a direction does not bring comes from what is met there."""
     monkeypatch.setattr(radiosity, "PATCHES", 2**7)
-    shares = [sky_share(operator_of(mesh, size=12, samples=2, transport=f"bounces:{n}")) for n in (1, 2, 4, 8, 100)]
+    shares = [sky_share(operator_of(mesh, size=12, samples=2, bounces=n)) for n in (1, 2, 4, 8, 100)]
     before = sky_share(operator_of(mesh, size=12, samples=2))
     for share in shares:
         assert (share >= before - 1e-9).all() and share.max() <= 1 + 1e-9
@@ -219,16 +219,14 @@ def test_the_gradient_of_light_is_the_transposed_of_all_49_rows():
 
 def test_missing_embree_is_told_in_a_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
-    with pytest.raises(InputError, match=r"pip install embreex, or choose renderer\.transport=direct"):
+    with pytest.raises(InputError, match=r"pip install embreex, or set renderer\.shadows=false"):
         operator_of(dented())
 
 
-@pytest.mark.parametrize("unknown", ["caustics", "bounces", "bounces:0", "bounces:101", "bounces:-1", "bounces:²", ""])
-def test_an_unknown_transport_is_refused(unknown):
-    with pytest.raises(
-        InputError, match=rf"renderer\.transport={unknown}: choose one of direct, shadows, or bounces:N"
-    ):
-        ImageSettings(transport=unknown)
+@pytest.mark.parametrize("bounces", [-1, 101])
+def test_too_many_bounces_are_refused(bounces):
+    with pytest.raises(InputError, match=rf"renderer\.bounces={bounces}"):
+        ImageSettings(bounces=bounces)
 
 
 @pytest.mark.parametrize("degree", [2, 6])
@@ -238,13 +236,14 @@ def test_render_shows_the_operators_shadows_also_of_moved_vertices(degree):
     stretched = replace(dented(), vertices=dented().vertices * [1.0, 0.5, 1.0])
     images = render(dented(), cameras, light, vertices=torch.from_numpy(stretched.vertices), **shown)
     expected = [
-        operator.image(F.pad(light, (0, 0, 0, 49 - len(light)))) for operator in operators(stretched, cameras, **shown)
+        operator.image(F.pad(light, (0, 0, 0, 49 - len(light))))
+        for operator in precompute_transfer(stretched, cameras, **shown)
     ]
     torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=10 * FLOAT32)
 
 
 def test_render_differentiates_shadows_by_the_light_and_holds_them_by_the_vertices():
-    def shade(transport, light, vertices):
+    def shade(shadows, light, vertices):
         image = render(
             dented(),
             ABOVE,
@@ -252,14 +251,14 @@ def test_render_differentiates_shadows_by_the_light_and_holds_them_by_the_vertic
             size=6,
             vertices=vertices,
             normals="flat",
-            transport=transport,
+            shadows=shadows,
             rasterizer="numpy",
         )
         return torch.autograd.grad(image.sum(), (light, vertices))
 
     light, vertices = ambient(torch.full((3,), 0.1).double()), torch.from_numpy(dented().vertices)
     light.requires_grad_(), vertices.requires_grad_()
-    (by_light, by_vertices), (_, direct_by_vertices) = (shade(t, light, vertices) for t in ("shadows", "direct"))
+    (by_light, by_vertices), (_, direct_by_vertices) = (shade(t, light, vertices) for t in (True, False))
     rows = all_rows(operator_of(dented(), samples=2)).sum(2).T
     torch.testing.assert_close(by_light, rows)
     assert torch.equal(by_vertices, direct_by_vertices)
