@@ -25,8 +25,8 @@ END
 }
 
 benchmark() {
-    "$python" scripts/benchmark_training.py data=npz "data.path=$DATA" "scene.meshes=$MESHES" "train.device=$device" \
-        "out=$docs/performance.md"
+    "$python" -m benchmarks.training speed --data "$DATA" --meshes "$MESHES" --device "$device" \
+        --csv "$docs/training_speed.csv"
 }
 
 sweep() {

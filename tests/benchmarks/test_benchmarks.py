@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks import common, lights, renderer, scene
+from benchmarks import common, lights, renderer, scene, training
 from renderer.errors import InputError
 from renderer.io.mitsuba import DIFFERENTIABLE, mitsuba
 from renderer.mesh import Mesh
@@ -142,3 +142,27 @@ def test_images_and_gradients_by_the_light_go_to_mitsubas_noise(mesh, paths):
         error, converged, direct = (row[f"{of}_error{end}"] for end in ("", "_converged", "_direct"))
         assert 0 < row[f"{of}_noise"] < 0.006 and converged < 1.3 * row[f"{of}_noise"]
         assert error < 1.3 * row[f"{of}_noise"] if mesh.startswith("convex") else converged < error < 0.02 < direct
+
+
+def test_training_is_timed_beside_a_plain_loop(tmp_path):
+    """With attacks that take all their steps."""
+    tiny = ["--images", "32", "--rounds", "1", "--depth", "10", "--width", "1", "--workers", "0"]
+    overrides = ["renderer.rasterizer=numpy", "renderer.samples=1", "augment.examples=10", "train.threads=1"]
+    first, middle = training.main(
+        ["speed", *tiny, "--csv", str(tmp_path / "speed.csv"), "--overrides", *overrides, "augment.attack.max_steps=2"]
+    )
+    assert first | {"round": "median"} == middle and first["attack_steps"] == 2
+    assert first["speedup"] == pytest.approx(first["train_images_per_second"] / first["plain_loop_images_per_second"])
+    assert 0 < first["attack_fraction_of_epoch"] < 1
+    assert len((tmp_path / "speed.csv").read_text().splitlines()) == 3
+
+
+def test_the_cost_of_renders_is_measured_over_their_number_size_and_meshes(tmp_path):
+    csv = tmp_path / "renders.csv"
+    rows = training.main(["renders", "--numbers", "10", "--sizes", "16", "--meshes", "1", "2", "--csv", str(csv)])
+    assert [(row["renders"], row["size"], row["meshes"], row["views"]) for row in rows] == [
+        (10, 16, 1, 2),
+        (20, 16, 2, 4),
+    ]
+    assert all(row["attack_seconds"] > 0 and row["memory_mb"] > 0 for row in rows)
+    assert len(csv.read_text().splitlines()) == 3

@@ -67,7 +67,6 @@ WRONG = [
     (["compare_runs", "runs=null"], "runs: "),
     (["compare_runs", "runs=[[a]]"], "runs[0]: give a plain value"),
     (["compare_runs", "runs=[a]", "exclude=[{a: b}]"], "exclude[0]: give a plain value"),
-    (["benchmark_growth", "rates={8 V100: [1]}"], "rates.8 V100: give a plain value"),
     (["compare_runs", "runs=[a]", "exclude=web"], "exclude: "),
     (["compare_runs", "runs=[2024]"], "2024 holds no finished run"),
     ([*EXPORT, "height=abc", "out=a.hdr"], "height: "),
@@ -77,10 +76,7 @@ WRONG = [
     (["fit_skylight", "out=photo.png"], "out=photo.png: name a .safetensors file"),
     (["attack", f"scene.width={10**400}"], "scene.width: int too large to convert to float"),
     (["attack", "target={a: 1}"], "target: give a class, least_likely, or a list of classes, one per view"),
-    (["check_interruptions", "kills=1.5", "out=a.md"], "kills: "),
-    (["check_interruptions", "jobs=0", "out=a.md"], "jobs=0 must be at least 1"),
     (["lab", "size=0", "out=a"], "size=0 must be at least 1"),
-    (["benchmark_training", "steps=-1", "out=a.md"], "steps=-1 must be at least 0"),
 ]
 
 
@@ -97,7 +93,7 @@ def test_a_setting_of_another_type_or_beyond_its_range_is_one_line(call, here, c
     ("command", "out"),
     [(EXPORT, "/proc/none/out"), (EXPORT, "file/out"), (EXPORT, "x" * 300), (EVALUATE, "/dev/full/out"),
      (["publish", "run=1.10"], "file/out"), (["fit_skylight"], "file/out"),
-     (["check_interruptions"], "file/out"), (["benchmark_training"], "file/out"), (["lab"], "file/out"),
+     (["lab"], "file/out"),
      (["report", "a"], "x" * 300)],
 )  # fmt: skip
 def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, capsys, command, out, monkeypatch):

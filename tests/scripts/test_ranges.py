@@ -11,17 +11,9 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from train.command_line.configuration import as_dict, composed, dotted, read_settings
 from train.laboratory.settings import LabSettings
-from train.studies.growth.study import GrowthSettings
-from train.studies.interruptions.study import InterruptionSettings
-from train.studies.load.study import LoadSettings
-from train.studies.reliability.study import ReliabilitySettings
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 SETTINGS = {
-    "benchmark_growth": GrowthSettings,
-    "check_interruptions": InterruptionSettings,
-    "check_load": LoadSettings,
-    "check_reliability": ReliabilitySettings,
     "lab": LabSettings,
 }
 OWN = ("compare_runs", "evaluate_photos", "export_light", "fit_skylight", "publish", "report")  # in the script itself
@@ -37,7 +29,7 @@ KINDS: dict[str, tuple[type, list[str]]] = {
     **{name: (kind, [*GIVEN.get(name, [])]) for name, kind in SETTINGS.items()},
     **{name: (runpy.run_path(str(SCRIPTS / f"{name}.py"))["Settings"], GIVEN.get(name, [])) for name in OWN},
 }
-ELSEWHERE = ("train", "attack", "benchmark_training")  # whose numbers are tried with their meaning: docs/reliability.md
+ELSEWHERE = ("train", "attack")  # whose numbers are tried in the tests of their settings
 
 
 def beyond(config: DictConfig) -> Iterator[tuple[str, Any]]:

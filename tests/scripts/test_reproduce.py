@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from benchmarks import training
 from train.command_line.configuration import composed, read_settings
 from train.settings import ExperimentSettings
 
@@ -66,9 +67,10 @@ def test_what_is_missing_is_said_before_anything_runs(tmp_path, arguments, envir
 def test_reproducing_measures_then_trains_and_compares_each_experiment(tmp_path, machine, experiments):
     status, (benchmark, *calls), said = reproduce(tmp_path, machine, "train.checkpoint_every=5", **GIVEN)
     assert (status, said) == (0, "")
-    assert benchmark[0] == "scripts/benchmark_training.py"
-    config = settings("benchmark_training", *benchmark[1:])
-    assert (config.out, config.data.path) == (f"{tmp_path}/performance.md", "cifar100.npz")
+    assert benchmark[:3] == ["-m", "benchmarks.training", "speed"]
+    options = training.parser().parse_args(benchmark[2:])
+    assert (options.csv, options.data) == (tmp_path / "training_speed.csv", Path("cifar100.npz"))
+    assert (options.meshes, options.device) == (GIVEN["MESHES"], {"cpu": "cpu", "gpu": "cuda"}[machine])
 
     for experiment, train, compare in zip(experiments, calls[::2], calls[1::2], strict=True):
         assert train[:4] == ["-m", "train", "--multirun", f"experiment={experiment}"]

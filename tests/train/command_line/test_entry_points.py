@@ -350,8 +350,8 @@ def test_an_error_of_the_users_input_is_not_followed_by_suggestions(monkeypatch,
     [
         (
             "/home/me/scripts/clone/scripts/torture.py",
-            ["out=docs/interruptions.md"],
-            "torture.py out=docs/interruptions.md",
+            ["out=docs/results.md"],
+            "torture.py out=docs/results.md",
         ),
         (
             "scripts/paper/run_time.py",

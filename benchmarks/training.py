@@ -1,0 +1,274 @@
+"""The speed of training, and what adversarial renders cost.
+
+    python -m benchmarks.training speed --data cifar100.npz --csv speed.csv
+    python -m benchmarks.training renders --numbers 100 1000 10000 --csv renders.csv
+
+`speed` lets three contestants take turns, so that a busy machine slows all alike: `python -m train` without renders and
+with adversarial ones, each a process whose second epoch counts, and the loop that one writes with torchvision: a
+DataLoader over PIL images, torch's own dropout, eager float32. `renders` measures one round of attacks over the number
+of renders, image sizes and meshes, each in a process of its own, whose peak memory is then its own.
+"""
+
+import argparse
+import itertools
+import json
+import multiprocessing
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+from torchvision import transforms
+
+from augment import AugmentationService, AugmentationSettings
+from augment.service import TrainingAttackSettings
+from benchmarks.common import machine, write_csv
+from train.run_folder import checkpoint
+from train.wideresnet import Dropout, WideResNet
+
+EPOCH_IMAGES = 45_000  # that a whole epoch of CIFAR-100 trains on: nine tenths of its training set
+GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
+SURE = 30.0  # a logit beyond all others, whose gradient float32 still holds: every attack takes all its steps
+
+Row = dict[str, Any]
+
+
+# ---------------------------------------------------------------------------- speed
+
+
+def write_data(source: Path | None, path: Path, images: int) -> Path:
+    """An .npz file with enough images for an epoch, of the source or random ones of 100 classes at 32 × 32 pixels."""
+    count = -(-images * 10 // 9) + 100
+    if source:
+        with np.load(source, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    else:
+        draws, classes = np.random.default_rng(0), ["orange", *(f"class {number}" for number in range(1, 100))]
+        arrays = {"classes": np.array(classes)}
+        for part, size in (("train", max(count, 1000)), ("test", 100)):
+            arrays[f"{part}_images"] = draws.integers(0, 256, (size, 3, 32, 32), dtype=np.uint8)
+            arrays[f"{part}_labels"] = np.arange(size) % 100
+    rows = np.random.default_rng(1).permutation(len(arrays["train_labels"]))[: max(count, 1000)]
+    arrays |= {name: arrays[name][rows] for name in ("train_images", "train_labels")}
+    np.savez(path, **arrays)
+    return path
+
+
+def train(run: Path, data: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
+    """The last epoch's metrics of two of `python -m train`; the first compiles and warms up."""
+    command = [sys.executable, "-m", "train", "experiment=paper", "data=npz", f"data.path={data}", f"run={run}"]
+    command += ["train.epochs=2", f"train.images_per_epoch={options.images}", f"train.device={options.device}"]
+    command += [f"scene.meshes={options.meshes}", *overrides, *options.overrides]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return next(line for line in reversed(lines) if "epoch" in line)
+
+
+def make_sure(path: Path, label: int = 0) -> None:
+    """Edit a checkpoint so that its network calls every image by one class, with a gradient left."""
+    state = checkpoint.load(path)
+    state["model"]["head.weight"][label] = 0
+    state["model"]["head.bias"][label] = SURE
+    checkpoint.save(path, state)
+
+
+class Images(Dataset[tuple[Tensor, int]]):
+    """uint8 images that become PIL images one by one, as torchvision.datasets.CIFAR100 holds them."""
+
+    def __init__(self, data: Path, count: int):
+        with np.load(data, allow_pickle=False) as archive:
+            images, labels = archive["train_images"][:count], archive["train_labels"][:count]
+            self.classes = len(archive["classes"])
+        self.images, self.labels = images.transpose(0, 2, 3, 1).copy(), labels.tolist()
+        scaled = images / 255
+        self.transform = transforms.Compose(
+            [
+                transforms.RandomCrop(images.shape[-1], padding=4, padding_mode="reflect"),
+                transforms.RandomHorizontalFlip(),
+                transforms.ToTensor(),
+                transforms.Normalize(scaled.mean((0, 2, 3)).tolist(), scaled.std((0, 2, 3)).tolist()),
+            ]
+        )
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, int]:
+        return self.transform(Image.fromarray(self.images[index])), self.labels[index]
+
+
+def plain_loop(data: Path, options: argparse.Namespace) -> Callable[[], float]:
+    """A function that trains one epoch and returns its seconds; the same network as `train`'s, eager, in float32."""
+    images = Images(data, options.images)
+    loader = DataLoader(
+        images,
+        batch_size=128,
+        shuffle=True,
+        num_workers=options.workers,
+        pin_memory=options.device == "cuda",
+        persistent_workers=options.workers > 0,
+    )
+    network = WideResNet(images.classes, options.depth, options.width, 0.3, mean=(0, 0, 0), std=(1, 1, 1))
+    for parent in list(network.modules()):
+        for name, child in parent.named_children():
+            if isinstance(child, Dropout):
+                setattr(parent, name, nn.Dropout(child.p))
+    network.to(options.device).train()
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.125, momentum=0.9, weight_decay=5e-4, nesterov=True)
+
+    def epoch() -> float:
+        start = time.perf_counter()
+        for batch, labels in loader:
+            batch, labels = batch.to(options.device), labels.to(options.device)
+            loss = F.cross_entropy(network(batch), labels)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        if options.device == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter() - start
+
+    return epoch
+
+
+def speed(options: argparse.Namespace) -> list[Row]:
+    """Images per second from stored images to updated weights, and the attack's fraction of a whole epoch."""
+    rows: list[Row] = []
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        data = write_data(options.data, folder / "data.npz", options.images)
+        network = (f"model.depth={options.depth}", f"model.width={options.width}")
+        plain = plain_loop(data, options)
+        train(folder / "sure", data, options, *network, "augment=none")
+        make_sure(folder / "sure" / checkpoint.BEST)
+        plain()  # warms up
+        attacked = (*network, "augment=adversarial", f"train.init_from={folder}/sure", "train.learning_rate=1e-6")
+        for number in range(options.rounds):
+            none = train(folder / f"none_{number}", data, options, *network, "augment=none")
+            adversarial = train(folder / f"adversarial_{number}", data, options, *attacked)
+            loop, ours, attack = plain(), none["seconds/training"], adversarial["seconds/attack"]
+            rows.append(
+                {
+                    "round": number,
+                    "train_images_per_second": options.images / ours,
+                    "plain_loop_images_per_second": options.images / loop,
+                    "speedup": loop / ours,
+                    "attack_seconds": attack,
+                    "attack_steps": adversarial["augment/steps"],
+                    "attack_fraction_of_epoch": attack / (attack + ours * EPOCH_IMAGES / options.images),
+                }
+            )
+            print(rows[-1], flush=True)
+    median = {name: statistics.median(row[name] for row in rows) for name in rows[0] if name != "round"}
+    return [*rows, {"round": "median", **median}]
+
+
+# ---------------------------------------------------------------------------- renders
+
+
+def peak_memory() -> int:
+    """Bytes. What `getrusage` reports begins with the peak of the process that started this one."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM")))
+
+
+def attack_cost(renders: int, size: int, meshes: int, steps: int) -> Row:
+    """Seconds of one core that one round of attacks takes, against a WideResNet-10-1 that is sure of the class."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    network = WideResNet(10, 10, 1, 0.0).eval()
+    with torch.no_grad():
+        network.head.weight[0], network.head.bias[0] = 0, SURE
+    views, before, start = renders // (meshes * len(GRAYS)), peak_memory(), time.process_time()
+    service = AugmentationService.from_meshes(
+        [(f"solid:orange:{seed}", 0) for seed in range(meshes)],
+        size,
+        AugmentationSettings(attack=TrainingAttackSettings(max_steps=steps)),
+        views=views,
+        backgrounds=GRAYS,
+        samples=2,
+        rasterizer="numpy",
+    )
+    assert service.scene is not None
+    _ = service.scene.stacks  # what is precomputed of each view
+    built = time.process_time()
+    service.regenerate(network, 0)
+    attack = time.process_time() - built
+    return {
+        "renders": renders,
+        "size": size,
+        "meshes": meshes,
+        "views": views * meshes,
+        "steps": steps,
+        "precompute_seconds": built - start,
+        "attack_seconds": attack,
+        "ms_per_render_and_pass": 1e3 * attack / (renders * (steps + 1)),
+        "memory_mb": (peak_memory() - before) / 1e6,
+    }
+
+
+def renders(options: argparse.Namespace) -> list[Row]:
+    """A row per number of renders, per image size and per number of meshes, the others at their first value."""
+    few, size, meshes = options.numbers[0], options.sizes[0], options.meshes[0]
+    loads = [(number, size, meshes) for number in options.numbers]
+    loads += [(few, side, meshes) for side in options.sizes]
+    loads += [(few * count, size, count) for count in options.meshes]
+    rows = []
+    for load in dict.fromkeys(loads):
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            rows.append(pool.submit(attack_cost, *load, options.steps).result())
+        print(rows[-1], flush=True)
+    for first, second in itertools.pairwise(rows[: len(options.numbers)]):
+        ratio = second["attack_seconds"] / first["attack_seconds"]
+        print(f"{second['renders'] / first['renders']:g} times the renders: {ratio:.3g} times the seconds")
+    return rows
+
+
+def parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    command = commands.add_parser("speed", help="against a plain loop, and the attack's fraction of an epoch")
+    command.set_defaults(measure=speed)
+    command.add_argument("--data", type=Path, help=".npz file; default: random images like CIFAR-100's")
+    command.add_argument("--meshes", default="[solid:orange:0,solid:orange:1]", help="a list, as scene.meshes takes it")
+    command.add_argument("--images", type=int, default=512, help="per epoch that is timed")
+    command.add_argument("--rounds", type=int, default=5)
+    command.add_argument("--depth", type=int, default=16)
+    command.add_argument("--width", type=int, default=4)
+    command.add_argument("--workers", type=int, default=min(8, os.cpu_count() or 1), help="of the plain loop's loader")
+    command.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    command.add_argument("--overrides", nargs="*", default=[], help="further ones of `python -m train`")
+    command = commands.add_parser("renders", help="the cost of attacks over the number of renders")
+    command.set_defaults(measure=renders, device="cpu")
+    command.add_argument("--numbers", nargs="+", type=int, default=[100, 1000, 10_000], help="multiples of 5 × meshes")
+    command.add_argument("--sizes", nargs="+", type=int, default=[32, 64, 128, 224], help="pixels per side")
+    command.add_argument("--meshes", nargs="+", type=int, default=[1, 2, 4, 8])
+    command.add_argument("--steps", type=int, default=1)
+    for command in commands.choices.values():
+        command.add_argument("--csv", type=Path)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> list[Row]:
+    options = parser().parse_args(arguments)
+    print(machine(options.device))
+    rows = options.measure(options)
+    if options.csv:
+        write_csv(options.csv, rows)
+    return rows
+
+
+if __name__ == "__main__":
+    main()

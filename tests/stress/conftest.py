@@ -1,0 +1,170 @@
+"""A folder with one small good file of every kind that the project reads, and a finished run in it."""
+
+import contextlib
+import os
+import runpy
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from renderer import export_mesh, save_light, solid
+from renderer.light.environment import to_map, write_map
+from renderer.light.local import Lamps
+from renderer.light.presets import probe
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 300  # seconds for a process that should end
+RENDERER = ("renderer.rasterizer=numpy", "renderer.samples=1", "renderer.cache=null")
+TRAINING = (
+    *("data=npz", "data.path=data.npz", "data.validation=0.3", "compare=[]", "evaluate.photos=photographs"),
+    *("model.depth=10", "model.width=1", "model.dropout=0.3", "train.batch_size=16", "train.precision=float32"),
+    *("train.device=cpu", "train.threads=1", "train.learning_rate=0.02", "augment.examples=4"),
+    *("augment.attack.max_steps=2", "scene.meshes=[mesh.obj]", "scene.backgrounds=[0.2,0.8]", *RENDERER),
+)
+
+Process = subprocess.Popen[str]
+
+
+def colored_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
+    """Images (N, 3, 16, 16) uint8 whose channel `label` is a little brighter, so that accuracy changes for many
+    epochs."""
+    images = rng.integers(0, 245, (len(labels), 3, 16, 16))
+    images[np.arange(len(labels)), labels] += 10
+    return images.astype(np.uint8)
+
+
+def write_data(folder: Path) -> None:
+    """data.npz, class folders, photographs and the textured mesh.obj."""
+    rng = np.random.default_rng(0)
+    train, test = np.repeat(np.arange(3), 20), np.repeat(np.arange(3), 10)
+    np.savez(
+        folder / "data.npz",
+        train_images=colored_noise(rng, train),
+        train_labels=train,
+        test_images=colored_noise(rng, test),
+        test_labels=test,
+        classes=np.array(["apple", "orange", "pear"]),
+    )
+    for name in (
+        "images/apple",
+        "images/orange",
+        "photographs/orange",
+        "photographs/apple",
+        "photographs/other_tomato",
+    ):
+        (folder / name).mkdir(parents=True)
+        for number in range(3):
+            pixels = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
+            Image.fromarray(pixels).save(folder / name / f"{number}.png")
+    paths = [path.relative_to(folder / "photographs").as_posix() for path in sorted(folder.glob("photographs/*/*"))]
+    (folder / "photographs" / "photos.csv").write_text("path,source_tag\n" + "".join(f"{path},web\n" for path in paths))
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    lines = ["mtllib mesh.mtl", *(f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in sphere.vertices)]
+    lines += ["vt 0 0", "vt 1 0", "vt 0 1", "usemtl peel"]
+    lines += [f"f {a}/1 {b}/2 {c}/3" for a, b, c in sphere.faces + 1]
+    (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
+    (folder / "mesh.mtl").write_text("newmtl peel\nKd 1 0.5 0\nmap_Kd peel.png\n")
+    Image.new("RGB", (4, 4), "orange").save(folder / "peel.png")
+
+
+def write_scene_files(folder: Path) -> None:
+    """Meshes, lights, lamps, a projector's pattern and a background."""
+    sphere, light = trimesh.creation.icosphere(subdivisions=2), probe("grace")
+    export_mesh(solid("lemon", 0), folder / "mesh.glb")
+    export_mesh(solid("lemon", 0), folder / "mesh.ply")
+    sphere.export(folder / "mesh.stl")
+    sphere.export(folder / "mesh.off")
+    for name in ("light.npy", "light.hdr", "light.exr"):
+        write_map(folder / name, to_map(light, 8))
+    save_light(folder / "light.json", light)
+    save_light(folder / "lamps.json", torch.ones(2, 3), Lamps(((2.0, 2.0, 2.0), (-2.0, 2.0, 2.0))))
+    for name in ("background.png", "pattern.png"):
+        Image.new("RGB", (20, 24), "gray").save(folder / name)
+
+
+def run_here(name: str, *arguments: str, folder: Path) -> int:
+    """`python -m train` or `python scripts/NAME.py` within this process, in a folder: the exit status."""
+    path = ROOT / "train" / "__main__.py" if name == "train" else ROOT / "scripts" / f"{name}.py"
+    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
+        patch.setattr(sys, "argv", [str(path), *arguments])
+        try:
+            runpy.run_path(str(path), run_name="__main__")
+        except SystemExit as stop:
+            return int(stop.code or 0)
+    return 0
+
+
+def start_command(
+    *arguments: str, folder: Path, limit: Callable[[], object] = lambda: None, **environment: str
+) -> Process:
+    """`python` with these arguments in a process of its own, in a folder; the words of scripts/ are the project's.
+
+    It heeds Ctrl-C even if the tests run in the background. limit: is called in the process before Python starts.
+    """
+
+    def prepare() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        limit()
+
+    return subprocess.Popen(
+        [sys.executable, *(str(ROOT / word) if word.startswith("scripts/") else word for word in arguments)],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=prepare,
+    )
+
+
+def end(process: Process) -> tuple[int, str, str]:
+    """Status, output and errors, once it has ended by itself."""
+    try:
+        output, errors = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    return process.returncode, output, errors
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory) -> Path:
+    """The folder of what a training run reads."""
+    folder = tmp_path_factory.mktemp("data")
+    write_data(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def corpus(tmp_path_factory) -> Path:
+    """A folder of good files, and a finished run of two epochs in finished/, its network also in published/."""
+    folder = tmp_path_factory.mktemp("corpus")
+    write_data(folder)
+    write_scene_files(folder)
+    assert run_here("train", "run=finished", "train.epochs=2", *TRAINING, folder=folder) == 0
+    assert run_here("publish", "run=finished", "out=published", folder=folder) == 0
+    return folder
+
+
+class Hang(BaseException):
+    """Raised by the alarm; no handler of errors catches it."""
+
+
+@pytest.fixture
+def time_limit() -> Iterator[Callable[[float], object]]:
+    """Ends with `Hang` what takes longer than so many seconds."""
+
+    def ring(*_: object) -> None:
+        raise Hang
+
+    before = signal.signal(signal.SIGALRM, ring)
+    yield lambda seconds: signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, before)

@@ -1,0 +1,400 @@
+"""Damaged and forged files, given to whatever reads them: each is used with finite results, or refused in one sentence.
+
+Never another exception, a hang, or code run from data. By default a small fixed sample; `-m slow` tries many more.
+"""
+
+import io
+import json
+import os
+import re
+import resource
+import shutil
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from augment import utils
+from augment.backgrounds import load_background
+from renderer import InputError, load_light, load_mesh
+from train.data import load_folder, load_npz
+from train.run_folder import checkpoint
+
+from .conftest import RENDERER, TRAINING, Hang, run_here
+
+CODE_RAN = "code_ran"  # a file that appears in the working folder where a reader runs code from its input
+SECONDS = 60
+MEMORY = 12 * 2**30  # bytes of address space beyond today's: what asks for more fails here, and not the machine
+
+MESHES = ("mesh.obj", "mesh.glb", "mesh.ply", "mesh.stl", "mesh.off")
+READERS: dict[str, Callable[[Path], Any]] = {  # the library's, by the file that is damaged
+    **dict.fromkeys(MESHES, load_mesh),
+    "mesh.mtl": lambda path: load_mesh(path.with_name("mesh.obj")),
+    "peel.png": lambda path: load_mesh(path.with_name("mesh.obj")),
+    **dict.fromkeys(("light.npy", "light.hdr", "light.exr", "light.json"), lambda path: load_light(str(path))),
+    "background.png": lambda path: load_background(str(path), 16),
+    "data.npz": lambda path: load_npz(str(path)),
+    "images/apple/0.png": lambda path: load_folder(str(path.parents[1]), 16, 0.3),
+}
+PHOTOGRAPHS = ("evaluate_photos", "photos=photographs", "run=finished", "out=out", "device=cpu", "precision=float32")
+ATTACK = (
+    *("attack", "classifier=run:finished", "scene.meshes=[mesh.obj]", "out=out", "device=cpu", "attack.max_steps=1"),
+    *("attack.force=true", "attack.checks=false", *RENDERER),
+)
+RESUME = ("train", "run=finished", *TRAINING, "train.epochs=3", "train.resume=true")
+COMPARE = ("compare_runs", "runs=[finished]")
+COMMANDS: dict[str, tuple[str, ...]] = {  # that read the file
+    "finished/best.pt": PHOTOGRAPHS,
+    "published/model.safetensors": tuple(word.replace("run=finished", "run=published") for word in PHOTOGRAPHS),
+    "finished/last.pt": RESUME,
+    "finished/config.yaml": RESUME,
+    "finished/metrics.jsonl": COMPARE,
+    "finished/photographs/summary.json": COMPARE,
+    "finished/photographs/photographs.csv": COMPARE,
+    "photographs/orange/0.png": PHOTOGRAPHS,
+    "photographs/photos.csv": PHOTOGRAPHS,
+    "lamps.json": (*ATTACK, "attack=lamps", "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: lamps.json}"),
+    "pattern.png": (*ATTACK, "attack=projector", "scene.projector={pixels: 4, pattern: pattern.png}"),
+}
+QUICK, MANY = 8, 100  # examples; a command takes longer: a fifth of them
+SLOW_COMMANDS = [file for file in COMMANDS if COMMANDS[file] == RESUME]  # they train
+
+
+# ---------------------------------------------------------------------------------------- damages at random
+
+NUMBER = re.compile(rb"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
+TOKENS = (b"nan", b"inf", b"-1", b"0", b"1e300", b"1e-300", b"9" * 19, b"9" * 400, b"word", b"[]", b"null", b"")
+OTHER = (
+    b"",
+    bytes(1000),
+    np.random.default_rng(0).bytes(1000),
+    b"<html>404</html>\n",
+    b"[" * 10**5,
+    b"1",
+    b"[]",
+    b"{}",
+)
+VALUES = (-1, 0, 10**9, 10**30, float("nan"), float("inf"), "word", None, [], {}, [1, "a"])
+ARRAY_EDITS: tuple[Callable[[np.ndarray], np.ndarray | None], ...] = (
+    lambda values: None,
+    lambda values: values[:0],
+    lambda values: values[: len(values) // 2],
+    lambda values: values[..., None],
+    lambda values: values.T,
+    lambda values: np.full(values.shape, np.nan),
+    lambda values: np.full(values.shape, 2**63 + 1, np.uint64),
+    lambda values: np.full(values.shape, -1),
+    lambda values: np.full(values.shape, "word"),
+    lambda values: np.full(values.shape, 1j),
+    lambda values: np.full(values.shape, {}, dtype=object),
+)
+TENSOR_EDITS: tuple[Callable[[torch.Tensor], Any], ...] = (
+    lambda values: values.float() * torch.nan,
+    lambda values: values[..., None],
+    lambda values: values.double(),
+    lambda values: values.reshape(-1)[:0],
+    lambda values: values.to(torch.complex64),
+    lambda values: "word",
+)
+
+
+@st.composite
+def bytes_changed(draw: st.DrawFn, good: bytes) -> bytes:
+    """Cut, with flipped bytes, with one number replaced, or another file altogether."""
+    numbers = [found.span() for found in NUMBER.finditer(good)]
+    kind = draw(st.sampled_from(["cut", "flip", "other", *(["number"] * 3 if numbers else [])]))
+    if kind == "cut":
+        return good[: draw(st.integers(0, len(good) - 1))]
+    if kind == "other":
+        return draw(st.sampled_from(OTHER))
+    if kind == "number":
+        begin, end = numbers[draw(st.integers(0, len(numbers) - 1))]
+        token = draw(st.sampled_from(TOKENS))
+        return good[:begin] + token.ljust(end - begin) + good[end:]  # padded: headers of binary files keep their length
+    changed = bytearray(good)
+    for place in draw(st.lists(st.integers(0, len(good) - 1), min_size=1, max_size=8)):
+        changed[place] ^= draw(st.integers(1, 255))
+    return bytes(changed)
+
+
+@st.composite
+def arrays_changed(draw: st.DrawFn, good: bytes) -> bytes:
+    """An .npz file, one of whose arrays is of another type or shape, or is missing."""
+    arrays = dict(np.load(io.BytesIO(good)))
+    name, edit = draw(st.sampled_from(sorted(arrays))), draw(st.sampled_from(ARRAY_EDITS))
+    arrays[name] = edit(arrays[name])
+    content = io.BytesIO()
+    np.savez(content, **{name: values for name, values in arrays.items() if values is not None})
+    return content.getvalue()
+
+
+def leaves(tree: Any, keys: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The keys to every value in nested mappings, inner nodes included."""
+    if keys:
+        yield keys
+    if isinstance(tree, Mapping):
+        for key, value in tree.items():
+            yield from leaves(value, (*keys, key))
+
+
+@st.composite
+def checkpoint_changed(draw: st.DrawFn, good: bytes) -> bytes:
+    """A checkpoint, one of whose values is another, with a hash that is right."""
+    state = torch.load(io.BytesIO(good), weights_only=True)
+    state.pop(checkpoint.HASH)
+    *outer, last = draw(st.sampled_from(list(leaves(state))))
+    node = state
+    for key in outer:
+        node = node[key]
+    if isinstance(node[last], torch.Tensor):
+        node[last] = draw(st.sampled_from(TENSOR_EDITS))(node[last])
+    else:
+        node[last] = draw(st.sampled_from(VALUES))
+    content = io.BytesIO()
+    torch.save({**state, checkpoint.HASH: checkpoint.content_hash(state)}, content)
+    return content.getvalue()
+
+
+def damages(file: str, good: bytes) -> st.SearchStrategy[bytes]:
+    if file.endswith(".npz"):
+        return bytes_changed(good) | arrays_changed(good)
+    return bytes_changed(good) | checkpoint_changed(good) if file.endswith(".pt") else bytes_changed(good)
+
+
+# ---------------------------------------------------------------------------------------- reading
+
+
+@pytest.fixture(autouse=True)
+def memory_limit() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@pytest.fixture
+def outcome(corpus, tmp_path, capfd, time_limit) -> Callable[[str, Callable[[Path], object]], str | None]:
+    """Gives what edits a file of a copy of the corpus, and reads it: the sentence of a refusal, None for a good result.
+
+    Fails for everything else.
+    """
+    folder = tmp_path / "copy"
+
+    def read(file: str, edit: Callable[[Path], object]) -> str | None:
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(corpus, folder)
+        edit(folder / file)
+        time_limit(SECONDS)
+        try:
+            sentence = _by_library(file) if file in READERS else _by_command(file)
+        except Hang:
+            pytest.fail(f"{file} was read for more than {SECONDS} s")
+        finally:
+            time_limit(0)
+        assert not list(folder.glob(f"**/{CODE_RAN}")), "code ran"
+        if sentence is not None:
+            assert "\n" not in sentence and any(name in sentence for name in (*Path(file).parts, "mesh.obj")), sentence
+        return sentence
+
+    def _by_library(file: str) -> str | None:
+        try:
+            require_finite(READERS[file](folder / file))
+        except InputError as error:
+            return str(error)
+        return None
+
+    def _by_command(file: str) -> str | None:
+        capfd.readouterr()
+        name, *arguments = COMMANDS[file]
+        status = run_here(name, *arguments, folder=folder)
+        errors = capfd.readouterr().err
+        assert status in (0, 2), errors
+        if status == 0:
+            return None
+        assert errors.startswith("error: ") and errors.count("\n") == 1, errors
+        return errors.removeprefix("error: ").rstrip("\n")
+
+    return read
+
+
+def require_finite(result: Any) -> None:
+    """Of every float in tensors, arrays and the fields of nested values."""
+    if isinstance(result, torch.Tensor | np.ndarray):
+        values = torch.as_tensor(result)
+        assert not values.is_floating_point() or values.isfinite().all()
+    elif isinstance(result, list | tuple):
+        for part in result:
+            require_finite(part)
+    elif hasattr(result, "__dict__"):
+        require_finite(list(vars(result).values()))
+
+
+@pytest.mark.filterwarnings("ignore")  # libraries warn of what they then refuse or read
+@pytest.mark.parametrize(
+    "file, examples",
+    [
+        *((file, QUICK) for file in READERS),
+        *(pytest.param(file, MANY, marks=pytest.mark.slow) for file in READERS),
+        *(pytest.param(file, MANY // 5, marks=pytest.mark.slow) for file in COMMANDS),
+    ],
+)
+def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(corpus, outcome, file, examples):
+    @settings(
+        max_examples=examples,
+        derandomize=examples == QUICK,
+        deadline=None,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(content=damages(file, (corpus / file).read_bytes()))
+    def used_or_refused(content: bytes) -> None:
+        outcome(file, lambda path: path.write_bytes(content))
+
+    used_or_refused()
+
+
+# ---------------------------------------------------------------------------------------- forgeries
+
+
+def pickled_code(path: Path) -> None:
+    class Code:
+        def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+            return os.system, (f"touch {CODE_RAN}",)
+
+    torch.save(Code(), path)
+
+
+def before(path: Path) -> Path:
+    return path.with_name(checkpoint.PREVIOUS)
+
+
+def npy_header(shape: str) -> bytes:
+    """A file that ends after the header."""
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+
+
+def zip_bomb(path: Path) -> None:
+    """Arrays of 10 TB, by their headers, in a small file."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (10**13,)})
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("train_images", "train_labels", "test_images", "test_labels", "classes"):
+            archive.writestr(f"{name}.npy", header.getvalue() + bytes(10**6))
+
+
+def huge_png() -> bytes:
+    """A small file whose header says 10¹⁰ pixels."""
+
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 10**5, 10**5, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(bytes(10**6))) + chunk(b"IEND", b"")
+
+
+def safetensors(**header: object) -> bytes:
+    """A file that ends after the header."""
+    text = json.dumps(header).encode()
+    return struct.pack("<Q", len(text)) + text
+
+
+PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face 1\n"
+PLY += "property list uchar int vertex_indices\nend_header\n{}\n"
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+DEEP = {"depth": 10**9, "width": 1, "dropout": 0, "classes": ["a"]}
+YAML_BOMB = "a: &a [1, 1, 1]\n" + "".join(
+    f"{letter}: &{letter} [{', '.join(9 * [f'*{before}'])}]\n"
+    for before, letter in zip("abcdefgh", "bcdefghi", strict=True)
+)
+FORGED: list[tuple[str, str, str | bytes | Callable[[Path], object]]] = [  # file, what is wrong with it, the content
+    ("mesh.obj", "no faces", "v 0 0 0\n"),
+    ("mesh.obj", "zero area", "v 0 0 0\n" * 3 + "f 1 2 3\n"),
+    ("mesh.obj", "NaN", "v nan 0 0\n" + TRIANGLE + "f 1 2 3\n"),
+    ("mesh.obj", "1e200", TRIANGLE.replace("1", "1e200") + "f 1 2 3\n"),
+    ("mesh.obj", "a vertex that does not exist", TRIANGLE + "f 1 2 9\n"),
+    ("mesh.obj", "vertex 10¹²", TRIANGLE + "f 1 2 1000000000000\n"),
+    ("mesh.obj", "no such material library", "mtllib gone.mtl\nusemtl a\n" + TRIANGLE + "f 1 2 3\n"),
+    ("mesh.mtl", "no such texture", "newmtl peel\nmap_Kd gone.png\n"),
+    ("mesh.mtl", "a color of NaN", "newmtl peel\nKd nan nan nan\n"),
+    ("mesh.ply", "10¹² vertices", PLY.format(10**12, "0 0 0")),
+    ("mesh.ply", "a negative vertex", PLY.format(3, "0 0 0\n1 0 0\n0 1 0\n3 0 1 -2")),
+    ("mesh.stl", "2³² faces", bytes(80) + b"\xff\xff\xff\xff" + bytes(50)),
+    ("mesh.off", "10¹² vertices", "OFF\n1000000000000 1 0\n0 0 0\n"),
+    ("light.npy", "10 TB", npy_header("(1000000, 1000000, 3)")),
+    ("light.npy", "code for a shape", npy_header("__import__('os').getcwd()")),
+    ("light.npy", "objects", lambda path: np.save(path, np.array([[{}]], dtype=object), allow_pickle=True)),
+    ("light.npy", "black", lambda path: np.save(path, np.zeros((4, 8, 3), np.float32))),
+    ("light.npy", "NaN", lambda path: np.save(path, np.full((4, 8, 3), np.nan))),
+    ("light.hdr", "10⁹ wide", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1000000000 +X 1000000000\n"),
+    ("light.json", "NaN", json.dumps([[float("nan")] * 3] * 49)),
+    ("light.json", "another basis", '{"basis": "word", "coefficients": [[1, 1, 1]]}'),
+    ("background.png", "10¹⁰ pixels", huge_png()),
+    ("photographs/orange/0.png", "10¹⁰ pixels", huge_png()),
+    ("data.npz", "10 TB", zip_bomb),
+    ("finished/best.pt", "code", pickled_code),
+    ("finished/last.pt", "code, and none before it", lambda path: (pickled_code(path), before(path).unlink())),
+    (
+        "published/model.safetensors",
+        "10 TB",
+        safetensors(a={"dtype": "F32", "shape": [10**13], "data_offsets": [0, 4]}),
+    ),
+    ("published/model.safetensors", "depth 10⁹", safetensors(__metadata__={"architecture": json.dumps(DEEP)})),
+    ("finished/config.yaml", "code", f"a: !!python/object/apply:os.system ['touch {CODE_RAN}']\n"),
+    ("finished/config.yaml", "aliases of 9⁸ items", YAML_BOMB),
+    ("finished/metrics.jsonl", "words", '{"epoch": "x"}\n'),
+    ("photographs/photos.csv", "a photograph that does not exist", "path,source_tag\nnowhere.png,web\n"),
+]
+INSTEAD: dict[str, Callable[[Path], object]] = {
+    "a folder": Path.mkdir,
+    "a pipe": os.mkfifo,
+    "a link to itself": lambda path: path.symlink_to(path.name),
+}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "file, content",
+    [
+        pytest.param(file, content, id=f"{file}: {fault}", marks=[pytest.mark.slow] if file in SLOW_COMMANDS else [])
+        for file, fault, content in FORGED
+    ],
+)
+def test_a_forged_file_is_refused(outcome, file, content):
+    if callable(content):
+        edit = content
+    else:
+        edit = partial(Path.write_bytes, data=content.encode() if isinstance(content, str) else content)
+    assert outcome(file, edit) is not None
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("instead", INSTEAD)
+@pytest.mark.parametrize("file", [file for file in READERS if file != "images/apple/0.png"])  # a folder may be there
+def test_what_is_no_file_is_refused(outcome, file, instead):
+    def edit(path: Path) -> None:
+        path.unlink()
+        INSTEAD[instead](path)
+
+    assert outcome(file, edit) is not None
+
+
+# ---------------------------------------------------------------------------------------- too much
+
+
+def test_renders_beyond_the_memory_are_refused_before_any_is_made(data, capfd, tmp_path, monkeypatch):
+    monkeypatch.setattr(utils, "_free", lambda device: 2**30)
+    asked = [word.replace("examples=4", "examples=200000") for word in TRAINING]
+    assert run_here("train", f"run={tmp_path}/run", *asked, folder=data) == 2
+    errors = capfd.readouterr().err
+    assert re.fullmatch(r"error: 200000 renders of 16 pixels per side .* and 1\.0 GB are free: .*\n", errors)

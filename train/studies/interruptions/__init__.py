@@ -1,1 +1,0 @@
-"""Training runs that are interrupted in many ways, and whether they end as if nothing had happened."""

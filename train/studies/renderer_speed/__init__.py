@@ -1,1 +1,0 @@
-"""A timer that other studies use."""
