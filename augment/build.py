@@ -12,10 +12,9 @@ from torch import Tensor
 from augment.backgrounds import load_background, load_backgrounds
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
-from renderer.arguments import as_device, checked, require_fields
 from renderer.cache import OperatorCache
 from renderer.camera import orbit_cameras
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import FACTOR, InputError, as_device, require_range
 from renderer.image import ImageSettings
 from renderer.io.lights import read_light
 from renderer.light.basis import with_local_lights
@@ -39,9 +38,6 @@ class ProjectorSettings:
     power: float = 1.0
     pattern: Any = 0.0
 
-    def __post_init__(self) -> None:
-        require_fields(self)
-
     def build(self) -> tuple[Projector, Tensor]:
         """The basis, and the pattern (pixels², 3)."""
         require_range("scene.projector.polar", self.polar, 0, 180)
@@ -63,9 +59,6 @@ class LampsSettings:
     power: float = 10.0
     radius: float = 0.0
     start: Any = 0.0
-
-    def __post_init__(self) -> None:
-        require_fields(self)
 
     def build(self) -> tuple[Lamps, Tensor]:
         """The basis, and the powers (L, 3)."""
@@ -89,7 +82,6 @@ Shown = str | Path | Mesh
 Member = ObjectSettings | tuple[Shown, str]
 
 
-@checked
 def build_scene(
     meshes: Sequence[Member],
     size: int,

@@ -15,7 +15,6 @@ from augment.objects import SceneObject
 from augment.relighting import Layer, OperatorStack, Relighting, in_place
 from augment.reshading import Reshading
 from augment.utils import require_memory
-from renderer.arguments import checked, require_fields
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
@@ -83,7 +82,6 @@ class Scene:
     camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
-        require_fields(self)
         self._require_consistent()
         self.examples = [self._seen_whole(example) for example in self.examples]
         self.backgrounds = self.backgrounds.to(self.lights)
@@ -129,7 +127,6 @@ class Scene:
         return Relighting(self.objects, seen, behind_images, self.backgrounds.flatten(2), settings, build)
 
     @classmethod
-    @checked
     def grid(
         cls,
         objects: Sequence[SceneObject],

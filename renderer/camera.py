@@ -10,7 +10,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from renderer.arguments import checked, require_fields
 from renderer.errors import LARGEST, InputError, require_range
 
 REACH = 2.0  # enough for a normalized mesh, whose radius is at most √3
@@ -39,7 +38,6 @@ class Camera(ABC):
     distance: ClassVar[float]
 
     def __post_init__(self) -> None:
-        require_fields(self)
         require_range("scene.width", self.width, 1 / LARGEST, LARGEST)
         require_range("a camera's reach", self.reach, 1 / LARGEST, LARGEST)
         for name in ("polar", "azimuth", "right", "up"):
@@ -136,7 +134,6 @@ class PerspectiveCamera(Camera):
         return depths
 
 
-@checked
 def orbit_cameras(
     views: int, width: float, polar: float = math.pi / 3, azimuth: float = 0.0, fov: float | None = None
 ) -> list[Camera]:

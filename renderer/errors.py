@@ -28,6 +28,14 @@ def is_out_of_memory(error: Exception) -> bool:
     return isinstance(error, torch.OutOfMemoryError | MemoryError) or "can't allocate memory" in str(error)
 
 
+def as_device(device: torch.device | str) -> torch.device:
+    """InputError where it is not a device, or not one of this machine."""
+    try:
+        return torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError) as error:  # torch without CUDA asserts
+        raise InputError(f"device={device} is not available here: use cpu, or cuda where there is a GPU") from error
+
+
 def require_file(path: Path, advice: str) -> None:
     """InputError naming what is no regular file: a pipe would be waited for."""
     if not os.path.isfile(path):  # False, too, where the name is none or its folder closed

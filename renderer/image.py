@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.arguments import require_fields
 from renderer.errors import InputError, require_bounded, require_choice, require_range
 
 if TYPE_CHECKING:
@@ -39,7 +38,6 @@ class ImageSettings:
     bounces: int = 0
 
     def __post_init__(self) -> None:
-        require_fields(self)
         require_range("size", self.size, 1, MOST_SAMPLES)
         require_range("renderer.samples", self.samples, 1, FINEST)
         if self.size * self.samples > MOST_SAMPLES:

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from renderer.arguments import checked, require_fields
 from renderer.errors import LARGEST, InputError, require_choice
 
 Y_UP_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
@@ -42,7 +41,6 @@ class Mesh:
     textures: tuple[np.ndarray, ...] = ()
 
     def __post_init__(self) -> None:
-        require_fields(self)
         count = self.faces.shape[:1]
         _require_shape("vertices", self.vertices, (*self.vertices.shape[:1], 3))
         _require_shape("faces", self.faces, (*count, 3), "iu")
@@ -151,7 +149,6 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-@checked
 def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     """Read a mesh with its colors and textures from .glb, .gltf, .obj, .ply, .stl or what else trimesh reads.
 
@@ -181,7 +178,6 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     return transformed(mesh, Y_UP_TO_Z_UP) if up == "y" or (up == "auto" and is_gltf) else mesh
 
 
-@checked
 def normalize(mesh: Mesh) -> Mesh:
     """Move the area-weighted centroid of the faces to the origin and scale the largest |coordinate| to 1, rounded to
     float32: so files hold the vertices exactly, and what is read back covers the same pixels.

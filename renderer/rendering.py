@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo, textured_albedo
-from renderer.arguments import checked
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 _choose = cache(choose)  # "auto" asks the driver, which takes longer than an image
 
 
-@checked
 def render(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],
@@ -85,7 +83,6 @@ def render(
     return torch.stack(images)
 
 
-@checked
 def precompute_transfer(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],

@@ -14,7 +14,6 @@ from difflib import get_close_matches
 import numpy as np
 from numpy.typing import ArrayLike
 
-from renderer.arguments import checked
 from renderer.errors import InputError, require_range
 from renderer.mesh import Mesh, concatenate
 
@@ -24,7 +23,6 @@ SEGMENTS = 48  # faces around an axis of revolution
 STEP = 0.1  # longest edge along a profile, in world units
 
 
-@checked
 def solid(name: str, seed: int = 0) -> Mesh:
     """The instance that `seed` picks of the solid `name`; InputError for a name that is in neither registry."""
     require_range("seed", seed, 0, 2**63 - 1)

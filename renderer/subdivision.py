@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from renderer.arguments import checked
 from renderer.errors import require_range
 from renderer.mesh import Mesh
 
@@ -15,7 +14,6 @@ _EDGES = ((0, 1), (1, 2), (2, 0))
 _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and the middles of the edges as 3 to 5
 
 
-@checked
 def subdivide(mesh: Mesh, vertices: int) -> Mesh:
     """The same surface with more than so many vertices: each face becomes four, as often as it takes.
 

@@ -18,9 +18,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import linear
 
 from renderer.albedo import surface_albedo
-from renderer.arguments import as_device, checked
 from renderer.camera import Camera
-from renderer.errors import InputError, require_bounded
+from renderer.errors import InputError, as_device, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, composite
 from renderer.light.basis import HARMONICS, Basis, EnvironmentBasis, LocalBasis, parts_of
@@ -64,7 +63,6 @@ class TransferOperator:
     basis: Basis = HARMONICS
     sparse: SparseTransfer | None = None
 
-    @checked
     def image(
         self, lights: Float[Tensor, "*lights coefficients 3"], background: float | Tensor = 0.5
     ) -> Float[Tensor, "*lights 3 size size"]:
@@ -116,7 +114,6 @@ class TransferOperator:
             gradient = gradient + entries.light_gradient(upstream, image, self.basis.size).view_as(gradient)
         return gradient.to(radiance_gradient.dtype)
 
-    @checked
     def to(self, device: torch.device | str) -> TransferOperator:
         """The same on another device."""
         device = as_device(device)

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from augment import utils
 from augment.labels import divergence, is_right, label_loss, ranking_loss
-from renderer.arguments import as_device
-from renderer.errors import InputError, require_choice
+from renderer.errors import InputError, as_device, require_choice
 from renderer.image import to_unit
 from train.run_folder.logs import console
 

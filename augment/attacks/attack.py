@@ -20,7 +20,6 @@ from augment.classifiers.adapter import Classifier
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from augment.utils import BatchSize, Phases, generator
-from renderer.arguments import checked, require_fields
 from renderer.errors import InputError, require_range
 
 if TYPE_CHECKING:
@@ -51,7 +50,6 @@ class AttackSettings(DescentSettings):
     eot: EOTSettings = field(default_factory=EOTSettings)
 
     def __post_init__(self) -> None:
-        require_fields(self)
         super().__post_init__()
         if self.lighting and self.skylight:
             raise InputError("attack: lighting and skylight both set the light: choose one of them")
@@ -151,14 +149,12 @@ class AttackResult:
 
         return check(self)
 
-    @checked
     def sweep(self, scales: Sequence[float]) -> Sweep:
         """Success against the radius of the norm-balls: see `augment.attacks.evaluate.sweep`."""
         from augment.attacks.evaluate import sweep
 
         return sweep(self, scales)
 
-    @checked
     def transfer(
         self,
         classifiers: Sequence[Classifier] = (),
@@ -170,7 +166,6 @@ class AttackResult:
 
         return transfer(self, classifiers, azimuths, objects)
 
-    @checked
     def save(
         self, folder: str | Path, checks: Checks | None = None, verify: Sequence[str] = ("reload",)
     ) -> list[RerenderCheck]:
@@ -183,7 +178,6 @@ class AttackResult:
         return write_files(self, checks, Path(folder), verify)
 
 
-@checked
 def attack(
     classifier: Classifier,
     scene: Scene,

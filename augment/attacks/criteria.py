@@ -12,7 +12,6 @@ from torch import Tensor
 
 from augment.classifiers.adapter import Classifier
 from augment.labels import require_known
-from renderer.arguments import require_fields
 from renderer.errors import InputError
 
 if TYPE_CHECKING:
@@ -98,9 +97,6 @@ class Targeted:
     """A class by name for all images, or a list of them, one for each of the views that share what is attacked."""
 
     classes: str | Sequence[str]
-
-    def __post_init__(self) -> None:
-        require_fields(self)
 
     def targets(self, logits: Tensor, classifier: Classifier) -> Tensor:
         views = logits.shape[1]

@@ -14,7 +14,6 @@ from augment.attacks.attack import AttackResult, predictions
 from augment.attacks.evaluate import Checks, RerenderCheck, require_renderers, verify
 from augment.attacks.figure import Panel, prediction_caption, save_figure
 from augment.scene import Conditions
-from renderer.arguments import checked
 from renderer.io.mesh_damage import mesh_damage
 from renderer.light.basis import Basis
 from renderer.light.light_sphere import light_sphere
@@ -23,7 +22,6 @@ LINES = "attack.jsonl"  # a line per example, and a last one with the checks
 SPHERE = 192
 
 
-@checked
 def write_files(
     attacked: AttackResult, checks: Checks | None, folder: Path, renderers: Sequence[str] = ("reload",)
 ) -> list[RerenderCheck]:

@@ -14,7 +14,6 @@ from torch.nn.utils.rnn import pad_sequence
 
 from augment.attacks.norm_ball import NormBall, anywhere
 from augment.scene import Conditions, Scene
-from renderer.arguments import require_fields
 from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
 from renderer.light.basis import EnvironmentBasis, LocalBasis, parts_of
 from renderer.light.convex import Ball, nearest_in_box
@@ -36,7 +35,6 @@ class StepSettings(NormBall):
     step_size: float = 0.05
 
     def __post_init__(self) -> None:
-        require_fields(self)
         super().__post_init__()
         require_choice("attack: step", self.step, STEPS)
         require_range("attack: step_size", self.step_size, 1 / LARGEST, FACTOR)

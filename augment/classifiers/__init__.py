@@ -15,7 +15,6 @@ from augment.classifiers.imagenet import (
     load_torchvision,
 )
 from augment.classifiers.python_function import load_python
-from renderer.arguments import checked
 from renderer.errors import InputError
 
 __all__ = ["SOURCES", "Classifier", "load_classifier"]
@@ -29,7 +28,6 @@ SOURCES: Mapping[str, Callable[..., Classifier]] = {
 }
 
 
-@checked
 def load_classifier(
     name: str, weights: str | Path | None = None, sources: Mapping[str, Callable[..., Classifier]] = SOURCES
 ) -> Classifier:

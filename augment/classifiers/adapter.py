@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Self
 import torch
 from torch import Tensor, nn
 
-from renderer.arguments import checked
 from renderer.errors import InputError, is_out_of_memory, require_range
 from renderer.image import LARGEST_SIZE
 
@@ -25,7 +24,6 @@ class Classifier(nn.Module):
     the C names, each once. The parameters need no gradient and the mode is eval, whatever `train` is told.
     """
 
-    @checked
     def __init__(self, function: Callable[[Tensor], Tensor], size: int, classes: Sequence[str], name: str = "callable"):
         """function: any callable from such images to logits. A module is moved with this one, frozen and put in eval
         mode. InputError for a class name that occurs twice, since labels are found by name, and a size beyond 4,096."""
@@ -41,7 +39,6 @@ class Classifier(nn.Module):
             raise InputError(f"classifier={name} has no classes: name them, in the order of its logits")
         self.requires_grad_(False).eval()
 
-    @checked
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
         """InputError for images of another size, and for a callable that fails or gives no logits, such that are not
         finite or none with a gradient."""
@@ -78,7 +75,6 @@ class Classifier(nn.Module):
         """Stays in eval mode: running batch statistics, no dropout."""
         return super().train(False)
 
-    @checked
     def label(self, class_name: str) -> int:
         """The index of a class; InputError with the nearest names for one that the classifier lacks."""
         return class_index(self.classes, class_name, f"classifier={self.name}")

@@ -10,7 +10,6 @@ import torch
 from PIL import Image
 
 from renderer.albedo import bilinear, mesh_textures
-from renderer.arguments import checked
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, require_choice
 from renderer.image import NORMALS, decode, encode
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
 _COLOR, _NORMAL = "_COLOR_0", "_NORMAL"
 
 
-@checked
 def export_mesh(
     mesh: Mesh, path: str | Path, normals: str = "smooth", cameras: Sequence[Camera] = (), first: int | None = None
 ) -> None:

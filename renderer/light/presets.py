@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from renderer.arguments import checked
 from renderer.errors import FACTOR, InputError, require_bounded
 from renderer.io.lights import read_light
 from renderer.light.basis import HARMONICS, Harmonics
@@ -37,7 +36,6 @@ _PUBLISHED_PROBES = {
 PROBES, UNIFORM = tuple(_PUBLISHED_PROBES), "uniform"
 
 
-@checked
 def load_light(light: str) -> Tensor:
     """Coefficients (49, 3) float32 of a named probe, of `uniform` light, in which a surface shows its albedo, of an
     environment map's file (.npy, .hdr, .exr) or of a file of coefficients (.json, as `renderer.save_light` writes it).
