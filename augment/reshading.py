@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, cached_property, partial, reduce
+from functools import cache, cached_property, partial
 
 import numpy as np
 import torch
@@ -13,12 +13,11 @@ from renderer.albedo import painted_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
-from renderer.light.basis import Basis, LightPaths, LocalBasis, parts_of
-from renderer.light.local import Lamps
+from renderer.light.basis import Basis, parts_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.shading import radiance
-from renderer.transport.local import lit, local_radiance
+from renderer.rendering import view_radiance
+from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
@@ -93,33 +92,6 @@ def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
     """(3, size²) the sum of the samples' albedo (S, 3) over each pixel."""
     pixel = fragments.pixels[fragments.pixel]
     return albedo.new_zeros(3, fragments.size**2).index_add(1, pixel, albedo.T)
-
-
-class LocalLightView:
-    """A view of one shape, computed on the CPU, which casts the rays: once for what stays in its place, and anew for
-    lamps at other places. Which lamps and which pixel of a pattern reach a sample is held in derivatives."""
-
-    def __init__(
-        self, rays: Rays, mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None
-    ):
-        """rays: among the shape's faces. vertices: the shape's (V, 3), where they are not the mesh's."""
-        vertices = None if vertices is None else vertices.cpu()
-        self._rays, self._surface = rays, Surface.of(mesh, fragments.to("cpu"), settings, vertices)
-        self._standing: dict[LocalBasis, LightPaths] = {}
-
-    def radiance(self, basis: LocalBasis, albedo: Tensor, light: Tensor, positions: Tensor | None) -> Tensor:
-        """(3, P) of one basis with a light (size, 3), in its dtype and device, and albedo (S, 3) at the samples;
-        differentiable in both, in the vertices and in the places (L, 3) of lamps, None where they stand."""
-        reach = self._reach(basis, positions)
-        return local_radiance(self._surface.fragments, albedo.cpu().double(), reach, light.cpu().double()).to(light)
-
-    def _reach(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:
-        points, normals = self._surface.points, self._surface.normals
-        if isinstance(basis, Lamps) and positions is not None:
-            return lit(self._rays, self._surface, basis.connect(points, normals, positions.cpu().double()))
-        if basis not in self._standing:
-            self._standing[basis] = lit(self._rays, self._surface, basis.connect(points, normals))
-        return self._standing[basis]
 
 
 class Reshading:
@@ -200,17 +172,13 @@ class Reshading:
         if added is not None:
             albedo = painted_albedo(mesh, fragments, self._settings.encoding, albedo_scale, added)
         smooth_faces = self._faces[number] if self._settings.normals == "smooth" else None
-        seen = []
-        for where, part in parts_of(self._basis):
-            own = light[where]
-            if isinstance(part, LocalBasis):
-                seen.append(placed().radiance(part, albedo, own, positions))
-                continue
-            seen.append(radiance(fragments, vertices, own, albedo, smooth_faces))
-            if self._settings.global_illumination:
-                frozen = self._frozen(example, number, camera, shape)
-                seen.append(frozen.radiance(camera, fragments, albedo, own))
-        return fragments, reduce(torch.add, seen)
+        lights = [(part, light[where]) for where, part in parts_of(self._basis)]
+
+        def indirect(albedo: Tensor, light: Tensor) -> Tensor:
+            return self._frozen(example, number, camera, shape).radiance(camera, fragments, albedo, light)
+
+        extra = indirect if self._settings.global_illumination else None
+        return fragments, view_radiance(fragments, vertices, albedo, lights, smooth_faces, placed, extra, positions)
 
     def _moved_view(self, mesh: Mesh, positions: np.ndarray, fragments: Fragments, vertices: Tensor) -> LocalLightView:
         return LocalLightView(Rays(replace(mesh, vertices=positions)), mesh, fragments, self._settings, vertices)

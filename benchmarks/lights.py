@@ -50,7 +50,7 @@ from renderer.subdivision import subdivide
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import local as sparse
 from renderer.transport import radiosity, rays
-from renderer.transport.local import lit, local_radiance
+from renderer.transport.local import local_radiance, unoccluded
 from renderer.transport.surface import Surface
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
@@ -212,7 +212,7 @@ def lamp_steps(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
     )
 
     def step(surface: Surface, albedo: Tensor) -> None:
-        connections = lit(caster, surface, LAMPS.connect(surface.points, surface.normals, positions.double()))
+        connections = unoccluded(caster, surface, LAMPS.connect(surface.points, surface.normals, positions.double()))
         radiance = local_radiance(surface.fragments, albedo, connections, powers)
         torch.autograd.grad(radiance.square().sum(), positions)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial, reduce
 from typing import TYPE_CHECKING
 
 import torch
@@ -15,28 +15,32 @@ from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, composite
-from renderer.light.basis import Harmonics
+from renderer.light.basis import EnvironmentBasis, Harmonics, LocalBasis, SumBasis
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.shading import radiance
 from renderer.transfer import TransferOperator, build_operators
-from renderer.transport.precomputed import build_transport
+from renderer.transport.local import LocalLightView
+from renderer.transport.precomputed import Transport, build_transport
+from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+LocalLight = LocalBasis | tuple[LocalBasis, Tensor]  # lamps or a projector, and coefficients (size, 3)
 _choose = cache(choose)  # "auto" asks the driver, which takes longer than an image
 
 
 def render(
     mesh: Mesh,
     cameras: Camera | Sequence[Camera],
-    light: Float[Tensor, "coefficients 3"],
+    light: Float[Tensor, "coefficients 3"] | None,
     size: int = 224,
     background: float | Float[Tensor, "*views channels size size"] | Float[Tensor, " 3"] = 0.5,
     *,
+    lights: Sequence[LocalLight] = (),
     vertices: Float[Tensor, "N 3"] | None = None,
     albedo: Float[Tensor, "F 3"] | Float[Tensor, "height width 3"] | None = None,
     albedo_scale: float = 1.0,
@@ -49,38 +53,93 @@ def render(
 ) -> Float[Tensor, "V 3 size size"]:
     """Images in [0, 1] of a mesh from V cameras; differentiable in light, vertices and albedo.
 
-    light: (degree + 1)² coefficients (`load_light`), whose dtype and device the images have. background: see
-    `renderer.image.as_background`; one for all views or an image for each. vertices: in place of the mesh's; the
-    gradient holds fixed which face covers each sample. albedo: linear, in place of the mesh's colors per face, or in
-    place of the texture of a mesh that has one. albedo_scale multiplies the albedo. samples: per pixel
-    side. encoding: linear or srgb. normals: flat or smooth. shadows: that the mesh casts on
-    itself. bounces: with shadows and light that its own colors send on so many times; the gradient by vertices and
-    albedo holds both fixed.
-    rasterizer: auto, opengl, numba or numpy.
+    light: (degree + 1)² coefficients (`load_light`), in whose dtype and on whose device the images are computed; None
+    for no environment light. lights: lamps and projectors, alone for full white power, or with coefficients (size, 3);
+    they cast shadows and do not bounce. background: see `renderer.image.as_background`; one for all views, or an image
+    for each. vertices: in place of the mesh's. albedo: linear, in place of the mesh's colors per face, or of its only
+    texture. albedo_scale multiplies the albedo. samples: per pixel side. encoding: linear or srgb. normals: flat or
+    smooth. shadows: that the mesh casts on itself. bounces: of light between its surfaces, shadows included.
+    rasterizer: auto, opengl, numba or numpy. The gradient by the vertices keeps which face covers each sample, and the
+    one by vertices and albedo keeps shadows and bounces of environment light.
     InputError: NaN, shapes that do not fit, unknown choices.
+
+    >>> import renderer
+    >>> apple, camera = renderer.normalize(renderer.solid("apple")), renderer.OrthographicCamera(1.0, 0.0, width=2.2)
+    >>> light = renderer.load_light("grace").requires_grad_()
+    >>> image = renderer.render(apple, camera, light, size=16, rasterizer="numpy")
+    >>> image.shape
+    torch.Size([1, 3, 16, 16])
+    >>> image.mean().backward()
+    >>> light.grad.shape
+    torch.Size([49, 3])
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
     if vertices is not None and vertices.shape != mesh.vertices.shape:
         given = tuple(vertices.shape)
         raise InputError(f"vertices of shape {given} does not fit the mesh: give {mesh.vertices.shape}")
-    vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(light)
+    local = [_with_coefficients(local) for local in lights]
+    like = next((values for _, values in [(None, light), *local] if values is not None), torch.zeros(0))
+    vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
     positions = vertices.detach().cpu().double().numpy()
     views = build_fragments(positions, mesh.faces, _listed(cameras), settings, _choose(rasterizer), closed=mesh.closed)
-    backgrounds = as_background(background, size, light).expand(len(views), -1, -1, -1)
-    smooth_faces = torch.from_numpy(mesh.faces).to(light.device) if normals == "smooth" else None
+    backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
+    smooth_faces = torch.from_numpy(mesh.faces).to(like.device) if normals == "smooth" else None
     moved = replace(mesh, vertices=positions)
-    indirect = build_transport(moved, settings, albedo_scale, Harmonics(degree_of(light)))
+    environment = [] if light is None else [(Harmonics(degree_of(light)), light)]
+    emitters = [*environment, *((basis, values.to(like)) for basis, values in local)]
+    basis = SumBasis(tuple(basis for basis, _ in emitters))
+    transport = build_transport(moved, settings, albedo_scale, basis) if emitters else None
+    rays = transport.rays if transport else Rays(moved)
     images = []
     for view, behind in zip(views, backgrounds, strict=True):
-        seen = view.to(light.device)
-        colors = _albedo(mesh, seen, albedo, encoding).to(light) * albedo_scale
-        shade = radiance(seen, vertices, light, colors, smooth_faces)
-        if indirect is not None:
-            surface = Surface.of(moved, view, settings)
-            shade = shade + indirect.radiance(surface, colors.detach().cpu().double(), light)
-        images.append(composite(shade, seen.coverage.to(light), seen.pixels, behind, encoding))
+        fragments = view.to(like.device)
+        colors = _albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale
+        surface = Surface.of(moved, view, settings)
+        indirect = partial(_indirect, transport, surface) if transport else None
+        in_local_light = cache(partial(LocalLightView, rays, mesh, view, settings, vertices))
+        shade = view_radiance(fragments, vertices, colors, emitters, smooth_faces, in_local_light, indirect)
+        images.append(composite(shade, fragments.coverage.to(like), fragments.pixels, behind, encoding))
     return torch.stack(images)
+
+
+def view_radiance(
+    fragments: Fragments,
+    vertices: Tensor,
+    albedo: Tensor,
+    lights: Sequence[tuple[EnvironmentBasis | LocalBasis, Tensor]],
+    smooth_faces: Tensor | None,
+    in_local_light: Callable[[], LocalLightView],
+    indirect: Callable[[Tensor, Tensor], Tensor] | None = None,
+    positions: Tensor | None = None,
+) -> Tensor:
+    """(3, P) radiance of one view: shaded environment light, what shadows and bounces change of it, and local lights.
+
+    albedo: (S, 3), at the samples. lights: bases with coefficients (size, 3). indirect: of albedo and coefficients of
+    environment light, the radiance that shadows and bounces add to it. positions: of lamps that moved, (L, 3).
+    """
+    radiances = [torch.zeros(3, len(fragments.pixels)).to(albedo)] if not lights else []
+    for basis, light in lights:
+        if isinstance(basis, LocalBasis):
+            radiances.append(in_local_light().radiance(basis, albedo, light, positions))
+            continue
+        radiances.append(radiance(fragments, vertices, light, albedo, smooth_faces))
+        if indirect is not None:
+            radiances.append(indirect(albedo, light))
+    return reduce(torch.add, radiances)
+
+
+def _indirect(transport: Transport, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
+    return transport.radiance(surface, albedo.detach().cpu().double(), light)
+
+
+def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:
+    """A local light with its coefficients (size, 3); without them it shines white, at its full power."""
+    basis, values = (light, None) if isinstance(light, LocalBasis) else light
+    values = torch.full((basis.size, 3), basis.power) if values is None else values
+    if values.shape != (basis.size, 3):
+        raise InputError(f"lights: {basis} has coefficients of shape {tuple(values.shape)}, give {(basis.size, 3)}")
+    return basis, values
 
 
 def precompute_transfer(
@@ -96,9 +155,16 @@ def precompute_transfer(
     bounces: int = 0,
     rasterizer: str = "auto",
 ) -> list[TransferOperator]:
-    """One operator per camera: images and gradients under any number of lights without another look at the mesh.
+    """One operator per camera: images and gradients under any number of lights, without rasterizing again.
 
-    `operator.image(light, background)` is the image that `render` makes, to rounding. Keywords as there.
+    `operator.image(light, background)` equals the image of `render`, to rounding. Keywords as there.
+
+    >>> import renderer
+    >>> pear, cameras = renderer.normalize(renderer.solid("pear")), renderer.orbit_cameras(2, width=2.2)
+    >>> operators = renderer.precompute_transfer(pear, cameras, size=16, rasterizer="numpy")
+    >>> lights = torch.stack([renderer.load_light("grace"), renderer.load_light("st_peters")])
+    >>> operators[0].image(lights).shape
+    torch.Size([2, 3, 16, 16])
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)

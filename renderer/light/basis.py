@@ -53,13 +53,13 @@ class EnvironmentBasis(LightBasis):
 
 
 class LightPaths(NamedTuple):
-    """E ways on which light goes: point, function: (E,) int64, to which surface point and of which function of a basis.
-    place: (E, 3), where it comes from. irradiance: (E,) per unit of the function's coefficient, differentiable in the
-    surface's points and normals; which ways there are is held."""
+    """E connections from lights to surface points. point, function: (E,) int64, the surface point and the function of
+    the basis. source: (E, 3), where the light starts. irradiance: (E,) per unit of the function's coefficient,
+    differentiable in the points and normals; which connections there are is held fixed."""
 
     point: Tensor
     function: Tensor
-    place: Tensor
+    source: Tensor
     irradiance: Tensor
 
 
@@ -76,7 +76,7 @@ class LocalBasis(LightBasis):
 
     @abstractmethod
     def connect(self, points: Tensor, normals: Tensor) -> LightPaths:
-        """All ways to surface points (S, 3) of unit normals (S, 3), were nothing in between."""
+        """The paths to surface points (S, 3) of unit normals (S, 3), occlusion ignored."""
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,11 @@ import torch
 from torch import Tensor
 
 from renderer.fragments import Fragments
+from renderer.image import ImageSettings
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.harmonics import unit_vectors
+from renderer.light.local import Lamps
+from renderer.mesh import Mesh
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 
@@ -65,33 +68,62 @@ def joined(*parts: SparseTransfer | None) -> SparseTransfer | None:
 
 
 def local_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBasis) -> SparseTransfer:
-    """All that is not zero of it, in float64; albedo: (S, C), at the samples.
+    """The nonzero entries of the transfer matrix, in float64; albedo: (S, C), at the samples.
 
-    Every sample of a view has a ray to each place, so that shadows are as sharp as the image's samples. InputError
-    where Embree is not installed.
+    Each sample casts a ray to each source, so that shadows are as sharp as the image's samples. InputError where Embree
+    is not installed.
     """
     fragments = surface.fragments
-    reach = lit(rays, surface, basis.connect(surface.points, surface.normals))
-    place, entry = (fragments.pixel[reach.point] * basis.size + reach.function).unique(return_inverse=True)
-    weights = albedo[reach.point] * reach.irradiance[:, None] / fragments.samples**2
-    summed = weights.new_zeros(len(place), albedo.shape[1]).index_add_(0, entry, weights)
-    return SparseTransfer(place % basis.size, place // basis.size, summed)
+    paths = unoccluded(rays, surface, basis.connect(surface.points, surface.normals))
+    index, entry = (fragments.pixel[paths.point] * basis.size + paths.function).unique(return_inverse=True)
+    weights = albedo[paths.point] * paths.irradiance[:, None] / fragments.samples**2
+    summed = weights.new_zeros(len(index), albedo.shape[1]).index_add_(0, entry, weights)
+    return SparseTransfer(index % basis.size, index // basis.size, summed)
 
 
-def local_radiance(fragments: Fragments, albedo: Tensor, reach: LightPaths, light: Tensor) -> Tensor:
-    """(3, P) float64 of a view in a light (size, 3) that arrives on some ways; differentiable in the light, the albedo
-    (S, 3) at the samples and what the ways' irradiance is."""
-    arriving = reach.irradiance[:, None] * light[reach.function]
-    weights = albedo[reach.point] / fragments.samples**2 * arriving
-    return weights.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel[reach.point], weights).T
+def local_radiance(fragments: Fragments, albedo: Tensor, paths: LightPaths, light: Tensor) -> Tensor:
+    """(3, P) float64 radiance of a view in a light (size, 3) along unoccluded paths; differentiable in the light, the
+    albedo (S, 3) at the samples and the irradiance of the paths."""
+    arriving = paths.irradiance[:, None] * light[paths.function]
+    weights = albedo[paths.point] / fragments.samples**2 * arriving
+    return weights.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel[paths.point], weights).T
 
 
-def lit(rays: Rays, surface: Surface, reach: LightPaths) -> LightPaths:
-    """The ways on which no surface is met, nor the point's own from behind."""
+def unoccluded(rays: Rays, surface: Surface, paths: LightPaths) -> LightPaths:
+    """The paths that no surface blocks and that arrive above the tangent plane."""
     with torch.no_grad():
-        planes = surface.planes[reach.point]
-        origins = surface.points[reach.point] + rays.offset * planes
-        directions, lengths = unit_vectors((reach.place - origins).T)
+        planes = surface.planes[paths.point]
+        origins = surface.points[paths.point] + rays.offset * planes
+        directions, lengths = unit_vectors((paths.source - origins).T)
         above = (directions.T * planes).sum(1) > 0
         free = above & (rays.meet(origins, directions.T, lengths) < 0)
-    return LightPaths(*(each[free] for each in reach))
+    return LightPaths(*(each[free] for each in paths))
+
+
+class LocalLightView:
+    """A view of one shape in local light, computed on the CPU, where the rays are cast: once for lights that stay, and
+    again for lamps that moved. Derivatives hold fixed which lamps and which pixel of a pattern reach a sample."""
+
+    def __init__(
+        self, rays: Rays, mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None
+    ):
+        """rays: among the shape's faces. vertices: of the shape (V, 3), unless they are the mesh's."""
+        vertices = None if vertices is None else vertices.cpu()
+        self._rays, self._surface = rays, Surface.of(mesh, fragments.to("cpu"), settings, vertices)
+        self._fixed: dict[LocalBasis, LightPaths] = {}
+
+    def radiance(self, basis: LocalBasis, albedo: Tensor, light: Tensor, positions: Tensor | None = None) -> Tensor:
+        """(3, P) radiance of a light (size, 3), in its dtype and on its device; albedo: (S, 3), at the samples.
+
+        positions: (L, 3) of lamps, None where the basis has them. Differentiable in all and in the vertices.
+        """
+        paths = self._paths(basis, positions)
+        return local_radiance(self._surface.fragments, albedo.cpu().double(), paths, light.cpu().double()).to(light)
+
+    def _paths(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:
+        points, normals = self._surface.points, self._surface.normals
+        if isinstance(basis, Lamps) and positions is not None:
+            return unoccluded(self._rays, self._surface, basis.connect(points, normals, positions.cpu().double()))
+        if basis not in self._fixed:
+            self._fixed[basis] = unoccluded(self._rays, self._surface, basis.connect(points, normals))
+        return self._fixed[basis]

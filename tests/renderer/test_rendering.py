@@ -9,8 +9,12 @@ from torch import Tensor
 
 import renderer
 from renderer.errors import InputError
-from renderer.image import ENCODINGS, NORMALS, as_background
-from renderer.light.presets import ambient
+from renderer.image import ENCODINGS, NORMALS, ImageSettings, as_background
+from renderer.light.basis import with_local_lights
+from renderer.light.local import Lamps, Projector
+from renderer.light.presets import ambient, load_light
+from renderer.rasterizer import choose
+from renderer.transfer import build_operators
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 CAMERAS = renderer.orbit_cameras(3, 2.4)
@@ -121,3 +125,34 @@ def test_what_is_no_background_is_refused(background):
 def test_bad_input_is_refused_in_one_sentence(stone, light, wrong, message):
     with pytest.raises(InputError, match=message):
         renderer.render(**{"mesh": stone, "cameras": CAMERAS, "light": light.float(), **SMALL, **wrong})
+
+
+@pytest.mark.parametrize("light", [None, load_light("grace")], ids=["alone", "beside"])
+@pytest.mark.parametrize("samples", [1, 2])
+def test_lamps_and_projectors_are_added_as_operators_have_them(light, samples):
+    """With all their power where they have no coefficients, and shadows."""
+    cup, lamps, projector = renderer.solid("cup"), Lamps(((2.0, 1.0, 2.0),), radius=0.3), Projector(8, 0.5, 1.6)
+    pattern = torch.rand(64, 3, generator=torch.Generator().manual_seed(0))
+    choices = {"size": 9, "samples": samples, "normals": "flat", "shadows": True, "rasterizer": "numpy"}
+    images = renderer.render(cup, CAMERAS, light, lights=[lamps, (projector, pattern)], **choices)
+    parts = [(lamps, torch.full((1, 3), lamps.power)), (projector, pattern)]
+    basis, coefficients = with_local_lights(torch.zeros(49, 3) if light is None else light, parts)
+    settings = ImageSettings(9, samples, normals="flat", shadows=True)
+    operators = build_operators(cup, CAMERAS, settings, choose("numpy"), basis=basis)
+    expected = torch.stack([operator.image(coefficients) for operator in operators])
+    torch.testing.assert_close(images, expected, rtol=0, atol=1e-5)
+    assert (images > 0.5).any()
+
+
+def test_an_image_is_differentiable_in_a_pattern_and_by_it_linear():
+    projector = Projector(4, 0.5, 1.6)
+    pattern = torch.full((16, 3), 0.01).requires_grad_()
+    lights = [(projector, pattern)]
+    image = renderer.render(renderer.solid("plate"), CAMERAS, None, lights=lights, background=0.0, **SMALL)
+    (gradient,) = torch.autograd.grad(image.sum(), pattern)
+    torch.testing.assert_close((gradient * pattern).sum(), image.sum())
+
+
+def test_coefficients_of_another_size_are_refused():
+    with pytest.raises(InputError, match=r"lights: a projector of 16² pixels has coefficients of shape \(9, 3\)"):
+        renderer.render(renderer.solid("plate"), CAMERAS, None, lights=[(Projector(), torch.zeros(9, 3))], **SMALL)

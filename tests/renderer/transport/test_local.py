@@ -21,7 +21,7 @@ from renderer.mesh import Mesh, concatenate
 from renderer.rasterizer import choose
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import local as sparse
-from renderer.transport.local import lit, local_radiance
+from renderer.transport.local import local_radiance, unoccluded
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 
@@ -206,7 +206,7 @@ def moved_image(
     settings = ImageSettings(size, samples)
     (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=mesh.closed)
     surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
-    reach = lit(Rays(mesh), surface, basis.connect(surface.points, surface.normals, positions))
+    reach = unoccluded(Rays(mesh), surface, basis.connect(surface.points, surface.normals, positions))
     return operator(mesh, basis, size, samples), local_radiance(view, albedo, reach, powers)
 
 
@@ -239,7 +239,9 @@ def test_the_derivative_by_vertices_and_albedo_is_that_of_finite_differences_whe
 
     def seen(vertices: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
         surface = Surface.of(mesh, view, settings, vertices)
-        return local_radiance(view, albedo, lit(rays, surface, basis.connect(surface.points, surface.normals)), powers)
+        return local_radiance(
+            view, albedo, unoccluded(rays, surface, basis.connect(surface.points, surface.normals)), powers
+        )
 
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
     albedo = surface_albedo(mesh, view, settings.encoding).contiguous().requires_grad_()
