@@ -22,9 +22,9 @@ from train.attacks.text import format_attack, format_reloaded
 from train.attacks.transfers import format_transfers, load_others, write_transfers
 from train.command_line.configuration import read_settings
 from train.command_line.outputs import writable_folder
-from train.device import choose_device
-from train.run_folder.classifier import load_classifier
+from train.networks import load_classifier
 from train.run_folder.files import sole_writer
+from train.runtime import choose_device
 
 
 def main(config: DictConfig) -> None:

@@ -10,11 +10,11 @@ import train.command_line.entry_points as command
 from augment.classifiers import Classifier
 from renderer.errors import InputError, require_range
 from train.command_line.outputs import writable_folder
-from train.device import MixedPrecision, choose_device, choose_precision
+from train.networks import load_classifier, load_run
 from train.photographs.scoring import evaluate_photographs
 from train.photographs.text import format_summary
-from train.run_folder.classifier import load_classifier, load_run
 from train.run_folder.files import sole_writer
+from train.runtime import MixedPrecision, choose_device, choose_precision
 from train.settings import LARGEST_SIZE
 
 

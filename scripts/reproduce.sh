@@ -67,8 +67,8 @@ harden() {
     local pgd_images=1800 # so many take as long as the others' images, at three steps each
     fine_tuned harden augment=none,random,adversarial "$@"
     fine_tuned harden augment=random "augment.random_light.radius=${DISTANCE:-0.6}" "$@"
-    fine_tuned harden augment=none train.distortion=color_jitter,trivial_augment,augmix "$@"
-    fine_tuned harden augment=none train.distortion=pgd "train.images_per_epoch=$pgd_images" "$@"
+    fine_tuned harden augment=none train.augmentation=color_jitter,trivial_augment,augmix "$@"
+    fine_tuned harden augment=none train.augmentation=pgd "train.images_per_epoch=$pgd_images" "$@"
 }
 
 compare_fine_tuned() {

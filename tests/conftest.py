@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from renderer.rasterizer import Rasterizer
-from train.interruption import heed_interrupts
+from train.runtime import heed_interrupts
 
 ROOT = Path(__file__).parents[1]
 

@@ -18,12 +18,11 @@ from renderer.io.lights import save_light
 from renderer.light.environment import read_map, write_map
 from renderer.light.presets import load_light, probe
 from train.data import load_npz
+from train.networks import PUBLISHED, WideResNet, describe, load_run, publish
 from train.photographs.answers import ANSWERS, Answer, read_answers, write_answers
 from train.photographs.folder import Photograph, find_photographs, load_photographs
 from train.run_folder.checkpoint import BEST, save
-from train.run_folder.classifier import PUBLISHED, describe, load_run, publish
 from train.run_folder.files import read_config, read_json, read_numbers
-from train.wideresnet import WideResNet
 
 CLASSES = ["fig", "lime"]
 

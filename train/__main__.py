@@ -15,16 +15,17 @@ from omegaconf import DictConfig, OmegaConf
 
 import train.command_line.entry_points as command
 from augment import utils
+from train.command_line.configuration import read_settings
 from train.command_line.overrides import quoted
 from train.data import DataSet
-from train.distributed import broadcast, first_process_first, process_group
-from train.experiment import load_data, prepare, write_images
-from train.interruption import Interrupted
 from train.report.overview import format_table
 from train.report.summary import summarize
 from train.report.write import report_of
+from train.run import load_data, prepare, write_images
 from train.run_folder.files import sole_writer
 from train.run_folder.logs import console
+from train.runtime import Interrupted, broadcast, first_process_first, process_group
+from train.settings import ExperimentSettings
 from train.sweep import check_launcher, run_cell
 
 NAMED_MODEL = re.compile(r"^model=(?!\{)")  # by its name alone
@@ -47,18 +48,18 @@ def main(config: DictConfig) -> None:
 def run_arms(config: DictConfig, folder: Path) -> None:
     """Train the arms to compare with and the arm itself, and print their table."""
     OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
-    data = load_data(config)
+    data = load_data(read_settings(ExperimentSettings, config))
     choices = {folder / str(arm): {"augment": {"arm": arm}} for arm in config.compare}
-    arms = {path: cast(DictConfig, OmegaConf.merge(config, choice)) for path, choice in choices.items()}
-    arms[folder] = config
+    configs = {path: cast(DictConfig, OmegaConf.merge(config, choice)) for path, choice in choices.items()}
+    arms = {path: read_settings(ExperimentSettings, arm) for path, arm in (configs | {folder: config}).items()}
     with sole_writer("run", *arms) if utils.rank() == 0 else nullcontext():
         with first_process_first():
             if utils.rank() == 0:
-                write_images(config, data.size)
+                write_images(arms[folder], data.size)
         _train_arms(arms, data, folder)
 
 
-def _train_arms(arms: Mapping[Path, DictConfig], data: DataSet, folder: Path) -> None:
+def _train_arms(arms: Mapping[Path, ExperimentSettings], data: DataSet, folder: Path) -> None:
     runs = {path: prepare(arm, data, path) for path, arm in arms.items()}  # all first: a mistake in any shows at once
     for path, train_and_score in runs.items():
         console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")

@@ -1,8 +1,8 @@
-"""Labeled images as uint8 arrays: CIFAR-100, an .npz file, a folder of class folders, or rendered shapes."""
+"""Labeled images as uint8 arrays: CIFAR-100, an .npz file, or a folder of class folders."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,7 +14,8 @@ from renderer.errors import InputError
 from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
 from train.run_folder.logs import console
 
-PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # no names of classes
+PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # not names of classes
+ARRAYS = ("train_images", "train_labels", "test_images", "test_labels", "classes")
 
 
 @dataclass(frozen=True)
@@ -48,19 +49,19 @@ class DataSet:
         return self.train.images.shape[-1]
 
 
-def stratified_split(split: Split, share: float, seed: int, key: str = "data.validation") -> tuple[Split, Split]:
-    """(train, held out) with the share of every class's images, rounded, held out. InputError names the key."""
-    if not 0 < share < 1:
-        raise InputError(f"{key}={share} must lie between 0 and 1")
+def stratified_split(split: Split, fraction: float, seed: int, key: str = "data.validation") -> tuple[Split, Split]:
+    """(train, held out) with the fraction of every class's images, rounded, held out. InputError names the key."""
+    if not 0 < fraction < 1:
+        raise InputError(f"{key}={fraction} must lie between 0 and 1")
     held_out = torch.zeros(len(split), dtype=torch.bool)
     draws = generator(seed, "validation")
     for label in split.labels.unique():
         members = torch.nonzero(split.labels == label).squeeze(1)
-        count = round(share * len(members))
+        count = round(fraction * len(members))
         if not 0 < count < len(members):
             raise InputError(
-                f"{key}={share} of the {len(members)} images of class {int(label)} is all or nothing: "
-                "add images or change the share"
+                f"{key}={fraction} of the {len(members)} images of class {int(label)} is all or nothing: "
+                "add images or change the fraction"
             )
         held_out[members[torch.randperm(len(members), generator=draws)[:count]]] = True
     return split[~held_out], split[held_out]
@@ -69,12 +70,11 @@ def stratified_split(split: Split, share: float, seed: int, key: str = "data.val
 def channel_statistics(images: Tensor) -> tuple[list[float], list[float]]:
     """Mean and standard deviation of each channel in [0, 1], exact: from histograms of the 256 values."""
     values = torch.arange(256, dtype=torch.float64) / 255
-    histograms = [torch.bincount(images[:, channel].flatten(), minlength=256).double() for channel in range(3)]
-    means = [float(counts @ values / counts.sum()) for counts in histograms]
-    deviations = [
-        float((counts @ (values - mean) ** 2 / counts.sum()).sqrt())
-        for counts, mean in zip(histograms, means, strict=True)
-    ]
+    means, deviations = [], []
+    for channel in range(3):
+        counts = torch.bincount(images[:, channel].flatten(), minlength=256).double()
+        means.append(float(counts @ values / counts.sum()))
+        deviations.append(float((counts @ (values - means[-1]) ** 2 / counts.sum()).sqrt()))
     return means, [max(deviation, 1e-3) for deviation in deviations]
 
 
@@ -97,30 +97,45 @@ def load_cifar100(path: str) -> DataSet:
 
 
 def load_npz(path: str) -> DataSet:
-    """Arrays train_images and test_images (N, 3, H, W) uint8, train_labels and test_labels (N,), classes (C,) str."""
-    required = ("train_images", "train_labels", "test_images", "test_labels", "classes")
+    """Arrays train_images and test_images (N, 3, S, S) uint8, train_labels and test_labels (N,), classes (C,) str."""
     if not Path(path).is_file():
         raise InputError(f"data.path={path} does not exist: give the path of an .npz file")
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in required if name in archive}
+            arrays = {name: archive[name] for name in ARRAYS if name in archive}
     except Exception as error:  # zipfile, zlib and NumPy raise many kinds for a damaged or foreign file
         raise InputError(f"data.path={path} is not an .npz file that loads without pickle: {error}") from error
-    if missing := [name for name in required if name not in arrays]:
-        raise InputError(f"data.path={path} lacks the array {missing[0]}: it needs {', '.join(required)}")
-    classes = arrays["classes"]
-    if classes.ndim != 1 or classes.dtype.kind != "U" or len(set(classes.tolist())) != len(classes):
-        raise InputError(f"data.path={path}: classes must be distinct strings, one per class")
-    splits = [_npz_split(path, arrays, part, len(classes)) for part in ("train", "test")]
-    if splits[0].images.shape[1:] != splits[1].images.shape[1:]:
-        raise InputError(f"data.path={path}: train_images and test_images differ in size; make them alike")
+    try:
+        if missing := [name for name in ARRAYS if name not in arrays]:
+            raise ValueError(f"the array {missing[0]} is missing; it needs {', '.join(ARRAYS)}")
+        classes = arrays["classes"]
+        if classes.ndim != 1 or classes.dtype.kind != "U" or len(set(classes.tolist())) != len(classes):
+            raise ValueError("classes must be distinct strings, one per class")
+        splits = [_npz_split(arrays, part, len(classes)) for part in ("train", "test")]
+        if splits[0].images.shape[1:] != splits[1].images.shape[1:]:
+            raise ValueError("train_images and test_images differ in size; make them alike")
+    except ValueError as error:
+        raise InputError(f"data.path={path}: {error}") from error
     return DataSet(tuple(classes.tolist()), *splits)
 
 
-def load_folder(path: str, size: int, test_share: float) -> DataSet:
+def _npz_split(arrays: Mapping[str, np.ndarray], part: str, classes: int) -> Split:
+    images, labels = arrays[f"{part}_images"], arrays[f"{part}_labels"]
+    if images.ndim != 4 or images.shape[1] != 3 or images.shape[2] != images.shape[3] or images.dtype != np.uint8:
+        raise ValueError(f"{part}_images is {images.dtype} of shape {images.shape}; it must be uint8 (N, 3, S, S)")
+    if labels.shape != images.shape[:1] or labels.dtype.kind not in "iu":
+        raise ValueError(
+            f"{part}_labels is {labels.dtype} of shape {labels.shape}; it must be integers ({len(images)},)"
+        )
+    if not len(labels) or labels.min() < 0 or labels.max() >= classes:
+        raise ValueError(f"{part}_labels must hold labels 0 to {classes - 1}, one at least")
+    return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
+
+
+def load_folder(path: str, size: int, test_fraction: float) -> DataSet:
     """Class folders of images, or `train` and `test` folders of them; center squares reduced to size × size.
 
-    Without a `test` folder, that share of every class is held out as the test split.
+    Without a `test` folder, that fraction of every class is held out as the test split.
     """
     root = Path(path)
     if not root.is_dir():
@@ -134,14 +149,15 @@ def load_folder(path: str, size: int, test_share: float) -> DataSet:
     classes = tuple(_folders(train_root))
     if len(classes) < 2:
         raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
-    if passed_over := left_out(root):
-        console.warning("%d files in %s are no images that are read: %s", len(passed_over), root, _some(passed_over))
+    if unread := left_out(root):
+        names = ", ".join([*map(str, unread[:3]), *(["..."] if len(unread) > 3 else [])])
+        console.warning("%d files in %s are not images that can be read: %s", len(unread), root, names)
     train = _folder_split(train_root, classes, size)
     if empty := set(range(len(classes))).difference(train.labels.tolist()):
         raise InputError(f"{train_root / classes[min(empty)]} holds no image: put some there or remove the folder")
     if parts:
         return DataSet(classes, train, _folder_split(root / "test", classes, size))
-    return DataSet(classes, *stratified_split(train, test_share, seed=0, key="data.test_share"))
+    return DataSet(classes, *stratified_split(train, test_fraction, seed=0, key="data.test_fraction"))
 
 
 def _folders(root: Path) -> list[str]:
@@ -151,23 +167,3 @@ def _folders(root: Path) -> list[str]:
 def _folder_split(root: Path, classes: tuple[str, ...], size: int) -> Split:
     photographs, images, _ = load_photographs(root, find_photographs(root, classes, classes[0]), size, advice="")
     return Split(images, torch.tensor([class_index(classes, item.label, f"data.path={root}") for item in photographs]))
-
-
-def _some(paths: Sequence[PurePosixPath]) -> str:
-    return ", ".join([*map(str, paths[:3]), *(["..."] if len(paths) > 3 else [])])
-
-
-def _npz_split(path: str, arrays: dict[str, np.ndarray], part: str, classes: int) -> Split:
-    images, labels = arrays[f"{part}_images"], arrays[f"{part}_labels"]
-    if images.ndim != 4 or images.shape[1] != 3 or images.shape[2] != images.shape[3] or images.dtype != np.uint8:
-        raise InputError(
-            f"data.path={path}: {part}_images is {images.dtype} of shape {images.shape}; it must be uint8 (N, 3, S, S)"
-        )
-    if labels.shape != images.shape[:1] or labels.dtype.kind not in "iu":
-        raise InputError(
-            f"data.path={path}: {part}_labels is {labels.dtype} of shape {labels.shape}; "
-            f"it must be integers ({len(images)},)"
-        )
-    if not len(labels) or labels.min() < 0 or labels.max() >= classes:
-        raise InputError(f"data.path={path}: {part}_labels must hold labels 0 to {classes - 1}, one at least")
-    return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))

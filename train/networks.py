@@ -1,21 +1,150 @@
-"""The networks that are trained: a WideResNet, a classifier of torchvision, or what a Python function returns."""
+"""The networks that are trained: a WideResNet, a classifier of torchvision, or one that a Python function returns; and
+loading them from a run's folder or a published file."""
 
-from collections.abc import Sequence
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import safetensors.torch
 import torch
+import torch.nn.functional as F
+from safetensors import safe_open
 from torch import Tensor, nn
 
+from augment import classifiers, utils
+from augment.classifiers import Classifier
 from augment.classifiers.adapter import Normalized
 from augment.classifiers.imagenet import require_architecture
 from augment.classifiers.python_function import call_python
 from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
-from train.wideresnet import WideResNet
+from renderer.image import ENCODINGS, LARGEST_SIZE
+from train.run_folder.checkpoint import BEST, VERSION, checked, load
 
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
+DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything
+DROPOUT_LEVELS = 2**16
+PUBLISHED = "model.safetensors"
+SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
+SIZE = 32  # of images, for networks of version 1, whose files do not say
 _WITHOUT_AUXILIARY = {"aux_logits": False, "init_weights": True}
 _OPTIONS = {"googlenet": _WITHOUT_AUXILIARY, "inception_v3": _WITHOUT_AUXILIARY}
+
+# ------------------------------------------------------------------------------------- wide residual networks
+
+
+class WideResNet(nn.Module):
+    """WRN-depth-width (Zagoruyko and Komodakis 2016) for small images of any size; WRN-16-4 for 100 classes has 2.77 M
+    parameters.
+
+    Takes (N, 3, H, W) RGB in [0, 1], normalizes with the data's own mean and std inside, gives logits (N, classes).
+    depth is 6n + 4: n blocks of two convolutions in each of three groups.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        classes: int,
+        depth: int = 16,
+        width: int = 4,
+        dropout: float = 0.3,
+        mean: Sequence[float] = (0.5, 0.5, 0.5),
+        std: Sequence[float] = (0.25, 0.25, 0.25),
+    ):
+        super().__init__()
+        shape = f"model.depth={depth}, model.width={width}"
+        if not (isinstance(depth, int) and isinstance(width, int)) or depth < 10 or (depth - 4) % 6 or width < 1:
+            raise InputError(f"{shape}: depth is 10, 16, 22, 28, ... and width at least 1")
+        parameters = 9 * (depth - 4) // 3 * width**2 * 16**2 * (1 + 4 + 16)
+        if depth > DEEPEST or parameters > MOST_PARAMETERS:
+            raise InputError(
+                f"{shape} make {parameters:.1g} parameters: the largest depth is {DEEPEST}, and {MOST_PARAMETERS:g} "
+                "parameters"
+            )
+        if not 0 <= dropout < 1:
+            raise InputError(f"model.dropout={dropout} must be at least 0 and below 1")
+        channels, blocks = [16, 16 * width, 32 * width, 64 * width], (depth - 4) // 6
+        self.register_buffer("mean", torch.tensor(mean).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(std).view(1, 3, 1, 1))
+        self.stem = nn.Conv2d(3, channels[0], 3, padding=1, bias=False)
+        self.groups = nn.Sequential()
+        for index in range(3):
+            group = [_Block(channels[index], channels[index + 1], 2 if index else 1, dropout)]
+            group += [_Block(channels[index + 1], channels[index + 1], 1, dropout) for _ in range(blocks - 1)]
+            self.groups.append(nn.Sequential(*group))
+        self.norm = nn.BatchNorm2d(channels[3])
+        self.head = nn.Linear(channels[3], classes)
+        self.apply(_initialize)
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.groups(self.stem((images - self.mean) / self.std))
+        return self.head(F.relu(self.norm(features)).mean((2, 3)))
+
+
+class _Block(nn.Module):
+    """Pre-activation: norm, ReLU, convolution, twice, with dropout between; the shortcut starts after the ReLU."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, dropout: float):
+        super().__init__()
+        self.norm1 = nn.BatchNorm2d(inputs)
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
+        self.norm2 = nn.BatchNorm2d(outputs)
+        self.dropout = Dropout(dropout)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        same = inputs == outputs and stride == 1
+        self.shortcut = None if same else nn.Conv2d(inputs, outputs, 1, stride, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        activated = F.relu(self.norm1(x))
+        shortcut = x if self.shortcut is None else self.shortcut(activated)
+        hidden = self.conv1(activated)
+        return self.conv2(self.dropout(F.relu(self.norm2(hidden)))) + shortcut
+
+
+def _initialize(module: nn.Module) -> None:
+    """He initialization (He et al. 2015)."""
+    if isinstance(module, nn.Conv2d):
+        nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+    elif isinstance(module, nn.Linear):
+        nn.init.kaiming_normal_(module.weight, nonlinearity="linear")
+        nn.init.zeros_(module.bias)
+
+
+class Dropout(nn.Dropout):
+    """`nn.Dropout`; on a CPU p is rounded to 2⁻¹⁶, since torch's own draws there take a third of a training step.
+
+    Several processes draw for the whole batch, of which each has an equal shard, and take their own part.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training or self.p == 0:
+            return x
+        if x.device.type == "cpu":
+            return x * self._drawn_by_numpy(x)
+        if utils.world_size() == 1:
+            return super().forward(x)
+        whole_batch = torch.rand(utils.world_size(), *x.shape, device=x.device)
+        return x * (whole_batch[utils.rank()] >= self.p) / (1 - self.p)
+
+    def _drawn_by_numpy(self, x: Tensor) -> Tensor:
+        """0 or 1 / (1 - p) for each value, in x's memory layout: 16 bits each, from a generator that torch seeds."""
+        shard, whole_batch = x.numel(), x.numel() * utils.world_size()
+        generator = np.random.Generator(np.random.SFC64(int(torch.randint(2**63 - 1, (1,)))))
+        words = generator.integers(0, 2**64 - 1, -(-whole_batch // 4), dtype=np.uint64, endpoint=True)
+        bits = torch.from_numpy(words.view(np.int16))[utils.rank() * shard :][:shard]
+        dropped = round(self.p * DROPOUT_LEVELS)
+        passed = bits.ge_(dropped - DROPOUT_LEVELS // 2)  # in place: int16 converts five times faster than bool
+        factors = torch.empty_like(x)  # dense, so that its storage can be filled in order
+        factors.as_strided((shard,), (1,)).copy_(passed).mul_(DROPOUT_LEVELS / (DROPOUT_LEVELS - dropped))
+        return factors
+
+
+# ------------------------------------------------------------------------------------- building
 
 
 def build_network(
@@ -42,7 +171,17 @@ def build_network(
         raise InputError(
             f"model={name} is not known: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION"
         )
-    _require_logits(network, name, len(classes), size)
+    try:
+        with eval_mode(network), torch.no_grad():
+            logits = network(torch.zeros(2, 3, size, size))
+    except (RuntimeError, ValueError, AssertionError, TypeError) as error:
+        raise InputError(
+            f"model={name} takes no images of {size} pixels per side ({in_one_line(error)}): choose another"
+        ) from error
+    expected = (2, len(classes))
+    if not isinstance(logits, Tensor) or logits.shape != expected:
+        found = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
+        raise InputError(f"model={name} gives {found} for 2 images: make it return logits {expected}")
     return network
 
 
@@ -75,16 +214,119 @@ def model_title(name: str = WIDERESNET, depth: int = 16, width: int = 4, dropout
     return f"WideResNet-{depth}-{width}, dropout {dropout}" if name == WIDERESNET else name
 
 
-@torch.no_grad()
-def _require_logits(network: nn.Module, name: str, classes: int, size: int) -> None:
-    """InputError where images of this size do not come out as logits."""
-    try:
-        with eval_mode(network):
-            logits = network(torch.zeros(2, 3, size, size))
-    except (RuntimeError, ValueError, AssertionError, TypeError) as error:
+def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
+    """The description that is stored with the weights, so that a network can be used without its run's configuration.
+
+    shape: the network's own settings. Its normalization is a part of it, unless the network's own code has it.
+    """
+    statistics = {name: getattr(network, name).flatten().tolist() for name in ("mean", "std") if hasattr(network, name)}
+    return {"version": VERSION, "classes": list(classes), "size": size, "encoding": encoding, **shape, **statistics}
+
+
+# ------------------------------------------------------------------------------------- loading and publishing
+
+
+def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
+    """`run:FOLDER`, or a name that `augment.classifiers.load_classifier` knows, whose errors are raised."""
+    return classifiers.load_classifier(name, weights, {**classifiers.SOURCES, "run:": load_run})
+
+
+def load_run(
+    run: str | Path, weights: str | Path | None = None, size: int | None = None, model: str | None = None
+) -> Classifier:
+    """The network that `load_selected` finds for a run's folder, one under pretrained/, or a file of either.
+
+    InputError for weights=, since the run holds its own. size: of images, for a network of version 1, whose file does
+    not say; None: 32. InputError where it does say.
+    model: the python:package.module:function that makes it, where one does: code runs because the user names it, never
+    because a file does.
+    """
+    if weights is not None:
         raise InputError(
-            f"model={name} takes no images of {size} pixels per side ({in_one_line(error)}): choose another"
+            f"weights={weights} is not for classifier=run:{run}, which has weights of its own: leave it out"
+        )
+    path, state = load_selected(Path(run))
+    shape = dict(state["architecture"])
+    shape.pop("version", None)
+    stored_size, encoding = shape.pop("size", None), shape.pop("encoding", "linear")
+    if stored_size is not None and not (isinstance(stored_size, int) and 1 <= stored_size <= LARGEST_SIZE):
+        raise InputError(f"checkpoint {path} says size={stored_size!r}, not pixels per side up to {LARGEST_SIZE}")
+    if encoding not in ENCODINGS:
+        raise InputError(f"checkpoint {path} says encoding={encoding!r}, not {' or '.join(ENCODINGS)}")
+    if size and stored_size and size != stored_size:
+        raise InputError(f"size={size}: {path} was trained on images of {stored_size} pixels per side; leave size out")
+    size = stored_size or size or SIZE
+    name = str(shape.get("name", WIDERESNET))
+    if name.startswith(PYTHON) and name != model:
+        raise InputError(
+            f"the network in {path} is made by {name}: give model={name} to run that code, which a file alone must not "
+            "do; an attack takes it as classifier=python: with a function that loads its weights"
+        )
+    try:
+        classes = tuple(map(str, shape.pop("classes")))
+        if not classes:
+            raise ValueError("it has no classes")
+        network = build_network(classes, size, **shape)
+    except (TypeError, ValueError, KeyError, AttributeError, RuntimeError) as error:
+        raise InputError(f"checkpoint {path} is from another architecture than can be built: {error}") from error
+    load_weights(network, state["model"], path)
+    return Classifier(network, size, classes, f"run:{run}")
+
+
+def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
+    """The file of a run's selected network, best.pt or model.safetensors or such a file itself, and its content."""
+    path = run if run.is_file() else next((run / name for name in (BEST, PUBLISHED) if (run / name).is_file()), None)
+    if path is None:
+        raise InputError(
+            f"run={run} holds neither {BEST} nor {PUBLISHED}: give a run folder that `python -m train` wrote"
+        )
+    return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
+
+
+def load_weights(network: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
+    """Fill the network; InputError naming the file where the weights belong to another architecture."""
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        reason = textwrap.shorten(str(error), 300)
+        raise InputError(
+            f"checkpoint {path} is from another architecture ({reason}): use the model settings that it was trained "
+            "with"
         ) from error
-    if not isinstance(logits, Tensor) or logits.shape != (2, classes):
-        found = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-        raise InputError(f"model={name} gives {found} for 2 images: make it return logits {(2, classes)}")
+
+
+def start_from(network: nn.Module, description: Mapping[str, Any], run: Path) -> None:
+    """Give the network the weights and the normalization of another run's, which `load_selected` finds.
+
+    description: the network's (see `describe`). InputError where the other has other classes, another size or shape.
+    """
+    path, state = load_selected(run)
+    defaults = {"name": WIDERESNET, "size": SIZE}
+    stored, description = defaults | state["architecture"], {**defaults, **description}
+    for key in SHAPE:
+        if stored.get(key, description.get(key)) != description.get(key):
+            other = "other classes" if key == "classes" else f"{key} {stored[key]}, not {description[key]}"
+            raise InputError(f"train.init_from={run} was trained with {other}: give this run the same")
+    load_weights(network, state["model"], path)
+
+
+def publish(path: Path, state: Mapping[str, Any]) -> None:
+    """Write a checkpoint's network as half-precision safetensors, its architecture in the file's metadata."""
+    weights = {
+        name: value.half().contiguous() if value.is_floating_point() else value
+        for name, value in state["model"].items()
+    }
+    path.write_bytes(safetensors.torch.save(weights, {"architecture": json.dumps(state["architecture"])}))
+
+
+def _load_published(path: Path) -> dict[str, Any]:
+    try:
+        with safe_open(path, "pt") as file:
+            architecture = json.loads(file.metadata()["architecture"])
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
+        if not isinstance(architecture, dict):
+            raise ValueError("it is not an object of keys and values")
+    except Exception as error:  # safetensors and JSON raise many kinds for a damaged or foreign file
+        raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error
+    return checked({"model": weights, "architecture": architecture}, path)

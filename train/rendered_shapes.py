@@ -2,7 +2,7 @@
 
 Training and test images stand in soft, even light, as stock photographs do. The held-out images, written to a
 folder and scored like photographs, show other instances in hard light from one side: every class under the same
-lights before the same cameras, so that nothing but the thing itself tells one from another. They are renders.
+lights before the same cameras, so that the classes differ in their shape and color alone. They are renders.
 """
 
 import csv
@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
@@ -70,7 +71,7 @@ def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None
 
 def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
     """A lamp near the camera and bright surroundings. back: (3,), towards the camera. Coefficients (49, 3)."""
-    direction = _unit(back + 0.5 * torch.randn(3, generator=draws))
+    direction = F.normalize(back + 0.5 * torch.randn(3, generator=draws), dim=0)
     tint = 1 + 0.05 * torch.randn(3, generator=draws)
     strength = 0.9 + 0.2 * torch.rand(1, generator=draws)
     return ambient(0.2 * strength * tint) + directional(direction, 0.45 * strength * tint)
@@ -78,7 +79,8 @@ def even_light(back: Tensor, draws: torch.Generator) -> Tensor:
 
 def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
     """One lamp of any color from above, far to one side of the camera, in dim surroundings. (49, 3)"""
-    direction = _unit(torch.randn(3, generator=draws) + 0.5 * torch.tensor([0.0, 0.0, 1.0]) - 0.3 * back)
+    upward = torch.tensor([0.0, 0.0, 0.5])
+    direction = F.normalize(torch.randn(3, generator=draws) + upward - 0.3 * back, dim=0)
     tint = torch.tensor([1.0, 0.8, 0.6]).lerp(torch.tensor([0.6, 0.8, 1.0]), torch.rand(1, generator=draws))
     strength = 0.5 + 1.2 * torch.rand(1, generator=draws)
     return ambient(0.06 * tint) + directional(direction, strength * tint)
@@ -86,15 +88,13 @@ def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
 
 def _render_split(part: str, per_class: int, seed: int, settings: ImageSettings, cache: TensorCache) -> Split:
     key = content_key(CODE, CLASSES, per_class, seed, part, settings)
-    kept = cache.read(key)
-    if kept is None:
-        kept = {"images": _render(part, per_class, seed, settings)}
-        cache.write(key, kept)
-        source = f"rendered; not kept: {cache.problem}" if cache.problem else "rendered"
-    else:
-        source = "from the cache"
-    console.info("%s images: %d %s", part, len(kept["images"]), source)
-    return Split(kept["images"], torch.arange(len(CLASSES)).repeat_interleave(per_class))
+    cached, source = cache.read(key), "from the cache"
+    if cached is None:
+        cached = {"images": _render(part, per_class, seed, settings)}
+        cache.write(key, cached)
+        source = f"rendered; not cached: {cache.problem}" if cache.problem else "rendered"
+    console.info("%s images: %d %s", part, len(cached["images"]), source)
+    return Split(cached["images"], torch.arange(len(CLASSES)).repeat_interleave(per_class))
 
 
 def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:
@@ -118,18 +118,14 @@ def _portraits(
     name: str, mesh: Mesh, light: Lights, settings: ImageSettings, rasterizer: Rasterizer, draws: torch.Generator
 ) -> Tensor:
     """20 images of one instance: uint8 (20, 3, size, size)."""
-    polar, azimuth, field = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
+    polar, azimuth, width = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
     cameras = [
-        OrthographicCamera(math.radians(40 + 45 * p), 2 * math.pi * a, 2 + f)
-        for p, a, f in zip(polar.tolist(), azimuth.tolist(), field.tolist(), strict=True)
+        OrthographicCamera(math.radians(40 + 45 * p), 2 * math.pi * a, 2 + w)
+        for p, a, w in zip(polar.tolist(), azimuth.tolist(), width.tolist(), strict=True)
     ]
     backgrounds = torch.rand(BACKGROUNDS, generator=draws).tolist()
     towards = [torch.tensor(camera.axes()[2], dtype=torch.float32) for camera in cameras for _ in backgrounds]
     lights = torch.stack([light(back, draws) for back in towards])
-    behind = load_backgrounds(backgrounds, settings.size)
-    scene = Scene.grid([SceneObject(name, normalize(mesh))], cameras, behind, lights, settings, rasterizer)
+    images = load_backgrounds(backgrounds, settings.size)
+    scene = Scene.grid([SceneObject(name, normalize(mesh))], cameras, images, lights, settings, rasterizer)
     return to_bytes(scene.render(Conditions(lights), torch.arange(len(scene))).flatten(0, 1))
-
-
-def _unit(vector: Tensor) -> Tensor:
-    return vector / vector.norm()

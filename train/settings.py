@@ -17,8 +17,8 @@ from renderer.image import LARGEST_SIZE
 from renderer.rasterizer import choose
 from renderer.subdivision import MOST_VERTICES
 from train.command_line.configuration import read_settings
-from train.fit.recipe import TrainSettings
 from train.networks import WIDERESNET
+from train.recipe import TrainSettings
 
 OTHER = "other"  # in place of the class of a hard negative that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
@@ -36,7 +36,7 @@ class DataSettings:
     validation: float = 0.1
     path: str = ""
     size: int = 32
-    test_share: float = 0.1
+    test_fraction: float = 0.1
     train_per_class: int = 300
     test_per_class: int = 60
     seed: int = 0

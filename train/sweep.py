@@ -15,6 +15,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,17 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
+from train.command_line.configuration import read_settings
 from train.command_line.entry_points import one_sentence, one_sentence_errors
-from train.experiment import load_data, run, write_images
 from train.report.overview import format_spread, format_table
 from train.report.summary import is_finished, summarize
 from train.report.write import report_of
+from train.run import load_data, run, write_images
 from train.run_folder import checkpoint
 from train.run_folder.continuation import CIRCUMSTANCES, differing_settings, require_same_inputs
 from train.run_folder.files import FAILURE, locked, state
 from train.run_folder.logs import console
+from train.settings import ExperimentSettings
 
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 NEEDS = {  # launcher: its extra and the package in it
@@ -107,9 +110,10 @@ def run_cell(config: DictConfig, folder: Path) -> None:
 def _train(config: DictConfig, folder: Path) -> None:
     OmegaConf.resolve(config)
     config.train.resume = checkpoint.exists(folder)
-    data = load_data(config)
-    write_images(config, data.size)
-    run(config, data, folder)
+    settings = read_settings(ExperimentSettings, config)
+    data = load_data(settings)
+    write_images(settings, data.size)
+    run(settings, data, folder)
 
 
 def _reason(error: Exception) -> str:
@@ -186,7 +190,8 @@ def _check_same_settings(folder: Path, cell: DictConfig) -> None:
     """InputError where the folder has a run, finished or begun, with other settings than the cell's."""
     if not (is_finished(folder) or checkpoint.exists(folder)):
         return
-    own = OmegaConf.masked_copy(cell, [str(key) for key in cell if key != "hydra"])
+    own = OmegaConf.masked_copy(cell, [item.name for item in fields(ExperimentSettings)])
+    own = OmegaConf.structured(read_settings(ExperimentSettings, own))
     for key, found, asked in differing_settings(folder, own):
         raise InputError(
             f"{folder} has {key}={found}, and {asked} is asked for: give another folder with sweep=, or remove this one"

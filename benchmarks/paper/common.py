@@ -24,7 +24,7 @@ from benchmarks.common import append_json as append
 from benchmarks.common import machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light
 from renderer.rasterizer import choose
-from train.run_folder.classifier import load_classifier
+from train.networks import load_classifier
 
 VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
 FIELDS_OF_VIEW = (2.0, 3.0)  # width of the image in world units (the paper's appendix on rendering quality)

@@ -26,7 +26,7 @@ from benchmarks.paper import common
 from renderer import ImageSettings, load_light, orbit_cameras
 from renderer.errors import FACTOR
 from renderer.rasterizer import choose
-from train.run_folder.classifier import load_classifier
+from train.networks import load_classifier
 
 WIDTHS = (2.0, 2.8, 4.0, 5.7, 8.0)  # of the field of view: each halves the pixels of the one before
 BATCH = 32  # images per pass through the classifier, as in conf/attack.yaml

@@ -25,7 +25,7 @@ from augment.objects import SceneObject
 from augment.utils import Phases, generator
 from benchmarks.paper import common
 from renderer.errors import FACTOR
-from train.run_folder.classifier import load_classifier
+from train.networks import load_classifier
 
 KINDS = ("lighting", "geometry")
 FURTHER = 10  # steps that an adversary goes on for

@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 
 from train.command_line.entry_points import USER_ERROR
+from train.networks import WideResNet
 from train.run_folder.checkpoint import BEST, save
 from train.run_folder.files import LOCK, sole_writer
-from train.wideresnet import WideResNet
 
 CLASSES = ["fig", "lime", "orange"]
 

@@ -11,9 +11,8 @@ import torch
 from PIL import Image
 
 from train.command_line.entry_points import USER_ERROR
+from train.networks import WideResNet, describe, load_run
 from train.run_folder.checkpoint import BEST, save
-from train.run_folder.classifier import describe, load_run
-from train.wideresnet import WideResNet
 
 CLASSES = ["lime", "orange"]
 

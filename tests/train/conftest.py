@@ -9,8 +9,9 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
-from train.command_line.configuration import composed
-from train.experiment import load_data, run
+from train.command_line.configuration import composed, read_settings
+from train.run import load_data, run
+from train.settings import ExperimentSettings
 
 CLASSES = ["apple", "orange", "pear"]
 TINY = [
@@ -73,9 +74,15 @@ def photos(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny(tiny_npz) -> Callable[..., DictConfig]:
+def tiny_config(tiny_npz) -> Callable[..., DictConfig]:
     """The real configuration, small; arguments are further overrides."""
     return lambda *overrides: composed("train", [*TINY, f"data.path={tiny_npz}", *overrides])
+
+
+@pytest.fixture(scope="session")
+def tiny(tiny_config) -> Callable[..., ExperimentSettings]:
+    """The settings of `tiny_config`."""
+    return lambda *overrides: read_settings(ExperimentSettings, tiny_config(*overrides))
 
 
 @pytest.fixture(scope="session")
@@ -88,7 +95,7 @@ def finished(tiny, photos, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def made_up_run(tiny) -> Callable[..., Path]:
+def made_up_run(tiny_config) -> Callable[..., Path]:
     """Makes a folder with what a finished run of two epochs writes, but for its checkpoints.
 
     photographs: the summaries of evaluations by the name of their sub-folder.
@@ -96,7 +103,7 @@ def made_up_run(tiny) -> Callable[..., Path]:
 
     def make(folder: Path, arm: str = "none", photographs: dict | None = None, *overrides: str) -> Path:
         folder.mkdir()
-        config = OmegaConf.to_container(tiny(f"augment={arm}", "seed=0", *overrides), resolve=True)
+        config = OmegaConf.to_container(tiny_config(f"augment={arm}", "seed=0", *overrides), resolve=True)
         OmegaConf.save(OmegaConf.create({**config, "versions": {"python": "3.11"}}), folder / "config.yaml")
         seconds = {"attack": 0.5, "attack_classifier": 0.25, "training": 3.0, "evaluation": 1.0, "input_output": 0.5}
         lines = [

@@ -70,7 +70,7 @@ def test_arrays_that_are_not_needed_are_not_read(tmp_path):
 @pytest.mark.parametrize(
     "changes, fault",
     [
-        ({"test_labels": None}, "lacks the array test_labels"),
+        ({"test_labels": None}, "the array test_labels is missing"),
         ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"train_images is uint8 of shape \(5, 8, 8, 3\)"),
         ({"train_images": np.zeros((5, 3, 8, 9), np.uint8)}, r"train_images is uint8 of shape \(5, 3, 8, 9\)"),
         ({"train_images": np.zeros((5, 3, 8), np.uint8)}, r"train_images is uint8 of shape \(5, 3, 8\)"),
@@ -151,7 +151,7 @@ def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_pat
         for number in range(10):
             save_image(tmp_path / name / f"{number}.png", 100 * label + number, size=(20 + number, 30))
     (tmp_path / ".thumbnails").mkdir()
-    data = load_folder(str(tmp_path), size=8, test_share=0.2)
+    data = load_folder(str(tmp_path), size=8, test_fraction=0.2)
     assert data.classes == ("fig", "lime")
     assert data.train.images.shape == (16, 3, 8, 8) and data.test.images.shape == (4, 3, 8, 8)
     shown = {}
@@ -165,7 +165,7 @@ def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_pat
 def test_train_and_test_folders_are_the_splits(tmp_path):
     for part, name, value in [("train", "fig", 1), ("train", "lime", 2), ("test", "lime", 3)]:
         save_image(tmp_path / part / name / "a.png", value)
-    data = load_folder(str(tmp_path), size=8, test_share=0.1)
+    data = load_folder(str(tmp_path), size=8, test_fraction=0.1)
     assert data.train.images[:, 0, 0, 0].tolist() == [1, 2] and data.train.labels.tolist() == [0, 1]
     assert data.test.images[:, 0, 0, 0].tolist() == [3] and data.test.labels.tolist() == [1]
 
@@ -174,7 +174,7 @@ def test_a_class_of_the_test_folder_alone_is_an_error(tmp_path):
     for name in ("train/fig", "train/lime", "test/fig", "test/other_limes"):
         save_image(tmp_path / name / "a.png", 0)
     with pytest.raises(InputError, match="'other_limes' is not a class of the model"):
-        load_folder(str(tmp_path), size=8, test_share=0.1)
+        load_folder(str(tmp_path), size=8, test_fraction=0.1)
 
 
 @pytest.mark.parametrize(
@@ -190,8 +190,8 @@ def test_a_class_of_the_test_folder_alone_is_an_error(tmp_path):
         ),
         (["Test/fig/a.png", "Train/fig/a.png"], 0.1, "holds the folders Test, Train: divide it"),
         (["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"], 0.1, "holds the folders test, train, val: divide it"),
-        (["fig/a.png", "lime/a.png"], 0.1, "data.test_share=0.1 of the 1 images of class 0"),
-        (["fig/a.png", "lime/a.png"], 60, "data.test_share=60 must lie between 0 and 1"),
+        (["fig/a.png", "lime/a.png"], 0.1, "data.test_fraction=0.1 of the 1 images of class 0"),
+        (["fig/a.png", "lime/a.png"], 60, "data.test_fraction=60 must lie between 0 and 1"),
     ],
 )
 def test_a_fault_in_a_folder_is_named(tmp_path, images, test, fault):
@@ -217,7 +217,9 @@ def test_files_of_other_kinds_are_counted_and_named_before_training(tmp_path, ca
             (tmp_path / name / f"{number}.heic").touch()
     with caplog.at_level("WARNING", "train"):
         load_folder(str(tmp_path), 8, 0.25)
-    assert f"6 files in {tmp_path} are no images that are read: fig/0.heic, fig/1.heic, fig/2.heic, ..." in caplog.text
+    assert (
+        f"6 files in {tmp_path} are not images that can be read: fig/0.heic, fig/1.heic, fig/2.heic, ..." in caplog.text
+    )
 
 
 # ---------------------------------------------------------------------------------------- CIFAR-100
@@ -264,7 +266,7 @@ def test_without_files_and_network_there_is_one_error(tmp_path, monkeypatch):
 
 
 def test_a_stratified_split_is_complete_disjoint_and_holds_out_a_share_of_every_class():
-    kept, held_out = stratified_split(numbered(200, classes=4), share=0.1, seed=0)
+    kept, held_out = stratified_split(numbered(200, classes=4), fraction=0.1, seed=0)
     rows = [split.images[:, 0, 0, 0].tolist() for split in (kept, held_out)]
     assert sorted(rows[0] + rows[1]) == list(range(200))
     assert held_out.labels.bincount().tolist() == [5] * 4

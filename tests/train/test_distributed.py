@@ -7,8 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +19,14 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from augment import utils
-from train.distributed import SyncBatchNormCPU, any_process, process_group, replicated, summed, synchronize_norms
-from train.experiment import load_data, run
-from train.fit import trainer
-from train.interruption import Interrupted
+from train import loop
+from train.command_line.configuration import read_settings
+from train.networks import WideResNet
+from train.run import load_data, run
 from train.run_folder import checkpoint
 from train.run_folder.logs import read_metrics
-from train.wideresnet import WideResNet
+from train.runtime import Interrupted, SyncBatchNormCPU, any_process, process_group, replicated, summed
+from train.settings import ExperimentSettings
 
 ROOT = Path(__file__).parents[2]
 BATCH = torch.rand(12, 3, 8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
@@ -59,10 +59,10 @@ def train_two_steps(folder: Path) -> None:
     """Writes the losses, the gradients of the second step, and the buffers, and what the processes agree on."""
     model = network()
     replica, losses = replicated(model), []
-    share = torch.arange(12).view(utils.world_size(), -1)[utils.rank()]
+    shard = torch.arange(12).view(utils.world_size(), -1)[utils.rank()]
     for step in range(2):
         torch.manual_seed(step)
-        loss = F.cross_entropy(replica(BATCH[share]), LABELS[share])
+        loss = F.cross_entropy(replica(BATCH[shard]), LABELS[shard])
         model.zero_grad()
         loss.backward()
         losses.append(float(summed(loss.detach().clone())) / utils.world_size())
@@ -79,12 +79,12 @@ def train_two_steps(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tiny, tmp_path_factory) -> Path:
+def folder(tiny_config, tmp_path_factory) -> Path:
     """What two processes wrote, one task after the other; for the runs, a configuration at a learning rate so low that
     rounding does not grow."""
     folder = tmp_path_factory.mktemp("distributed")
     for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
-        config = tiny("train.learning_rate=0.001", *overrides)
+        config = tiny_config("train.learning_rate=0.001", *overrides)
         OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / f"{name}.yaml")
     in_two_processes(all_tasks, folder)
     return folder
@@ -129,19 +129,18 @@ def test_processes_agree_and_their_shares_become_whole(steps):
 
 @pytest.mark.parametrize(
     "options",
-    [{"affine": False}, {"momentum": None}, {"track_running_stats": False}, {"affine": False, "momentum": None}],
+    [{}, {"affine": False}, {"momentum": None}, {"track_running_stats": False}, {"affine": False, "momentum": None}],
     ids=str,
 )
-def test_a_norm_of_any_options_becomes_one_over_all_processes(options):
-    """With one process, it is what it was."""
-    network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.BatchNorm2d(4, **options)).double()
-    plain = copy.deepcopy(network)
-    synchronize_norms(network)
-    assert type(network[1]) is SyncBatchNormCPU
+def test_a_norm_over_all_processes_is_torchs_where_there_is_one_process(options):
+    """Whatever the norm's options."""
+    norm = torch.nn.BatchNorm2d(3, **options).double()
+    synchronized = copy.deepcopy(norm)
+    synchronized.__class__ = SyncBatchNormCPU
     for _ in range(2):
-        torch.testing.assert_close(network(BATCH), plain(BATCH))
-    torch.testing.assert_close(network.state_dict(), plain.state_dict())
-    torch.testing.assert_close(network.eval()(BATCH), plain.eval()(BATCH))
+        torch.testing.assert_close(synchronized(BATCH), norm(BATCH))
+    torch.testing.assert_close(synchronized.state_dict(), norm.state_dict())
+    torch.testing.assert_close(synchronized.eval()(BATCH), norm.eval()(BATCH))
 
 
 def test_one_process_uses_the_model_as_it_is():
@@ -154,29 +153,24 @@ def test_one_process_uses_the_model_as_it_is():
 
 
 def run_from_file(config: Path, folder: Path) -> None:
-    settings = OmegaConf.load(config)
+    settings = read_settings(ExperimentSettings, OmegaConf.load(config))
     run(settings, load_data(settings), folder)
 
 
 def run_until_a_signal(config: Path, folder: Path) -> None:
     """The second process alone gets it, in the second step of the second epoch."""
-    with interrupted_at(epoch=1, step=2, process=1), pytest.raises(Interrupted):
-        run_from_file(config, folder)
+    training_batches = loop.training_batches
 
-
-@contextmanager
-def interrupted_at(epoch: int, step: int, process: int) -> Iterator[None]:
-    training_batches = trainer.training_batches
-
-    def signalled(images, labels, batch_size, seed, now, *rest, **more):
-        for count, batch in enumerate(training_batches(images, labels, batch_size, seed, now, *rest, **more), 1):
-            if (now.epoch, count, utils.rank()) == (epoch, step, process):
+    def signalled(split, batch_size, seed, now, *rest):
+        for count, batch in enumerate(training_batches(split, batch_size, seed, now, *rest), 1):
+            if (now.epoch, count, utils.rank()) == (1, 2, 1):
                 signal.raise_signal(signal.SIGTERM)
             yield batch
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "training_batches", signalled)
-        yield
+        patch.setattr(loop, "training_batches", signalled)
+        with pytest.raises(Interrupted):
+            run_from_file(config, folder)
 
 
 @pytest.fixture(scope="module")

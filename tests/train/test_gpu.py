@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from train.experiment import load_data, run
-from train.fit.trainer import Trainer
+from train.loop import Trainer
+from train.run import load_data, run
 from train.run_folder import checkpoint
 from train.run_folder.logs import read_metrics
 
@@ -42,25 +42,18 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tiny, tmp_path):
     assert all(torch.equal(value, parts[name]) for name, value in whole.items())
 
 
-@pytest.mark.parametrize("averaging", [0.0, 0.9])
-def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, averaging):
+@pytest.mark.parametrize("ema_decay", [0.0, 0.9])
+def test_no_step_waits_for_the_gpu(tiny, tmp_path, monkeypatch, ema_decay):
     """Steps that synchronize raise an error; phases and the ends of epochs may."""
-    train = Trainer._train
+    step = Trainer._step
 
-    def watched(self, *arguments):
-        now, pass_ = self._under_way, self.learner._training_pass
-
-        def asynchronous(*batch):
-            torch.cuda.set_sync_debug_mode("error" if now.step > 3 else "default")  # after what is compiled
-            return pass_(*batch)
-
-        self.learner._training_pass = asynchronous
+    def asynchronous(self, *batch):
+        torch.cuda.set_sync_debug_mode("error" if self._under_way.step > 3 else "default")  # after what is compiled
         try:
-            return train(self, *arguments)
+            return step(self, *batch)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-            self.learner._training_pass = pass_
 
-    monkeypatch.setattr(Trainer, "_train", watched)
+    monkeypatch.setattr(Trainer, "_step", asynchronous)
     few = ("augment=none", "train.epochs=1", "train.batch_size=4")
-    weights_of(tiny("train.device=cuda", *few, f"train.averaging={averaging}"), tmp_path)
+    weights_of(tiny("train.device=cuda", *few, f"train.ema_decay={ema_decay}"), tmp_path)

@@ -1,19 +1,38 @@
+import math
 import re
 import textwrap
 from pathlib import Path
 
+import numpy as np
 import pytest
+import safetensors.torch
 import torch
+import torch.nn.functional as F
+from PIL import Image, ImageOps
+from torch import nn
 from torchvision.models import resnet18
 
 from renderer.errors import InputError
-from train.networks import build_network, model_title
-from train.run_folder import checkpoint
-from train.run_folder.classifier import describe, load_run, start_from
-from train.wideresnet import WideResNet
+from train.networks import (
+    PUBLISHED,
+    Dropout,
+    WideResNet,
+    build_network,
+    describe,
+    load_classifier,
+    load_run,
+    load_selected,
+    model_title,
+    publish,
+    start_from,
+)
+from train.run_folder.checkpoint import BEST, save
 
+PRETRAINED = Path(__file__).parents[2] / "pretrained"
+DATA = Path(__file__).parents[3] / "shared" / "data"
 CLASSES = ("apple", "orange", "pear")
 MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.3, 0.25)
+LAYOUTS = [torch.contiguous_format, torch.channels_last]
 SOURCE = """
 import torch
 from torch import nn
@@ -34,27 +53,168 @@ def of_other_logits(): return Network(4), 16, ["apple", "orange", "pear"]
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch) -> Path:
+def own_models(tmp_path, monkeypatch) -> None:
     (tmp_path / "own_models.py").write_text(textwrap.dedent(SOURCE))
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    return tmp_path
 
 
-def saved(path: Path, network: torch.nn.Module, **shape) -> Path:
-    """A checkpoint of a network for images of 16 pixels."""
-    described = describe(network, CLASSES, size=16, encoding="linear", **shape)
-    checkpoint.save(path / checkpoint.BEST, {"model": network.state_dict(), "architecture": described})
-    return path
+@pytest.fixture
+def network() -> WideResNet:
+    """With statistics of its own, as after training."""
+    torch.manual_seed(0)
+    network = WideResNet(3, 10, 1, 0.0, MEAN, STD)
+    with torch.no_grad():
+        for _ in range(3):
+            network(torch.rand(8, 3, 16, 16))
+    return network.eval()
+
+
+def description_of(network: nn.Module, **changes) -> dict:
+    shape = {"size": 48, "encoding": "linear", "depth": 10, "width": 1, "dropout": 0.0} | changes
+    return describe(network, CLASSES, **shape)
+
+
+def write(folder: Path, network: nn.Module, description: dict | None = None, **changes) -> Path:
+    """best.pt and model.safetensors of a network, whose description is changed or another."""
+    description = description_of(network) if description is None else description
+    state = {"model": network.state_dict(), "architecture": {**description, **changes}}
+    save(folder / BEST, state)
+    publish(folder / PUBLISHED, state)
+    return folder
+
+
+# ---------------------------------------------------------------------------------------- WideResNet
+
+
+def count_parameters(network: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in network.parameters())
+
+
+@pytest.mark.parametrize("depth, width, published", [(40, 1, "0.6"), (40, 4, "8.9"), (16, 8, "11.0"), (28, 10, "36.5")])
+def test_parameter_counts_are_those_published(depth, width, published):
+    with torch.device("meta"):
+        assert f"{count_parameters(WideResNet(10, depth, width)) / 1e6:.1f}" == published
+
+
+def test_wrn_16_4_for_100_classes_has_2_772_020_parameters():
+    assert count_parameters(WideResNet(100)) == 2_772_020
+
+
+def test_convolutions_start_with_he_initialization():
+    torch.manual_seed(0)
+    for name, module in WideResNet(100).named_modules():
+        if isinstance(module, nn.Conv2d):
+            weight = module.weight.detach()
+            expected = math.sqrt(2 / (weight.shape[0] * weight[0, 0].numel()))
+            spread = 5 / math.sqrt(2 * weight.numel())  # five standard errors of a standard deviation
+            assert weight.std() / expected == pytest.approx(1, abs=spread), name
+            assert abs(weight.mean()) < 5 * expected / math.sqrt(weight.numel()), name
+
+
+def test_the_forward_pass_is_the_published_block_by_block():
+    """A functional pass written down from the paper: pre-activation, the shortcut after the first ReLU."""
+    torch.manual_seed(0)
+    network = WideResNet(5, 16, 2, 0.3, MEAN, STD).double().eval()
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean.uniform_(-1, 1), module.running_var.uniform_(0.5, 2)
+            nn.init.uniform_(module.weight, 0.5, 2), nn.init.uniform_(module.bias, -1, 1)
+    state = network.state_dict()
+
+    def norm_relu(x, name):
+        parts = (state[f"{name}.{part}"] for part in ("running_mean", "running_var", "weight", "bias"))
+        return F.relu(F.batch_norm(x, *parts))
+
+    images = torch.rand(2, 3, 12, 12, dtype=torch.float64)
+    mean, std = (torch.tensor(values).double().view(1, 3, 1, 1) for values in (MEAN, STD))  # they began as float32
+    x = F.conv2d((images - mean) / std, state["stem.weight"], padding=1)
+    for group in range(3):
+        for block in range(2):
+            name, stride = f"groups.{group}.{block}", 2 if group and not block else 1
+            activated = norm_relu(x, f"{name}.norm1")
+            hidden = F.conv2d(activated, state[f"{name}.conv1.weight"], stride=stride, padding=1)
+            hidden = F.conv2d(norm_relu(hidden, f"{name}.norm2"), state[f"{name}.conv2.weight"], padding=1)
+            x = hidden + (x if block else F.conv2d(activated, state[f"{name}.shortcut.weight"], stride=stride))
+    logits = norm_relu(x, "norm").mean((2, 3)) @ state["head.weight"].T + state["head.bias"]
+    torch.testing.assert_close(network(images), logits)
+
+
+def test_dropout_acts_in_training_alone_and_images_may_have_any_size():
+    network = WideResNet(5, 10, 1, dropout=0.5)
+    for size in [(8, 8), (33, 17)]:
+        images = torch.rand(4, 3, *size)
+        assert not torch.equal(network.train()(images), network(images))
+        assert torch.equal(network.eval()(images), network(images)) and network(images).shape == (4, 5)
+
+
+@pytest.mark.parametrize("settings", [{"depth": 15}, {"depth": 4}, {"width": 0}, {"dropout": 1.0}, {"dropout": -0.1}])
+def test_an_impossible_architecture_names_its_key(settings):
+    (key,) = settings
+    with pytest.raises(InputError, match=f"model.{key}={settings[key]}"):
+        WideResNet(10, **settings)
+
+
+# ---------------------------------------------------------------------------------------- dropout
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_values_are_dropped_or_scaled_so_that_their_mean_stays(layout, dtype):
+    x = torch.ones(16, 32, 31, 33, dtype=dtype).contiguous(memory_format=layout)
+    torch.manual_seed(0)
+    y = Dropout(0.3)(x)
+    assert y.dtype == dtype and y.is_contiguous(memory_format=layout)
+    factor, passed = torch.tensor(1 / 0.7).to(dtype), y != 0
+    # p is a multiple of 2⁻¹⁶
+    torch.testing.assert_close(y[passed], factor.expand(int(passed.sum())), rtol=2**-15, atol=0)
+    assert abs(passed.double().mean() - 0.7) < 4 * (0.3 * 0.7 / x.numel()) ** 0.5  # four standard deviations
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_neighbors_are_dropped_independently(layout):
+    torch.manual_seed(0)
+    dropped = (Dropout(0.3)(torch.ones(8, 16, 64, 64).contiguous(memory_format=layout)) == 0).double() - 0.3
+    for dim in range(4):
+        pairs = dropped.narrow(dim, 1, dropped.shape[dim] - 1) * dropped.narrow(dim, 0, dropped.shape[dim] - 1)
+        assert abs(pairs.mean()) < 4 * 0.21 / pairs.numel() ** 0.5  # four standard deviations of a product's mean
+
+
+def test_the_gradient_passes_where_values_do():
+    x = torch.randn(4, 8, 5, 7, requires_grad=True)
+    y = Dropout(0.5)(x)
+    y.sum().backward()
+    assert torch.equal(x.grad, torch.where(y != 0, 2.0, 0.0))
+
+
+def test_draws_follow_torchs_seed_and_move_on():
+    x, dropout = torch.ones(1000), Dropout(0.5)
+    torch.manual_seed(3)
+    first, second = dropout(x), dropout(x)
+    torch.manual_seed(3)
+    assert torch.equal(dropout(x), first) and not torch.equal(first, second)
+
+
+def test_nothing_is_dropped_or_drawn_in_eval_mode_or_at_zero():
+    x, state = torch.randn(10), torch.get_rng_state()
+    assert Dropout(0.5).eval()(x) is x and Dropout(0.0)(x) is x
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_almost_all_and_almost_none_of_any_number_are_dropped():
+    x = torch.ones(10**6)
+    assert (Dropout(1 - 2**-16)(x) != 0).sum() < 50  # 15 expected
+    assert (Dropout(2**-16)(x) == 0).sum() < 50
+    torch.testing.assert_close(F.dropout(x, 2**-16).max(), Dropout(2**-16)(x).max())
+    assert [len(Dropout(0.5)(torch.ones(size))) for size in (0, 1, 5)] == [0, 1, 5]
+
+
+# ---------------------------------------------------------------------------------------- building
 
 
 def test_the_default_is_the_wide_residual_network_itself():
-    torch.manual_seed(0)
     built = build_network(CLASSES, 32, mean=MEAN, std=STD, depth=10, width=1, dropout=0.0)
-    torch.manual_seed(0)
-    own = WideResNet(3, 10, 1, 0.0, MEAN, STD)
-    images = torch.rand(2, 3, 32, 32)
-    assert torch.equal(built.eval()(images), own.eval()(images))
+    assert type(built) is WideResNet and built.mean.flatten().tolist() == pytest.approx(MEAN)
 
 
 def test_a_network_of_torchvision_is_torchvisions_behind_the_datas_normalization():
@@ -79,7 +239,7 @@ def test_every_family_of_torchvision_gives_logits_in_training_too(name, size):
     assert network(torch.rand(2, 3, size, size)).shape == (2, 3)
 
 
-def test_a_function_of_ones_own_makes_the_network():
+def test_a_users_function_makes_the_network():
     network = build_network(CLASSES, 16, "python:own_models:build", MEAN, STD)
     assert [name for name, _ in network.named_parameters()] == ["layer.weight", "layer.bias"]
     assert network.training and network.layer.weight.requires_grad
@@ -88,59 +248,193 @@ def test_a_function_of_ones_own_makes_the_network():
 @pytest.mark.parametrize(
     ("name", "size", "message"),
     [
-        ("resnet18", 16, "is not known: choose wideresnet, torchvision:NAME or python:MODULE:FUNCTION"),
-        ("torchvision:resnet19", 16, "is no classifier of torchvision: choose one, such as resnet18"),
-        ("torchvision:vit_b_32", 40, "takes no images of 40 pixels per side"),
-        ("torchvision:alexnet", 16, "takes no images of 16 pixels per side"),
-        ("python:own_models", 16, "names no function"),
+        ("resnet18", 16, "choose wideresnet, torchvision:NAME or python:MODULE:FUNCTION"),
+        ("torchvision:resnet19", 16, "choose one, such as resnet18"),
+        ("torchvision:vit_b_32", 40, "40 pixels per side"),
+        ("torchvision:alexnet", 16, "16 pixels per side"),
         ("python:own_models:of_other_size", 16, "is for images of 32 pixels per side, and the data has 16"),
-        ("python:own_models:of_other_classes", 16, "has other classes than the data, or in another order"),
-        ("python:own_models:of_other_logits", 16, r"gives (2, 4) for 2 images: make it return logits (2, 3)"),
+        ("python:own_models:of_other_classes", 16, "other classes than the data, or in another order"),
+        ("python:own_models:of_other_logits", 16, "(2, 4) for 2 images: make it return logits (2, 3)"),
     ],
 )
-def test_what_is_no_network_for_the_data_is_refused_by_name(name, size, message):
-    with pytest.raises(InputError, match=f"^model={name} {re.escape(message)}"):
+def test_a_network_that_does_not_take_the_data_is_refused_by_name(name, size, message):
+    with pytest.raises(InputError, match=f"^model={name} .*{re.escape(message)}"):
         build_network(CLASSES, size, name)
-
-
-def test_a_network_of_torchvision_comes_back_from_its_file(tmp_path):
-    network = build_network(CLASSES, 16, "torchvision:shufflenet_v2_x0_5", MEAN, STD).eval()
-    loaded = load_run(saved(tmp_path, network, name="torchvision:shufflenet_v2_x0_5"))
-    images = torch.rand(2, 3, 16, 16)
-    assert torch.equal(loaded(images), network(images))
-    assert (loaded.classes, loaded.size) == (CLASSES, 16)
-
-
-def test_no_file_runs_code_that_the_user_did_not_name(tmp_path):
-    run = saved(tmp_path, build_network(CLASSES, 16, "python:own_models:build"), name="python:own_models:build")
-    (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
-    with pytest.raises(InputError, match="give model=python:own_models:build to run that code"):
-        load_run(run)
-
-
-def test_a_network_of_ones_own_comes_back_where_its_function_is_named(tmp_path):
-    network = build_network(CLASSES, 16, "python:own_models:build").eval()
-    run = saved(tmp_path, network, name="python:own_models:build")
-    images = torch.rand(2, 3, 16, 16)
-    assert torch.equal(load_run(str(run), model="python:own_models:build")(images), network(images))
-
-
-def test_one_goes_on_from_a_network_of_ones_own_without_its_code(tmp_path):
-    name = "python:own_models:build"
-    trained, fresh = (build_network(CLASSES, 16, name) for _ in range(2))
-    own = {"classes": list(CLASSES), "size": 16, "name": name}
-    start_from(fresh, own, saved(tmp_path, trained, name=name))
-    assert torch.equal(fresh.layer.weight, trained.layer.weight)
-
-
-def test_weights_of_another_kind_of_network_are_refused(tmp_path):
-    run = saved(tmp_path, build_network(CLASSES, 16, "python:own_models:build"), name="python:own_models:build")
-    network = WideResNet(3, 10, 1)
-    own = {"classes": list(CLASSES), "size": 16, "depth": 10, "width": 1}
-    with pytest.raises(InputError, match="was trained with name python:own_models:build, not wideresnet"):
-        start_from(network, own, run)
 
 
 def test_titles_name_the_network():
     assert model_title(depth=28, width=10, dropout=0.3) == "WideResNet-28-10, dropout 0.3"
     assert model_title("torchvision:resnet18") == "torchvision:resnet18"
+
+
+# ---------------------------------------------------------------------------------------- loading
+
+
+@pytest.mark.parametrize("file", ["", BEST, PUBLISHED], ids=["folder", "checkpoint", "published"])
+def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_path, file):
+    classifier = load_classifier(f"run:{write(tmp_path, network) / file}")
+    assert (classifier.classes, classifier.size) == (CLASSES, 48)
+    assert classifier.name == f"run:{tmp_path / file}"
+    images = torch.rand(3, 3, 48, 48)
+    expected = network(images)
+    if file == PUBLISHED:
+        torch.testing.assert_close(classifier(images), expected, rtol=0.01, atol=0.01)  # half precision
+    else:
+        assert torch.equal(classifier(images), expected)
+
+
+@pytest.mark.parametrize("name", ["torchvision:shufflenet_v2_x0_5", "python:own_models:build"])
+def test_other_networks_come_back_from_their_file_code_only_where_it_is_named(tmp_path, name):
+    network = build_network(CLASSES, 16, name, MEAN, STD).eval()
+    write(tmp_path, network, describe(network, CLASSES, size=16, encoding="linear", name=name))
+    images = torch.rand(2, 3, 16, 16)
+    assert torch.equal(load_run(tmp_path / BEST, model=name)(images), network(images))
+    fresh = build_network(CLASSES, 16, name)
+    (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
+    start_from(fresh, {"classes": [*CLASSES], "size": 16, "name": name}, tmp_path / BEST)
+    assert torch.equal(fresh.eval()(images), network(images))
+    if name.startswith("python:"):
+        with pytest.raises(InputError, match=f"give model={name} to run that code"):
+            load_run(tmp_path)
+
+
+def test_a_network_that_does_not_say_its_size_has_32_or_the_one_asked_for(network, tmp_path):
+    save(
+        tmp_path / BEST, {"model": network.state_dict(), "architecture": {"classes": CLASSES, "depth": 10, "width": 1}}
+    )
+    assert load_run(tmp_path).size == 32
+    assert load_run(tmp_path, size=64).size == 64
+    with pytest.raises(InputError, match=r"size=32: .* was trained on images of 48 pixels per side"):
+        load_run(write(tmp_path, network), size=32)
+
+
+@pytest.mark.parametrize(
+    "name, weights, message",
+    [
+        ("run:absent", None, "run=absent holds neither best.pt nor model.safetensors"),
+        ("run:absent", "a.pth", "weights=a.pth is not for classifier=run:absent"),
+        ("runs/2026-01-01", None, "squeezenet_caffe, torchvision:NAME, python:NAME, run:NAME"),
+        ("squeezenet_caffe", None, "classifier=squeezenet_caffe comes without weights"),
+    ],
+)
+def test_a_classifier_that_cannot_be_loaded_is_one_sentence(name, weights, message):
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
+        load_classifier(name, weights)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"version": "2"}, {"version": 99}, {"size": "32"}, {"size": 0}, {"size": 10**9}, {"encoding": ["srgb"]},
+        {"classes": 3}, {"classes": []}, {"classes": ["fig", "lime"]}, {"depth": "10"}, {"depth": 11}, {"width": 2},
+        {"depth": 6 * 10**9 + 4}, {"width": 10**9}, {"heads": 3}, {"mean": "a"}, {"mean": [0.5]},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(network, tmp_path, changes):
+    write(tmp_path, network, **changes)
+    for name in (BEST, PUBLISHED):
+        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} [^\n]+$"):
+            load_run(tmp_path / name)
+
+
+@pytest.mark.parametrize("architecture", [None, [], "orange"])
+@pytest.mark.parametrize("weights", [None, ["stem"], {"stem.weight": 1}, {}])
+def test_a_checkpoint_of_other_things_is_one_sentence(network, tmp_path, architecture, weights):
+    for state in ({"model": network.state_dict(), "architecture": architecture},
+                  {"model": weights, "architecture": description_of(network)}):  # fmt: skip
+        save(tmp_path / BEST, state)
+        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / BEST} [^\n]+$"):
+            load_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda path: path.write_bytes(path.read_bytes()[:-10]), id="truncated"),
+        pytest.param(lambda path: path.write_bytes(b""), id="empty"),
+        pytest.param(lambda path: safetensors.torch.save_file({"a": torch.zeros(1)}, path), id="no architecture"),
+        pytest.param(
+            lambda path: safetensors.torch.save_file({"a": torch.zeros(1)}, path, {"architecture": "{"}), id="no JSON"
+        ),
+    ],
+)
+def test_a_damaged_published_file_is_one_error(network, tmp_path, damage):
+    damage(write(tmp_path, network) / PUBLISHED)
+    with pytest.raises(InputError, match=r"model.safetensors is damaged or lacks its architecture"):
+        load_run(tmp_path / PUBLISHED)
+
+
+# ---------------------------------------------------------------------------------------- starting from another run's
+
+
+def test_a_network_starts_with_the_weights_and_the_normalization_of_another(network, tmp_path):
+    fresh = WideResNet(3, 10, 1, 0.3, mean=(0.5, 0.5, 0.5))
+    start_from(fresh, description_of(fresh, dropout=0.3), write(tmp_path, network))
+    images = torch.rand(3, 3, 32, 32)
+    assert torch.equal(fresh.eval()(images), network(images))
+
+
+@pytest.mark.parametrize(
+    "change, fault",
+    [
+        ({"classes": ["pear", "apple", "orange"]}, "other classes"),
+        ({"size": 64}, "size 48, not 64"),
+        ({"depth": 16}, "depth 10, not 16"),
+        ({"name": "torchvision:resnet18"}, "name wideresnet, not torchvision:resnet18"),
+    ],
+)
+def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, change, fault):
+    write(tmp_path, network)
+    with pytest.raises(
+        InputError, match=f"train.init_from={tmp_path} was trained with {fault}: give this run the same"
+    ):
+        start_from(network, {**description_of(network), **change}, tmp_path)
+
+
+# ---------------------------------------------------------------------------------------- publishing
+
+
+def test_a_published_network_is_the_same_to_half_precision_with_all_that_it_takes_to_use_it(network, tmp_path):
+    write(tmp_path, network, encoding="srgb")
+    published = load_selected(tmp_path / PUBLISHED)[1]
+    assert published["architecture"] == load_selected(tmp_path / BEST)[1]["architecture"]
+    assert published["architecture"]["mean"] == pytest.approx(MEAN)
+    for name, value in network.state_dict().items():
+        half = published["model"][name]
+        assert half.dtype == value.dtype
+        # rounding to 11 bits; below 2⁻¹⁴ half precision is spaced evenly
+        bound = value.double().abs() * 2**-11 + 2**-25
+        assert ((half.double() - value.double()).abs() <= bound).all(), name
+
+
+def test_a_published_file_takes_half_the_room_whatever_the_memory_layout(network, tmp_path):
+    numbers, contents = sum(value.numel() for value in network.state_dict().values()), set()
+    for layout in LAYOUTS:
+        path = write(tmp_path, network.to(memory_format=layout)) / PUBLISHED
+        assert path.stat().st_size < 2 * numbers + 10_000
+        contents.add(path.read_bytes())
+    assert len(contents) == 1
+
+
+@pytest.mark.parametrize("arm", ["none", "random", "adversarial"])
+def test_the_published_networks_are_classifiers_of_cifar_100(arm):
+    classifier = load_classifier(f"run:{PRETRAINED / arm}")
+    assert (len(classifier.classes), classifier.size, classifier.label("orange")) == (100, 32, 53)
+    images = torch.full((1, 3, 32, 32), 0.5, requires_grad=True)
+    (gradient,) = torch.autograd.grad(classifier(images)[0, 53], images)
+    assert gradient.isfinite().all() and gradient.any()
+
+
+@pytest.mark.realdata
+@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
+def test_the_published_base_recognizes_most_oranges_in_rgb():
+    """And hardly one with red and blue exchanged, unlike the networks that were hardened against light."""
+    classifier = load_classifier(f"run:{PRETRAINED / 'none'}")
+    paths = sorted((DATA / "photos" / "orange").iterdir())[::9]
+    squares = [ImageOps.fit(Image.open(path).convert("RGB"), (32, 32), Image.Resampling.LANCZOS) for path in paths]
+    images = torch.from_numpy(np.stack(squares)).permute(0, 3, 1, 2).float() / 255
+    with torch.no_grad():
+        recall, swapped = ((classifier(each).argmax(1) == 53).float().mean() for each in (images, images.flip(1)))
+    assert recall > 0.6 and swapped < 0.05

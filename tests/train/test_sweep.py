@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
-from train import sweep
+from train import loop, sweep
 from train.__main__ import main
 from train.command_line.entry_points import USER_ERROR
-from train.fit import trainer
 from train.run_folder import checkpoint
 from train.run_folder.checkpoint import LAST, content_hash
 from train.run_folder.continuation import decisive_settings
@@ -164,7 +163,7 @@ def test_a_second_call_skips_finished_cells_and_shows_them_again(run_sweep, cell
 def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_none(
     run_sweep, cell, swept, tmp_path, monkeypatch, capsys, undone, number
 ):
-    evaluate, calls = trainer.evaluate, []
+    evaluate, calls = loop.evaluate, []
 
     def interrupted(*arguments):
         calls.append(arguments)
@@ -173,7 +172,7 @@ def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_no
         return evaluate(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(trainer, "evaluate", interrupted)
+        patch.setattr(loop, "evaluate", interrupted)
         try:
             assert run_sweep(tmp_path, "seed=0,1") == 128 + number
         except KeyboardInterrupt:
@@ -233,10 +232,10 @@ def test_a_failed_cell_is_told_with_its_reason_and_tried_again_and_stops_no_othe
     assert printed.splitlines()[-1] == told[0] and not (unlucky / FAILURE).exists()
 
 
-def test_a_cell_that_another_process_trains_is_left_alone(tiny, tmp_path, capsys):
+def test_a_cell_that_another_process_trains_is_left_alone(tiny_config, tmp_path, capsys):
     with locked(tmp_path) as ours:
         assert ours
-        run_cell(tiny(), tmp_path)
+        run_cell(tiny_config(), tmp_path)
         assert format_sweep([tmp_path]).endswith(f"{tmp_path}: in training")
     assert capsys.readouterr().out == f"in training elsewhere: {tmp_path}\n"
     assert [path.name for path in tmp_path.iterdir()] == [LOCK]
@@ -319,9 +318,9 @@ def test_a_sweep_that_cannot_be_meant_is_one_sentence(run_sweep, cell, tmp_path,
     assert not (tmp_path / "none").exists()
 
 
-def test_what_decides_a_result_is_all_but_its_folder_and_circumstances(tiny):
+def test_what_decides_a_result_is_all_but_its_folder_and_circumstances(tiny_config):
     def settings(*overrides):
-        return decisive_settings(tiny("+data.images=${run}/images", *overrides))
+        return decisive_settings(tiny_config("+data.images=${run}/images", *overrides))
 
     here = settings("run=here")
     assert here["data.images"] == "${run}/images" and here["augment.attack.max_steps"] == 3

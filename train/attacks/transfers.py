@@ -13,9 +13,9 @@ from augment.classifiers import Classifier
 from augment.objects import load_object, on_ground
 from renderer.errors import InputError
 from train.attacks.settings import AttackExperimentSettings
+from train.networks import load_classifier
 from train.photographs.shares import counted, share
 from train.report.tables import aligned
-from train.run_folder.classifier import load_classifier
 from train.settings import read_object
 
 FILE = "transfer.jsonl"

@@ -23,7 +23,7 @@ from renderer.errors import InputError, is_out_of_memory
 from train.command_line import INTERRUPTED
 from train.command_line.configuration import read_settings
 from train.command_line.overrides import as_text, is_hydras, refusal
-from train.distributed import is_process_lost
+from train.runtime import is_process_lost
 
 USER_ERROR = 2
 LONGEST_NAME = 200  # characters

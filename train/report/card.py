@@ -8,13 +8,12 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from train.networks import PYTHON, model_title
+from train.networks import PUBLISHED, PYTHON, load_run, model_title, publish
 from train.photographs.figures import figure_title
 from train.photographs.text import format_interval
 from train.report.summary import RunSummary, complete, summarize
 from train.report.tables import aligned
 from train.run_folder import checkpoint
-from train.run_folder.classifier import PUBLISHED, load_run, publish
 
 RECIPE = (
     "epochs",
@@ -26,7 +25,7 @@ RECIPE = (
     "schedule",
     "ranking",
     "distillation",
-    "averaging",
+    "ema_decay",
     "soup",
     "precision",
 )

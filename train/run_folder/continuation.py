@@ -17,7 +17,7 @@ from train.settings import ExperimentSettings
 
 # Where, how and with what a run was made: these do not decide its result, nor name a sweep's cell.
 CIRCUMSTANCES = (
-    *("run", "sweep", "launcher", "compare", "versions", "inputs", "renderer.cache"),
+    *("run", "sweep", "launcher", "compare", "versions", "inputs", "hardware", "renderer.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = "inputs"  # in a run's config.yaml
@@ -95,7 +95,7 @@ def _paths(value: Any) -> Iterator[str]:
             for item in value:
                 yield from _paths(item)
         case dict():
-            yield from _paths([value.get("mesh"), value.get("beside")])
+            yield from _paths([value.get("mesh"), value.get("props")])
 
 
 def _of_folder(path: str) -> str:

@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.__main__ import main
+from train.command_line.configuration import read_settings
 from train.command_line.entry_points import (
     USER_ERROR,
     command_line,
@@ -23,9 +24,10 @@ from train.command_line.entry_points import (
 )
 from train.command_line.outputs import Folders
 from train.command_line.overrides import quoted
-from train.experiment import load_data, prepare
+from train.run import load_data, prepare
 from train.run_folder.checkpoint import LAST
 from train.run_folder.files import locked
+from train.settings import ExperimentSettings
 
 ROOT = Path(__file__).parents[3]
 SMALL = [
@@ -156,21 +158,25 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_np
         (["train=3"], "train: Merge error: int is not a subclass of TrainSettings. value: 3"),
     ],
 )
-def test_what_a_user_can_mend_is_one_line_and_status_2(tiny, tmp_path, capsys, overrides, message):
-    command = one_sentence_errors(lambda config: prepare(config, load_data(config), tmp_path))
+def test_what_a_user_can_mend_is_one_line_and_status_2(tiny_config, tmp_path, capsys, overrides, message):
+    @one_sentence_errors
+    def command(config):
+        settings = read_settings(ExperimentSettings, config)
+        prepare(settings, load_data(settings), tmp_path)
+
     with pytest.raises(SystemExit) as stop:
-        command(tiny(*overrides))
+        command(tiny_config(*overrides))
     assert stop.value.code == USER_ERROR
     assert capsys.readouterr() == ("", f"error: {message}\n")
 
 
-def test_unset_and_unresolved_keys_are_one_line_too(tiny, capsys):
+def test_unset_and_unresolved_keys_are_one_line_too(tiny_config, capsys):
     for override, message in [
         ("data.path=???", "data.path is not set: give data.path=..."),
         ("data.path=${nowhere}", "data.path: Interpolation key 'nowhere' not found"),
     ]:
         with pytest.raises(SystemExit):
-            one_sentence_errors(lambda config: config.data.path)(tiny(override))
+            one_sentence_errors(lambda config: config.data.path)(tiny_config(override))
         assert capsys.readouterr().err == f"error: {message}\n"
 
 

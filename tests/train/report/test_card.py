@@ -5,12 +5,12 @@ import pytest
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
+from train.networks import PUBLISHED, load_run
 from train.photographs.figures import FIGURES, figure_title
 from train.report.card import publish_run
 from train.report.summary import summarize
 from train.run_folder import checkpoint
 from train.run_folder.checkpoint import BEST
-from train.run_folder.classifier import PUBLISHED, load_run
 
 
 def test_a_published_run_is_a_network_and_a_card_that_names_no_folder_of_this_machine(

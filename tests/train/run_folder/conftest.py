@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from train.wideresnet import WideResNet
+from train.networks import WideResNet
 
 
 @pytest.fixture

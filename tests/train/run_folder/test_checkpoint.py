@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from renderer.errors import InputError
+from train.networks import WideResNet
 from train.run_folder import files
 from train.run_folder.checkpoint import BEST, LAST, PREVIOUS, content_hash, load, load_newest, save
-from train.wideresnet import WideResNet
 
 
 def state_of(network: WideResNet) -> dict:

@@ -1,0 +1,172 @@
+import pytest
+import torch
+import torch.nn.functional as F
+
+from augment.service import Renders
+from renderer.image import to_bytes, to_unit
+from train import batches
+from train.batches import PADDING, Round, crop_and_flip, put_last, rounds_of_epoch, training_batches, with_room
+from train.data import Split
+
+
+def noise(*shape: int) -> torch.Tensor:
+    return torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+
+
+def whole_epoch(images: torch.Tensor, epoch: int) -> Round:
+    return Round(epoch, epoch, torch.arange(len(images)))
+
+
+def numbered(images: torch.Tensor) -> Split:
+    """Each image's row is its label."""
+    return Split(images, torch.arange(len(images)))
+
+
+def epoch_of(count: int, batch_size: int = 7) -> list[tuple[torch.Tensor, ...]]:
+    """Batches of plain images, each of its own value, which is its label too."""
+    images = torch.arange(count).view(-1, 1, 1, 1).expand(-1, 3, 8, 8).to(torch.uint8)
+    return list(training_batches(numbered(images), batch_size, 0, whole_epoch(images, 0)))
+
+
+# ---------------------------------------------------------------------------------------- crops and flips
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (5, 5), (6, 11)])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flipped):
+    height, width = shape
+    images = noise(3, 3, height, width)
+    steps = range(-PADDING, PADDING + 1)
+    shifts = torch.tensor([(down, right) for down in steps for right in steps]).T
+    chosen = torch.arange(shifts.shape[1]) % len(images)
+    cropped = crop_and_flip(images, chosen, shifts, torch.full((len(chosen),), flipped))
+    padded = F.pad(images.double(), (PADDING,) * 4, mode="reflect").to(torch.uint8)
+    for image, row, (down, right) in zip(cropped, chosen, shifts.T, strict=True):
+        top, left = PADDING + down, PADDING + right
+        expected = padded[row, :, top : top + height, left : left + width]
+        assert torch.equal(image, expected.flip(2) if flipped else expected)
+
+
+def test_shifts_and_flips_are_all_drawn_about_equally_often():
+    count, size, middle = 6000, 11, 5
+    pixel = torch.arange(size * size).view(1, 1, size, size).expand(count, 3, -1, -1).to(torch.uint8)
+    (images, *_), *_ = training_batches(Split(pixel, torch.zeros(count)), count, 0, whole_epoch(pixel, 0))
+    rows = images[:, 0, middle].long()
+    flipped = rows[:, middle - 1] > rows[:, middle + 1]
+    assert abs(flipped.double().mean() - 0.5) < 4 * 0.5 / count**0.5  # four standard deviations
+    counts = rows[:, middle].bincount(minlength=size * size).view(size, size)[1:-1, 1:-1]
+    assert counts.sum() == count
+    chi_square = ((counts - count / 81) ** 2 / (count / 81)).sum()
+    assert chi_square < 80 + 4 * (2 * 80) ** 0.5  # four standard deviations at 80 degrees of freedom
+
+
+def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
+    ramp = torch.arange(11, dtype=torch.uint8).expand(40, 3, 11, 11)
+
+    def mirrored(epoch: int) -> torch.Tensor:
+        """By image."""
+        ((images, labels, _),) = training_batches(numbered(ramp), 40, 0, whole_epoch(ramp, epoch), "alternating")
+        flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
+        return flipped[labels.argsort()]
+
+    first, second, third = (mirrored(epoch) for epoch in range(3))
+    assert torch.equal(first, ~second) and torch.equal(first, third)
+    assert 0 < first.sum() < 40
+
+
+def test_bytes_survive_the_way_to_unit_and_back():
+    values = torch.arange(256, dtype=torch.uint8)
+    assert torch.equal(to_bytes(to_unit(values)), values)
+    assert to_unit(values)[[0, 255]].tolist() == [0, 1]
+
+
+# ---------------------------------------------------------------------------------------- batches
+
+
+def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last_batch_with_the_first():
+    epoch = epoch_of(100)
+    assert [len(labels) for _, labels, _ in epoch] == [7] * 15
+    order = torch.cat([labels for _, labels, _ in epoch]).tolist()
+    assert sorted(order[:100]) == list(range(100)) and order[100:] == order[:5]
+    for images, labels, _ in epoch:
+        assert images.dtype == torch.uint8 and images.shape == (len(labels), 3, 8, 8)
+        assert torch.equal(images, labels.to(torch.uint8).view(-1, 1, 1, 1).expand_as(images))
+
+
+def test_fewer_images_than_a_batch_fill_it_several_times():
+    ((_, labels, _),) = epoch_of(3)
+    assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
+
+
+def test_batches_tell_which_of_their_images_are_renders():
+    rows = torch.arange(30)
+    epoch = training_batches(numbered(noise(30, 3, 8, 8)), 7, 0, Round(0, 0, rows[5:], renders=4))
+    assert all(torch.equal(rendered, labels >= 26) for _, labels, rendered in epoch)
+
+
+@pytest.mark.parametrize("flips", ["random", "alternating"])
+@pytest.mark.parametrize("images_at_once", [1, 20, 10**6])
+def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, images_at_once):
+    split = numbered(noise(50, 3, 8, 8))
+    whole = list(training_batches(split, 8, 0, whole_epoch(split.images, 1), flips))
+    monkeypatch.setattr(batches, "CHUNK_BYTES", images_at_once * 3 * 8 * 8)
+    for first in range(len(whole) + 1):
+        rest = list(training_batches(split, 8, 0, whole_epoch(split.images, 1), flips, first))
+        assert len(rest) == len(whole) - first
+        for batch, expected in zip(rest, whole[first:], strict=True):
+            assert all(torch.equal(*pair) for pair in zip(batch, expected, strict=True))
+
+
+def test_batches_are_a_function_of_seed_and_epoch_alone():
+    split, drawn = numbered(noise(50, 3, 8, 8)), {}
+    for seed, epoch in [(0, 0), (0, 1), (1, 0)]:
+        torch.manual_seed(len(drawn))
+        first, again = (
+            torch.cat([images for images, *_ in training_batches(split, 16, seed, whole_epoch(split.images, epoch))])
+            for _ in range(2)
+        )
+        assert torch.equal(first, again)
+        drawn[seed, epoch] = first
+    assert not torch.equal(drawn[0, 0], drawn[0, 1]) and not torch.equal(drawn[0, 0], drawn[1, 0])
+
+
+# ---------------------------------------------------------------------------------------- rounds and renders
+
+
+def test_the_rounds_renders_follow_the_data_as_bytes_with_their_labels():
+    data = numbered(noise(5, 3, 16, 16))
+    mixed = with_room(data, 2)
+    for renders in (torch.ones(2, 3, 16, 16), torch.rand(2, 3, 16, 16)):
+        put_last(mixed, Renders(renders, torch.tensor([1, 0]), {}))
+        assert torch.equal(mixed.images[:5], data.images)
+        assert (mixed.images[5:] / 255 - renders).abs().max() <= 0.5 / 255 + 1e-6
+        assert mixed.labels.tolist() == [*data.labels.tolist(), 1, 0]
+
+
+def test_without_renders_the_data_stay_as_they_are():
+    data = numbered(noise(5, 3, 16, 16))
+    mixed = with_room(data, 0)
+    put_last(mixed, Renders(torch.zeros(0, 3, 1, 1), torch.zeros(0, dtype=torch.int64), {}))
+    assert torch.equal(mixed.images, data.images) and torch.equal(mixed.labels, data.labels)
+
+
+def test_without_rounds_an_epoch_is_one_of_all_images_and_renders():
+    (only,) = rounds_of_epoch(5, 2, seed=0, epoch=3, images_per_epoch=None, every=None)
+    assert (only.number, only.epoch, only.rows.tolist()) == (3, 3, list(range(7)))
+
+
+def test_rounds_divide_the_epochs_images_and_each_has_all_renders():
+    rounds = rounds_of_epoch(100, 7, seed=0, epoch=4, images_per_epoch=50, every=20)
+    assert [(part.number, part.epoch) for part in rounds] == [(12, 4), (13, 4), (14, 4)]
+    rows = [part.rows.tolist() for part in rounds]
+    assert [len(part) for part in rows] == [27, 27, 17]
+    assert all(part == sorted(part) and part[-7:] == list(range(100, 107)) for part in rows)
+    images = [row for part in rows for row in part[:-7]]
+    assert len(set(images)) == 50 and max(images) < 100
+
+
+def test_an_epochs_images_are_drawn_anew_and_are_never_more_than_there_are():
+    (first,), (second,) = (rounds_of_epoch(100, 0, 0, epoch, 50, None) for epoch in (0, 1))
+    assert first.rows.tolist() != second.rows.tolist()
+    (everything,) = rounds_of_epoch(100, 0, 0, 0, 5000, None)
+    assert everything.rows.tolist() == list(range(100))

@@ -1,0 +1,357 @@
+import copy
+import itertools
+import math
+import signal
+from types import SimpleNamespace
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from augment.service import Renders
+from augment.utils import Phases
+from renderer.errors import InputError
+from train.data import Split
+from train.loop import Trainer, evaluate
+from train.networks import WideResNet
+from train.recipe import TrainSettings, cosine
+from train.run_folder import checkpoint
+from train.run_folder.logs import RunLog, read_metrics
+from train.runtime import MixedPrecision
+
+ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
+
+
+class NoRenders:
+    """Stands for the augmentation service."""
+
+    settings = SimpleNamespace(arm="none", every=None)
+    label = None
+
+    def __len__(self):
+        return 0
+
+    def regenerate(self, model, number):
+        return Renders(torch.zeros(0, 3, 1, 1), torch.zeros(0, dtype=torch.int64), {})
+
+    def state_dict(self):
+        return {}
+
+    def load_state_dict(self, state):
+        assert state == {}
+
+
+def noise(count: int) -> Split:
+    draws = torch.Generator().manual_seed(count)
+    images = torch.randint(0, 256, (count, 3, 16, 16), dtype=torch.uint8, generator=draws)
+    return Split(images, torch.randint(0, 3, (count,), generator=draws))
+
+
+def make_trainer(folder, network: nn.Module | None = None, **settings) -> Trainer:
+    torch.manual_seed(0)
+    model = MixedPrecision(network or WideResNet(3, 10, 1, dropout=0.0), "float32")
+    settings = TrainSettings(**{"epochs": 3, "batch_size": 16, "learning_rate": 0.05, "init_from": "base"} | settings)
+    return Trainer(settings, model, ARCHITECTURE, NoRenders(), Phases(), folder, seed=0)
+
+
+def fit_noise(trainer: Trainer) -> list[dict]:
+    trainer.fit(noise(40), noise(20), RunLog(trainer.folder))
+    return read_metrics(trainer.folder)
+
+
+def state_of(folder, name: str = checkpoint.LAST) -> dict:
+    return checkpoint.load(folder / name)
+
+
+def validation(monkeypatch, accuracies, losses=itertools.repeat(1.0)) -> None:  # noqa: B008
+    """Script the results of validation."""
+    results = ({"loss": loss, "accuracy": accuracy} for loss, accuracy in zip(losses, accuracies, strict=False))
+    monkeypatch.setattr("train.loop.evaluate", lambda *arguments: next(results))
+
+
+# ---------------------------------------------------------------------------------------- steps and epochs
+
+
+def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tmp_path, monkeypatch):
+    """Two steps of a linear network against the update written down."""
+    images, labels = torch.rand(2, 4, 3, 2, 2), torch.tensor([[0, 1, 2, 0], [1, 1, 2, 0]])
+    as_bytes = (images * 255).round().to(torch.uint8)
+    images = as_bytes / 255
+    monkeypatch.setattr("train.loop.training_batches", lambda *rest: zip(as_bytes, labels, labels < 0, strict=True))
+    validation(monkeypatch, [0.0])
+    network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
+    weight, bias = (parameter.detach().clone().requires_grad_() for parameter in network[1].parameters())
+    recipe = {"learning_rate": 0.5, "momentum": 0.9, "weight_decay": 0.1, "schedule": "cosine"}
+    trainer = make_trainer(tmp_path, network, epochs=1, batch_size=4, **recipe)
+    trainer.fit(Split(as_bytes.flatten(0, 1), labels.flatten()), noise(1), RunLog(tmp_path))
+
+    velocities, losses = [torch.zeros_like(weight), torch.zeros_like(bias)], []
+    for step in range(2):
+        loss = F.cross_entropy(images[step].flatten(1) @ weight.T + bias, labels[step])
+        losses.append(loss.item())
+        gradients = torch.autograd.grad(loss, (weight, bias))
+        with torch.no_grad():
+            for parameter, gradient, velocity in zip((weight, bias), gradients, velocities, strict=True):
+                gradient = gradient + 0.1 * parameter
+                velocity.mul_(0.9).add_(gradient)
+                parameter -= 0.5 * cosine(step / 2) * (gradient + 0.9 * velocity)
+    torch.testing.assert_close(network[1].weight, weight)
+    torch.testing.assert_close(network[1].bias, bias)
+    (line,) = read_metrics(tmp_path)
+    assert line["train/loss"] == pytest.approx(sum(losses) / 2)
+    assert line["train/learning_rate"] == pytest.approx(0.5 * cosine(1 / 2))
+
+
+def test_training_learns_what_can_be_told_apart(tmp_path):
+    data = noise(64)
+    data.images[torch.arange(64), data.labels] //= 4
+    make_trainer(tmp_path, epochs=5, schedule="one_cycle").fit(data, data, RunLog(tmp_path))
+    assert read_metrics(tmp_path)[-1]["validation/accuracy"] > 0.95
+
+
+def test_epochs_train_in_training_mode_whatever_the_mode_before(tmp_path):
+    trainer = make_trainer(tmp_path, epochs=2)
+    trainer.model.eval()
+    fit_noise(trainer)
+    assert trainer.model.network.norm.num_batches_tracked == 2 * math.ceil(40 / 16)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode(monkeypatch, training):
+    monkeypatch.setattr("train.loop.EVALUATION_BATCH", 7)
+    torch.manual_seed(0)
+    model = WideResNet(3, 10, 1, dropout=0.5).train(training)
+    before = copy.deepcopy(model.state_dict())
+    split = noise(40)
+    scores = evaluate(model, split)
+    assert model.training == training
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    logits = model.eval().double()(split.images / 255)
+    assert scores["loss"] == pytest.approx(F.cross_entropy(logits, split.labels).item(), rel=1e-5)
+    assert scores["accuracy"] == (logits.argmax(1) == split.labels).double().mean().item()
+
+
+def test_a_ranking_without_look_alikes_is_refused(tmp_path):
+    with pytest.raises(
+        InputError, match=r"train\.ranking=1\.0 ranks hard negatives: name some in scene\.hard_negatives"
+    ):
+        make_trainer(tmp_path, ranking=1.0)
+
+
+# ---------------------------------------------------------------------------------------- averages
+
+
+def test_the_moving_average_follows_the_steps_and_is_validated_and_kept(tmp_path):
+    trainer, weights = make_trainer(tmp_path, epochs=2, ema_decay=0.8), []
+    trainer.optimizer.register_step_post_hook(
+        lambda *arguments: weights.append(trainer.model.network.head.weight.detach().clone())
+    )
+    fit_noise(trainer)
+    average = weights[0]
+    for weight in weights[1:]:
+        average = 0.8 * average + 0.2 * weight
+    torch.testing.assert_close(trainer.selected.network.head.weight, average)
+    assert not torch.allclose(trainer.model.network.head.weight, average)
+    accuracy = evaluate(trainer.selected, noise(20))["accuracy"]
+    assert accuracy == read_metrics(tmp_path)[-1]["validation/accuracy"]
+
+
+@pytest.mark.parametrize("ema_decay", [0.0, 0.8])
+def test_a_soup_is_the_mean_of_epochs_that_each_begin_anew(tmp_path, monkeypatch, ema_decay):
+    trainer = make_trainer(tmp_path, soup=True, ema_decay=ema_decay, schedule="one_cycle")
+    begun, ends, rates = [], [], []
+    regenerate, update = trainer._regenerate, trainer.soup.update_parameters
+
+    def regenerated(*rest):
+        begun.append(copy.deepcopy(trainer.model.state_dict()))
+        return regenerate(*rest)
+
+    def updated(model):
+        ends.append(copy.deepcopy(model.state_dict()))
+        update(model)
+
+    monkeypatch.setattr(trainer, "_regenerate", regenerated)
+    monkeypatch.setattr(trainer.soup, "update_parameters", updated)
+    trainer.optimizer.register_step_post_hook(lambda *rest: rates.append(trainer.optimizer.param_groups[0]["lr"]))
+    initial = copy.deepcopy(trainer.model.state_dict())
+    fit_noise(trainer)
+    for name, value in initial.items():
+        assert all(torch.equal(state[name], value) for state in begun)
+        mean = torch.stack([state[name].double() for state in ends]).mean(0)
+        kept = trainer.selected.state_dict()[name]
+        torch.testing.assert_close(kept.double(), mean, rtol=0, atol=1e-6 if kept.is_floating_point() else 1)
+    assert rates == 3 * rates[: len(rates) // 3]
+    assert not torch.equal(ends[0]["network.head.weight"], ends[1]["network.head.weight"])
+
+
+def test_of_a_soup_the_last_is_kept_whatever_its_validation(tmp_path, monkeypatch):
+    validation(monkeypatch, [0.9, 0.5])
+    trainer = make_trainer(tmp_path, epochs=2, soup=True)
+    fit_noise(trainer)
+    kept = state_of(tmp_path, checkpoint.BEST)
+    assert kept["epoch"] == 2
+    expected = trainer.selected.network.state_dict()
+    assert all(torch.equal(value, expected[name]) for name, value in kept["model"].items())
+
+
+@pytest.mark.parametrize("soup", [False, True])
+def test_a_resumed_average_goes_on_bit_for_bit(tmp_path, soup):
+    settings = {"ema_decay": 0.8, "soup": soup}
+    fit_noise(make_trainer(tmp_path, **settings))
+    whole = state_of(tmp_path)
+    (tmp_path / checkpoint.LAST).unlink()  # the epoch before the last is left
+    resumed = make_trainer(tmp_path, **settings)
+    resumed.resume()
+    assert resumed.epoch == 2
+    fit_noise(resumed)
+    again, key = state_of(tmp_path), "soup" if soup else "ema"
+    assert again[key].keys() == whole[key].keys()
+    assert all(torch.equal(value, whole[key][name]) for name, value in again[key].items())
+
+
+# ---------------------------------------------------------------------------------------- the selected network
+
+
+def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_path, monkeypatch):
+    trainer, weights = make_trainer(tmp_path, epochs=5), []
+    accuracies = iter([0.2, 0.6, 0.5, 0.6, 0.1])
+
+    def scripted(model, split):
+        weights.append(copy.deepcopy(model.network.state_dict()))
+        return {"loss": 1.0, "accuracy": next(accuracies)}
+
+    monkeypatch.setattr("train.loop.evaluate", scripted)
+    fit_noise(trainer)
+    best, last = state_of(tmp_path, checkpoint.BEST), state_of(tmp_path)
+    assert (best["epoch"], best["validation_accuracy"]) == (2, 0.6)
+    assert (last["epoch"], last["epoch_best"], last["validation_accuracy_best"]) == (5, 2, 0.6)
+    for state, expected in [(best, weights[1]), (last, weights[4])]:
+        assert all(torch.equal(value, expected[name]) for name, value in state["model"].items())
+
+
+def test_a_resumed_run_remembers_the_best_epoch(tmp_path, monkeypatch):
+    validation(monkeypatch, [0.6, 0.5])
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    resumed = make_trainer(tmp_path, epochs=2)
+    resumed.resume()
+    fit_noise(resumed)
+    assert state_of(tmp_path, checkpoint.BEST)["epoch"] == 1
+    last = state_of(tmp_path)
+    assert (last["epoch"], last["epoch_best"], last["validation_accuracy_best"]) == (2, 1, 0.6)
+
+
+# ---------------------------------------------------------------------------------------- errors while training
+
+
+def test_a_loss_that_is_not_finite_ends_the_run_with_the_last_good_checkpoint(tmp_path, monkeypatch):
+    validation(monkeypatch, [0.5, 0.5], losses=[1.0, math.nan])
+    with pytest.raises(InputError, match=r"_rate=0.05 with .*_decay=.* made the loss NaN or infinite in epoch 2"):
+        fit_noise(make_trainer(tmp_path))
+    assert state_of(tmp_path)["epoch"] == 1
+    assert [line["epoch"] for line in read_metrics(tmp_path)] == [1]
+
+
+@pytest.mark.parametrize("ended", ["by itself", "by a signal"])
+def test_weights_that_are_not_finite_are_named_and_the_last_good_checkpoint_stays(tmp_path, monkeypatch, ended):
+    trainer, steps = make_trainer(tmp_path), itertools.count(1)
+    finite = trainer._loss
+
+    def infinite(*batch):
+        loss, hits = finite(*batch)
+        if next(steps) < 5:  # the second of three steps of the second epoch
+            return loss, hits
+        if ended == "by a signal":
+            signal.raise_signal(signal.SIGTERM)
+        return loss * math.inf, hits
+
+    monkeypatch.setattr(trainer, "_loss", infinite)
+    with pytest.raises(InputError, match=r"made the weight stem.weight NaN or infinite in epoch 2: set lower"):
+        fit_noise(trainer)
+    assert state_of(tmp_path)["epoch"] == 1
+
+
+@pytest.mark.parametrize(
+    "error", [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(), RuntimeError("can't allocate memory: you ")]
+)
+def test_where_memory_runs_out_in_training_the_setting_is_named(tmp_path, monkeypatch, error):
+    def too_large(*batch):
+        raise error
+
+    trainer = make_trainer(tmp_path)
+    monkeypatch.setattr(trainer, "_loss", too_large)
+    with pytest.raises(InputError, match=r"train.batch_size=16 needs more memory than there is: set a lower one"):
+        fit_noise(trainer)
+
+
+# ---------------------------------------------------------------------------------------- checkpoints
+
+
+def test_every_epoch_has_its_line_before_its_checkpoint(tmp_path, monkeypatch):
+    """A crash between the two then loses nothing: the epoch comes again."""
+    saved, save = [], checkpoint.save
+
+    def recorded(path, state, *previous):
+        saved.append((path.name, state["epoch"], [line["epoch"] for line in read_metrics(tmp_path)]))
+        save(path, state, *previous)
+
+    monkeypatch.setattr(checkpoint, "save", recorded)
+    fit_noise(make_trainer(tmp_path, epochs=2))
+    assert [rest for name, *rest in saved if name == checkpoint.LAST] == [[1, [1]], [2, [1, 2]]]
+
+
+def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tmp_path):
+    """So a second accident, while the next one is written, is not the end of the run."""
+    fit_noise(make_trainer(tmp_path, epochs=2))
+    (tmp_path / checkpoint.LAST).write_bytes(b"")
+    trainer = make_trainer(tmp_path, epochs=2)
+    trainer.resume()
+    assert trainer.epoch == 1
+    fit_noise(trainer)
+    assert [state_of(tmp_path, name)["epoch"] for name in (checkpoint.PREVIOUS, checkpoint.LAST)] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"history": []},
+        {"epoch": "x"},
+        {"optimizer": [1]},
+        {"precision": "int3"},
+        {"random_state": "x"},
+        {"under_way": {"step": 1}},
+        {"model": []},
+        {"architecture": {**ARCHITECTURE, "version": 99}},
+        {"architecture": {**ARCHITECTURE, "classes": ["fig", "lime", "plum"]}},
+    ],
+    ids=str,
+)
+def test_a_forged_checkpoint_with_a_right_hash_is_refused_in_one_sentence(tmp_path, changes):
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    checkpoint.save(tmp_path / checkpoint.LAST, state_of(tmp_path) | changes)
+    with pytest.raises(InputError, match=str(tmp_path)) as caught:
+        make_trainer(tmp_path).resume()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("settings", [{"ema_decay": 0.8}, {"soup": True}], ids=str)
+def test_resuming_with_an_average_that_the_run_does_not_have_is_an_error(tmp_path, settings):
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    with pytest.raises(InputError, match=f"the checkpoint in {tmp_path} is not one that this run can go on from"):
+        make_trainer(tmp_path, **settings).resume()
+
+
+def test_a_network_alone_is_not_a_run_to_go_on_with(tmp_path):
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    (tmp_path / checkpoint.BEST).rename(tmp_path / checkpoint.LAST)
+    with pytest.raises(InputError, match=f"the checkpoint in {tmp_path} is not one that this run can go on from"):
+        make_trainer(tmp_path).resume()
+
+
+def test_weights_of_nan_are_not_gone_on_with(tmp_path):
+    fit_noise(make_trainer(tmp_path, epochs=1))
+    state = state_of(tmp_path)
+    state["model"]["stem.weight"].fill_(math.nan)
+    checkpoint.save(tmp_path / checkpoint.LAST, state)
+    with pytest.raises(InputError, match=r"last.pt has NaN or infinity in stem.weight: use another one"):
+        make_trainer(tmp_path).resume()

@@ -1,0 +1,202 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+from torchvision.transforms import v2
+
+from augment import utils
+from augment.labels import ranking_loss
+from renderer.errors import InputError
+from renderer.image import to_unit
+from train.networks import WideResNet
+from train.recipe import (
+    AUGMENTATIONS,
+    PGD_RADIUS,
+    SCHEDULES,
+    TRANSFORMS,
+    MovingAverage,
+    TrainSettings,
+    augmentation,
+    cosine,
+    one_cycle,
+    soup,
+    step,
+    torchvision_transform,
+    training_loss,
+)
+
+LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
+
+
+@pytest.fixture
+def images() -> torch.Tensor:
+    return torch.randint(0, 256, (6, 3, 16, 16), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture
+def model() -> nn.Module:
+    torch.manual_seed(0)
+    return WideResNet(4, 10, 1, 0.3)
+
+
+# ---------------------------------------------------------------------------------------- settings
+
+
+def test_the_recipe_is_the_papers():
+    settings = TrainSettings()
+    assert (settings.epochs, settings.batch_size, settings.learning_rate) == (150, 128, 0.125)
+    assert (settings.momentum, settings.weight_decay, settings.schedule) == (0.9, 5e-4, "step")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"epochs": 0}, {"batch_size": 0}, {"threads": 0}, {"checkpoint_every": 0},
+        {"learning_rate": 0.0}, {"learning_rate": math.nan}, {"learning_rate": 1e300},
+        {"ranking": -1.0}, {"distillation": 1.0}, {"soup": True}, {"momentum": 1.0}, {"momentum": -0.1},
+        {"weight_decay": math.nan}, {"weight_decay": 1e300}, {"label_smoothing": 1.0}, {"ema_decay": -0.1},
+        {"schedule": "linear"}, {"flips": "vertical"}, {"compile": "maybe"}, {"augmentation": "cutout"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_setting_out_of_range_is_named(settings):
+    (name,) = settings
+    with pytest.raises(InputError, match=rf"\b{name}\b"):
+        TrainSettings(**settings)
+
+
+# ---------------------------------------------------------------------------------------- schedules
+
+
+@pytest.mark.parametrize("epochs", [10, 50, 150, 200])
+def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent_of_the_epochs(epochs):
+    rates = [step(epoch / epochs) for epoch in range(epochs)]
+    parts = [3, 3, 2, 2]
+    assert rates == [0.2**fall for fall, part in enumerate(parts) for _ in range(part * epochs // 10)]
+
+
+def test_the_cosine_schedule_is_half_a_cosine():
+    progress = np.linspace(0, 1, 101)
+    rates = [cosine(value) for value in progress]
+    np.testing.assert_allclose(rates, np.cos(math.pi / 2 * progress) ** 2, atol=1e-15)  # by the half-angle formula
+
+
+def test_one_cycle_rises_from_a_tenth_to_1_in_a_fifth_and_falls_to_0_in_straight_lines():
+    progress = np.linspace(0, 1, 1001)
+    rates = [one_cycle(value) for value in progress]
+    np.testing.assert_allclose(rates, np.interp(progress, [0, 0.2, 1], [0.1, 1, 0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES.values())
+def test_every_schedule_stays_within_the_peak_rate_and_reaches_it(schedule):
+    rates = [schedule(value) for value in np.linspace(0, 1, 1001)]
+    assert min(rates) >= 0 and max(rates) == 1
+
+
+# ---------------------------------------------------------------------------------------- loss
+
+
+def loss_of(model, images, labels, rendered, label=None, teacher=None, **settings) -> tuple[torch.Tensor, torch.Tensor]:
+    weights = TrainSettings(init_from="base", **settings)
+    return training_loss(model, weights, label, teacher)(images, labels, rendered)
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.1])
+def test_the_loss_is_the_mean_smoothed_cross_entropy_and_comes_with_the_number_of_hits(model, images, smoothing):
+    loss, hits = loss_of(model.eval(), images, LABELS, LABELS == 0, label_smoothing=smoothing)
+    logits = model(images / 255)
+    uniform = -F.log_softmax(logits, 1).mean(1)
+    expected = (1 - smoothing) * F.cross_entropy(logits, LABELS) + smoothing * uniform.mean()
+    torch.testing.assert_close(loss, expected)
+    assert hits == (logits.argmax(1) == LABELS).sum()
+
+
+def test_the_ranking_is_added_by_its_weight(model, images):
+    labels = LABELS - 1  # two of "anything but class 0"
+    alone, _ = loss_of(model.eval(), images, labels, labels == 0)
+    both, _ = loss_of(model, images, labels, labels == 0, label=1, ranking=4.0)
+    torch.testing.assert_close(both, alone + 4 * ranking_loss(model(images / 255), labels, 1))
+
+
+def test_the_divergence_from_the_teacher_is_added_on_images_that_are_not_renders(model, images):
+    """The teacher's probabilities q are a constant: Σ q log(q / p)."""
+    rendered, teacher = torch.arange(6) < 2, WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
+    alone, _ = loss_of(model.eval(), images, LABELS, rendered)
+    both, _ = loss_of(model, images, LABELS, rendered, teacher=teacher, distillation=4.0)
+    p, q = (network(images[2:] / 255).softmax(1) for network in (model, teacher))
+    torch.testing.assert_close(both, alone + 4 * (q * (q / p).log()).sum() / 6)
+
+
+# ---------------------------------------------------------------------------------------- averaged weights
+
+
+@pytest.mark.parametrize("kind", ["moving average", "soup"])
+def test_averages_are_of_weights_and_statistics_and_begin_with_the_first_update(kind):
+    """Of weights 3, 5, 10: the mean, or (3 × 0.8 + 5 × 0.2) × 0.8 + 10 × 0.2."""
+    module = nn.BatchNorm1d(2)
+    average = soup(module) if kind == "soup" else MovingAverage(module, 0.8)
+    for value in (3.0, 5.0, 10.0):
+        nn.init.constant_(module.weight, value)
+        module.running_mean.fill_(value)
+        module.num_batches_tracked.fill_(7)
+        average.update_parameters(module)
+    expected = torch.full((2,), 6.0 if kind == "soup" else 4.72)
+    torch.testing.assert_close(average.module.weight.detach(), expected)
+    torch.testing.assert_close(average.module.running_mean, expected)
+    assert average.n_averaged == 3 and 6 <= average.module.num_batches_tracked <= 7
+
+
+# ---------------------------------------------------------------------------------------- augmentations
+
+
+@pytest.mark.parametrize("name", AUGMENTATIONS)
+def test_an_augmentation_is_a_function_of_seed_and_step_and_leaves_model_and_random_state_alone(name, images, model):
+    before = torch.get_rng_state()
+    first, again = (augmentation(name, model, 3)(images, LABELS, 7) for _ in range(2))
+    assert first.dtype == torch.uint8 and first.shape == images.shape
+    assert torch.equal(first, again)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert model.training and all(parameter.grad is None for parameter in model.parameters())
+    if name == "none":
+        assert torch.equal(first, images)
+    else:
+        assert not torch.equal(first, augmentation(name, model, 3)(images, LABELS, 8))
+        assert not torch.equal(first, augmentation(name, model, 4)(images, LABELS, 7))
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_every_image_is_changed_by_draws_of_its_own_whatever_the_number_of_processes(name, images, model, monkeypatch):
+    same = images[:1].expand(6, -1, -1, -1)
+    whole = augmentation(name, model, 0)(same, LABELS, 1)
+    assert len(whole.unique(dim=0)) > 1
+    monkeypatch.setattr(utils, "rank", lambda: 1)
+    assert torch.equal(augmentation(name, model, 0)(same[3:], LABELS[3:], 1), whole[3:])
+
+
+def test_color_jitter_is_torchvisions(images, model):
+    """Brightness changes by at most 0.4 of itself: no value of a uniform image leaves that range, but for contrast."""
+    uniform = torch.full_like(images, 100)
+    jittered = augmentation("color_jitter", model, 0)(uniform, LABELS, 0)
+    assert jittered.min() >= 60 - 1 and jittered.max() <= 140 + 1
+    assert isinstance(torchvision_transform("color_jitter"), v2.ColorJitter)
+
+
+def test_pgd_stays_within_its_radius_and_raises_the_loss(images, model):
+    adversarial = augmentation("pgd", model, 0)(images, LABELS, 0)
+    assert (to_unit(adversarial) - to_unit(images)).abs().max() <= PGD_RADIUS + 1e-6
+    model.eval()
+    before, after = (F.cross_entropy(model(to_unit(batch)), LABELS) for batch in (images, adversarial))
+    noise = torch.randint(-8, 9, images.shape, generator=torch.Generator().manual_seed(1))
+    random = F.cross_entropy(model(to_unit((images.int() + noise).clamp(0, 255))), LABELS)
+    assert after > before + 10 * abs(random - before)
+
+
+def test_pgd_takes_labels_of_no_class(images, model):
+    """Hard negatives are "anything but" a class: its probability is raised."""
+    labels = torch.full((6,), -1 - 2)
+    adversarial = augmentation("pgd", model.eval(), 0)(images, labels, 0)
+    before, after = (model(to_unit(batch)).softmax(1)[:, 2].mean() for batch in (images, adversarial))
+    assert after > before

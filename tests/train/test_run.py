@@ -1,0 +1,577 @@
+import errno
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from omegaconf import OmegaConf
+
+from augment.labels import complementary_label
+from augment.variation import VariationSettings
+from renderer.errors import InputError
+from train import loop
+from train.command_line.configuration import composed, read_settings
+from train.data import DataSet
+from train.networks import load_run
+from train.run import load_data, prepare, run
+from train.run_folder import checkpoint
+from train.run_folder.continuation import require_same_settings
+from train.run_folder.logs import read_metrics
+from train.runtime import Interrupted
+from train.settings import ExperimentSettings
+
+
+def train(settings: ExperimentSettings, folder: Path) -> dict[str, float]:
+    return run(settings, load_data(settings), folder)
+
+
+def assert_same_weights(first: Path, second: Path) -> None:
+    expected = torch.load(second, weights_only=True)["model"]
+    for name, value in torch.load(first, weights_only=True)["model"].items():
+        assert torch.equal(value, expected[name]), name
+
+
+def metrics_without_times(folder: Path) -> list[dict]:
+    return [{k: v for k, v in line.items() if not k.startswith("seconds/")} for line in read_metrics(folder)]
+
+
+def files_in(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -> None:
+    """Call `act` while a step of a round is taken, counted from 1."""
+    training_batches = loop.training_batches
+
+    def acting(split, batch_size, seed, now, *rest):
+        for count, batch in enumerate(training_batches(split, batch_size, seed, now, *rest), 1):
+            if (now.number, count) == (round_number, step):
+                act()
+            yield batch
+
+    monkeypatch.setattr(loop, "training_batches", acting)
+
+
+def train_with_signal(settings, folder: Path, round_number: int, step: int, number: signal.Signals) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        act_at(patch, round_number, step, lambda: signal.raise_signal(number))
+        train(settings, folder)
+
+
+@pytest.fixture
+def regenerated(monkeypatch) -> list:
+    """The renders of each round, as they are handed to training."""
+    renders, put_last = [], loop.put_last
+    monkeypatch.setattr(loop, "put_last", lambda split, new: renders.append(new) or put_last(split, new))
+    return renders
+
+
+# ---------------------------------------------------------------------------------------- resuming
+
+
+def interrupt_in_the_second_epoch(monkeypatch) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    act_at(monkeypatch, 1, 2, interrupt)
+
+
+def interrupt_while_the_second_checkpoint_is_written(monkeypatch) -> None:
+    save = torch.save
+
+    def interrupted(state, file):
+        if "optimizer" in state and state["epoch"] == 2:
+            file.write(b"the beginning of a checkpoint")
+            raise KeyboardInterrupt
+        save(state, file)
+
+    monkeypatch.setattr(checkpoint.torch, "save", interrupted)
+
+
+@pytest.mark.parametrize("interrupt", [interrupt_in_the_second_epoch, interrupt_while_the_second_checkpoint_is_written])
+def test_an_interrupted_and_resumed_run_ends_as_an_uninterrupted_one(tiny, photos, finished, tmp_path, interrupt):
+    """Bit for bit, with adversaries whose lights continue from epoch to epoch, and dropout."""
+    assert all(line["augment/light_change"] > 0 for line in read_metrics(finished)[:-1])
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(tiny(), tmp_path)
+    assert checkpoint.load(tmp_path / checkpoint.LAST)["epoch"] == 1
+    torch.manual_seed(17)
+    train(tiny("train.resume=true", f"evaluate.photos={photos}"), tmp_path)
+    for name in (checkpoint.LAST, checkpoint.BEST):
+        assert_same_weights(tmp_path / name, finished / name)
+    assert metrics_without_times(tmp_path) == metrics_without_times(finished)
+    for name in ("epoch_002.png", "epoch_003.png"):
+        assert (tmp_path / "renders" / name).read_bytes() == (finished / "renders" / name).read_bytes()
+
+
+@pytest.mark.parametrize("number, step", [(signal.SIGTERM, 2), (signal.SIGINT, 4)])
+def test_a_signal_ends_the_run_after_its_step_and_resuming_ends_as_if_it_had_not_come(
+    tiny, photos, finished, tmp_path, number, step
+):
+    """Bit for bit, in the middle of an epoch and at its end (of 4 steps); with two more signals on the way."""
+    handlers = [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)]
+    overrides = (f"evaluate.photos={photos}", "train.resume=true")
+    for epoch, at in [(0, 1), (1, step), (2, 1)]:
+        with pytest.raises(Interrupted) as stopped:
+            train_with_signal(tiny(*overrides), tmp_path, epoch, at, number)
+        assert (stopped.value.code, stopped.value.signal) == (128 + number, number.name)
+        assert [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)] == handlers
+        state = checkpoint.load(tmp_path / checkpoint.LAST)
+        under_way = state["under_way"]
+        assert (state["epoch"], under_way and under_way["step"]) == ((epoch, at) if at < 4 else (epoch + 1, None))
+        assert [line["epoch"] for line in read_metrics(tmp_path)] == list(range(1, state["epoch"] + 1))
+    torch.manual_seed(17)
+    train(tiny(*overrides), tmp_path)
+    for name in (checkpoint.LAST, checkpoint.BEST):
+        assert_same_weights(tmp_path / name, finished / name)
+    assert metrics_without_times(tmp_path) == metrics_without_times(finished)
+
+
+@pytest.mark.parametrize("listens", [True, False])
+def test_a_batch_systems_signal_writes_a_checkpoint_before_its_own_handler_acts(tiny, tmp_path, listens):
+    epochs = []
+
+    def requeue(number, frame):
+        epochs.append(checkpoint.load(tmp_path / checkpoint.LAST)["epoch"])
+        raise SystemExit(-1)
+
+    before = signal.signal(signal.SIGUSR2, requeue if listens else signal.SIG_DFL)
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            train_with_signal(tiny("augment=none"), tmp_path, 1, 2, signal.SIGUSR2)
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert (stopped.value.code, epochs) == ((-1, [1]) if listens else (128 + signal.SIGUSR2, []))
+    assert checkpoint.load(tmp_path / checkpoint.LAST)["under_way"]["step"] == 2
+
+
+def test_a_signal_that_is_ignored_stays_so(tiny, tmp_path):
+    """As nohup ignores SIGHUP, a shell ignores SIGINT for what it starts in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        train_with_signal(tiny("augment=none"), tmp_path, 1, 2, signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "test/accuracy" in read_metrics(tmp_path)[-1]
+
+
+def test_a_second_signal_acts_at_once(tiny, tmp_path, monkeypatch):
+    act_at(monkeypatch, 0, 1, lambda: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
+    with pytest.raises(KeyboardInterrupt):
+        train(tiny("augment=none"), tmp_path)
+    assert not checkpoint.exists(tmp_path)
+
+
+def test_a_damaged_newest_checkpoint_is_reported_and_the_one_before_leads_to_the_same_end(
+    tiny, photos, finished, tmp_path, caplog
+):
+    shutil.copytree(finished, tmp_path / "run")
+    newest = tmp_path / "run" / checkpoint.LAST
+    newest.write_bytes(newest.read_bytes()[:-1000])
+    with caplog.at_level("WARNING", "train"):
+        train(tiny("train.resume=true", f"evaluate.photos={photos}"), tmp_path / "run")
+    assert str(newest) in caplog.text and "the one before" in caplog.text
+    assert_same_weights(newest, finished / checkpoint.LAST)
+    assert metrics_without_times(tmp_path / "run") == metrics_without_times(finished)
+
+
+def test_checkpoints_of_every_other_epoch_hold_the_same_and_the_last_one(tiny, photos, finished, tmp_path, monkeypatch):
+    saved, save = [], checkpoint.save
+    monkeypatch.setattr(checkpoint, "save", lambda path, *rest: saved.append(path.name) or save(path, *rest))
+    train(tiny("train.checkpoint_every=2", f"evaluate.photos={photos}"), tmp_path)
+    assert saved.count(checkpoint.LAST) == 2  # after epochs 2 and 3
+    for name in (checkpoint.LAST, checkpoint.BEST):
+        assert_same_weights(tmp_path / name, finished / name)
+
+
+def test_resuming_a_finished_run_trains_no_further_and_scores_the_same(tiny, tmp_path):
+    train(tiny("augment=none", "train.epochs=1"), tmp_path)
+    before, last = metrics_without_times(tmp_path), (tmp_path / checkpoint.LAST).read_bytes()
+    train(tiny("augment=none", "train.epochs=1", "train.resume=true"), tmp_path)
+    assert metrics_without_times(tmp_path) == before
+    assert (tmp_path / checkpoint.LAST).read_bytes() == last
+
+
+def test_a_folder_that_holds_a_run_is_not_written_over(tiny, finished):
+    before = files_in(finished)
+    with pytest.raises(InputError, match=r"holds a run already: set train.resume=true to go on, or choose another"):
+        train(tiny(), finished)
+    assert files_in(finished) == before
+
+
+@pytest.mark.parametrize("change", ["seed=8", "augment.arm=none", "train.epochs=2", "data.path={other}"])
+def test_resuming_with_other_settings_is_refused_by_name_and_changes_nothing(
+    tiny, tiny_npz, finished, change, tmp_path
+):
+    before = files_in(finished)
+    change = change.format(other=shutil.copy(tiny_npz, tmp_path / "other.npz"))
+    key, _, asked = change.partition("=")
+    settings = tiny("train.resume=true", change)
+    with pytest.raises(InputError, match=rf"was trained with {key}=\S+, and train.resume=true asks for {asked}"):
+        prepare(settings, load_data(settings), finished)
+    assert files_in(finished) == before
+
+
+def test_resuming_for_more_epochs_and_under_other_circumstances_is_no_change(tiny_config, finished):
+    for changes in (["train.epochs=4"], ["train.threads=1", "renderer.cache=null", "train.checkpoint_every=2"]):
+        require_same_settings(finished, tiny_config("train.resume=true", *changes))
+
+
+# ---------------------------------------------------------------------------------------- full disks
+
+
+def fail_with(number: int):
+    def fail(*arguments, **more):
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    "writer, done",
+    [
+        pytest.param("train.run_folder.logs.RunLog._show", 0, id="TensorBoard"),
+        pytest.param("train.run_folder.logs.RunLog.renders", 0, id="renders"),
+        pytest.param("train.run_folder.logs.RunLog.scalars", 0, id="metrics"),
+        pytest.param("train.run_folder.files.os.fsync", 0, id="checkpoint"),
+        pytest.param("train.run.evaluate_photographs", 1, id="photographs"),
+    ],
+)
+def test_a_full_disk_is_one_error_wherever_it_is_met_and_the_run_can_go_on(tiny, photos, tmp_path, writer, done):
+    settings = tiny("train.epochs=1", "train.resume=true", f"evaluate.photos={photos}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(writer, fail_with(errno.ENOSPC))
+        with pytest.raises(InputError, match=rf"{re.escape(str(tmp_path))}\S* cannot be written \(No space left"):
+            train(settings, tmp_path)
+    assert checkpoint.exists(tmp_path) == bool(done)
+    train(settings, tmp_path)
+    assert len(read_metrics(tmp_path)) == 2
+
+
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Callable[[int], Path]]:
+    """Makes a file system of so many KiB, or changes its size."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1k", "tmpfs", str(folder)]
+    if not shutil.which("mount") or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting is not allowed")
+
+    def sized(kibibytes: int) -> Path:
+        subprocess.run(["mount", "-o", f"remount,size={kibibytes}k", str(folder)], check=True)
+        return folder
+
+    yield sized
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kibibytes", [8, 100, 500, 1300])
+def test_a_run_on_a_small_disk_ends_in_one_error_and_goes_on_when_there_is_room(tiny, small_disk, kibibytes):
+    disk = small_disk(kibibytes)
+    settings = tiny("train.epochs=2", "train.resume=true", f"renderer.cache={disk / 'cache'}")
+    with pytest.raises(InputError, match=rf"{disk}\S* cannot be written \(No space left"):
+        train(settings, disk / "run")
+    small_disk(8000)
+    train(settings, disk / "run")
+    assert [line.get("epoch") for line in read_metrics(disk / "run")] == [1, 2, None]
+
+
+def test_another_error_of_the_system_is_not_called_a_full_disk(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr("train.run_folder.logs.RunLog.scalars", fail_with(errno.EIO))
+    with pytest.raises(OSError, match="Input/output error"):
+        train(tiny("train.epochs=1"), tmp_path)
+
+
+def test_a_configuration_that_does_not_fit_leaves_the_old_one_whole(tiny, finished, tmp_path, monkeypatch):
+    shutil.copytree(finished, tmp_path / "run")
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+    monkeypatch.setattr("train.run_folder.files.os.fsync", fail_with(errno.ENOSPC))
+    with pytest.raises(InputError, match=r"make room and go on with train\.resume=true"):
+        train(tiny("train.resume=true"), tmp_path / "run")
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+
+
+# ---------------------------------------------------------------------------------------- rounds and starts
+
+
+def test_a_signal_between_two_rounds_or_within_one_leads_to_the_same_end(tiny, finished, tmp_path):
+    """Bit for bit: 40 of 54 images an epoch, in rounds of 16, 16 and 8, each with 4 renders (2, 2 and 1 steps); held to
+    the predictions of the network begun with."""
+    rounds = ("augment.every=16", "train.images_per_epoch=40", "train.resume=true")
+    settings = tiny(*rounds, f"train.init_from={finished}", "train.distillation=2")
+    train(settings, tmp_path / "whole")
+    folder = tmp_path / "stopped"
+    for number, at in [(1, 2), (4, 1), (6, 2)]:
+        with pytest.raises(Interrupted):
+            train_with_signal(settings, folder, number, at, signal.SIGTERM)
+        assert checkpoint.load(folder / checkpoint.LAST)["under_way"]["step"] == {1: 4, 4: 3, 6: 2}[number]
+    train(settings, folder)
+    assert_same_weights(folder / checkpoint.LAST, tmp_path / "whole" / checkpoint.LAST)
+    assert metrics_without_times(folder) == metrics_without_times(tmp_path / "whole")
+
+
+def test_every_round_is_trained_on_renders_made_for_its_own_weights(tiny, tmp_path, regenerated):
+    train(tiny("train.epochs=1", "augment=random", "augment.every=20"), tmp_path)
+    assert len(regenerated) == 3  # 54 images
+    assert len(torch.cat([renders.images for renders in regenerated]).unique(dim=0)) == 3 * 4
+    (line,) = [line for line in read_metrics(tmp_path) if "epoch" in line]
+    assert line["augment/loss"] == pytest.approx(sum(renders.diagnostics["loss"] for renders in regenerated) / 3)
+
+
+def test_a_run_starts_from_the_selected_network_of_another(tiny, finished, tmp_path):
+    overrides = ("augment=none", "train.epochs=1", "train.learning_rate=1e-30")
+    train(tiny(f"train.init_from={finished}", *overrides), tmp_path)
+    first, found = checkpoint.load(finished / checkpoint.BEST), checkpoint.load(tmp_path / checkpoint.LAST)
+    for name, value in first["model"].items():
+        assert "running" in name or "batches" in name or torch.equal(found["model"][name], value), name
+    assert found["epoch"] == 1
+
+
+# ---------------------------------------------------------------------------------------- arms
+
+
+def test_no_examples_and_no_augmentation_train_the_same_weights(tiny, tmp_path):
+    """So the arms differ in their renders alone: nothing else draws from the training's random streams."""
+    arms = {"none": ["augment=none"], "empty": ["augment.examples=0"], "renders": []}
+    for name, overrides in arms.items():
+        train(tiny("train.epochs=2", *overrides), tmp_path / name)
+    assert_same_weights(tmp_path / "empty" / checkpoint.LAST, tmp_path / "none" / checkpoint.LAST)
+    with pytest.raises(AssertionError):
+        assert_same_weights(tmp_path / "renders" / checkpoint.LAST, tmp_path / "none" / checkpoint.LAST)
+    assert not (tmp_path / "none" / "renders").exists()
+
+
+@pytest.mark.parametrize("arm", ["none", "random", "adversarial"])
+def test_a_run_is_a_function_of_its_seed(tiny, tmp_path, arm):
+    for name, seed in [("first", 0), ("again", 0), ("other", 1)]:
+        torch.manual_seed(len(name))
+        train(tiny("train.epochs=1", f"augment={arm}", f"seed={seed}"), tmp_path / name)
+    first, again, other = (tmp_path / name / checkpoint.LAST for name in ("first", "again", "other"))
+    assert_same_weights(again, first)
+    with pytest.raises(AssertionError):
+        assert_same_weights(other, first)
+
+
+def test_meshes_and_look_alikes_are_rendered_with_their_own_labels(tiny, tmp_path, regenerated):
+    """A hard negative that names no class is anything but the label."""
+    meshes = "scene.meshes=[{mesh: 'solid:pear', label: pear}, 'solid:orange']"
+    hard_negatives = "scene.hard_negatives=['solid:fruit', {mesh: 'solid:apple:2', label: apple}]"
+    train(tiny("train.epochs=1", meshes, hard_negatives, "augment.examples=16"), tmp_path)
+    (renders,) = regenerated
+    apple, orange, pear = range(3)
+    # mesh by mesh: 2 views × 2 backgrounds each
+    expected = [pear, orange, complementary_label(orange), apple]
+    assert renders.labels.tolist() == [label for label in expected for _ in range(4)]
+    assert len(renders.images.unique(dim=0)) == 16
+    assert np.isfinite(read_metrics(tmp_path)[0]["train/loss"])
+
+
+def test_another_class_takes_a_label_meshes_and_look_alikes_alone(tiny, tmp_path, regenerated):
+    meshes = ["label=pear", "scene.meshes=['solid:pear']", "scene.hard_negatives=[{mesh: 'solid:apple', label: apple}]"]
+    small = ["augment.examples=null", "scene.views=2", "augment.every=30", "augment.warm_start=false", "train.epochs=1"]
+    train(tiny("experiment=best", "train.init_from=null", "train.soup=false", *meshes, *small), tmp_path)
+    first, second = regenerated
+    apple, pear = 0, 2
+    assert first.labels.tolist() == second.labels.tolist() == [pear] * 4 + [apple] * 4
+    assert len(torch.cat([first.images, second.images]).unique(dim=0)) == 16
+
+
+# ---------------------------------------------------------------------------------------- what a run leaves
+
+
+def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(finished, tiny_npz, photos):
+    config = OmegaConf.load(finished / "config.yaml")
+    assert OmegaConf.missing_keys(config) == set()
+    assert (config.data.path, config.evaluate.photos, config.train.epochs) == (str(tiny_npz), str(photos), 3)
+    assert set(config.versions) == {"python", "torch", "torchvision", "numpy"}
+    assert config.hardware == {"device": "cpu", "precision": "float32"}
+    last, best = (torch.load(finished / name, weights_only=True) for name in ("last.pt", "best.pt"))
+    assert (last["epoch"], last["seed"], last["arm"], last["precision"]) == (3, 7, "adversarial", "float32")
+    assert last["model"].keys() == best["model"].keys() and "optimizer" not in best
+    assert sorted(path.name for path in (finished / "renders").glob("*.png")) == [f"epoch_00{n}.png" for n in (1, 2, 3)]
+    assert {path.name for path in (finished / "photographs").iterdir()} == {
+        "photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png"
+    }  # fmt: skip
+    assert not list(finished.glob("*.tmp")) and list(finished.glob("events.out.tfevents.*"))
+
+
+def test_metrics_have_each_epochs_losses_attack_and_seconds_and_the_final_scores(finished):
+    *epochs, scores = read_metrics(finished)
+    assert [line["epoch"] for line in epochs] == [1, 2, 3]
+    for line in epochs:
+        assert {
+            "train/loss", "train/accuracy", "train/learning_rate", "validation/loss", "validation/accuracy",
+            "augment/attack_success_before", "augment/attack_success", "augment/steps", "augment/loss_before",
+            "augment/loss", "augment/light_change", "augment/clamped",
+            "seconds/attack", "seconds/training", "seconds/evaluation", "seconds/input_output",
+        } <= line.keys()  # fmt: skip
+        assert all(isinstance(value, int | float) for value in line.values())
+    summary = json.loads((finished / "photographs" / "summary.json").read_text())
+    assert scores.keys() == {
+        "test/accuracy", "test/accuracy_last", "test/epoch",
+        *(f"photographs/{name}" for name in ("recall", "top5", "false_alarms", "auc")),
+        *(f"photographs/recall_at/{rate}" for rate in ("0.05", "0.10", "0.20")),
+    }  # fmt: skip
+    for name in ("recall", "top5", "false_alarms", "auc"):
+        assert scores[f"photographs/{name}"] == summary[name]["value"]
+    for rate, metric in summary["recall_at"].items():
+        assert scores[f"photographs/recall_at/{rate}"] == metric["value"]
+
+
+def test_several_folders_of_photographs_are_scored_in_sub_folders_of_their_names(tiny, photos, tmp_path):
+    named = f"evaluate.photos={{lab: {photos}, wild-1: {photos / 'orange'}}}"
+    scores = train(tiny("augment=none", "train.epochs=1", named), tmp_path / "run")
+    assert scores == read_metrics(tmp_path / "run")[-1]
+    for name in ("lab", "wild-1"):
+        summary = json.loads((tmp_path / "run" / name / "summary.json").read_text())
+        assert scores[f"{name}/recall"] == summary["recall"]["value"]
+    assert "lab/auc" in scores and "wild-1/auc" not in scores  # a folder of oranges alone
+    assert not (tmp_path / "run" / "photographs").exists()
+
+
+def test_photographs_among_which_the_scores_would_lie_are_refused_before_training(tiny, photos, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(photos, folder / "photographs")
+    settings = tiny(f"evaluate.photos={folder / 'photographs'}")
+    with pytest.raises(InputError, match="photographs lies inside the photographs' folder: choose another"):
+        prepare(settings, load_data(settings), folder)
+
+
+def test_the_selected_network_is_the_best_on_validation_and_the_one_that_is_scored(finished, tiny):
+    *epochs, scores = read_metrics(finished)
+    accuracies = [line["validation/accuracy"] for line in epochs]
+    best = checkpoint.load(finished / checkpoint.BEST)
+    assert best["epoch"] == scores["test/epoch"] == accuracies.index(max(accuracies)) + 1
+    network = load_run(finished)
+    test = load_data(tiny()).test
+    logits = network(test.images / 255)
+    assert scores["test/accuracy"] == pytest.approx((logits.argmax(1) == test.labels).double().mean().item())
+    assert network.classes == ("apple", "orange", "pear") and network.size == 16
+
+
+class GuardedData:
+    """A data set whose test split can be had only once the last epoch is done."""
+
+    def __init__(self, data: DataSet, folder: Path, epochs: int):
+        self.classes, self.train, self.size = data.classes, data.train, data.size
+        self._test, self._last, self._epochs = data.test, folder / checkpoint.LAST, epochs
+        self.looks = 0
+
+    @property
+    def test(self):
+        assert checkpoint.load(self._last)["epoch"] == self._epochs
+        self.looks += 1
+        return self._test
+
+
+def test_the_test_set_is_looked_at_once_after_the_last_epoch(tiny, tmp_path):
+    data = GuardedData(load_data(tiny()), tmp_path, epochs=3)
+    run(tiny(), data, tmp_path)
+    assert data.looks == 1
+
+
+def test_training_and_validation_images_are_apart(tiny, tmp_path, monkeypatch):
+    splits = {}
+
+    def record(self, train, validation, log):
+        splits.update(train=train, validation=validation)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop.Trainer, "fit", record)
+    with pytest.raises(KeyboardInterrupt):
+        train(tiny(), tmp_path)
+    assert (len(splits["train"]), len(splits["validation"])) == (54, 6)
+    assert splits["validation"].labels.bincount().tolist() == [2, 2, 2]
+    both = torch.cat([splits["train"].images, splits["validation"].images])
+    assert torch.equal(both.unique(dim=0), load_data(tiny()).train.images.unique(dim=0))
+
+
+# ---------------------------------------------------------------------------------------- what is skipped
+
+
+def test_the_log_says_what_is_shared_and_what_is_skipped(tiny, tmp_path, caplog, rasterized):
+    """A wall that hides another, both open, and a closed box, seen from the front and above; 1 view, 2 backgrounds.
+
+    The wall covers 15 of the image's 16 rows, and the box no other. Unseen are 2 of the walls' 4 faces and 8 of the
+    box's 12.
+    """
+    wall, box = np.array([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]]), trimesh.creation.box((1, 2, 1))
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    walls = trimesh.Trimesh(np.concatenate([wall, wall / 2 - [0.5, 0, 0]]), np.concatenate([faces, faces + 4]))
+    for name, mesh in (("walls", walls), ("box", box)):
+        mesh.export(tmp_path / f"{name}.ply")
+    meshes = f"scene.meshes=[{tmp_path}/walls.ply, {{mesh: {tmp_path}/box.ply, label: pear}}]"
+    numbers = [18, 49, 6, 62, 1, 2]  # light coefficients, % of pixels, % of faces, views with back faces skipped
+    for cache, loaded, built in [(f"{tmp_path}/cache", 0, 2), (f"{tmp_path}/cache", 2, 0), ("null", 0, 2)]:
+        rasterized.clear()
+        caplog.clear()
+        settings = tiny(meshes, f"renderer.cache={cache}")
+        with caplog.at_level("INFO", "train"):
+            prepare(settings, load_data(settings), tmp_path / "run")
+        shutil.rmtree(tmp_path / "run")
+        lines = dict(line.split(": ", 1) for line in caplog.messages if ": " in line)
+        operators = rf"2 views for 4 examples, {loaded} from the cache, {built} built \(\d\.\d\d s\)"
+        assert re.fullmatch(operators, lines["operators"])
+        assert list(map(int, re.findall(r"\d+", lines["skipped"]))) == numbers
+        assert rasterized == [1] * built
+
+
+def test_a_run_whose_operators_are_on_disk_rasterizes_nothing_and_trains_the_same(tiny, tmp_path, rasterized):
+    settings = tiny(f"renderer.cache={tmp_path}/cache", "train.epochs=1")
+    for name, calls in [("first", [1, 1]), ("second", [1, 1])]:
+        train(settings, tmp_path / name)
+        assert rasterized == calls
+    assert_same_weights(tmp_path / "second" / checkpoint.LAST, tmp_path / "first" / checkpoint.LAST)
+
+
+# ---------------------------------------------------------------------------------------- experiments
+
+
+def settings_of(*overrides: str) -> ExperimentSettings:
+    return read_settings(ExperimentSettings, composed("train", ["run=here", *overrides]))
+
+
+@pytest.mark.parametrize("experiment", ["demo", "cpu", "paper"])
+def test_every_experiment_is_a_configuration_that_runs_on_other_data_too(tiny_npz, experiment):
+    """The command line's data set wins over the experiment's, and no photographs are asked for."""
+    settings = settings_of(f"experiment={experiment}", "data=npz", f"data.path={tiny_npz}")
+    assert settings.evaluate.photos is None
+    assert len(load_data(settings).train) == 60
+
+
+def test_the_papers_renders_are_as_they_are_and_have_no_look_alikes():
+    settings = settings_of("experiment=paper")
+    assert settings.augment.vary == VariationSettings() and settings.scene.hard_negatives == []
+
+
+def test_the_demonstration_is_scored_on_the_images_that_it_renders():
+    settings = settings_of()
+    assert settings.evaluate.photos == settings.data.images == "here/rendered_images"
+
+
+def test_training_takes_the_attacks_of_scripts_attack_and_the_papers_where_none_is_named():
+    """The keys that were there before any other kind set the paper's step on the light."""
+
+    def kinds(*overrides: str) -> dict:
+        return {name: asdict(each) for name, each in settings_of(*overrides).augment.attack.parameters.items()}
+
+    paper = {"norm": "linf", "radius": None, "step": "unit", "step_size": 0.05}
+    assert kinds() == kinds("experiment=paper") == {"lighting": paper}
+    assert kinds("augment.attack.step=sign", "augment.attack.step_size=0.1") == {
+        "lighting": paper | {"step": "sign", "step_size": 0.1}
+    }
+    alone = composed("attack", ["attack=[geometry,lighting]"]).attack
+    both = kinds("attack@augment.attack=[geometry,lighting]", "augment.attack.geometry.radius=0.01")
+    assert both == {"lighting": dict(alone.lighting), "geometry": dict(alone.geometry) | {"radius": 0.01}}

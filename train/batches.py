@@ -1,0 +1,130 @@
+"""Batches of training images, data and renders, in the rounds of an epoch: shuffled, cropped and flipped.
+
+Images are uint8 and live on the device, cropped and flipped there for many batches at once.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from augment import utils
+from augment.service import Renders
+from augment.utils import generator
+from renderer.image import to_bytes
+from train.data import Split
+
+PADDING = 4
+CHUNK_BYTES = 2**28  # holds a whole epoch of CIFAR-100; larger data sets are cropped in several chunks
+FLIPS = ("random", "alternating")
+
+
+@dataclass(frozen=True)
+class Round:
+    """The training between two regenerations of the renders: an epoch, or a part of one.
+
+    number: counts a run's rounds from 0. epoch: from 0. rows: (N,) int64, ascending, the images that it shows.
+    renders: how many of these, the last, are renders.
+    """
+
+    number: int
+    epoch: int
+    rows: Tensor
+    renders: int = 0
+
+
+def rounds_of_epoch(
+    images: int, renders: int, seed: int, epoch: int, images_per_epoch: int | None, every: int | None
+) -> list[Round]:
+    """The epoch's images, drawn anew each epoch where they are not all, in rounds of `every`, each with all renders.
+
+    images, renders: how many there are; renders come last. None: all images, and one round.
+    """
+    drawn = torch.randperm(images, generator=generator(seed, epoch, "rounds"))[:images_per_epoch]
+    parts = drawn.split(every or len(drawn))
+    last = torch.arange(images, images + renders)
+    return [
+        Round(epoch * len(parts) + index, epoch, torch.cat([part.sort().values, last]), renders)
+        for index, part in enumerate(parts)
+    ]
+
+
+def batch_count(images: int, batch_size: int) -> int:
+    """Batches in a round."""
+    return math.ceil(images / batch_size)
+
+
+def with_room(split: Split, count: int) -> Split:
+    """The split's images and, behind them, room for a round's renders."""
+    images, labels = split.images, split.labels
+    return Split(
+        torch.cat([images, images.new_zeros(count, *images.shape[1:])]), torch.cat([labels, labels.new_zeros(count)])
+    )
+
+
+def put_last(split: Split, renders: Renders) -> None:
+    """Overwrite the split's last images with the renders, as 8-bit images."""
+    first = len(split) - len(renders.labels)
+    split.images[first:] = to_bytes(renders.images)
+    split.labels[first:] = renders.labels
+
+
+def training_batches(
+    split: Split, batch_size: int, seed: int, now: Round, flips: str = "random", first: int = 0
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """One shuffled round of the split as (images (B, 3, H, W) uint8, labels (B,), which are renders (B,)): this
+    process's shard of every batch.
+
+    Reflect-pads by 4 and crops, then flips half of the images: "random" ones, or "alternating", each image in every
+    other epoch. All batches have one shape, as the device's graphs need; the last one is filled up with the round's
+    first images. All draws are made on the CPU and moved over once, so that they are the same on every device and for
+    any number of processes. first: the batch to begin with.
+    """
+    images = split.images
+    order = _order(now.rows, batch_size, generator(seed, now.number, "batches"))
+    shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, now.number, "shifts"))
+    flipped = _flipped(order, len(images), seed, now, flips)
+    shard = batch_size // utils.world_size()
+    columns = slice(utils.rank() * shard, (utils.rank() + 1) * shard)
+    order, shifts, flipped = (draws[..., first:, columns].to(images.device) for draws in (order, shifts, flipped))
+    batches_at_once = max(1, CHUNK_BYTES // (shard * images[0].numel()))
+    for begin in range(0, len(order), batches_at_once):
+        rows = slice(begin, begin + batches_at_once)
+        chosen = order[rows].flatten()
+        cropped = crop_and_flip(images, chosen, shifts[:, rows].flatten(1), flipped[rows].flatten())
+        rendered = chosen >= len(images) - now.renders
+        yield from zip(*(part.split(shard) for part in (cropped, split.labels[chosen], rendered)), strict=True)
+
+
+def _order(rows: Tensor, batch_size: int, draws: torch.Generator) -> Tensor:
+    """Rows in random order, (batches, batch_size), beginning again where they run out."""
+    order = rows[torch.randperm(len(rows), generator=draws)]
+    indices = torch.arange(batch_count(len(rows), batch_size) * batch_size) % len(rows)
+    return order[indices].view(-1, batch_size)
+
+
+def _flipped(order: Tensor, images: int, seed: int, now: Round, flips: str) -> Tensor:
+    if flips == "random":
+        return torch.randint(0, 2, order.shape, generator=generator(seed, now.number, "flips"), dtype=torch.bool)
+    in_even_epochs = torch.randint(0, 2, (images,), generator=generator(seed, "flips"), dtype=torch.bool)
+    return in_even_epochs[order] ^ bool(now.epoch % 2)
+
+
+def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:
+    """The chosen images (B,) shifted by (2, B) rows and columns, mirrored at the border, and flipped where (B,)."""
+    height, width = images.shape[2:]
+    rows = _reflect(torch.arange(height, device=images.device) + shifts[0, :, None], height)
+    columns = torch.arange(width, device=images.device).expand(len(chosen), -1)
+    columns = torch.where(flips[:, None], columns.flip(1), columns)
+    columns = _reflect(columns + shifts[1, :, None], width)
+    channels = torch.arange(3, device=images.device)
+    return images[
+        chosen[:, None, None, None], channels[:, None, None], rows[:, None, :, None], columns[:, None, None, :]
+    ]
+
+
+def _reflect(index: Tensor, size: int) -> Tensor:
+    """Indices outside 0..size-1 mirrored at the border pixel, as torch's "reflect" padding does."""
+    return (size - 1) - ((size - 1) - index.abs()).abs()

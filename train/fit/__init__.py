@@ -1,1 +1,0 @@
-"""Training: epochs of data and renders, steps, schedules, distortions, validation, checkpoints."""

@@ -1,0 +1,390 @@
+"""The training loop: an epoch has one or more rounds, each with fresh renders; validation and a checkpoint end it."""
+
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from augment import utils
+from augment.service import AugmentationService, Renders
+from augment.utils import Phases, eval_mode, progress, stream_seed
+from renderer.errors import InputError, in_one_line, is_out_of_memory
+from renderer.image import to_bytes, to_unit
+from train.batches import Round, batch_count, put_last, rounds_of_epoch, training_batches, with_room
+from train.data import Split
+from train.recipe import SCHEDULES, MovingAverage, TrainSettings, augmentation, soup, training_loss
+from train.run_folder import checkpoint
+from train.run_folder.checkpoint import random_state, restore_random_state
+from train.run_folder.logs import PHASES, Log, console
+from train.runtime import (
+    PRECISIONS,
+    GraphedModel,
+    Interruption,
+    MixedPrecision,
+    compiled_pass,
+    compiles,
+    replicated,
+    summed,
+)
+
+EVALUATION_BATCH = 512  # images at a time
+
+
+@dataclass
+class EpochState:
+    """How far an epoch has come.
+
+    renders: of the current round. sums: loss and hits over the images that this process has trained on, (2,).
+    diagnostics: of the renders of each round so far. step: steps taken, in all rounds.
+    """
+
+    renders: Renders
+    sums: Tensor
+    diagnostics: list[Mapping[str, float]]
+    step: int = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values and tensors, over all processes; the renders as bytes, as they are trained on."""
+        return {
+            "images": to_bytes(self.renders.images),
+            "labels": self.renders.labels,
+            "diagnostics": [dict(diagnostics) for diagnostics in self.diagnostics],
+            "sums": summed(self.sums.clone()),
+            "step": self.step,
+        }
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any], device: torch.device) -> "EpochState":
+        diagnostics = state["diagnostics"]
+        renders = Renders(to_unit(state["images"]).to(device), state["labels"].to(device), diagnostics[-1])
+        sums = state["sums"] if utils.rank() == 0 else torch.zeros(2)
+        return cls(renders, sums.to(device), diagnostics, state["step"])
+
+
+class Trainer:
+    """One run's network, optimizer, augmentation service and folder. `fit` trains; `resume` goes on with the folder.
+
+    attacked: the network that renders are made against. selected: the network that is validated and kept, which is the
+    soup or the moving average where there is one; validated: the same, perhaps as CUDA graphs.
+    """
+
+    def __init__(
+        self,
+        settings: TrainSettings,
+        model: MixedPrecision,
+        architecture: dict[str, Any],
+        service: AugmentationService,
+        phases: Phases,
+        folder: Path,
+        seed: int,
+    ):
+        """model: as the run begins; it is the teacher of a distillation, and each epoch of a soup begins with it.
+        architecture: what rebuilds the network from a checkpoint, classes included.
+
+        InputError where the processes cannot share a batch equally, or for a ranking without hard negatives.
+        """
+        if settings.batch_size % utils.world_size():
+            raise InputError(
+                f"train.batch_size={settings.batch_size} is not a multiple of the {utils.world_size()} processes"
+            )
+        if settings.ranking and service.label is None:
+            raise InputError(
+                f"train.ranking={settings.ranking} ranks hard negatives: name some in scene.hard_negatives"
+            )
+        self.settings, self.architecture, self.service = settings, architecture, service
+        self.phases, self.folder, self.seed = phases, folder, seed
+        self.epoch, self.best_accuracy, self.best_epoch = 0, -1.0, 0
+        self.history: list[dict[str, float]] = []  # the metrics of each epoch
+        self._under_way: EpochState | None = None  # of the epoch that has begun
+        self._random_state: dict[str, Any] = {}  # where a checkpoint within an epoch left it
+        self._best: dict[str, Any] | None = None  # selected, but not written yet
+
+        self.model, self.device = model, next(model.parameters()).device
+        self.ema = MovingAverage(model, settings.ema_decay) if settings.ema_decay else None
+        self.soup = soup(model) if settings.soup else None
+        self._initial = deepcopy(model.state_dict()) if settings.soup else None
+        teacher = deepcopy(model).eval().requires_grad_(False) if settings.distillation else None
+        replica = replicated(model)  # may replace layers, so the optimizer comes after it
+        self.optimizer = torch.optim.SGD(
+            model.parameters(),
+            lr=settings.learning_rate,
+            momentum=settings.momentum,
+            weight_decay=settings.weight_decay,
+            nesterov=settings.momentum > 0,
+            fused=True,
+        )
+        compiled = compiles(settings.compile, self.device)
+        loss = training_loss(replica, settings, service.label, teacher)
+        self._loss = compiled_pass(loss) if compiled else loss
+        self._augment = augmentation(settings.augmentation, model, seed)
+        self.attacked: nn.Module = GraphedModel(model) if compiled else model
+        self.validated: nn.Module = GraphedModel(self.selected) if compiled else self.selected
+
+    @property
+    def selected(self) -> MixedPrecision:
+        return cast(MixedPrecision, self.soup.module) if self.soup else self._trained
+
+    @property
+    def _trained(self) -> MixedPrecision:
+        """The result of the current epoch's steps."""
+        return cast(MixedPrecision, self.ema.module) if self.ema else self.model
+
+    # --------------------------------------------------------------------------------- epochs and rounds
+
+    def fit(self, train: Split, validation: Split, log: Log) -> None:
+        """Train to the last epoch; best.pt holds the network of the best validation, or a soup's last.
+
+        InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked for it.
+        """
+        mixed = with_room(train, len(self.service))
+        with Interruption() as interruption:
+            while self.epoch < self.settings.epochs:
+                if self._train_epoch(mixed, len(train), interruption, log):
+                    self._end_epoch(validation, log)
+                stopping = interruption.requested()
+                due = self._under_way is None and self.epoch % self.settings.checkpoint_every == 0
+                if stopping or due or self.epoch == self.settings.epochs:
+                    self._save()
+                if stopping:
+                    interruption.stop()
+
+    def _train_epoch(self, mixed: Split, images: int, interruption: Interruption, log: Log) -> bool:
+        """Take the epoch's remaining steps; whether all were taken, since a signal ends them early.
+
+        mixed: the training images, and behind them room for the renders.
+        """
+        settings, shown, every = self.settings, self.settings.images_per_epoch, self.service.settings.every
+        rounds = rounds_of_epoch(images, len(self.service), self.seed, self.epoch, shown, every)
+        steps = [batch_count(len(part.rows), settings.batch_size) for part in rounds]
+        total = sum(steps)
+        if self._under_way is None:
+            self._reset_to_initial()
+            renders = self._regenerate(rounds[0], log)
+            self._under_way = EpochState(renders, torch.zeros(2, device=self.device), [renders.diagnostics])
+        else:
+            restore_random_state(self._random_state)
+        state = self._under_way
+        for index in range(len(state.diagnostics) - 1, len(rounds)):
+            if index == len(state.diagnostics):
+                state.renders = self._regenerate(rounds[index], log)
+                state.diagnostics.append(state.renders.diagnostics)
+            with self.phases("training"):
+                put_last(mixed, state.renders)
+                self.model.train()
+                first = state.step - sum(steps[:index])
+                batches = training_batches(mixed, settings.batch_size, self.seed, rounds[index], settings.flips, first)
+                for batch in progress(batches, f"epoch {self.epoch + 1}", total, state.step):
+                    state.sums += self._step(*batch, state.step / total, self.epoch * total + state.step)
+                    state.step += 1
+                    if interruption.requested():
+                        return state.step == total
+        return True
+
+    def _regenerate(self, now: Round, log: Log) -> Renders:
+        """Renders made against the current weights."""
+        torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
+        with self.phases("attack"):
+            renders = self.service.regenerate(self.attacked, now.number)
+        if renders.attack_examples:
+            with self.phases("input_output"):  # now, since a run that is resumed within the epoch makes no others
+                log.attack_examples(renders.attack_examples, self.architecture["classes"], self.epoch + 1)
+        return renders
+
+    def _reset_to_initial(self) -> None:
+        """Of a soup: begin the epoch with the weights that the run began with."""
+        if self._initial:
+            self.model.load_state_dict(self._initial)
+            self.optimizer.state.clear()
+            if self.ema:
+                self.ema.n_averaged.zero_()
+
+    def _step(self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int) -> Tensor:
+        """Learn from uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool; returns (2,) the sum of
+        their losses, and how many predictions were correct.
+
+        progress: the fraction of the epoch that is over. number: the run's step. InputError where memory runs out.
+        """
+        settings = self.settings
+        if not settings.soup:
+            progress = (self.epoch + progress) / settings.epochs
+        for group in self.optimizer.param_groups:
+            group["lr"] = settings.learning_rate * SCHEDULES[settings.schedule](progress)
+        images = self._augment(images, labels, number)
+        self.optimizer.zero_grad(set_to_none=True)
+        try:
+            loss, hits = self._loss(images, labels, rendered)
+            loss.backward()
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            setting = f"train.batch_size={settings.batch_size}"
+            raise InputError(f"{setting} needs more memory than there is: set a lower one") from error
+        self.optimizer.step()
+        if self.ema:
+            self.ema.update_parameters(self.model)
+        return torch.stack([loss.detach() * len(labels), hits])
+
+    def _end_epoch(self, validation: Split, log: Log) -> None:
+        """Validate, remember the best network, and log the epoch's metrics."""
+        state, self._under_way = cast(EpochState, self._under_way), None
+        images = state.step * self.settings.batch_size
+        loss_sum, hits = summed(state.sums).tolist()
+        if self.soup:
+            self.soup.update_parameters(self._trained)
+        with self.phases("evaluation"):
+            validated = evaluate(self.validated, validation)
+        self.epoch += 1
+        self._require_finite(loss_sum / images + validated["loss"], self.epoch)
+        if validated["accuracy"] > self.best_accuracy or self.soup:  # a soup has all epochs in it
+            self.best_accuracy, self.best_epoch = validated["accuracy"], self.epoch
+            weights = self.selected.network.state_dict()
+            weights = {name: value.to("cpu", copy=True) for name, value in weights.items()}
+            self._best = {"model": weights, **self._description(), "validation_accuracy": validated["accuracy"]}
+        if len(state.renders.labels):
+            with self.phases("input_output"):
+                log.renders(state.renders.images, self.epoch)
+        names = state.renders.diagnostics
+        diagnostics = {name: fmean(part[name] for part in state.diagnostics) for name in names}
+        seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()  # one resumed after its last attack has no more
+        metrics = {
+            "train/loss": loss_sum / images,
+            "train/accuracy": hits / images,
+            **{f"validation/{name}": value for name, value in validated.items()},
+            "train/learning_rate": self.optimizer.param_groups[0]["lr"],
+            **{f"augment/{name}": value for name, value in diagnostics.items()},
+            **{f"seconds/{name}": value for name, value in seconds.items()},
+        }
+        self.history.append({"epoch": self.epoch, **metrics})
+        log.scalars(metrics, self.epoch)
+        success = diagnostics.get("attack_success")
+        console.info(
+            "epoch %d/%d  train loss %.3f accuracy %.3f  validation accuracy %.3f%s  %.0f s (attack %.1f s)",
+            self.epoch,
+            self.settings.epochs,
+            metrics["train/loss"],
+            metrics["train/accuracy"],
+            validated["accuracy"],
+            "" if success is None else f"  attack success {success:.2f}",
+            sum(seconds[name] for name in PHASES),
+            seconds["attack"],
+        )
+
+    def _require_finite(self, loss: float, epoch: int) -> None:
+        """InputError naming what is NaN or infinite, before any of it is kept."""
+        network = self.model.network
+        tensors = {f"weight {name}": value for name, value in network.state_dict().items()}
+        tensors |= {f"gradient of {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
+        tensors["loss"] = torch.tensor(loss)
+        finite = torch.stack([value.isfinite().all().to(self.device) for value in tensors.values()]).tolist()
+        if not all(finite):
+            name = list(tensors)[finite.index(False)]
+            raise InputError(
+                f"train.learning_rate={self.settings.learning_rate} with train.weight_decay="
+                f"{self.settings.weight_decay} made the {name} NaN or infinite in epoch {epoch}: set lower ones; the "
+                "checkpoint before, if any, is kept"
+            )
+
+    # --------------------------------------------------------------------------------- checkpoints
+
+    def _save(self) -> None:
+        """Write last.pt, keeping the one before, and best.pt where there is a better network, by the first process."""
+        if self._under_way:
+            self._require_finite(float(self._under_way.sums[0]), self.epoch + 1)
+        with self.phases("input_output"):  # after the epoch's line, so that a resumed run never lacks it
+            state, best, self._best = self.state_dict(), self._best, None
+            if utils.rank() > 0:
+                return
+            if best:
+                checkpoint.save(self.folder / checkpoint.BEST, best)
+            checkpoint.save(self.folder / checkpoint.LAST, state, self.folder / checkpoint.PREVIOUS)
+
+    def _description(self) -> dict[str, Any]:
+        """What is stored beside the weights of a network."""
+        arm = self.service.settings.arm
+        return {"architecture": self.architecture, "epoch": self.epoch, "seed": self.seed, "arm": arm}
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a run needs to go on as if it had never ended. bfloat16 needs no loss scaler."""
+        return {
+            **self._description(),
+            "model": self.model.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "ema": self.ema.state_dict() if self.ema else None,
+            "soup": self.soup.state_dict() if self.soup else None,
+            "precision": self.model.precision,
+            "service": self.service.state_dict(),
+            "random_state": random_state(),
+            "under_way": self._under_way.state_dict() if self._under_way else None,
+            "history": self.history,
+            "validation_accuracy_best": self.best_accuracy,
+            "epoch_best": self.best_epoch,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """What `state_dict` gave; many kinds of error for anything else."""
+        epoch, history, precision = state["epoch"], state["history"], state["precision"]
+        if not isinstance(epoch, int) or not isinstance(history, list) or len(history) != epoch:
+            raise ValueError(f"metrics of other epochs than the {epoch!r} that it has")
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision {precision!r}")
+        self.model.network.load_state_dict(state["model"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        if self.ema:
+            self.ema.load_state_dict(state["ema"])
+        if self.soup:
+            self.soup.load_state_dict(state["soup"])
+        self.model.precision = self._trained.precision = self.selected.precision = precision
+        self.service.load_state_dict(state["service"])
+        self._random_state = dict(state["random_state"])
+        if state["under_way"]:
+            self._under_way = EpochState.from_state_dict(state["under_way"], self.device)
+        self.epoch, self.history = epoch, history
+        self.best_accuracy, self.best_epoch = state["validation_accuracy_best"], state["epoch_best"]
+
+    def resume(self) -> None:
+        """Go on from the folder's newest whole checkpoint; InputError where it does not belong to this run."""
+        state, problem = checkpoint.load_newest(self.folder)
+        stored, place = state["architecture"], f"the checkpoint in {self.folder}"
+        if any(stored.get(key, value) != value for key, value in self.architecture.items() if key != "version"):
+            raise InputError(
+                f"{place} is from another architecture or other classes: resume with the settings of "
+                f"{self.folder / 'config.yaml'}, or start in another folder with run="
+            )
+        try:
+            self.load_state_dict(state)
+        except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"{place} is not one that this run can go on from ({in_one_line(error)}): restore {checkpoint.LAST}, "
+                "or start in another folder with run="
+            ) from error
+        if problem:
+            console.warning("%s: going on from the one before", problem)
+            (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or it would take the place of the whole one
+        steps = f" and {self._under_way.step} steps" if self._under_way else ""
+        console.info("resumed %s after epoch %d%s", self.folder, self.epoch, steps)
+
+
+@torch.no_grad()
+def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
+    """Mean cross entropy and top-1 accuracy in eval mode; the model's mode is restored.
+
+    Every process of a run scores its shard of the images; all get the result.
+    """
+    shard = slice(utils.rank(), None, utils.world_size())
+    loss_sum, hits = totals = torch.zeros(2, device=split.images.device)
+    batches = zip(*(part[shard].split(EVALUATION_BATCH) for part in (split.images, split.labels)), strict=True)
+    with eval_mode(model):
+        for images, labels in batches:
+            logits = model(to_unit(images))
+            loss_sum += F.cross_entropy(logits, labels, reduction="sum")
+            hits += (logits.argmax(1) == labels).sum()
+    loss_sum, hits = summed(totals).tolist()
+    return {"loss": loss_sum / len(split), "accuracy": hits / len(split)}

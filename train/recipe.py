@@ -1,0 +1,198 @@
+"""How a network is trained: settings, learning-rate schedules, the loss, averaged weights, baseline augmentations."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
+
+from augment import utils
+from augment.labels import divergence, is_right, label_loss, ranking_loss
+from augment.utils import as_found, generator, stream_seed
+from renderer.errors import FACTOR, InputError, require_choice, require_range
+from renderer.image import to_bytes, to_unit
+from train.batches import FLIPS
+from train.runtime import COMPILE
+
+Augment = Callable[[Tensor, Tensor, int], Tensor]  # uint8 images (B, 3, H, W), labels (B,) and the step to images
+Loss = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+TRANSFORMS = ("color_jitter", "trivial_augment", "augmix")
+AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
+PGD_RADIUS, PGD_STEP, PGD_STEPS = 8 / 255, 4 / 255, 3  # in the L∞ norm; Madry et al. 2018 take 7 steps of 2/255
+LARGEST = {"epochs": 10**6, "images_per_epoch": 10**9, "batch_size": 10**6, "checkpoint_every": 10**6, "threads": 1024}
+
+# ------------------------------------------------------------------------------------- schedules
+
+
+def step(progress: float) -> float:
+    """×0.2 at 30, 60 and 80 % of the epochs (Zagoruyko and Komodakis 2016: 60, 120 and 160 of 200)."""
+    return 0.2 ** sum(progress >= milestone for milestone in (0.3, 0.6, 0.8))
+
+
+def cosine(progress: float) -> float:
+    """Half a cosine from 1 to 0."""
+    return (1 + math.cos(math.pi * progress)) / 2
+
+
+def one_cycle(progress: float) -> float:
+    """Linear from 0.1 to 1 over the first fifth, then linear to 0: the most from a few epochs."""
+    return 0.1 + 0.9 * progress / 0.2 if progress < 0.2 else (1 - progress) / 0.8
+
+
+SCHEDULES = {"step": step, "cosine": cosine, "one_cycle": one_cycle}
+
+# ------------------------------------------------------------------------------------- settings
+
+
+@dataclass
+class TrainSettings:
+    """The defaults are the paper's recipe; conf/train.yaml says what each key does."""
+
+    init_from: str | None = None
+    epochs: int = 150
+    images_per_epoch: int | None = None
+    batch_size: int = 128
+    learning_rate: float = 0.125
+    momentum: float = 0.9
+    weight_decay: float = 5e-4
+    schedule: str = "step"
+    flips: str = "random"
+    augmentation: str = "none"
+    label_smoothing: float = 0.0
+    ranking: float = 0.0
+    distillation: float = 0.0
+    ema_decay: float = 0.0
+    soup: bool = False
+    precision: str = "auto"
+    device: str = "auto"
+    threads: int | None = None
+    compile: str = "auto"
+    deterministic: bool = False
+    checkpoint_every: int = 1
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        choices = {"schedule": SCHEDULES, "flips": FLIPS, "augmentation": AUGMENTATIONS, "compile": COMPILE}
+        for name, known in choices.items():
+            require_choice(f"train.{name}", getattr(self, name), known)
+        for name, largest in LARGEST.items():
+            require_range(f"train.{name}", getattr(self, name), 1, largest)
+        for name in ("momentum", "label_smoothing", "ema_decay"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")
+        for name in ("ranking", "distillation", "weight_decay"):
+            require_range(f"train.{name}", getattr(self, name), 0, FACTOR)
+        for name in ("distillation", "soup"):
+            if getattr(self, name) and not self.init_from:
+                raise InputError(f"train.{name} needs a network to begin with: set train.init_from")
+        if not 0 < self.learning_rate <= FACTOR:
+            raise InputError(f"train.learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
+
+
+# ------------------------------------------------------------------------------------- loss and averaged weights
+
+
+def training_loss(model: nn.Module, settings: TrainSettings, label: int | None, teacher: nn.Module | None) -> Loss:
+    """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the loss, and the number
+    of correct predictions.
+
+    The loss is the mean `label_loss`; plus, by their weights in the settings, the `ranking_loss` of the class `label`
+    and, on images that are no renders, the `divergence` from the teacher's predictions.
+    """
+
+    def loss_and_hits(images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
+        logits = model(to_unit(images))
+        loss = label_loss(logits, labels, settings.label_smoothing).mean()
+        if teacher is not None:
+            with torch.no_grad():
+                targets = teacher(to_unit(images))
+            loss = loss + settings.distillation * (divergence(logits, targets) * ~rendered).mean()
+        if label is not None and settings.ranking:
+            loss = loss + settings.ranking * ranking_loss(logits, labels, label)
+        return loss, is_right(logits.detach().argmax(1), labels).sum()
+
+    return loss_and_hits
+
+
+class MovingAverage(AveragedModel):
+    """The exponential moving average of a model's weights and statistics, beginning with those of the first update."""
+
+    def __init__(self, model: nn.Module, decay: float):
+        super().__init__(model, use_buffers=True)
+        self._average = get_ema_multi_avg_fn(decay)
+
+    def update_parameters(self, model: nn.Module) -> None:
+        """As torch's own, which makes a GPU wait at every step, since it moves its counter there."""
+        if self.n_averaged == 0:
+            return super().update_parameters(model)
+        tensors = [[*module.parameters(), *module.buffers()] for module in (self.module, model)]
+        pairs = [(average.detach(), latest.detach()) for average, latest in zip(*tensors, strict=True)]
+        for floating in (True, False):  # a call takes tensors of one type
+            if group := [pair for pair in pairs if pair[0].is_floating_point() == floating]:
+                self._average([average for average, _ in group], [latest for _, latest in group], None)
+        self.n_averaged += 1
+
+
+def soup(model: nn.Module) -> AveragedModel:
+    """A copy of a model for the mean of its weights and statistics over updates (Wortsman et al. 2022)."""
+    return AveragedModel(model, avg_fn=get_swa_avg_fn(), use_buffers=True)
+
+
+# ------------------------------------------------------------------------------------- baseline augmentations
+
+
+def augmentation(name: str, model: nn.Module, seed: int) -> Augment:
+    """One of `AUGMENTATIONS`, the usual ways to robustness; model: that an adversarial one attacks.
+
+    Every image is changed by draws of its own, which depend on the seed, the step and its index in the global batch
+    alone.
+    """
+    if name == "none":
+        return lambda images, labels, step: images
+    if name == "pgd":
+        return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", utils.rank()))
+    transform = torchvision_transform(name)
+    return lambda images, labels, step: _transform_each(transform, images, seed, step)
+
+
+def torchvision_transform(name: str) -> nn.Module:
+    """One of `TRANSFORMS`, as torchvision has it; the jitter at half the strengths of Chen et al. 2020, as is usual
+    for small images."""
+    from torchvision.transforms import v2  # takes a second, as wherever torchvision is imported where it is used
+
+    return {
+        "color_jitter": v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1),
+        "trivial_augment": v2.TrivialAugmentWide(),
+        "augmix": v2.AugMix(),
+    }[name]
+
+
+@torch.enable_grad()
+def pgd(model: nn.Module, images: Tensor, labels: Tensor, draws: torch.Generator) -> Tensor:
+    """Images in the L∞ ball around the given ones, by steps along the sign of the loss's gradient from a random start
+    (Madry et al. 2018); the model is in eval mode meanwhile."""
+    clean = to_unit(images)
+    noise = torch.rand(clean.shape, generator=draws).to(clean)
+    adversarial = (clean + PGD_RADIUS * (2 * noise - 1)).clamp(0, 1)
+    with as_found(model):
+        for _ in range(PGD_STEPS):
+            adversarial.requires_grad_(True)
+            loss = label_loss(model(adversarial), labels).sum()
+            (gradient,) = torch.autograd.grad(loss, adversarial)
+            moved = adversarial.detach() + PGD_STEP * gradient.sign()
+            adversarial = moved.clamp(clean - PGD_RADIUS, clean + PGD_RADIUS).clamp(0, 1)
+    return to_bytes(adversarial)
+
+
+def _transform_each(transform: nn.Module, images: Tensor, seed: int, step: int) -> Tensor:
+    """torchvision's transforms draw once for a whole batch, and from the global generator."""
+    first = utils.rank() * len(images)
+    transformed = []
+    with torch.random.fork_rng(devices=[]):
+        for index, image in enumerate(images, first):
+            torch.manual_seed(stream_seed(seed, step, index, "distortion"))
+            transformed.append(transform(image))
+    return torch.stack(transformed)

@@ -1,0 +1,274 @@
+"""One run from its settings: data, network, augmentation service, training, scores on the test set and photographs."""
+
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from omegaconf import OmegaConf
+
+from augment import utils
+from augment.build import build_scene
+from augment.classifiers.adapter import class_index
+from augment.labels import complementary_label
+from augment.scene import Scene
+from augment.service import AugmentationService
+from augment.utils import Phases, stream_seed
+from renderer.cache import OperatorCache, TensorCache, cache_folder
+from renderer.errors import InputError, require_choice
+from renderer.image import LARGEST_SIZE
+from renderer.light.harmonics import nonzero_coefficients
+from renderer.transfer import COEFFICIENTS, DEGREE
+from train.command_line.configuration import as_dict
+from train.command_line.entry_points import NO_ROOM
+from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
+from train.loop import Trainer, evaluate
+from train.networks import build_network, describe, start_from
+from train.photographs.figures import FIGURES, find_figure
+from train.photographs.folder import find_photographs, require_outside
+from train.photographs.scoring import evaluate_photographs
+from train.photographs.text import format_summary
+from train.rendered_shapes import load_shapes, write_held_out
+from train.run_folder import checkpoint
+from train.run_folder.continuation import INPUTS, fingerprints, require_same_inputs, require_same_settings
+from train.run_folder.files import CONFIG, write_whole
+from train.run_folder.logs import NoLog, RunLog, console
+from train.runtime import (
+    MixedPrecision,
+    choose_device,
+    choose_precision,
+    first_process_first,
+    set_deterministic,
+    set_threads,
+)
+from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings
+
+
+def run(settings: ExperimentSettings, data: DataSet, folder: Path) -> dict[str, float]:
+    """Train one arm into `folder` and score it; the scores, which are in the folder's files, too."""
+    return prepare(settings, data, folder)()
+
+
+def prepare(settings: ExperimentSettings, data: DataSet, folder: Path) -> Callable[[], dict[str, float]]:
+    """All of `run` that comes before the first epoch, where wrong input shows; returns a function for the rest."""
+    for name, photographs in settings.evaluate.folders.items():
+        require_outside(folder / name, photographs)
+        find_photographs(photographs, data.classes, settings.label)
+    device = choose_device(settings.train.device)
+    set_threads(settings.train.threads)
+    set_deterministic(settings.train.deterministic)
+    train, validation = stratified_split(data.train, settings.data.validation, seed=0)
+    trainer = build_trainer(settings, data, folder, device)
+    with _one_error_without_room(folder):
+        _open_folder(trainer, settings)
+
+    @_one_error_without_room(folder)
+    def train_and_score() -> dict[str, float]:
+        console.info(
+            "%s images, %s classes; %s, %s, %d threads, %d processes",
+            len(train),
+            len(data.classes),
+            device,
+            trainer.model.precision,
+            torch.get_num_threads(),
+            utils.world_size(),
+        )
+        log = NoLog() if utils.rank() else RunLog(folder, trainer.history)
+        trainer.fit(train.to(device), validation.to(device), log)
+        scores = _test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device)
+        log.scalars(scores)
+        return scores
+
+    return train_and_score
+
+
+# ------------------------------------------------------------------------------------- data
+
+
+def load_data(settings: ExperimentSettings) -> DataSet:
+    """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
+    data, cache = settings.data, TensorCache(cache_folder(settings.renderer.cache))
+    loaders = {
+        "cifar100": lambda: load_cifar100(data.path),
+        "npz": lambda: load_npz(data.path),
+        "folder": lambda: load_folder(data.path, data.size, data.test_fraction),
+        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed, cache),
+    }
+    require_choice("data.name", data.name, loaders)
+    console.info("data: %s", data.name)
+    with first_process_first():
+        loaded = loaders[data.name]()
+    if not SMALLEST_SIZE <= loaded.size <= LARGEST_SIZE:
+        raise InputError(
+            f"data.path={data.path} has images of {loaded.size} pixels per side: give {SMALLEST_SIZE} to {LARGEST_SIZE}"
+        )
+    return loaded
+
+
+def write_images(settings: ExperimentSettings, size: int) -> None:
+    """Write the rendered held-out images that `data=shapes` is scored on, where the settings ask for them."""
+    data = settings.data
+    if data.name == "shapes" and data.images:
+        console.info("writing held-out renders in hard light (not photographs) to %s", data.images)
+        with _one_error_without_room(data.images):
+            write_held_out(Path(data.images), size, data.seed, TensorCache(cache_folder(settings.renderer.cache)))
+
+
+# ------------------------------------------------------------------------------------- network and renders
+
+
+def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
+    """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before."""
+    phases = Phases(device)
+    precision = choose_precision(settings.train.precision, device)
+    mean, std = channel_statistics(data.train.images)
+    shape = settings.model.shape
+    torch.manual_seed(stream_seed(settings.seed, "weights"))
+    network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
+    facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
+    if settings.train.init_from:
+        start_from(network, facts, Path(settings.train.init_from))
+    service = build_service(settings, data, device, phases)
+    model = MixedPrecision(network.to(device), precision)
+    return Trainer(settings.train, model, describe(network, **facts), service, phases, folder, settings.seed)
+
+
+def build_service(
+    settings: ExperimentSettings, data: DataSet, device: torch.device, phases: Phases
+) -> AugmentationService:
+    """The scene, its labels and the service that regenerates its renders."""
+    scene, labels, ranked = None, torch.zeros(0, dtype=torch.int64, device=device), None
+    if settings.augment.renders:
+        with phases("operators"), first_process_first():
+            scene = _build_scene(settings, data, device)
+        label = class_index(data.classes, settings.label, "label")
+        numbers = {OTHER: complementary_label(label)} | {name: index for index, name in enumerate(data.classes)}
+        labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
+        ranked = label if settings.scene.hard_negatives else None
+    process = utils.rank(), utils.world_size()
+    return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process)
+
+
+def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
+    """The scene; logs what its examples share and what is left out of them."""
+    for key, item in settings.objects.items():
+        if item.label != OTHER:
+            class_index(data.classes, item.label, f"label of {key}")
+    choices, start = settings.renderer.choices, time.perf_counter()
+    console.info("rasterizer: %s", choices["rasterizer"].description)
+    objects = list(settings.objects.values())
+    scene = build_scene(objects, data.size, settings.views, **settings.scene.choices, **choices, device=device)
+    if not settings.augment.relights:
+        console.info("operators: none are kept, since views are rasterized in every epoch")
+        return scene
+    cache: OperatorCache = choices["operators"]
+    tally, covered = cache.tally, sum(len(stack.pixels) for stack in scene.stacks) / len(scene.stacks)
+    console.info(
+        "operators: %d views for %d examples, %d from the cache, %d built (%.2f s)%s",
+        tally["views"],
+        len(scene),
+        tally["views"] - tally["built"],
+        tally["built"],
+        time.perf_counter() - start,
+        f"; not kept: {cache.problem}" if cache.problem else "",
+    )
+    console.info(
+        "skipped: rasterization in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background), "
+        "%.0f %% of the faces (seen by no sample), back faces in %d of %d views (closed meshes)",
+        COEFFICIENTS - len(nonzero_coefficients(DEGREE)),
+        COEFFICIENTS,
+        100 * (1 - covered / scene.settings.size**2),
+        100 * tally["unseen_faces"] / tally["faces"],
+        tally["closed"],
+        tally["views"],
+    )
+    return scene
+
+
+# ------------------------------------------------------------------------------------- the folder
+
+
+def _open_folder(trainer: Trainer, settings: ExperimentSettings) -> None:
+    """Resume from the folder, or start in it; InputError rather than writing over another run."""
+    folder = trainer.folder
+    if checkpoint.exists(folder):
+        if not settings.train.resume:
+            raise InputError(
+                f"run={folder} holds a run already: set train.resume=true to go on, or choose another run="
+            )
+        config = OmegaConf.structured(settings)
+        require_same_settings(folder, config)
+        require_same_inputs(folder, config)
+        trainer.resume()
+    elif settings.train.resume:
+        console.info("nothing to resume in %s; starting at epoch 1", folder)
+    if utils.rank() == 0:
+        _write_config(settings, trainer)
+
+
+def _write_config(settings: ExperimentSettings, trainer: Trainer) -> None:
+    config = OmegaConf.structured(settings)
+    resolved = as_dict(config, resolve=True)
+    resolved[INPUTS] = fingerprints(config)
+    resolved["hardware"] = {"device": str(trainer.device), "precision": trainer.model.precision}
+    resolved["versions"] = {
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "torchvision": version("torchvision"),
+        "numpy": version("numpy"),
+    }
+    trainer.folder.mkdir(parents=True, exist_ok=True)
+    write_whole(trainer.folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
+
+
+@contextmanager
+def _one_error_without_room(folder: Path | str) -> Iterator[None]:
+    """InputError where the disk is full, whatever was being written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        path = error.filename or folder
+        raise InputError(
+            f"{path} cannot be written ({error.strerror}): make room and go on with train.resume=true"
+        ) from error
+
+
+# ------------------------------------------------------------------------------------- scores
+
+
+def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
+    """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
+    test = data.test.to(device)
+    last = selected = evaluate(trainer.selected, test)["accuracy"]
+    best = checkpoint.load(trainer.folder / checkpoint.BEST)
+    if best["epoch"] != trainer.epoch:
+        trainer.selected.network.load_state_dict(best["model"])
+        selected = evaluate(trainer.selected, test)["accuracy"]
+    console.info("test accuracy %.4f (the selected network, epoch %d), %.4f (the last)", selected, best["epoch"], last)
+    return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
+
+
+def _photograph_scores(
+    settings: ExperimentSettings, trainer: Trainer, data: DataSet, device: torch.device
+) -> dict[str, float]:
+    """The network's metrics on each folder of photographs, as NAME/METRIC; empty without one."""
+    scores: dict[str, float | None] = {}
+    for name, photographs in settings.evaluate.folders.items() if utils.rank() == 0 else ():
+        summary = evaluate_photographs(
+            trainer.selected,
+            data.classes,
+            photographs,
+            settings.label,
+            trainer.folder / name,
+            size=data.size,
+            skip_unreadable=settings.evaluate.skip_unreadable,
+            device=device,
+        )
+        console.info("%s: %s", name, format_summary(summary))
+        scores |= {f"{name}/{figure}": find_figure(summary, figure)["value"] for figure in ("top5", *FIGURES)}
+    return {name: value for name, value in scores.items() if value is not None}
