@@ -17,7 +17,7 @@ from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 
 SPARSE = 1 / 16  # of all entries, below which those that are not zero are multiplied one by one in less time,
-SMALL = 2**16  # unless they are no more than this; see docs/performance.md
+SMALL = 2**16  # unless they are no more than this
 
 
 class SparseTransfer(NamedTuple):
