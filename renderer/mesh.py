@@ -162,7 +162,7 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
     are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area.
     """
-    from renderer.io.mesh_reading import read_parts
+    from renderer.io.meshes import read_parts
 
     path = Path(path)
     require_choice(f"{path}: up", up, ("auto", "y", "z"))
