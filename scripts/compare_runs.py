@@ -6,7 +6,7 @@ from pathlib import Path
 import train.command_line.entry_points as command
 from augment.utils import progress
 from renderer.errors import InputError
-from train.report.comparison import format_comparison
+from train.report.compare import format_comparison
 from train.report.summary import summarize
 
 

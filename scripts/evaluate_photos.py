@@ -11,8 +11,7 @@ from augment.classifiers import Classifier
 from renderer.errors import InputError, require_range
 from train.command_line.outputs import writable_folder
 from train.networks import load_classifier, load_run
-from train.photographs.scoring import evaluate_photographs
-from train.photographs.text import format_summary
+from train.photographs.scoring import evaluate_photographs, format_summary
 from train.run_folder.files import sole_writer
 from train.runtime import MixedPrecision, choose_device, choose_precision
 from train.settings import LARGEST_SIZE

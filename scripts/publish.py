@@ -1,11 +1,17 @@
-"""Write a run's network as half-precision safetensors with a card: python scripts/publish.py run=... out=..."""
+"""Write a run's network as half-precision safetensors: python scripts/publish.py run=runs/a out=pretrained/a
+
+The file's metadata holds the run's settings and scores as JSON.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from train.command_line.entry_points import script
 from train.command_line.outputs import writable_folder
-from train.report.card import publish_run
+from train.networks import PUBLISHED, PYTHON, load_run, publish
+from train.report.summary import summarize
+from train.run_folder import checkpoint
 
 
 @dataclass
@@ -17,8 +23,31 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    publish_run(Path(settings.run), writable_folder(settings.out, "out"))
+    run, out = summarize(Path(settings.run)), writable_folder(settings.out, "out")
+    state = checkpoint.load(run.folder / checkpoint.BEST)
+    if not str(state["architecture"].get("name")).startswith(PYTHON):  # only its user runs that code
+        load_run(run.folder / checkpoint.BEST)  # or InputError, since nobody could use it
+    out.mkdir(parents=True, exist_ok=True)
+    publish(
+        out / PUBLISHED,
+        state,
+        settings=without_folders(run.settings),
+        scores={**run.scores, **run.photographs},
+        versions=dict(run.config.versions),
+    )
     print(f"published in {settings.out}")
+
+
+def without_folders(value: Any) -> Any:
+    """Settings with the names of files in place of their paths, which are of this machine alone."""
+    match value:
+        case dict():
+            return {key: without_folders(item) for key, item in value.items()}
+        case list():
+            return [without_folders(item) for item in value]
+        case str() if value.startswith("/"):
+            return Path(value).name
+    return value
 
 
 if __name__ == "__main__":

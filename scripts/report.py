@@ -10,7 +10,7 @@ from renderer.errors import InputError
 from train.command_line.entry_points import script
 from train.command_line.outputs import writable_folder
 from train.command_line.overrides import quoted
-from train.report.write import write_report
+from train.report.page import write_report
 
 
 @dataclass

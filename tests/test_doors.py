@@ -19,8 +19,8 @@ from renderer.light.environment import read_map, write_map
 from renderer.light.presets import load_light, probe
 from train.data import load_npz
 from train.networks import PUBLISHED, WideResNet, describe, load_run, publish
-from train.photographs.answers import ANSWERS, Answer, read_answers, write_answers
 from train.photographs.folder import Photograph, find_photographs, load_photographs
+from train.photographs.predictions import PREDICTIONS, Prediction, read_predictions, write_predictions
 from train.run_folder.checkpoint import BEST, save
 from train.run_folder.files import read_config, read_json, read_numbers
 
@@ -47,8 +47,8 @@ def network_state() -> dict:
 
 
 def write_scores(path: Path) -> None:
-    asked = Answer(Photograph(PurePosixPath("a.png"), "fig", "web"), "fig", 0.5, 0.5, 1, 0.5, 1, 0.0)
-    write_answers(path, [asked], "fig")
+    item = Prediction(Photograph(PurePosixPath("a.png"), "fig", "web"), "fig", 0.5, 0.5, 1, 0.5, 1, 0.0)
+    write_predictions(path, [item], "fig")
 
 
 def write_table(path: Path) -> None:
@@ -80,7 +80,7 @@ DOORS = [
     Door("config.yaml", lambda path: path.write_text("seed: 1\ndata: {path: '${a}', size: [1, 2]}\n"), read_config),
     Door("metrics.jsonl", lambda path: path.write_text('{"epoch": 1}\n{"test/accuracy": 0.5}\n'), read_numbers),
     Door("summary.json", lambda path: path.write_text(json.dumps({"recall": {"value": None, "n": 0}})), read_json),
-    Door(ANSWERS, write_scores, lambda path: read_answers(path, "fig")),
+    Door(PREDICTIONS, write_scores, lambda path: read_predictions(path, "fig")),
     Door("photos.csv", write_table, read_photographs),
     Door("photo.png", lambda path: Image.new("RGB", (1, 2)).save(path), read_photographs),
     Door("photo.jpg", lambda path: Image.new("RGB", (2, 1)).save(path), read_photographs),

@@ -18,9 +18,8 @@ from augment import utils
 from train.command_line.configuration import read_settings
 from train.command_line.overrides import quoted
 from train.data import DataSet
-from train.report.overview import format_table
-from train.report.summary import summarize
-from train.report.write import report_of
+from train.report.page import report_of
+from train.report.summary import format_table, summarize
 from train.run import load_data, prepare, write_images
 from train.run_folder.files import sole_writer
 from train.run_folder.logs import console

@@ -209,11 +209,6 @@ def _python_network(name: str, classes: Sequence[str], size: int) -> nn.Module:
     return network
 
 
-def model_title(name: str = WIDERESNET, depth: int = 16, width: int = 4, dropout: float = 0.3) -> str:
-    """A network's settings in words."""
-    return f"WideResNet-{depth}-{width}, dropout {dropout}" if name == WIDERESNET else name
-
-
 def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
     """The description that is stored with the weights, so that a network can be used without its run's configuration.
 
@@ -310,13 +305,15 @@ def start_from(network: nn.Module, description: Mapping[str, Any], run: Path) ->
     load_weights(network, state["model"], path)
 
 
-def publish(path: Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint's network as half-precision safetensors, its architecture in the file's metadata."""
+def publish(path: Path, state: Mapping[str, Any], **facts: object) -> None:
+    """Write a checkpoint's network as half-precision safetensors, with its architecture and other facts as metadata."""
     weights = {
         name: value.half().contiguous() if value.is_floating_point() else value
         for name, value in state["model"].items()
     }
-    path.write_bytes(safetensors.torch.save(weights, {"architecture": json.dumps(state["architecture"])}))
+    facts = {"architecture": state["architecture"], **facts}
+    metadata = {name: json.dumps(value, ensure_ascii=False) for name, value in facts.items()}
+    path.write_bytes(safetensors.torch.save(weights, metadata))
 
 
 def _load_published(path: Path) -> dict[str, Any]:

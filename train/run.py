@@ -27,10 +27,9 @@ from train.command_line.entry_points import NO_ROOM
 from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
 from train.loop import Trainer, evaluate
 from train.networks import build_network, describe, start_from
-from train.photographs.figures import FIGURES, find_figure
 from train.photographs.folder import find_photographs, require_outside
-from train.photographs.scoring import evaluate_photographs
-from train.photographs.text import format_summary
+from train.photographs.metrics import METRICS, find_metric
+from train.photographs.scoring import evaluate_photographs, format_summary
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import checkpoint
 from train.run_folder.continuation import INPUTS, fingerprints, require_same_inputs, require_same_settings
@@ -270,5 +269,5 @@ def _photograph_scores(
             device=device,
         )
         console.info("%s: %s", name, format_summary(summary))
-        scores |= {f"{name}/{figure}": find_figure(summary, figure)["value"] for figure in ("top5", *FIGURES)}
+        scores |= {f"{name}/{metric}": find_metric(summary, metric)["value"] for metric in ("top5", *METRICS)}
     return {name: value for name, value in scores.items() if value is not None}

@@ -29,9 +29,8 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from train.command_line.configuration import read_settings
 from train.command_line.entry_points import one_sentence, one_sentence_errors
-from train.report.overview import format_spread, format_table
-from train.report.summary import is_finished, summarize
-from train.report.write import report_of
+from train.report.page import report_of
+from train.report.summary import format_spread, format_table, is_finished, summarize
 from train.run import load_data, run, write_images
 from train.run_folder import checkpoint
 from train.run_folder.continuation import CIRCUMSTANCES, differing_settings, require_same_inputs

@@ -41,9 +41,9 @@ def test_folders_whose_names_look_like_numbers_or_have_no_utf_8_are_scored(call,
     assert call(*EVALUATE, "out=1e3") == 0
     assert "1 images of orange, 1 of other things" in capsys.readouterr().out
     assert {path.name for path in (here / "1e3").iterdir()} == {
-        *("photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK)
+        *("predictions.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK)
     }
-    assert r"other_\udcff/a.png" in (here / "1e3" / "photographs.csv").read_text(encoding="utf-8")
+    assert r"other_\udcff/a.png" in (here / "1e3" / "predictions.csv").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("command", [EVALUATE, ["attack", "classifier=run:1.10"], ["lab"]], ids=lambda given: given[0])
@@ -100,7 +100,7 @@ def test_an_output_that_cannot_be_written_is_told_before_the_work(call, here, ca
     def work(*arguments, **more):
         raise AssertionError("the work was begun")
 
-    for name in ("train.photographs.scoring.evaluate_photographs", "train.report.card.publish_run",
+    for name in ("train.photographs.scoring.evaluate_photographs", "train.run_folder.checkpoint.load",
                  "renderer.light.environment.to_map", "renderer.light.skylight.fit_polynomials"):  # fmt: skip
         monkeypatch.setattr(name, work)
     suffix = ".hdr" if command is EXPORT else ""

@@ -47,7 +47,7 @@ def evaluate(call, photos) -> Callable[..., int]:
 def test_a_network_is_scored_at_the_size_that_it_was_trained_at(evaluate, run, photos):
     assert evaluate(f"run={run}") == 0
     assert json.loads((run.parent / "out" / "summary.json").read_text())["size"] == 64
-    rows = (run.parent / "out" / "photographs.csv").read_text().splitlines()
+    rows = (run.parent / "out" / "predictions.csv").read_text().splitlines()
     header, first = (row.split(",") for row in rows[:2])
     image = np.asarray(Image.open(photos / first[0])).transpose(2, 0, 1).copy()
     with torch.no_grad():
@@ -82,7 +82,7 @@ def test_any_network_of_ones_own_is_scored_at_its_size_and_on_its_classes(evalua
         Image.new("RGB", (40, 30), color).save(tmp_path / "lit" / name / "one.png")
     assert evaluate("classifier=python:own:build", f"photos={tmp_path / 'lit'}") == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (summary["size"], summary["recall"]["value"], summary["false_alarms"]["value"]) == (16, 1, 0)
+    assert (summary["size"], summary["recall"]["value"], summary["false_positive_rate"]["value"]) == (16, 1, 0)
 
 
 @pytest.mark.parametrize(

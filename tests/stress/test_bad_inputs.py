@@ -59,7 +59,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {  # that read the file
     "finished/config.yaml": RESUME,
     "finished/metrics.jsonl": COMPARE,
     "finished/photographs/summary.json": COMPARE,
-    "finished/photographs/photographs.csv": COMPARE,
+    "finished/photographs/predictions.csv": COMPARE,
     "photographs/orange/0.png": PHOTOGRAPHS,
     "photographs/photos.csv": PHOTOGRAPHS,
     "lamps.json": (*ATTACK, "attack=lamps", "scene.lamps={positions: [[2, 2, 2], [-2, 2, 2]], start: lamps.json}"),

@@ -22,7 +22,6 @@ from train.networks import (
     load_classifier,
     load_run,
     load_selected,
-    model_title,
     publish,
     start_from,
 )
@@ -260,11 +259,6 @@ def test_a_users_function_makes_the_network():
 def test_a_network_that_does_not_take_the_data_is_refused_by_name(name, size, message):
     with pytest.raises(InputError, match=f"^model={name} .*{re.escape(message)}"):
         build_network(CLASSES, size, name)
-
-
-def test_titles_name_the_network():
-    assert model_title(depth=28, width=10, dropout=0.3) == "WideResNet-28-10, dropout 0.3"
-    assert model_title("torchvision:resnet18") == "torchvision:resnet18"
 
 
 # ---------------------------------------------------------------------------------------- loading

@@ -402,7 +402,7 @@ def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(fi
     assert last["model"].keys() == best["model"].keys() and "optimizer" not in best
     assert sorted(path.name for path in (finished / "renders").glob("*.png")) == [f"epoch_00{n}.png" for n in (1, 2, 3)]
     assert {path.name for path in (finished / "photographs").iterdir()} == {
-        "photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png"
+        "predictions.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png"
     }  # fmt: skip
     assert not list(finished.glob("*.tmp")) and list(finished.glob("events.out.tfevents.*"))
 
@@ -421,10 +421,10 @@ def test_metrics_have_each_epochs_losses_attack_and_seconds_and_the_final_scores
     summary = json.loads((finished / "photographs" / "summary.json").read_text())
     assert scores.keys() == {
         "test/accuracy", "test/accuracy_last", "test/epoch",
-        *(f"photographs/{name}" for name in ("recall", "top5", "false_alarms", "auc")),
+        *(f"photographs/{name}" for name in ("recall", "top5", "false_positive_rate", "auc")),
         *(f"photographs/recall_at/{rate}" for rate in ("0.05", "0.10", "0.20")),
     }  # fmt: skip
-    for name in ("recall", "top5", "false_alarms", "auc"):
+    for name in ("recall", "top5", "false_positive_rate", "auc"):
         assert scores[f"photographs/{name}"] == summary[name]["value"]
     for rate, metric in summary["recall_at"].items():
         assert scores[f"photographs/recall_at/{rate}"] == metric["value"]

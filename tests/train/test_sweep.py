@@ -403,7 +403,7 @@ def test_joblib_trains_cells_in_processes_at_once(tiny_npz, cell, tmp_path):
     done = command(folder, *overrides)
     assert done.returncode == 1 and "Traceback" not in done.stderr and "nearest" not in done.stderr
     good, bad = (cell(folder, "train.epochs=1", f"train.learning_rate={rate}") for rate in ("0.05", "-1"))
-    assert {path for path in folder.iterdir() if path.is_dir()} == {good, bad, folder / "report_files"}
+    assert {path for path in folder.iterdir() if path.is_dir()} == {good, bad}
     assert [row[0] for row in rows(done.stdout)] == ["augment", "none"]
     assert done.stdout.splitlines()[-1] == f"{bad}: failed: {(bad / FAILURE).read_text().strip()}"
     assert f"#1 failed: {(bad / FAILURE).read_text()}" in done.stdout
@@ -420,7 +420,6 @@ def test_submitits_executor_trains_cells_in_jobs(tiny_npz, cell, tmp_path):
     assert {path for path in folder.iterdir() if path.is_dir()} == {
         trained,
         folder / ".submitit",
-        folder / "report_files",
     }
     assert [row[:2] for row in rows(done.stdout)] == [["augment", "seed"], ["none", "0"]]
     (log,) = (folder / ".submitit").glob("*/*_log.out")

@@ -8,9 +8,8 @@ from typing import Any
 import torch
 
 from augment.attacks.evaluate import Sweep
-from train.photographs.shares import counted, share
 from train.report.plots import COLORS, LINES, MARKERS
-from train.report.tables import aligned
+from train.tables import aligned, format_fraction, fraction
 
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
 TABLE, FIGURE = "sweep.csv", "sweep.png"
@@ -18,14 +17,14 @@ ALL = "all"
 
 
 def curve(found: Mapping[str, Sweep]) -> list[dict[str, Any]]:
-    """A record for each mesh, and where there are several for all of them, each method and radius: the share fooled of
-    what was recognized before, with its 95 % Wilson interval; radii by the name of what is attacked."""
+    """A record for each mesh (and all of several), method and radius: the success rate on examples that were correct
+    before, with its 95 % Wilson interval; radii by the name of the attacked parameter."""
     together = {}
     if len(found) > 1:
         pooled = (torch.cat([getattr(each, method) for each in found.values()], dim=1) for method in METHODS)
         together[ALL] = Sweep(next(iter(found.values())).radii, *pooled)
     return [
-        {"mesh": mesh, "method": method, **radii, **share(int(success.sum()), len(success))}
+        {"mesh": mesh, "method": method, **radii, **fraction(int(success.sum()), len(success))}
         for mesh, sweep in {**found, **together}.items()
         for method in METHODS
         for radii, success in zip(sweep.radii, getattr(sweep, method), strict=True)
@@ -35,9 +34,9 @@ def curve(found: Mapping[str, Sweep]) -> list[dict[str, Any]]:
 def format_curve(sweep: Sweep) -> str:
     """One mesh's, a line per radius."""
     if not sweep.adversarial.numel():
-        return "nothing was recognized before, so that there is no success against radius"
+        return "no example was correct before, so that there is no success against radius"
     rows = [
-        [_words(radii), *(counted(share(int(each.sum()), len(each))) for each in (adversarial, random))]
+        [_words(radii), *(format_fraction(fraction(int(each.sum()), len(each))) for each in (adversarial, random))]
         for radii, adversarial, random in zip(sweep.radii, sweep.adversarial, sweep.random, strict=True)
     ]
     return aligned(["radius", *METHODS.values()], rows)
@@ -68,7 +67,7 @@ def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: 
         panel.fill_between(
             radii, [each["low"] for each in own], [each["high"] for each in own], color=color, alpha=0.15
         )
-    panel.set(xscale="log", ylim=(-0.03, 1.03), ylabel="share fooled", xlabel=f"{norms[first]} radius of {first}")
+    panel.set(xscale="log", ylim=(-0.03, 1.03), ylabel="success rate", xlabel=f"{norms[first]} radius of {first}")
     if others:
         panel.set_xlabel(f"{panel.get_xlabel()}; {' and '.join(others)} in proportion")
     ticks = sorted({each[first] for each in records})
@@ -76,6 +75,6 @@ def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: 
     panel.set_xticks([], minor=True)
     panel.spines[["top", "right"]].set_visible(False)
     if records:
-        panel.set_title(f"{records[0]['n']} examples recognized before, 95 % intervals", fontsize=10)
+        panel.set_title(f"{records[0]['n']} examples correct before, 95 % intervals", fontsize=10)
         figure.legend(loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(path, dpi=150)

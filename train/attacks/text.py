@@ -7,7 +7,7 @@ from torch import Tensor
 from augment.attacks.adversary import Adversary
 from augment.attacks.attack import AttackResult
 from augment.attacks.evaluate import Checks, RerenderCheck
-from train.photographs.shares import share
+from train.tables import format_fraction, fraction
 
 
 def format_attack(
@@ -45,17 +45,17 @@ def _survival(rerender_check: RerenderCheck, success: Tensor) -> str:
 
 
 def _success(attacked: AttackResult) -> str:
-    """Among what was recognized before the attack, in examples and in views, with the 95 % Wilson interval."""
+    """On examples that were correct before, and on their views, with the 95 % Wilson interval."""
     clean_correct = attacked.clean_correct
-    found = share(int(attacked.success[clean_correct].sum()), int(clean_correct.sum()))
-    if not found["n"]:
-        return f"none of {len(clean_correct)} examples was recognized before: there is nothing to count"
-    text = "{hits} of {n} examples fooled [{low:.0%}, {high:.0%}]".format(**found)
+    result = fraction(int(attacked.success[clean_correct].sum()), int(clean_correct.sum()))
+    if not result["n"]:
+        return f"none of {len(clean_correct)} examples was correct before: there is nothing to count"
+    text = f"success on {format_fraction(result)} examples"
     if attacked.success_in_views.shape[1] > 1:
         views = attacked.success_in_views[clean_correct]
         text += f", {int(views.sum())} of {views.numel()} views"
     wrong = int((~clean_correct).sum())
-    return text + (f"; {wrong} not recognized before, which do not count" if wrong else "")
+    return text + (f"; {wrong} wrong before, which do not count" if wrong else "")
 
 
 def format_reloaded(adversary: Adversary, images: Tensor, logits: Tensor, classes: Sequence[str]) -> str:

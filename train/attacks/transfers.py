@@ -14,9 +14,8 @@ from augment.objects import load_object, on_ground
 from renderer.errors import InputError
 from train.attacks.settings import AttackExperimentSettings
 from train.networks import load_classifier
-from train.photographs.shares import counted, share
-from train.report.tables import aligned
 from train.settings import read_object
+from train.tables import aligned, format_fraction, fraction
 
 FILE = "transfer.jsonl"
 
@@ -40,11 +39,11 @@ def load_others(settings: AttackExperimentSettings, attacked: Classifier, device
 
 
 def write_transfers(found: Sequence[Transfer], folder: Path) -> None:
-    """transfer.jsonl: a line for each place, with the share fooled and every adversary's answers by view."""
+    """transfer.jsonl: a line for each place, with the fraction of successes and every adversary's answers by view."""
     lines = [
         {
             each.kind: each.name,
-            **_share(each),
+            **_fraction(each),
             "clean_correct": each.clean_correct.tolist(),
             "success": each.success.tolist(),
             **{f"{name}_before": answer for name, answer in _answers(each.before, each.classes).items()},
@@ -56,18 +55,18 @@ def write_transfers(found: Sequence[Transfer], folder: Path) -> None:
 
 
 def format_transfers(found: Sequence[Transfer]) -> str:
-    """The shares as a table."""
+    """The fractions as a table."""
     rows = []
     for each in found:
-        found_here = _share(each)
+        result = _fraction(each)
         rows.append(
-            [f"{each.kind} {each.name}", f"{found_here['n']} of {len(each.clean_correct)}", counted(found_here)]
+            [f"{each.kind} {each.name}", f"{result['n']} of {len(each.clean_correct)}", format_fraction(result)]
         )
-    return aligned(["what fools, shown to", "recognized before", "success"], rows)
+    return aligned(["what fools, shown to", "correct before", "success"], rows)
 
 
-def _share(found: Transfer) -> dict[str, Any]:
-    return share(int(found.success[found.clean_correct].sum()), int(found.clean_correct.sum()))
+def _fraction(found: Transfer) -> dict[str, Any]:
+    return fraction(int(found.success[found.clean_correct].sum()), int(found.clean_correct.sum()))
 
 
 def _answers(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""Finished runs and attacks, read from their folders: tables, comparisons, model cards, and a page to look at."""
+"""Runs and attacks, read from their folders: tables, comparisons, and a page of tables, plots and images."""

@@ -27,17 +27,17 @@ SPHERE = 64  # pixels
 @dataclass(frozen=True)
 class Side:
     """An attack example, before or after: its image and a white ball in its light, (3, H, W) uint8, and the model's
-    answer."""
+    predicted."""
 
     image: Tensor
     sphere: Tensor
-    answer: str
+    predicted: str
     confidence: float
 
 
 def write_attack_examples(path: Path, attack_examples: AttackExamples, classes: Sequence[str]) -> None:
-    """Images as bytes, in the safetensors format; labels and answers in its metadata."""
-    tensors, answers = (
+    """Images as bytes, in the safetensors format; labels and predictions in its metadata."""
+    tensors, predictions = (
         {},
         {"label": [classes[index] if index >= 0 else OTHER for index in attack_examples.labels.tolist()]},
     )
@@ -49,9 +49,9 @@ def write_attack_examples(path: Path, attack_examples: AttackExamples, classes: 
         spheres = [to_bytes(light_sphere(light, SPHERE, basis=attack_examples.basis)) for light in lights]
         tensors[f"spheres_{name}"] = torch.stack(spheres)
         best = probabilities.max(1)
-        answers[name] = [classes[index] for index in best.indices.tolist()]
-        answers[f"confidence_{name}"] = best.values.tolist()
-    path.write_bytes(save(tensors, {"answers": json.dumps(answers)}))  # an error of which names the file
+        predictions[name] = [classes[index] for index in best.indices.tolist()]
+        predictions[f"confidence_{name}"] = best.values.tolist()
+    path.write_bytes(save(tensors, {"predictions": json.dumps(predictions)}))  # an error of which names the file
 
 
 def read_attack_examples(path: Path) -> list[tuple[str, Side, Side]]:
@@ -60,24 +60,24 @@ def read_attack_examples(path: Path) -> list[tuple[str, Side, Side]]:
         if not path.is_file():
             raise ValueError("there is no such file")
         with safe_open(path, "pt") as file:
-            answers = json.loads(file.metadata()["answers"])
+            predictions = json.loads(file.metadata()["predictions"])
             tensors = {f"{kind}_{name}": file.get_tensor(f"{kind}_{name}") for kind in KINDS for name in NAMES}
-        labels = [str(label) for label in answers["label"]]
-        sides = [_sides(tensors, answers, name, len(labels)) for name in NAMES]
+        labels = [str(label) for label in predictions["label"]]
+        sides = [_sides(tensors, predictions, name, len(labels)) for name in NAMES]
         return list(zip(labels, *sides, strict=True))
     except Exception as error:  # safetensors raises a kind of its own
         raise InputError(f"{path} is damaged or of another version ({in_one_line(error)})") from error
 
 
-def _sides(tensors: dict[str, Tensor], answers: dict[str, Any], name: str, count: int) -> list[Side]:
+def _sides(tensors: dict[str, Tensor], predictions: dict[str, Any], name: str, count: int) -> list[Side]:
     for images in (shown := [tensors[f"{kind}_{name}"] for kind in KINDS]):
         if not (len(images) == count <= SHOWN_EXAMPLES and images.dtype == torch.uint8):
-            raise ValueError(f"{len(images)} images for {count} answers")
+            raise ValueError(f"{len(images)} images for {count} predictions")
         if images.shape[1] != 3 or images.shape[2] > LARGEST_SIDE or images.shape[2] != images.shape[3]:
             raise ValueError(f"images of shape {tuple(images.shape)}")
-    told = zip(answers[name], answers[f"confidence_{name}"], strict=True)
+    told = zip(predictions[name], predictions[f"confidence_{name}"], strict=True)
     rows = zip(*shown, told, strict=True)
-    return [Side(image, sphere, str(answer), float(share)) for image, sphere, (answer, share) in rows]
+    return [Side(image, sphere, str(predicted), float(share)) for image, sphere, (predicted, share) in rows]
 
 
 def _reduced(images: Tensor) -> Tensor:

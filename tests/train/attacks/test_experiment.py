@@ -297,7 +297,7 @@ def test_success_is_counted_among_what_was_recognized_before():
     dark = Classifier(sky_in_the_dark, SIZE, CLASSES[:3])
     done = attacked("scene.backgrounds=[0.5,0.0]", "attack.force=true", "attack.max_steps=30", classifier=dark)
     assert done.clean_correct.tolist() == [True, False] and done.success.tolist() == [True, True]
-    assert "1 of 1 examples fooled [21%, 100%]; 1 not recognized before, which do not count" in format_attack(
+    assert "success on 1 of 1 [21%, 100%] examples; 1 wrong before, which do not count" in format_attack(
         "mesh", done, None
     )
 
@@ -307,7 +307,7 @@ def test_views_that_share_a_light_are_counted_one_by_one_too():
     done = attacked("target=[lime,sky]", "scene.views=2", "attack.shared=true", "attack.max_steps=30")
     assert done.success_in_views.shape == (1, 2)
     views = int(done.success_in_views.sum())
-    assert f"{int(done.success)} of 1 examples fooled" in (text := format_attack("mesh", done, None))
+    assert f"{int(done.success)} of 1 [" in (text := format_attack("mesh", done, None))
     assert f", {views} of 2 views" in text
 
 

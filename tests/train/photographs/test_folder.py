@@ -129,7 +129,7 @@ def test_a_photos_csv_that_names_none_of_the_photographs_is_refused(tmp_path, ro
     touch(tmp_path, "orange/a.jpg")
     (tmp_path / "photos.csv").write_text(f"path,source_tag\n{rows}\n")
     with pytest.raises(
-        InputError, match=r"photos\.csv has 1 of 1 rows for no file of the folder: .*; give paths such as orange/a\.jpg"
+        InputError, match=r"photos\.csv has 1 of 1 rows for no file of the folder, .*; give paths such as orange/a\.jpg"
     ):
         find_photographs(tmp_path, CLASSES, "orange")
 
@@ -148,29 +148,31 @@ def test_sources_come_from_photos_csv_whatever_its_other_columns_and_rows(tmp_pa
     with caplog.at_level(logging.WARNING):
         found = find_photographs(tmp_path, CLASSES, "orange")
     assert [photograph.source for photograph in found] == ["web", None, "shop"]
-    assert "photos.csv has 1 of 4 rows for no file of the folder: fig/gone.jpg, for one" in caplog.text
+    assert "photos.csv has 1 of 4 rows for no file of the folder, such as fig/gone.jpg" in caplog.text
 
 
-def test_look_alikes_are_the_sources_named_in_photos_csv(tmp_path):
+def test_hard_negatives_are_the_sources_named_in_photos_csv(tmp_path):
     touch(tmp_path, "orange/a.jpg", "orange/b.jpg", "other_lemon/c.jpg", "other_lemon/d.jpg", "other_lemon/e.jpg")
-    rows = ["look_alikes,path,source_tag", "lab; web,orange/a.jpg,sun", ",orange/b.jpg,web", ",other_lemon/c.jpg,lab"]
+    rows = [
+        "hard_negatives,path,source_tag", "lab; web,orange/a.jpg,sun", ",orange/b.jpg,web", ",other_lemon/c.jpg,lab"
+    ]  # fmt: skip
     (tmp_path / "photos.csv").write_text("\n".join([*rows, ",other_lemon/d.jpg,web", ";,other_lemon/e.jpg,sun"]))
     found = find_photographs(tmp_path, CLASSES, "orange")
     assert [photograph.source for photograph in found] == ["sun", "web", "lab", "web", "sun"]
-    assert [photograph.look_alikes for photograph in found] == [("lab", "web"), (), (), (), ()]
+    assert [photograph.hard_negatives for photograph in found] == [("lab", "web"), (), (), (), ()]
 
 
-def test_look_alikes_of_a_source_without_images_are_refused_by_name(tmp_path):
+def test_hard_negatives_of_a_source_without_images_are_refused_by_name(tmp_path):
     touch(tmp_path, "orange/a.jpg", "other_lemon/b.jpg")
     rows = [
-        "path,source_tag,look_alikes",
+        "path,source_tag,hard_negatives",
         "orange/a.jpg,web,lib",
         "other_lemon/b.jpg,lab,",
         "other_lemon/gone.jpg,lib,",
     ]
     (tmp_path / "photos.csv").write_text("\n".join(rows))
     with pytest.raises(
-        InputError, match=r"photos\.csv pairs orange/a\.jpg with .* source 'lib', .* name one of lab, web$"
+        InputError, match=r"photos\.csv gives orange/a\.jpg hard_negatives of source 'lib', .* name one of lab, web$"
     ):
         find_photographs(tmp_path, CLASSES, "orange")
 
@@ -178,7 +180,7 @@ def test_look_alikes_of_a_source_without_images_are_refused_by_name(tmp_path):
 def test_a_photos_csv_with_two_words_on_an_image_or_linked_to_nothing_is_refused(tmp_path):
     touch(tmp_path, "a.jpg")
     (tmp_path / "photos.csv").write_text("path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n")
-    with pytest.raises(InputError, match=r"photos\.csv has two rows for a\.jpg, which differ"):
+    with pytest.raises(InputError, match=r"photos\.csv has two different rows for a\.jpg"):
         find_photographs(tmp_path, CLASSES, "orange")
     (tmp_path / "photos.csv").unlink()
     (tmp_path / "photos.csv").symlink_to("nowhere.csv")

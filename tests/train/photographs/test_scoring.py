@@ -8,23 +8,16 @@ import pytest
 import torch
 from PIL import Image
 from scipy.special import logsumexp, softmax
-from scipy.stats import binomtest
 
 from renderer.errors import InputError
-from train.photographs.answers import read_answers
-from train.photographs.scoring import evaluate_photographs
-from train.photographs.text import format_summary
-
-
-def share(hits: int, n: int) -> dict:
-    interval = binomtest(hits, n).proportion_ci(method="wilson")
-    return {"value": hits / n, "low": interval.low, "high": interval.high, "hits": hits, "n": n}
-
+from train.photographs.predictions import read_predictions
+from train.photographs.scoring import evaluate_photographs, format_summary
+from train.tables import fraction
 
 NOTHING = {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
 
 
-def ranked(auc: float | None, label: int, others: int) -> dict:
+def ranked(auc: float | None, positives: int, negatives: int) -> dict:
     """The ranking of the story's photographs, without intervals.
 
     Their log-odds depend on the rank of orange alone; 1 is the highest. The only thresholds are those of rank 1, which
@@ -34,9 +27,13 @@ def ranked(auc: float | None, label: int, others: int) -> dict:
     if auc is not None:
         recall = {"value": 0, "threshold": -logsumexp([-1, -2, -3, -4, -5])}
     return {
-        "auc": {"value": auc, "label": label, "others": others},
+        "auc": {"value": auc, "positives": positives, "negatives": negatives},
         "recall_at": dict.fromkeys(("0.05", "0.10", "0.20"), recall),
     }
+
+
+def counted(recall: dict, top5: dict, false_positive_rate: dict) -> dict:
+    return {"recall": recall, "top5": top5, "false_positive_rate": false_positive_rate}
 
 
 # Orange has the ranks 1, 2, 6, 5, 2 on its own photographs a to e and 1, 5, 2, 1, 2 on the others f to j, so that those
@@ -44,43 +41,55 @@ def ranked(auc: float | None, label: int, others: int) -> dict:
 STORY_SUMMARY = {
     "label": "orange",
     "size": 32,
-    "n": {"photographs": 10, "label": 5, "others": 5, "unreadable": 0, "left_out": 0},
-    "recall": share(1, 5),
-    "top5": share(4, 5),
-    "false_alarms": share(2, 5),
+    "n": {"photographs": 10, "positives": 5, "negatives": 5, "unreadable": 0, "left_out": 0},
+    "recall": fraction(1, 5),
+    "top5": fraction(4, 5),
+    "false_positive_rate": fraction(2, 5),
     **ranked(0.34, 5, 5),
     "most_common_wrong": {"pear": 2, "apple": 1, "plum": 1},
     "by_source": {
-        "lab": {"n": 2, "recall": share(1, 2), "top5": share(2, 2), "false_alarms": NOTHING, **ranked(None, 2, 0)},
-        "shop": {"n": 2, "recall": NOTHING, "top5": NOTHING, "false_alarms": share(1, 2), **ranked(None, 0, 2)},
+        "lab": {
+            "n": 2,
+            "recall": fraction(1, 2),
+            "top5": fraction(2, 2),
+            "false_positive_rate": NOTHING,
+            **ranked(None, 2, 0),
+        },
+        "shop": {
+            "n": 2,
+            "recall": NOTHING,
+            "top5": NOTHING,
+            "false_positive_rate": fraction(1, 2),
+            **ranked(None, 0, 2),
+        },
         "street": {
             "n": 4,
-            "recall": share(0, 2),
-            "top5": share(1, 2),
-            "false_alarms": share(1, 2),
+            "recall": fraction(0, 2),
+            "top5": fraction(1, 2),
+            "false_positive_rate": fraction(1, 2),
             **ranked(0.25, 2, 2),
         },
     },
     "by_class": {
         "orange": {
             "n": 5,
-            "recall": share(1, 5),
-            "top5": share(4, 5),
-            "called_label": share(1, 5),
+            "recall": fraction(1, 5),
+            "top5": fraction(4, 5),
+            "predicted_label": fraction(1, 5),
             "most_common_wrong": {"pear": 2, "apple": 1, "plum": 1},
         },
         "other_lemon": {
             "n": 2,
             "recall": NOTHING,
             "top5": NOTHING,
-            "called_label": share(1, 2),
+            "predicted_label": fraction(1, 2),
             "most_common_wrong": {"lime": 1, "orange": 1},
         },
         "pear": {
             "n": 3,
-            "recall": share(1, 3),
-            "top5": share(2, 3),
-            "called_label": share(1, 3),
+            "recall": fraction(1, 3),
+            "top5": fraction(2, 3),
+            "predicted_label": fraction(1, 3),
             "most_common_wrong": {"apple": 1, "orange": 1},
         },
     },
@@ -96,18 +105,18 @@ def rounded(tree):
     return round(tree, 12) if isinstance(tree, float) else tree
 
 
-def take_intervals(figures: dict) -> list[dict]:
+def take_intervals(metrics: dict) -> list[dict]:
     """Remove the intervals of a ranking; what is removed, with the values."""
-    ranked = [figures["auc"], *figures["recall_at"].values()]
-    return [{"value": figure["value"], "low": figure.pop("low"), "high": figure.pop("high")} for figure in ranked]
+    ranked = [metrics["auc"], *metrics["recall_at"].values()]
+    return [{"value": metric["value"], "low": metric.pop("low"), "high": metric.pop("high")} for metric in ranked]
 
 
 @pytest.mark.parametrize("batch_size", [1, 3, 256])
-def test_every_figure_of_a_known_model_is_right(story, tmp_path, batch_size):
+def test_every_metric_of_a_known_model_is_right(story, tmp_path, batch_size):
     summary = evaluate_photographs(*story, "orange", tmp_path / "out", batch_size=batch_size)
-    for figures in (summary, *summary["by_source"].values()):
-        for figure in take_intervals(figures):
-            assert set(figure.values()) == {None} or figure["low"] <= figure["value"] <= figure["high"]
+    for metrics in (summary, *summary["by_source"].values()):
+        for metric in take_intervals(metrics):
+            assert set(metric.values()) == {None} or metric["low"] <= metric["value"] <= metric["high"]
     assert rounded(summary) == rounded(STORY_SUMMARY)
     ordered = summary["by_class"]["orange"]["most_common_wrong"]
     assert list(ordered.items()) == [("pear", 2), ("apple", 1), ("plum", 1)]
@@ -123,37 +132,41 @@ def test_the_summary_written_is_the_summary_returned_in_strict_json(story, tmp_p
     assert json.loads(text, parse_constant=refuse) == summary
 
 
-def test_a_source_is_ranked_against_the_look_alikes_that_it_names(story, tmp_path):
+def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(story, tmp_path):
     """The oranges of the lab, of rank 1 and 2, against the pears of the shop, of rank 2 and 1: one win and two ties."""
     _, _, folder = story
     header, *rows = (folder / "photos.csv").read_text().splitlines()
     paired = [f"{row},{'shop' if row.startswith('orange/a') else ''}" for row in rows]
-    (folder / "photos.csv").write_text("\n".join([f"{header},look_alikes", *paired]))
+    (folder / "photos.csv").write_text("\n".join([f"{header},hard_negatives", *paired]))
     summary = evaluate_photographs(*story, "orange", tmp_path / "out")
     lab = summary["by_source"]["lab"]
-    assert {key: lab["auc"][key] for key in ("value", "label", "others")} == {"value": 0.5, "label": 2, "others": 2}
-    assert lab["false_alarms"] == NOTHING  # its own
+    assert {key: lab["auc"][key] for key in ("value", "positives", "negatives")} == {
+        "value": 0.5,
+        "positives": 2,
+        "negatives": 2,
+    }
+    assert lab["false_positive_rate"] == NOTHING  # its own
     assert summary["auc"]["value"] == 0.34 and summary["by_source"]["street"]["auc"]["value"] == 0.25
-    table = {row["path"]: row["look_alikes"] for row in read_csv(tmp_path / "out" / "photographs.csv")}
+    table = {row["path"]: row["hard_negatives"] for row in read_csv(tmp_path / "out" / "predictions.csv")}
     assert {path: names for path, names in table.items() if names} == {"orange/a.png": "shop"}
 
 
-def test_look_alikes_that_cannot_be_read_are_left_out(story, tmp_path):
+def test_hard_negatives_that_cannot_be_read_are_left_out(story, tmp_path):
     _, _, folder = story
     (folder / "pear" / "broken.png").touch()
-    rows = ["path,source_tag,look_alikes", "orange/a.png,lab,wreck", "pear/broken.png,wreck,"]
+    rows = ["path,source_tag,hard_negatives", "orange/a.png,lab,wreck", "pear/broken.png,wreck,"]
     (folder / "photos.csv").write_text("\n".join(rows))
     summary = evaluate_photographs(*story, "orange", tmp_path / "out", skip_unreadable=True)
-    assert summary["by_source"]["lab"]["auc"]["others"] == 0
+    assert summary["by_source"]["lab"]["auc"]["negatives"] == 0
 
 
 def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(known_model, tmp_path):
     logits = [[0, 100, 3], [0, -900, 3], [1, 2, 3]]
     names = [f"{index}.png" for index in range(3)]
     evaluate_photographs(*known_model(names, logits, ["a", "b", "c"]), "b", tmp_path)
-    told = [float(row["b_log_odds"]) for row in read_csv(tmp_path / "photographs.csv")]
+    odds = [float(row["b_log_odds"]) for row in read_csv(tmp_path / "predictions.csv")]
     expected = [100 - logsumexp([0, 3]), -900 - logsumexp([0, 3]), 2 - logsumexp([1, 3])]
-    assert told == pytest.approx(expected, rel=1e-15)
+    assert odds == pytest.approx(expected, rel=1e-15)
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
@@ -166,13 +179,13 @@ def test_the_csv_gives_each_photograph_its_probabilities_and_brute_force_ranks(k
     names = [f"{label}/{index}.png" for label in ("orange", "other_x", "plum") for index in range(4)]
     logits = np.random.default_rng(0).normal(0, 3, (len(names), len(classes))).astype(np.float32)
     evaluate_photographs(*known_model(names, logits, classes), "orange", tmp_path)
-    rows = read_csv(tmp_path / "photographs.csv")
+    rows = read_csv(tmp_path / "predictions.csv")
     assert [row["path"] for row in rows] == names
     for row, scores in zip(rows, logits.astype(float), strict=True):
         probabilities = dict(zip(classes, softmax(scores), strict=True))
         ranking = sorted(classes, key=probabilities.get, reverse=True)
         label = row["path"].split("/")[0]
-        assert (row["label"], row["source"], row["prediction"]) == (label, "", ranking[0])
+        assert (row["label"], row["source"], row["predicted"]) == (label, "", ranking[0])
         assert float(row["probability"]) == pytest.approx(probabilities[ranking[0]], rel=1e-12)
         assert float(row["orange_probability"]) == pytest.approx(probabilities["orange"], rel=1e-12)
         assert int(row["orange_rank"]) == ranking.index("orange") + 1
@@ -185,7 +198,7 @@ def test_the_csv_gives_each_photograph_its_probabilities_and_brute_force_ranks(k
 
 def test_ranks_hold_where_probabilities_round_to_zero(known_model, tmp_path):
     evaluate_photographs(*known_model(["a.png"], [[0, -5000, -4000]], ["a", "b", "c"]), "c", tmp_path)
-    (row,) = read_csv(tmp_path / "photographs.csv")
+    (row,) = read_csv(tmp_path / "predictions.csv")
     assert (float(row["c_probability"]), row["c_rank"]) == (0, "2")
 
 
@@ -209,19 +222,19 @@ def test_black_reaches_the_model_as_0_and_white_as_1(tmp_path):
     evaluate_photographs(check, ["orange", "pear"], tmp_path / "photos", "orange", tmp_path, size=8)
 
 
-def test_a_model_that_calls_everything_orange_has_recall_1_and_false_alarms_1(story, tmp_path):
+def test_a_model_that_predicts_orange_everywhere_has_recall_1_and_fpr_1(story, tmp_path):
     _, classes, folder = story
     orange = torch.tensor([float(name == "orange") for name in classes])
     summary = evaluate_photographs(lambda x: orange.expand(len(x), -1), classes, folder, "orange", tmp_path)
-    assert summary["recall"]["value"] == summary["false_alarms"]["value"] == 1
+    assert summary["recall"]["value"] == summary["false_positive_rate"]["value"] == 1
     assert summary["most_common_wrong"] == {}
-    assert all(figures["called_label"]["value"] == 1 for figures in summary["by_class"].values())
+    assert all(metrics["predicted_label"]["value"] == 1 for metrics in summary["by_class"].values())
 
 
 def test_a_class_without_photographs_has_no_recall_rather_than_a_wrong_one(story, tmp_path):
     summary = evaluate_photographs(*story, "fig", tmp_path)
     assert summary["recall"] == summary["top5"] == NOTHING
-    assert rounded(summary["false_alarms"]) == rounded(share(0, 10))
+    assert rounded(summary["false_positive_rate"]) == rounded(fraction(0, 10))
 
 
 def test_skipped_photographs_are_counted_and_named_but_not_scored(story, tmp_path):
@@ -231,12 +244,12 @@ def test_skipped_photographs_are_counted_and_named_but_not_scored(story, tmp_pat
         evaluate_photographs(*story, "orange", tmp_path)
     summary = evaluate_photographs(*story, "orange", tmp_path, skip_unreadable=True)
     assert summary["unreadable"] == ["orange/broken.jpg"]
-    assert summary["n"] == {"photographs": 10, "label": 5, "others": 5, "unreadable": 1, "left_out": 0}
+    assert summary["n"] == {"photographs": 10, "positives": 5, "negatives": 5, "unreadable": 1, "left_out": 0}
     assert format_summary(summary).endswith("1 unreadable: orange/broken.jpg")
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_the_model_is_asked_in_eval_mode_without_gradients_and_left_as_it_was(story, tmp_path, fails):
+def test_the_model_runs_in_eval_mode_without_gradients_and_is_left_as_it_was(story, tmp_path, fails):
     oracle, classes, folder = story
 
     class Spy(torch.nn.Module):
@@ -262,13 +275,13 @@ def test_the_model_is_asked_in_eval_mode_without_gradients_and_left_as_it_was(st
 
 
 @pytest.mark.parametrize(
-    ("answer", "message"),
-    [(torch.zeros(10), r"shape \(10, 10\), not \(10, 6\)"), (torch.full((6,), torch.nan), "not finite")],
+    ("logits", "message"),
+    [(torch.zeros(10), r"shape \(10, 10\), not \(10, 6\)"), (torch.full((6,), torch.nan), "NaN or infinite logits")],
 )
-def test_a_model_that_does_not_fit_is_refused(story, tmp_path, answer, message):
+def test_a_model_that_does_not_fit_is_refused(story, tmp_path, logits, message):
     _, classes, folder = story
     with pytest.raises(InputError, match=message):
-        evaluate_photographs(lambda x: answer.expand(len(x), -1), classes, folder, "orange", tmp_path / "out")
+        evaluate_photographs(lambda x: logits.expand(len(x), -1), classes, folder, "orange", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -279,7 +292,7 @@ def test_scores_are_never_written_among_the_photographs(story, tmp_path, out):
     before = sorted(folder.rglob("*"))
 
     def refuse(images):
-        raise AssertionError("the model was asked")
+        raise AssertionError("the model was called")
 
     with pytest.raises(InputError, match=r"^out=.* lies inside the photographs' folder: choose another$"):
         evaluate_photographs(refuse, classes, folder, "orange", tmp_path / out)
@@ -297,12 +310,44 @@ def test_names_that_a_spreadsheet_would_run_are_text_and_numbers_stay_numbers(kn
     classes = ["=HYPERLINK", "@b", "orange"]
     logits = [[-9.0, 0.0, 1.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
     evaluate_photographs(*known_model(names, logits, classes), "orange", tmp_path / "out")
-    with open(tmp_path / "out" / "photographs.csv", newline="", encoding="utf-8") as file:
+    with open(tmp_path / "out" / "predictions.csv", newline="", encoding="utf-8") as file:
         _, *rows = csv.reader(file)
     assert {row[0] for row in rows} == {"other_x/=1+1.png", "'=HYPERLINK/a.png", "'@b/-2.png"}
     assert {row[4] for row in rows} == {"orange", "'=HYPERLINK", "'@b"}
     names, numbers = ([cell for row in rows for cell in row[part]] for part in (slice(5), slice(5, None)))
     assert all(cell[:1] not in ("=", "+", "-", "@") for cell in names)
     assert all(math.isfinite(float(cell)) for cell in numbers if cell)
-    answers = read_answers(tmp_path / "out" / "photographs.csv", "orange")
-    assert [answer.photograph.label for answer in answers] == ["=HYPERLINK", "@b", "other_x"]
+    predictions = read_predictions(tmp_path / "out" / "predictions.csv", "orange")
+    assert [prediction.photograph.label for prediction in predictions] == ["=HYPERLINK", "@b", "other_x"]
+
+
+def test_the_terminal_tables_are_complete(story, tmp_path, read_markdown):
+    first, *tables = format_summary(evaluate_photographs(*story, "orange", tmp_path)).split("\n\n")
+    assert first == "5 images of orange, 5 of other things"
+    counts, ranked, classes = (read_markdown(table)[""] for table in tables)
+    assert counts[0] == ["", "recall", "top-5", "FPR"]
+    assert counts[1:3] == [
+        ["overall", "1/5 = 0.200 [0.036, 0.624]", "4/5 = 0.800 [0.376, 0.964]", "2/5 = 0.400 [0.118, 0.769]"],
+        ["lab", "1/2 = 0.500 [0.095, 0.905]", "2/2 = 1.000 [0.342, 1.000]", "-"],
+    ]
+    assert ranked[:3] == [
+        ["", "AUC", "recall at 5% FPR", "recall at 10% FPR", "recall at 20% FPR"],
+        ["overall", "0.340 [0.060, 0.680]", *["0.000 [0.000, 0.200]"] * 2, "0.000 [0.000, 0.400]"],
+        ["lab", *"----"],
+    ]
+    assert classes == [
+        ["class", "n", "recall", "top-5", "predicted orange", "most common wrong classes"],
+        ["orange", "5", "0.200", "0.800", "0.200", "pear 2, apple 1, plum 1"],
+        ["other_lemon", "2", "-", "-", "0.500", "lime 1, orange 1"],
+        ["pear", "3", "0.333", "0.667", "0.333", "apple 1, orange 1"],
+    ]
+
+
+def test_files_that_were_left_out_are_counted_and_named(story, tmp_path):
+    _, _, folder = story
+    for number in range(12):
+        (folder / "orange" / f"{number:02d}.HEIC").touch()
+    summary = evaluate_photographs(*story, "orange", tmp_path / "out")
+    assert summary["n"]["left_out"] == 12 and summary["left_out"][:2] == ["orange/00.HEIC", "orange/01.HEIC"]
+    last = format_summary(summary).splitlines()[-1]
+    assert last.startswith("12 left out, ") and "orange/09.HEIC" in last and "orange/10.HEIC" not in last

@@ -11,10 +11,8 @@ from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train.command_line.configuration import composed
-from train.report.card import publish_run
-from train.report.comparison import format_comparison
-from train.report.overview import format_table
-from train.report.summary import summarize
+from train.report.compare import format_comparison
+from train.report.summary import format_table, summarize
 from train.run_folder.files import LOCK, read_config, read_numbers, sole_writer
 
 SCORES = {"test/accuracy": 0.5, "test/accuracy_last": 0.4, "test/epoch": 1}
@@ -53,7 +51,7 @@ def test_what_looks_like_an_interpolation_is_text(tmp_path, monkeypatch):
     assert OmegaConf.to_container(config, resolve=True) == json.loads(path.read_text())
 
 
-def test_publishing_a_run_shows_no_variable_of_the_environment(run, tmp_path, monkeypatch):
+def test_tables_of_a_run_show_no_variable_of_the_environment(run, monkeypatch):
     monkeypatch.setenv("SECRET", "hunter2")
     text = (run / "config.yaml").read_text()
     for key, value in [
@@ -63,10 +61,8 @@ def test_publishing_a_run_shows_no_variable_of_the_environment(run, tmp_path, mo
         assert key in text
         text = text.replace(key, value)
     (run / "config.yaml").write_text(text)
-    publish_run(run, tmp_path / "out")
-    card = (tmp_path / "out" / "README.md").read_text()
-    shown = card + format_table([summarize(run)]) + format_comparison([summarize(run)], [])
-    assert "hunter2" not in shown and "${oc.env:SECRET}" in card
+    shown = format_table([summarize(run)]) + format_comparison([summarize(run)], [])
+    assert "hunter2" not in shown and "${oc.env:SECRET}" in shown
 
 
 BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{n}'])}]\n" for n in range(9))
@@ -79,15 +75,13 @@ BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{
     ids=["empty", "word", "list", "cut", "utf-16", "twice", "unset", "deep", "bomb", "large",
          "code", "none", "few", "odd"],
 )  # fmt: skip
-def test_a_damaged_configuration_is_one_sentence_that_names_it(run, tmp_path, content):
+def test_a_damaged_configuration_is_one_sentence_that_names_it(run, content):
     (run / "config.yaml").write_bytes(content)
-    for command in (summarize, lambda folder: publish_run(folder, tmp_path / "out")):
-        with pytest.raises(
-            InputError, match=rf"^{re.escape(str(run))}\S* .*config\.yaml|config\.yaml is damaged"
-        ) as caught:
-            command(run)
-        assert "\n" not in str(caught.value)
-    assert not (tmp_path / "out").exists()
+    with pytest.raises(
+        InputError, match=rf"^{re.escape(str(run))}\S* .*config\.yaml|config\.yaml is damaged"
+    ) as caught:
+        summarize(run)
+    assert "\n" not in str(caught.value)
 
 
 # ---------------------------------------------------------------------------------------- metrics and scores

@@ -1,26 +1,30 @@
 """The report, of runs in every state, as a file and in a browser."""
 
-import base64
 import io
 import json
 import os
 import re
 import shlex
 import shutil
+import time
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 
+from augment.service import AttackExamples
 from renderer.errors import InputError
 from train.command_line.configuration import composed
-from train.report import images, plots
+from train.report import plots
 from train.report.command import training_command
+from train.report.page import report_of, write_report
 from train.report.summary import summarize
-from train.report.write import report_of, write_report
+from train.run_folder.attack_examples import write_attack_examples
 from train.run_folder.continuation import decisive_settings
 from train.run_folder.files import locked
+from train.tables import fraction
 
 HOSTILE = "<script>alert(1)</script>|*x*"
 
@@ -56,7 +60,10 @@ def page(finished, made_up_run, tmp_path_factory) -> Path:
     (folder / "failed" / "failed.txt").write_text(HOSTILE)
     attack = folder / "attacks" / HOSTILE.replace("/", "_")
     attack.mkdir(parents=True)
-    line = {"example": 0, "label": [HOSTILE], "predicted": ["b"], "confidence": [0.5], "success": True, "steps": 3}
+    line = {
+        "example": 0, "label": [HOSTILE], "predicted_before": ["a"], "confidence_before": [0.5], "predicted": ["b"],
+        "confidence": [0.5], "success": True, "success_before": False, "steps": 3,
+    }  # fmt: skip
     lines = [line, line | {"example": 1, "steps": 0, "success_before": True}]
     (attack / "attack.jsonl").write_text("".join(json.dumps(each) + "\n" for each in lines))
     with locked(folder / "begun"):
@@ -81,22 +88,12 @@ def test_runs_in_every_state_are_shown_or_named(page):
     for name in ("damaged", "old"):
         assert re.search(rf"/{name}</td><td[^>]*>cannot be read: [^<]*/{name}", text)
     assert "2 of 8 runs finished" in text
-    assert re.search(r'alt="accuracy, training over epochs, at the end: [^"]*unfinished: going 0.50"', text)
-    assert "1 attacks" in text and "in 1 of 2, 1 more being wrong before any step" in text
+    assert re.search(r'alt="training accuracy by epoch, at the end: [^"]*unfinished: going 0.50"', text)
+    assert "1 attacks" in text and "Attacks succeed on 1 of 1 examples; 1 more were wrong before any step" in text
 
 
-def test_markdown_says_the_same_and_its_images_are_there(page):
-    text = (page.parent / "report.md").read_text()
-    images = re.findall(r"!\[.*\]\((.*)\)", text)
-    found = Sources(page.read_text())
-    assert len(images) == len(found.alts) and "<script>" not in text
-    for name, address in zip(images, [each for each in found.addresses if each.startswith("data:")], strict=True):
-        assert (page.parent / name).read_bytes() == base64.b64decode(address.partition(",")[2])
-    assert re.findall(r"^## (.*)$", text, re.M)[:2] == ["In short", "Arms"]
-
-
-def test_the_lights_that_fooled_are_shown(page):
-    assert re.search(r'alt="orange before: called [^"]*; a ball in its light"', page.read_text())
+def test_attack_examples_are_shown_with_their_light(page):
+    assert re.search(r'alt="orange before: [^"]*; a ball in its light"', page.read_text())
 
 
 @pytest.mark.parametrize(
@@ -117,9 +114,9 @@ def test_paths_below_the_current_folder_are_relative(tmp_path, made_up_run, monk
     paths = [here / "a" / "data.npz", tmp_path / "there" / "orange.glb", f"/else{here}/data.glb"]
     made_up_run(here / "run", "none", None, f"data.path={paths[0]}", f"scene.meshes=['{paths[1]}','{paths[2]}']")
     report = write_report([here / "run"], here)
-    for text in (report.read_text(), report.with_suffix(".md").read_text()):
-        assert "data.path=a/data.npz" in text and str(paths[1]) in text and paths[2] in text
-        assert str(here) not in text.replace(paths[2], "")
+    text = report.read_text()
+    assert "data.path=a/data.npz" in text and str(paths[1]) in text and paths[2] in text
+    assert str(here) not in text.replace(paths[2], "")
 
 
 def test_where_there_is_nothing_one_sentence_says_so(tmp_path):
@@ -143,7 +140,94 @@ def test_a_fault_of_the_report_is_told_with_its_place_and_raises_nothing(finishe
     monkeypatch.setattr(plots, "curves", lambda *_: 1 / 0)
     first, *frames, last = report_of([finished], tmp_path).strip().splitlines()
     assert first.startswith("no report: Traceback") and last == "ZeroDivisionError: division by zero"
-    assert any(frame.endswith(", in _training") for frame in frames)
+    assert any(frame.endswith(", in _epochs") for frame in frames)
+
+
+# ------------------------------------------------------------------------------------- headline
+
+
+def write_examples(folder: Path, epoch: int, before: list[float], after: list[float]) -> None:
+    """Two gray renders of orange that are predicted as apple or orange with these probabilities."""
+    images, lights = torch.full((2, 2, 3, 8, 8), 0.5), torch.zeros(2, 2, 49, 3)
+    probabilities = torch.tensor([before, after])[:, None].expand(2, 2, 2)
+    (folder / "renders").mkdir(exist_ok=True)
+    examples = AttackExamples(*images, *lights, *probabilities, torch.ones(2, dtype=torch.int64))
+    write_attack_examples(folder / "renders" / f"epoch_{epoch:03d}.safetensors", examples, ["apple", "orange"])
+
+
+@pytest.fixture
+def arm(made_up_run, tmp_path):
+    """The folders of an arm's runs, a seed for each pair of true and false positives among ten."""
+
+    def make(name: str, *counts: tuple[int, int], overrides: tuple[str, ...] = ()) -> list[Path]:
+        folders = []
+        for seed, (hits, false_positives) in enumerate(counts):
+            auc = {"value": 0.9, "low": 0.8, "high": 1.0}
+            scores = {"recall": fraction(hits, 10), "false_positive_rate": fraction(false_positives, 10), "auc": auc}
+            settings = [f"seed={seed}", "evaluate.photos=/data/a", *overrides]
+            folders.append(made_up_run(tmp_path / f"{name}{seed}", name, {"photographs": scores}, *settings))
+        return folders
+
+    return make
+
+
+def headline(folders: list[Path], out: Path) -> str:
+    """The alternative text of the page's first image."""
+    return Sources(write_report(folders, out).read_text()).alts[0]
+
+
+def test_the_headline_shows_changed_predictions_and_the_scores_of_every_arm(arm, tmp_path):
+    folders = [*arm("none", (2, 0)), *arm("random", (5, 1)), *arm("adversarial", (7, 2))]
+    write_report(folders, tmp_path / "out")
+    assert not (tmp_path / "out" / "report.png").exists()
+    write_examples(folders[2], 1, [0.125, 0.875], [0.75, 0.25])
+    write_examples(folders[2], 2, [0.75, 0.25], [0.75, 0.25])  # wrong before, too
+    assert headline(folders, tmp_path / "out") == (
+        "Orange before and after its light changed, classified as orange, then apple; orange, then apple. "
+        "recall on photographs: none 0.20, random 0.50, adversarial 0.70. "
+        "FPR on photographs: none 0.00, random 0.10, adversarial 0.20. "
+        "AUC on photographs: none 0.90, random 0.90, adversarial 0.90."
+    )
+    with Image.open(tmp_path / "out" / "report.png") as image:
+        assert image.width == 1440
+
+
+def test_of_several_seeds_the_headline_has_the_mean_and_names_rendered_images(arm, tmp_path):
+    folders = [*arm("none", (2, 0), (4, 0), overrides=("+data.images=/data/a",)), *arm("adversarial", (7, 0))]
+    write_examples(folders[0], 1, [0.125, 0.875], [0.75, 0.25])
+    assert "recall on held-out renders: none 0.30, adversarial 0.70." in headline(folders, tmp_path / "out")
+
+
+# ------------------------------------------------------------------------------------- many runs
+
+
+@pytest.mark.parametrize(
+    "count, seconds", [(70, 20), pytest.param(1000, 120, marks=pytest.mark.slow)], ids=["70", "1000"]
+)
+def test_each_of_many_runs_is_shown_or_named_in_bounded_time_and_size(made_up_run, tmp_path, count, seconds):
+    """Half of them failed; of the others, five seeds share their settings."""
+    scores = {"photographs": {"recall": fraction(4, 10), "false_positive_rate": fraction(1, 10)}}
+    one = made_up_run(tmp_path / "one", "adversarial", scores)
+    files = {path.relative_to(one): path.read_text() for path in one.rglob("*") if path.is_file()}
+    config = files[Path("config.yaml")]
+    for number in range(count):
+        folder = tmp_path / "runs" / f"run{number:04d}"
+        (folder / "photographs").mkdir(parents=True)
+        if number % 2:
+            (folder / "failed.txt").write_text("no room")
+            continue
+        rate, seed = 0.001 * (1 + number // 10), number // 2 % 5
+        files[Path("config.yaml")] = config.replace("seed: 0", f"seed: {seed}").replace(": 0.05\n", f": {rate}\n")
+        for path, text in files.items():
+            (folder / path).write_text(text)
+    start = time.process_time()
+    text = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
+    assert time.process_time() - start < seconds
+    assert len(text) < 10 * 2**20 and f"{count // 2} of {count} runs finished" in text
+    assert all(f"/run{number:04d}" in text for number in range(count))
+
+
+# ------------------------------------------------------------------------------------- in a browser
 
 
 @pytest.fixture(scope="module")
@@ -182,4 +266,4 @@ def test_a_browser_shows_it_without_overflow_wide_and_narrow_light_and_dark(page
 
 def test_a_pipe_in_an_images_place_is_left_out(tmp_path):
     os.mkfifo(tmp_path / "contact_sheet.png")
-    assert images.from_file(tmp_path / "contact_sheet.png", "answers", 100) == []
+    assert plots.from_file(tmp_path / "contact_sheet.png", "answers", 100) == []

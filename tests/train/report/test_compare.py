@@ -5,26 +5,25 @@ import numpy as np
 import pytest
 
 from renderer.errors import InputError
-from train.photographs.answers import Answer, write_answers
 from train.photographs.folder import Photograph
-from train.report.comparison import format_comparison
+from train.photographs.predictions import Prediction, write_predictions
+from train.report.compare import format_comparison
+from train.report.page import write_report
 from train.report.summary import summarize
-from train.report.write import write_report
 
 TITLES = [
-    "Photographs: orange recognized", "Photographs: others called orange", "Photographs: AUC",
-    "Photographs: recall at 5% false alarms", "Photographs: recall at 10% false alarms",
-    "Photographs: recall at 20% false alarms",
-]  # fmt: skip
+    f"Photographs: {name} of orange"
+    for name in ("recall", "FPR", "AUC", "recall at 5% FPR", "recall at 10% FPR", "recall at 20% FPR")
+]
 
 
-def answer(index: int, label: str, source: str | None, score: float) -> Answer:
-    """Of a network that calls orange what scores above 0."""
+def prediction(index: int, label: str, source: str | None, score: float) -> Prediction:
+    """Of a network that predicts orange above a score of 0."""
     orange = score > 0
     photograph = Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source)
     right = orange == (label == "orange")
     rank = (1 if right else 2) if label == "orange" else None
-    return Answer(photograph, "orange" if orange else "pear", 0.5, None, rank, 0.5, 1 if orange else 2, score)
+    return Prediction(photograph, "orange" if orange else "pear", 0.5, None, rank, 0.5, 1 if orange else 2, score)
 
 
 @pytest.fixture
@@ -40,8 +39,8 @@ def scored_run(tmp_path, made_up_run):
             for label, group in zip(("orange", "other_lime"), pair, strict=True)
             for score in group
         ]
-        answers = [answer(index, *kind) for index, kind in enumerate(kinds)]
-        write_answers(folder / name / "photographs.csv", answers, "orange")
+        predictions = [prediction(index, *kind) for index, kind in enumerate(kinds)]
+        write_predictions(folder / name / "predictions.csv", predictions, "orange")
         return folder
 
     return make
@@ -66,22 +65,17 @@ def test_a_comparison_shows_every_source_and_pools_all_but_some(scored_run, made
         ["adversarial", "1", "0.7654", "2", "0.7500"],
         ["random", "0", "0.7654", "2", "0.7500"],
     ]
-    values = [[cell.partition(" ")[0] for cell in row] for row in tables["Photographs: orange recognized"][1:]]
-    assert tables["Photographs: orange recognized"][0] == ["source", "none, seed 0", "adversarial, seed 1"]
+    values = [[cell.partition(" ")[0] for cell in row] for row in tables[TITLES[0]][1:]]
+    assert tables[TITLES[0]][0] == ["source", "none, seed 0", "adversarial, seed 1"]
     assert values == [["studio", "1.000", "1.000"], ["web", "0.200", "0.600"], ["all", "0.286", "0.571"]]
-    assert tables["Photographs: orange recognized"][-1][0] == "all but studio"
+    assert tables[TITLES[0]][-1][0] == "all but studio"
     # the studio has nothing to rank oranges against
-    ranked = tables["Photographs: AUC"][1:]
+    ranked = tables[TITLES[2]][1:]
     assert [[cell.partition(" ")[0] for cell in row] for row in ranked] == [
         ["web", "0.500", "0.800"],
         ["all", "0.500", "0.714"],
     ]
     assert tables["Seconds per epoch"][1] == ["none", "0.75", "4.50", "1.50", "0.75", "50.0%", "10.0%", "7.00"]
-
-
-def test_without_exclusions_a_comparison_pools_all_photographs(scored_run, read_markdown):
-    table = compare(read_markdown, [scored_run("none", STUDIO_AND_WEB)])["Photographs: orange recognized"]
-    assert table[-1][0] == "all" and table[-1][1].startswith(f"{6 / 11:.3f} [")
 
 
 def test_a_mistyped_source_to_exclude_is_an_error(scored_run):
@@ -97,8 +91,8 @@ def test_runs_without_photographs_are_compared_by_accuracy_and_time(made_up_run,
 
 def test_another_folder_of_photographs_is_compared_by_its_name(scored_run, read_markdown):
     folders = [scored_run(arm, STUDIO_AND_WEB, name="lab") for arm in ("none", "random")]
-    assert "Photographs: AUC" not in compare(read_markdown, folders)
-    assert "Photographs: AUC" in compare(read_markdown, folders, photographs="lab")
+    assert TITLES[2] not in compare(read_markdown, folders)
+    assert TITLES[2] in compare(read_markdown, folders, photographs="lab")
     with pytest.raises(InputError, match=r"^photographs=lib: no run has a sub-folder of that name"):
         compare(read_markdown, folders, photographs="lib")
 
@@ -108,7 +102,7 @@ def test_a_report_of_runs_scored_on_different_photographs_shows_each_and_says_so
     text = write_report(runs, tmp_path / "out").read_text()
     assert f"{runs[1]}/photographs has other photographs or sources than {runs[0]}/photographs" in text
     assert re.search(r'alt="ROC; AUC: none 0\.\d+, random 0\.\d+"', text)
-    assert re.search(r'alt="orange recognized, by source or pattern\. all: none 0\.55, random 0\.86', text)
+    assert re.search(r'alt="recall of orange\. all: none 0\.55, random 0\.86', text)
 
 
 def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run, read_markdown):
@@ -124,22 +118,10 @@ def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run, re
 
 def test_scores_of_another_class_are_refused(scored_run):
     folder = scored_run("none", STUDIO_AND_WEB)
-    table = folder / "photographs" / "photographs.csv"
+    table = folder / "photographs" / "predictions.csv"
     table.write_text(table.read_text().replace("orange_", "pear_"))
-    with pytest.raises(
-        InputError, match=r"photographs\.csv cannot be used: score the photographs again, with label=orange"
-    ):
+    with pytest.raises(InputError, match=r"predictions\.csv cannot be used .*, with label=orange"):
         format_comparison([summarize(folder)], [])
-
-
-def test_scores_from_before_the_ranking_are_compared_without_it(scored_run, read_markdown):
-    folders = [scored_run(arm, STUDIO_AND_WEB) for arm in ("none", "random")]
-    for folder in folders:
-        table = folder / "photographs" / "photographs.csv"
-        table.write_text("\n".join(line.rpartition(",")[0] for line in table.read_text().splitlines()) + "\n")
-    tables = compare(read_markdown, folders)
-    assert len(tables["Photographs: orange recognized"]) == 4 and len(tables["Photographs: AUC"]) == 1
-    assert tables["random minus none, one seed"][-1][3:] == ["-"] * 4
 
 
 # ---------------------------------------------------------------------------------------- differences
@@ -173,7 +155,7 @@ def test_a_difference_is_that_of_the_means_over_seeds_with_the_interval_of_a_boo
     folders, oranges, others = arms
     tables = compare(read_markdown, folders)
     header, web, pooled = tables["random minus none, 3 seeds in pairs"]
-    assert header[:4] == ["source", "orange recognized", "others called orange", "AUC"]
+    assert header[:4] == ["source", "recall", "FPR", "AUC"]
     assert web[0] == "web" and pooled == ["all", *web[1:]]
 
     generator, drawn = np.random.default_rng(1), []
@@ -190,8 +172,8 @@ def test_a_difference_is_that_of_the_means_over_seeds_with_the_interval_of_a_boo
         np.mean([auc(oranges[1, seed], others[1, seed]) - auc(oranges[0, seed], others[0, seed]) for seed in range(3)]),
     ]
     for cell, value, reference in zip((web[1], web[3]), values, intervals, strict=True):
-        told, low, high = read_difference(cell)
-        assert told == pytest.approx(value, abs=5.1e-4)  # printed to three digits
+        difference, low, high = read_difference(cell)
+        assert difference == pytest.approx(value, abs=5.1e-4)  # printed to three digits
         assert (low, high) == pytest.approx(tuple(reference), abs=0.02)
 
 

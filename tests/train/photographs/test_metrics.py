@@ -1,0 +1,175 @@
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import bootstrap, mannwhitneyu
+
+from train.photographs.metrics import (
+    RATES,
+    REPLICATES,
+    Roc,
+    draw_samples,
+    replicate_difference,
+    replicate_fraction,
+    roc_metrics,
+)
+
+SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)  # of few values, so that ties are common
+
+
+def brute_force_recall(positives: list[float], negatives: list[float], rate: str) -> tuple[float, float]:
+    """Recall and threshold by trying every score: the lowest that at most the fraction `rate` of negatives exceeds."""
+    allowed = Fraction(rate) * len(negatives)
+    scores = positives + negatives
+    threshold = min(score for score in scores if sum(negative > score for negative in negatives) <= allowed)
+    return sum(score > threshold for score in positives) / len(positives), threshold
+
+
+@settings(deadline=None)
+@given(positives=SCORES, negatives=SCORES)
+def test_auc_is_the_mann_whitney_statistic_with_ties_counted_half(positives, negatives):
+    statistic = mannwhitneyu(positives, negatives, method="asymptotic").statistic
+    auc, swapped = Roc(positives, negatives).values()["auc"], Roc(negatives, positives).values()["auc"]
+    assert auc == pytest.approx(statistic / (len(positives) * len(negatives)), rel=0, abs=1e-12)
+    assert auc + swapped == pytest.approx(1, rel=0, abs=1e-12)
+
+
+@settings(deadline=None)
+@given(positives=SCORES, negatives=SCORES)
+def test_recall_at_a_rate_has_the_lowest_threshold_that_keeps_the_rate(positives, negatives):
+    roc = Roc(positives, negatives)
+    values, thresholds = roc.values(), roc.thresholds()
+    for rate in RATES:
+        assert (values[f"recall_at/{rate}"], thresholds[rate]) == brute_force_recall(positives, negatives, rate)
+
+
+@settings(deadline=None)
+@given(positives=SCORES, negatives=SCORES)
+def test_only_the_order_of_the_scores_counts(positives, negatives):
+    assert Roc(positives, negatives).values() == Roc(np.exp(positives) - 7, np.exp(negatives) - 7).values()
+
+
+@pytest.mark.parametrize(("m", "allowed"), [(19, 0), (20, 1), (39, 1), (40, 2), (100, 5), (60, 3), (2000, 100)])
+def test_a_rate_allows_exactly_its_number_of_false_positives(m, allowed):
+    negatives = np.arange(m, dtype=float)
+    assert (negatives > Roc([0.0], negatives).thresholds()["0.05"]).sum() == allowed
+
+
+def test_a_positive_tied_with_the_threshold_is_missed():
+    """Of 10 negatives one may be a false positive at 10 %: the threshold is the second-best of them."""
+    assert roc_metrics([2.0, 2.0, 2.5, 3.0], [3.0, 2.0, *[0.0] * 8])["recall_at"]["0.10"]["value"] == 0.5
+    assert roc_metrics([2.0], [2.0] * 10)["recall_at"]["0.20"]["value"] == 0
+
+
+def test_perfect_and_reversed_scores_are_1_and_0_with_intervals_of_no_width():
+    perfect, reversed_ = roc_metrics([2, 3], [0, 1]), roc_metrics([0, 1], [2, 3])
+    assert perfect["auc"] == {"value": 1, "low": 1, "high": 1, "positives": 2, "negatives": 2}
+    assert perfect["recall_at"] == {rate: {"value": 1, "low": 1, "high": 1, "threshold": 1} for rate in RATES}
+    assert reversed_["auc"]["value"] == reversed_["auc"]["high"] == 0
+    assert all(metric["value"] == 0 for metric in reversed_["recall_at"].values())
+
+
+@pytest.mark.parametrize(("positives", "negatives"), [([], [1.0]), ([1.0, 2.0], []), ([], [])])
+def test_without_both_kinds_metrics_are_unknown(positives, negatives):
+    unknown = {"value": None, "low": None, "high": None}
+    metrics = roc_metrics(positives, negatives)
+    assert metrics["auc"] == {**unknown, "positives": len(positives), "negatives": len(negatives)}
+    assert metrics["recall_at"] == {rate: {**unknown, "threshold": None} for rate in RATES}
+
+
+@pytest.fixture(scope="module")
+def scores() -> tuple[np.ndarray, np.ndarray]:
+    """Positives and negatives of a mediocre network, with ties."""
+    generator = np.random.default_rng(3)
+    return generator.normal(1, 1, 80).round(1), generator.normal(0, 1.5, 120).round(1)
+
+
+def statistic_of(name: str, positives: np.ndarray, negatives: np.ndarray) -> np.ndarray:
+    """Of samples along the last axis; AUC by comparing all pairs, recall by sorting the negatives."""
+    if name == "auc":
+        pairs = positives[..., :, None] - negatives[..., None, :]
+        return ((pairs > 0) + (pairs == 0) / 2).mean(axis=(-2, -1))
+    allowed = int(Fraction(name.removeprefix("recall_at/")) * negatives.shape[-1])
+    return (positives > np.sort(negatives)[..., -1 - allowed, None]).mean(axis=-1)
+
+
+@pytest.mark.parametrize("name", ["auc", "recall_at/0.10"])
+def test_intervals_are_those_of_scipys_stratified_percentile_bootstrap(scores, name):
+    """Up to the replicates' chance: an end's own standard error is below 0.006 here, and a recall's step is 1/80."""
+    reference = bootstrap(
+        scores,
+        lambda positives, negatives, axis: statistic_of(name, positives, negatives),
+        vectorized=True, method="percentile", n_resamples=2000, batch=50, rng=np.random.default_rng(8),
+    ).confidence_interval  # fmt: skip
+    metrics = roc_metrics(*scores)
+    metric = metrics["auc"] if name == "auc" else metrics["recall_at"]["0.10"]
+    assert (metric["low"], metric["high"]) == pytest.approx(tuple(reference), rel=0, abs=0.02)
+    assert metrics == roc_metrics(*scores)  # the same at every call
+
+
+def test_counts_stand_for_images_drawn_twice_or_not_at_all(scores):
+    generator = np.random.default_rng(4)
+    counts = [generator.multinomial(len(group), [1 / len(group)] * len(group), size=5) for group in scores]
+    metrics = Roc(*scores).metrics(*counts)
+    for row in range(5):
+        sample = [np.repeat(group, drawn[row]) for group, drawn in zip(scores, counts, strict=True)]
+        for name, values in metrics.items():
+            assert values[row] == pytest.approx(statistic_of(name, *sample), rel=0, abs=1e-12)
+
+
+@pytest.mark.slow
+def test_nineteen_in_twenty_intervals_cover_the_truth():
+    """Normal scores one standard deviation apart have an AUC of Φ(1/√2) = 0.760; 3 % is two standard errors of 200."""
+    generator = np.random.default_rng(5)
+    intervals = [roc_metrics(generator.normal(1, 1, 150), generator.normal(0, 1, 150))["auc"] for _ in range(200)]
+    assert 0.92 <= np.mean([auc["low"] <= 0.7602 <= auc["high"] for auc in intervals]) <= 0.98
+
+
+def test_the_curve_has_a_point_per_threshold_and_the_trapezoids_below_it_are_the_auc(scores):
+    positives, negatives = scores
+    rates, recalls, thresholds = Roc(positives, negatives).curve()
+    assert (rates[0], recalls[0], rates[-1], recalls[-1], thresholds[-1]) == (0, 0, 1, 1, -np.inf)
+    assert len(rates) == len(np.unique([*positives, *negatives])) + 1 and (np.diff(thresholds) < 0).all()
+    for rate, recall, threshold in zip(rates, recalls, thresholds, strict=True):
+        assert (rate, recall) == ((negatives > threshold).mean(), (positives > threshold).mean())
+    assert np.trapezoid(recalls, rates) == pytest.approx(statistic_of("auc", positives, negatives), rel=0, abs=1e-12)
+
+
+# ------------------------------------------------------------------------------------- bootstrap
+
+
+def test_samples_have_the_size_and_the_variance_of_draws_with_replacement():
+    """A multinomial count has the variance 1 - 1/n."""
+    counts = [np.concatenate(blocks) for blocks in zip(*draw_samples(7, 30), strict=True)]
+    for drawn, size in zip(counts, (7, 30), strict=True):
+        assert drawn.shape == (REPLICATES, size) and (drawn.sum(axis=1) == size).all()
+        np.testing.assert_allclose(drawn.mean(axis=0), 1, atol=5 / np.sqrt(REPLICATES))
+        np.testing.assert_allclose(drawn.var(), 1 - 1 / size, atol=0.05)
+    assert abs(np.corrcoef(counts[0][:, 0], counts[1][:, 0])[0, 1]) < 5 / np.sqrt(REPLICATES)
+
+
+def test_images_and_seeds_are_drawn_independently():
+    (images,), (runs,) = (next(draw_samples(4, seed=seed)) for seed in (0, 1))
+    assert abs(np.corrcoef(images.ravel(), runs.ravel())[0, 1]) < 0.2
+
+
+def test_a_fraction_spreads_as_the_binomial():
+    replicates = replicate_fraction(np.arange(50) < 20)
+    assert replicates.mean() == pytest.approx(0.4, abs=0.01)
+    assert replicates.std() == pytest.approx(np.sqrt(0.4 * 0.6 / 50), rel=0.1)
+
+
+def test_pairing_cancels_what_both_runs_share():
+    """The luck of four seeds, 0 to 3: unpaired, the difference of two means of four has the variance 2 · 1.25 / 4."""
+    luck = np.arange(4.0)[:, None] + np.zeros(REPLICATES)
+    paired, unpaired = (replicate_difference(luck + 0.5, luck, paired) for paired in (True, False))
+    np.testing.assert_array_equal(paired, 0.5)
+    assert unpaired.mean() == pytest.approx(0.5, abs=0.1) and unpaired.std() == pytest.approx(np.sqrt(0.625), rel=0.1)
+
+
+def test_a_single_run_adds_no_spread():
+    one, other = np.random.default_rng(0).normal(size=(2, 1, REPLICATES))
+    for paired in (True, False):
+        np.testing.assert_array_equal(replicate_difference(one, other, paired), (one - other)[0])

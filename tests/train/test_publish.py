@@ -1,0 +1,36 @@
+import json
+from shutil import copytree
+
+import pytest
+from safetensors import safe_open
+
+from renderer.errors import InputError
+from scripts.publish import Settings, main
+from train.networks import PUBLISHED, load_run
+from train.run_folder import checkpoint
+
+
+def test_a_published_network_loads_and_its_file_holds_settings_and_scores_without_paths(finished, tmp_path):
+    out = tmp_path / "pretrained" / "tiny"
+    main(Settings(str(finished), str(out)))
+    assert [path.name for path in out.iterdir()] == [PUBLISHED]
+    network = load_run(out)
+    assert network.classes == ("apple", "orange", "pear") and network.function.head.in_features == 64
+    with safe_open(out / PUBLISHED, "pt") as file:
+        metadata = {name: json.loads(text) for name, text in file.metadata().items()}
+    assert metadata["settings"]["data.path"] == "tiny.npz" and metadata["settings"]["train.epochs"] == 3
+    summary = json.loads((finished / "photographs" / "summary.json").read_text())
+    assert metadata["scores"]["photographs"]["auc"] == summary["auc"]
+    assert str(finished.parent) not in str(metadata) and str(tmp_path) not in str(metadata)
+
+
+def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
+    run = copytree(finished, tmp_path / "run")
+    state = checkpoint.load(run / checkpoint.BEST)
+    checkpoint.save(run / checkpoint.BEST, state | {"architecture": state["architecture"] | {"width": "wide"}})
+    with pytest.raises(InputError, match=r"best\.pt is from another architecture"):
+        main(Settings(str(run), str(tmp_path / "out")))
+    (run / checkpoint.BEST).unlink()
+    with pytest.raises(InputError, match=r"best\.pt does not exist"):
+        main(Settings(str(run), str(tmp_path / "out")))
+    assert not (tmp_path / "out").exists()

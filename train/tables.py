@@ -1,0 +1,62 @@
+"""Fractions with their intervals, and tables, as text for people."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a title, which may be empty. As text: aligned Markdown without the title."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[object]]
+
+    def __str__(self) -> str:
+        return aligned(self.header, self.rows)
+
+
+def aligned(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table whose columns are aligned on a console, too."""
+    lines = [[as_text(cell) for cell in line] for line in (header, *rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    lines.insert(1, ["-" * width for width in widths])
+    padded = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in padded)
+
+
+def as_text(value: object) -> str:
+    """A cell: numbers with three significant digits, nothing for None."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def fraction(hits: int, n: int) -> dict[str, Any]:
+    """hits / n with its 95 % Wilson score interval (Wilson 1927).
+
+    Returns {value, low, high, hits, n}, the first three in [0, 1], or None with n = 0.
+    """
+    from scipy.stats import binomtest  # half a second
+
+    if n == 0:
+        return {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
+    low, high = binomtest(hits, n).proportion_ci(0.95, method="wilson")
+    return {"value": hits / n, "low": float(low), "high": float(high), "hits": hits, "n": n}
+
+
+def format_fraction(result: Mapping[str, Any]) -> str:
+    """A result of `fraction`: hits of n [low, high]."""
+    return "{hits} of {n} [{low:.0%}, {high:.0%}]".format(**result) if result["n"] else "none of 0"
+
+
+def format_interval(metric: Mapping[str, Any]) -> str:
+    """A metric's value [low, high]; "-" where it is unknown or absent."""
+    if metric.get("value") is None:
+        return "-"
+    return "{value:.3f} [{low:.3f}, {high:.3f}]".format(**metric)
