@@ -3,7 +3,6 @@ import torch
 import torch.nn.functional as F
 
 from augment.service import Renders
-from renderer.image import to_bytes, to_unit
 from train import batches
 from train.batches import PADDING, Round, crop_and_flip, put_last, rounds_of_epoch, training_batches, with_room
 from train.data import Split
@@ -74,12 +73,6 @@ def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
     assert 0 < first.sum() < 40
 
 
-def test_bytes_survive_the_way_to_unit_and_back():
-    values = torch.arange(256, dtype=torch.uint8)
-    assert torch.equal(to_bytes(to_unit(values)), values)
-    assert to_unit(values)[[0, 255]].tolist() == [0, 1]
-
-
 # ---------------------------------------------------------------------------------------- batches
 
 
@@ -117,19 +110,6 @@ def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch,
             assert all(torch.equal(*pair) for pair in zip(batch, expected, strict=True))
 
 
-def test_batches_are_a_function_of_seed_and_epoch_alone():
-    split, drawn = numbered(noise(50, 3, 8, 8)), {}
-    for seed, epoch in [(0, 0), (0, 1), (1, 0)]:
-        torch.manual_seed(len(drawn))
-        first, again = (
-            torch.cat([images for images, *_ in training_batches(split, 16, seed, whole_epoch(split.images, epoch))])
-            for _ in range(2)
-        )
-        assert torch.equal(first, again)
-        drawn[seed, epoch] = first
-    assert not torch.equal(drawn[0, 0], drawn[0, 1]) and not torch.equal(drawn[0, 0], drawn[1, 0])
-
-
 # ---------------------------------------------------------------------------------------- rounds and renders
 
 
@@ -141,13 +121,6 @@ def test_the_rounds_renders_follow_the_data_as_bytes_with_their_labels():
         assert torch.equal(mixed.images[:5], data.images)
         assert (mixed.images[5:] / 255 - renders).abs().max() <= 0.5 / 255 + 1e-6
         assert mixed.labels.tolist() == [*data.labels.tolist(), 1, 0]
-
-
-def test_without_renders_the_data_stay_as_they_are():
-    data = numbered(noise(5, 3, 16, 16))
-    mixed = with_room(data, 0)
-    put_last(mixed, Renders(torch.zeros(0, 3, 1, 1), torch.zeros(0, dtype=torch.int64), {}))
-    assert torch.equal(mixed.images, data.images) and torch.equal(mixed.labels, data.labels)
 
 
 def test_without_rounds_an_epoch_is_one_of_all_images_and_renders():

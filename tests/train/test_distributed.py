@@ -143,12 +143,6 @@ def test_a_norm_over_all_processes_is_torchs_where_there_is_one_process(options)
     torch.testing.assert_close(synchronized.eval()(BATCH), norm.eval()(BATCH))
 
 
-def test_one_process_uses_the_model_as_it_is():
-    model = network()
-    before = copy.deepcopy(model)
-    assert replicated(model) is model and [type(m) for m in model.modules()] == [type(m) for m in before.modules()]
-
-
 # ---------------------------------------------------------------------------------------- whole runs
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 import torch.nn.functional as F
 from PIL import Image, ImageOps
@@ -186,14 +185,6 @@ def test_the_gradient_passes_where_values_do():
     assert torch.equal(x.grad, torch.where(y != 0, 2.0, 0.0))
 
 
-def test_draws_follow_torchs_seed_and_move_on():
-    x, dropout = torch.ones(1000), Dropout(0.5)
-    torch.manual_seed(3)
-    first, second = dropout(x), dropout(x)
-    torch.manual_seed(3)
-    assert torch.equal(dropout(x), first) and not torch.equal(first, second)
-
-
 def test_nothing_is_dropped_or_drawn_in_eval_mode_or_at_zero():
     x, state = torch.randn(10), torch.get_rng_state()
     assert Dropout(0.5).eval()(x) is x and Dropout(0.0)(x) is x
@@ -209,11 +200,6 @@ def test_almost_all_and_almost_none_of_any_number_are_dropped():
 
 
 # ---------------------------------------------------------------------------------------- building
-
-
-def test_the_default_is_the_wide_residual_network_itself():
-    built = build_network(CLASSES, 32, mean=MEAN, std=STD, depth=10, width=1, dropout=0.0)
-    assert type(built) is WideResNet and built.mean.flatten().tolist() == pytest.approx(MEAN)
 
 
 def test_a_network_of_torchvision_is_torchvisions_behind_the_datas_normalization():
@@ -331,33 +317,6 @@ def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(
     for name in (BEST, PUBLISHED):
         with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / name} [^\n]+$"):
             load_run(tmp_path / name)
-
-
-@pytest.mark.parametrize("architecture", [None, [], "orange"])
-@pytest.mark.parametrize("weights", [None, ["stem"], {"stem.weight": 1}, {}])
-def test_a_checkpoint_of_other_things_is_one_sentence(network, tmp_path, architecture, weights):
-    for state in ({"model": network.state_dict(), "architecture": architecture},
-                  {"model": weights, "architecture": description_of(network)}):  # fmt: skip
-        save(tmp_path / BEST, state)
-        with pytest.raises(InputError, match=rf"^checkpoint {tmp_path / BEST} [^\n]+$"):
-            load_run(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        pytest.param(lambda path: path.write_bytes(path.read_bytes()[:-10]), id="truncated"),
-        pytest.param(lambda path: path.write_bytes(b""), id="empty"),
-        pytest.param(lambda path: safetensors.torch.save_file({"a": torch.zeros(1)}, path), id="no architecture"),
-        pytest.param(
-            lambda path: safetensors.torch.save_file({"a": torch.zeros(1)}, path, {"architecture": "{"}), id="no JSON"
-        ),
-    ],
-)
-def test_a_damaged_published_file_is_one_error(network, tmp_path, damage):
-    damage(write(tmp_path, network) / PUBLISHED)
-    with pytest.raises(InputError, match=r"model.safetensors is damaged or lacks its architecture"):
-        load_run(tmp_path / PUBLISHED)
 
 
 # ---------------------------------------------------------------------------------------- starting from another run's

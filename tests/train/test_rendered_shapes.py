@@ -6,12 +6,10 @@ import pytest
 import torch
 
 from renderer.cache import TensorCache
-from renderer.errors import InputError
 from renderer.light.harmonics import irradiance_basis, nonzero_coefficients
 from train import rendered_shapes
 from train.photographs.folder import find_photographs, load_photographs
-from train.rendered_shapes import CLASSES, SOURCE, even_light, hard_light, load_shapes, write_held_out
-from train.settings import DataSettings
+from train.rendered_shapes import SOURCE, even_light, hard_light, load_shapes, write_held_out
 
 SIZE = 8
 FEW = ("apple", "orange", "plate")
@@ -37,10 +35,6 @@ def instances(monkeypatch) -> list[tuple[str, int]]:
 
     monkeypatch.setattr(rendered_shapes, "solid", recorded)
     return made
-
-
-def test_the_classes_are_ten_solids_the_orange_among_them():
-    assert len(set(CLASSES)) == len(CLASSES) == 10 and "orange" in CLASSES
 
 
 def test_every_class_has_the_images_asked_for_of_as_many_individuals_as_that_takes(instances):
@@ -134,9 +128,3 @@ def test_training_light_leaves_no_side_dark_and_held_out_light_does():
         luminance = np.einsum("nk,lkc->ln", shading, lights)
         ratios[light] = luminance.min(1) / luminance.max(1)
     assert ratios[even_light].min() > 0.45 > 0.3 > ratios[hard_light].max()
-
-
-@pytest.mark.parametrize("part", ["train", "test"])
-def test_no_images_of_a_class_is_an_error(part):
-    with pytest.raises(InputError, match=f"data.{part}_per_class=0 must be at least 1"):
-        DataSettings(**{f"{part}_per_class": 0})
