@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.scene import ALBEDO, CAMERA, View, coefficients
-from renderer.io.mitsuba import DIFFERENTIABLE, TO_Z_UP, mitsuba, mitsuba_map
+from renderer.io.mitsuba import DIFFERENTIABLE, environment, integrator, load, mitsuba, mitsuba_map, sensor_of, shape
 from renderer.transfer import DEGREE
 
 
@@ -29,11 +29,15 @@ class MitsubaView:
         self._view, self._positions = view, view.mesh.vertices.astype(np.float32).ravel()
         self._light = coefficients(DEGREE).float().numpy()
         numbered = np.tile(np.arange(2 * self.rows, dtype=np.float32)[:, None], (self.rows, 1, 3))
-        to_world = self._mi.ScalarTransform4f(np.array(TO_Z_UP))
-        integrator = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1, "hide_emitters": True}
-        environment = {"type": "envmap", "bitmap": self._mi.Bitmap(numbered), "to_world": to_world}
-        scene = {"type": "scene", "integrator": integrator, "light": environment}
-        self._scene = self._mi.load_dict(scene | {"mesh": self._mesh(), "sensor": self._sensor()})
+        scene = {
+            "type": "scene",
+            "integrator": integrator(bounces=0),
+            "light": environment(numbered),
+            "sensor": sensor_of(CAMERA, view.size, "rgb"),
+        }
+        surface = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ALBEDO)}}
+        mesh = shape(self._mi, surface, view.mesh.vertices, view.mesh.faces)
+        self._scene = load(self._mi, scene | {"mesh": mesh})
         self._parameters = self._mi.traverse(self._scene)
         columns = np.array(self._parameters["light.data"])[0, :, 0].astype(int)  # Mitsuba repeats some at the seam
         by_coefficient = mitsuba_map(torch.eye(len(self._light), dtype=torch.float64), self.rows)
@@ -67,22 +71,3 @@ class MitsubaView:
 
     def _render(self) -> Any:
         return self._mi.render(self._scene, self._parameters, spp=self.samples**2)
-
-    def _mesh(self) -> Any:
-        properties, faces = self._mi.Properties(), self._view.mesh.faces
-        properties["face_normals"] = True
-        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ALBEDO)}}
-        properties["bsdf"] = self._mi.load_dict(diffuse)
-        mesh = self._mi.Mesh("mesh", len(self._positions) // 3, len(faces), props=properties)
-        buffers = self._mi.traverse(mesh)
-        buffers["vertex_positions"] = self._positions
-        buffers["faces"] = faces.astype(np.uint32).ravel()
-        buffers.update()
-        return mesh
-
-    def _sensor(self) -> dict[str, Any]:
-        _, up, back = CAMERA.axes()
-        half, size = CAMERA.width / 2, self._view.size  # Mitsuba's image spans [-1, 1]
-        look = self._mi.ScalarTransform4f().look_at(origin=list(4 * back), target=[0, 0, 0], up=list(up))
-        film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-        return {"type": "orthographic", "to_world": look.scale([half, half, 1]), "film": film}

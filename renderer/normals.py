@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import require_finite
+from renderer.errors import require_choice, require_finite
+from renderer.image import NORMALS
 from renderer.light.harmonics import unit_vectors
+from renderer.mesh import Mesh
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
@@ -43,6 +46,18 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) ->
     areas = weighted.new_zeros(len(vertices)).index_add(0, corners, _length(weighted.detach()))
     canceled = _length(summed.detach()) <= ROUNDING * areas
     return unit(summed.masked_fill(canceled, 0)).T.to(vertices.dtype)
+
+
+def corner_normals(mesh: Mesh, normals: str, crease: float = -2.0) -> np.ndarray:
+    """(F, 3, 3) float64 unit normals that the corners of faces are shaded with, "smooth" or "flat"; up where there is
+    none. crease: a corner is flat where the cosine between both normals is below it. InputError: another choice."""
+    require_choice("normals", normals, NORMALS)
+    flat = np.broadcast_to(mesh.face_normals()[:, None], (len(mesh.faces), 3, 3))
+    if normals == "smooth":
+        smooth = vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)).numpy()[mesh.faces]
+        is_flat = ~smooth.any(axis=-1) | ((smooth * flat).sum(axis=-1) < crease)
+        flat = np.where(is_flat[..., None], flat, smooth)
+    return np.where(flat.any(axis=-1, keepdims=True), flat, [0.0, 0.0, 1.0])
 
 
 def unit(vectors: Tensor) -> Tensor:

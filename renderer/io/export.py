@@ -11,10 +11,10 @@ from PIL import Image
 
 from renderer.albedo import bilinear, mesh_textures
 from renderer.camera import Camera, PerspectiveCamera
-from renderer.errors import InputError, require_choice
-from renderer.image import NORMALS, decode, encode
+from renderer.errors import InputError
+from renderer.image import decode, encode
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh
-from renderer.normals import vertex_normals
+from renderer.normals import corner_normals
 
 if TYPE_CHECKING:
     import trimesh  # takes half a second: imported where it is used
@@ -46,17 +46,6 @@ def export_mesh(
         path.write_bytes(writers[path.suffix.lower()](mesh, corner_normals(mesh, normals)))
     except OSError as error:
         raise InputError(f"mesh {path} cannot be written: {error}") from error
-
-
-def corner_normals(mesh: Mesh, normals: str) -> np.ndarray:
-    """(F, 3, 3) float64 unit normals that the corners of faces are shaded with, "smooth" or "flat"; up where there is
-    none. InputError: another choice."""
-    require_choice("normals", normals, NORMALS)
-    flat = np.broadcast_to(mesh.face_normals()[:, None], (len(mesh.faces), 3, 3))
-    if normals == "smooth":
-        smooth = vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)).numpy()[mesh.faces]
-        flat = np.where(smooth.any(axis=-1, keepdims=True), smooth, flat)
-    return np.where(flat.any(axis=-1, keepdims=True), flat, [0.0, 0.0, 1.0])
 
 
 def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int | None) -> bytes:

@@ -1,95 +1,54 @@
-"""Views of a mesh as a Mitsuba 3 scene in files: scene.xml, .ply parts with their normals, and their textures.
+"""Scenes for Mitsuba 3, as files of their own or in memory.
 
-Light from an environment map, with shadows always and with the bounces of `ImageSettings`: without shadows,
-what a concave mesh throws on itself is dark there, and lit here. Mitsuba's diffuse surfaces reflect albedo / π of the
-irradiance, ours all of it: the map's scale makes up for that, and for the albedo's gain, which only a bounce would have
-more than once. Its radiance is premultiplied with alpha, as ours with the coverage.
+A scene is a dictionary as `mitsuba.load_dict` takes it, in which a to_world transform is an array (4, 4) and an image
+is an array (H, W, 3) under "bitmap" or a file's name under "filename". `load` gives it to Mitsuba, and
+`write_mitsuba_scene` writes it as scene.xml with .ply parts and textures beside it, which needs no Mitsuba.
+
+Mitsuba's diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the scale of a light makes up for that,
+and for the albedo's scale, which a bounce would otherwise have more than once. Shadows are always on: without shadows
+here, what a concave mesh throws on itself is dark there. Its radiance is premultiplied with alpha, as ours with the
+coverage.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+import xml.etree.ElementTree as xml
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jinja2 import StrictUndefined, Template
 from PIL import Image
 
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode
-from renderer.io.export import corner_normals
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import EnvironmentBasis, LocalBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.light.local import Lamps, Projector
 from renderer.mesh import Mesh
+from renderer.normals import corner_normals
 
 SCENE, PATTERN = "scene.xml", "pattern.exr"
-TEMPLATE = Path(__file__).with_name("mitsuba.xml.jinja")
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
 VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
 DIFFERENTIABLE = "llvm_ad_rgb"
-TO_Z_UP = ((0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1))  # its maps have y up and +z in the middle
-
-
-def write_mitsuba_scene(
-    folder: Path,
-    mesh: Mesh,
-    albedo_scale: float,
-    cameras: Sequence[Camera],
-    settings: ImageSettings,
-    light: str,
-    placed: Sequence[tuple[EnvironmentBasis | LocalBasis, torch.Tensor]] = (),
-) -> None:
-    """Write a folder whose scene.xml shows a mesh to each camera, a sensor each. light: the map's file, as seen from
-    there. placed: projectors and lamps, with their coefficients. Where a texture is on corners of other colors it is
-    painted anew, since Mitsuba has no product of the two.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
-        mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), settings.encoding)
-    template = Template(
-        TEMPLATE.read_text("utf-8"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    scene = template.render(
-        bounces=settings.bounces,
-        light=light,
-        scale=math.pi * albedo_scale,
-        to_z_up=" ".join(str(entry) for row in TO_Z_UP for entry in row),
-        placed=[emitter for lit in placed for emitter in _emitters(folder, *lit, albedo_scale)],
-        sensors=[_sensor(camera) for camera in cameras],
-        size=settings.size,
-        samples=SAMPLES,
-        parts=list(_write_parts(folder, mesh, settings)),
-        encoding=settings.encoding,
-    )
-    (folder / SCENE).write_text(scene, encoding="utf-8")
-
-
-def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
-    """Radiance (height, 2 · height, 3) float64 of a light's coefficients at the texels as Mitsuba's `envmap` places
-    them: its outermost rows are the poles. At 256 rows those of `to_map` would be taken for light 0.2 % dimmer."""
-    around, _ = equirectangular(1, 2 * height)  # z is 0, the mean
-    polar = torch.linspace(0, math.pi, height, dtype=torch.float64)[:, None, None]
-    return light_radiance(coefficients, polar.sin() * around + polar.cos() * torch.tensor([0.0, 0.0, 1.0]))
-
-
-def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
-    """(views, 4, size, size) float32 linear radiance and coverage of a scene's .xml file, a sensor each.
-
-    InputError: Mitsuba is not installed, or refuses the file.
-    """
-    with mitsuba() as mi:
-        try:
-            scene = mi.load_file(str(path))
-            images = [np.array(mi.render(scene, sensor=view)) for view in range(views)]
-        except RuntimeError as error:
-            raise InputError(f"{path} is not rendered by Mitsuba: {str(error).splitlines()[0]}") from error
-    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # its maps: y up, +z in the middle
+XML_TAGS = {
+    **dict.fromkeys(("path", "direct"), "integrator"),
+    **dict.fromkeys(("envmap", "projector", "point", "area"), "emitter"),
+    **dict.fromkeys(("perspective", "orthographic"), "sensor"),
+    **dict.fromkeys(("ply", "disk"), "shape"),
+    **dict.fromkeys(("twosided", "diffuse"), "bsdf"),
+    **dict.fromkeys(("bitmap", "mesh_attribute"), "texture"),
+    **{"hdrfilm": "film", "box": "rfilter", "multijitter": "sampler"},
+    **{bool: "boolean", int: "integer", float: "float", str: "string", list: "point"},
+}
+Scene = dict[str, Any]
 
 
 @contextmanager
@@ -113,64 +72,242 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
             module.set_variant(before)
 
 
+def load(module: Any, scene: Mapping[str, Any]) -> Any:
+    """Mitsuba's object of a dictionary, with its arrays as transforms and bitmaps."""
+    converted = {}
+    for name, value in scene.items():
+        if isinstance(value, dict) and value["type"] != "rgb":
+            value = load(module, value)
+        elif isinstance(value, np.ndarray):
+            value = module.ScalarTransform4f(value) if value.shape == (4, 4) else module.Bitmap(value)
+        converted[name] = value
+    return module.load_dict(converted)
+
+
+def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
+    """(views, 4, size, size) float32 linear radiance and coverage of a scene's .xml file, a sensor each.
+
+    InputError: Mitsuba is not installed, or refuses the file.
+    """
+    with mitsuba() as module:
+        try:
+            scene = module.load_file(str(path))
+            images = [np.array(module.render(scene, sensor=view)) for view in range(views)]
+        except RuntimeError as error:
+            raise InputError(f"{path} is not rendered by Mitsuba: {str(error).splitlines()[0]}") from error
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+
+
+def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
+    """Radiance (height, 2 · height, 3) float64 of a light's coefficients at the texels as Mitsuba's `envmap` places
+    them: its outermost rows are the poles. At 256 rows those of `to_map` would be taken for light 0.2 % dimmer."""
+    around, _ = equirectangular(1, 2 * height)  # z is 0, the mean
+    polar = torch.linspace(0, math.pi, height, dtype=torch.float64)[:, None, None]
+    return light_radiance(coefficients, polar.sin() * around + polar.cos() * torch.tensor([0.0, 0.0, 1.0]))
+
+
+# Parts of a scene
+
+
+def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
+    """Direct light by rays that leave surfaces by the cosine, and to emitters, if any; or paths with bounces."""
+    if bounces:
+        return {"type": "path", "max_depth": bounces + 2, "rr_depth": bounces + 2, "hide_emitters": True}
+    return {"type": "direct", "emitter_samples": emitter_samples, "bsdf_samples": 1, "hide_emitters": True}
+
+
+def image_of(source: str | np.ndarray) -> Scene:
+    """The entry for an image, a file's name or an array (H, W, 3)."""
+    return {"filename": source} if isinstance(source, str) else {"bitmap": source}
+
+
+def environment(radiance: str | np.ndarray, scale: float = 1.0) -> Scene:
+    """An environment map, laid out as in `renderer.light.environment`."""
+    return {"type": "envmap", **image_of(radiance), "scale": scale, "to_world": TO_Z_UP}
+
+
+def projector(pose: np.ndarray, fov: float, pattern: Scene, scale: float) -> Scene:
+    """A projector of a pattern (entries of a bitmap), `fov` in degrees. A white surface that faces it at distance 1
+    gets the pattern's radiance times the scale."""
+    irradiance = {"type": "bitmap", **pattern, "raw": True}
+    return {"type": "projector", "irradiance": irradiance, "fov": fov, "scale": scale, "to_world": pose}
+
+
+def sensor(pose: np.ndarray, size: int, fov: float | None = None, pixel_format: str = "rgba") -> Scene:
+    """A camera of size² pixels, `fov` in degrees, or without perspective, with [-1, 1] in x and y under its pose."""
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": pixel_format, "rfilter": {"type": "box"}}
+    perspective = {"type": "orthographic"} if fov is None else {"type": "perspective", "fov": fov}
+    return {**perspective, "to_world": pose, "film": film}
+
+
+def sensor_of(camera: Camera, size: int, pixel_format: str = "rgba") -> Scene:
+    """A camera of the renderer."""
+    if isinstance(camera, PerspectiveCamera):
+        return sensor(pose_of(camera), size, math.degrees(camera.angle), pixel_format)
+    return sensor(pose_of(camera, camera.width / 2), size, None, pixel_format)
+
+
+def pose_of(camera: Camera, scale: float = 1.0) -> np.ndarray:
+    """(4, 4) camera to world. Mitsuba's cameras and projectors look along +z and have x to the left."""
+    pose = camera.pose()
+    pose[:3] *= [-scale, scale, -1, 1]
+    return pose
+
+
+def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(4, 4) camera to world of a camera or projector at a point that looks at another, with z up."""
+    ahead = (target - origin) / np.linalg.norm(target - origin)
+    left = np.cross([0, 0, 1], ahead)
+    left /= np.linalg.norm(left)
+    return np.block([[np.stack([left, np.cross(ahead, left), ahead, origin], axis=1)], [np.array([0, 0, 0, 1.0])]])
+
+
+@dataclass(frozen=True)
+class Part:
+    """F faces of one texture (H, W, 3) uint8, or of none, with corners of their own.
+
+    positions, normals, colors: (F, 3, 3), the last linear. uvs: (F, 3, 2), as in `Mesh`.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+    uvs: np.ndarray
+    colors: np.ndarray
+    texture: np.ndarray | None
+
+
+def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
+    """The faces of each texture, and those of none. normals: (F, 3, 3), of the corners.
+
+    Textures are on white corners: where they are on others they are painted anew, since Mitsuba has no product of the
+    two.
+    """
+    if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
+        mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
+    colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
+    parts = []
+    for index in np.unique(mesh.texture_ids):
+        faces, texture = mesh.texture_ids == index, mesh.textures[index] if index >= 0 else None
+        corners = mesh.vertices[mesh.faces[faces]]
+        parts.append(Part(corners, normals[faces], mesh.corner_uvs[faces], colors[faces], texture))
+    return parts
+
+
+def shape(
+    module: Any,
+    surface: Scene,
+    positions: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray | None = None,
+    uvs: np.ndarray | None = None,
+    colors: np.ndarray | None = None,
+) -> Any:
+    """A mesh in memory of vertices (V, 3) with normals (V, 3), uvs (V, 2), as in `Mesh`, and linear colors (V, 3) as
+    the attribute "vertex_color"; shaded flat without normals. surface: the dictionary of its bsdf."""
+    properties = module.Properties()
+    properties["bsdf"], properties["face_normals"] = load(module, surface), normals is None
+    has = {"has_vertex_normals": normals is not None, "has_vertex_texcoords": uvs is not None}
+    mesh = module.Mesh("mesh", len(positions), len(faces), props=properties, **has)
+    if colors is not None:
+        mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
+    buffers = module.traverse(mesh)
+    buffers["faces"] = faces.astype(np.uint32).ravel()
+    values = {"positions": positions, "normals": normals, "texcoords": None if uvs is None else uvs * [1, -1] + [0, 1]}
+    for name, value in values.items():
+        if value is not None:
+            buffers[f"vertex_{name}"] = value.astype(np.float32).ravel()
+    buffers.update()
+    return mesh
+
+
+# Files
+
+
+def write_mitsuba_scene(
+    folder: Path,
+    mesh: Mesh,
+    albedo_scale: float,
+    cameras: Sequence[Camera],
+    settings: ImageSettings,
+    light: str,
+    placed: Sequence[tuple[EnvironmentBasis | LocalBasis, torch.Tensor]] = (),
+) -> None:
+    """Write a folder whose scene.xml shows a mesh to each camera, a sensor each. light: the map's file, as seen from
+    there. placed: projectors and lamps, with their coefficients."""
+    folder.mkdir(parents=True, exist_ok=True)
+    emitters = [emitter for lit in placed for emitter in _emitters(folder, *lit, albedo_scale)]
+    # Surfaces find the sky by themselves, with less noise.
+    sky = environment(light, math.pi * albedo_scale) | {"sampling_weight": 0.0 if emitters else 1.0}
+    sampler = {"type": "multijitter", "sample_count": SAMPLES}
+    sensors = [sensor_of(camera, settings.size) | {"sampler": sampler} for camera in cameras]
+    scene = xml.Element("scene", version="3.0.0")
+    for entry in (integrator(settings.bounces, int(bool(emitters))), sky, *emitters, *sensors):
+        _append(scene, "", entry)
+    for number, part in enumerate(split_parts(mesh, corner_normals(mesh, settings.normals), settings.encoding)):
+        _append(scene, "", _write_part(folder, number, part, settings.encoding))
+    xml.indent(scene, "    ")
+    (folder / SCENE).write_text(xml.tostring(scene, "unicode") + "\n", encoding="utf-8")
+
+
+def _append(parent: xml.Element, name: str, value: Any) -> None:
+    """Write an entry of a dictionary below an element."""
+    named = {"name": name} if name else {}
+    if isinstance(value, np.ndarray):
+        transform = xml.SubElement(parent, "transform", named)
+        xml.SubElement(transform, "matrix", value=" ".join(f"{entry:.17g}" for entry in value.ravel()))
+    elif not isinstance(value, dict):
+        text = " ".join(map(str, value)) if isinstance(value, list) else str(value)
+        xml.SubElement(parent, XML_TAGS[type(value)], named, value=text.lower() if isinstance(value, bool) else text)
+    elif value["type"] == "rgb":
+        xml.SubElement(parent, "rgb", named, value=" ".join(map(str, value["value"])))
+    else:
+        element = xml.SubElement(parent, XML_TAGS[value["type"]], named, type=value["type"])
+        for key, entry in value.items():
+            if key != "type":
+                _append(element, key, entry)
+
+
 def _emitters(
     folder: Path, basis: EnvironmentBasis | LocalBasis, coefficients: torch.Tensor, albedo_scale: float
-) -> Iterator[dict[str, Any]]:
-    """The scales make up for what `write_mitsuba_scene` says of the sky's; a projector's radiance is over π already.
+) -> Iterator[Scene]:
+    """Lamps, or a projector, whose radiance is over π already.
 
     Mitsuba's disks have radius 1 and shine along +z; their radiance is that of a far point's intensity on the area.
     """
     if isinstance(basis, Lamps):
         for (x, y, z), color in zip(basis.positions, math.pi * albedo_scale * coefficients, strict=True):
             if not basis.radius:
-                yield {"type": "point", "place": (x, y, z), "color": color.tolist()}
+                yield {"type": "point", "position": [x, y, z], "intensity": {"type": "rgb", "value": color.tolist()}}
                 continue
             polar, distance = math.atan2(math.hypot(x, y), z), math.hypot(x, y, z)
             camera = PerspectiveCamera(polar, math.atan2(y, x), 1.0, distance=distance)
             area = math.pi * basis.radius**2
-            color = [channel / area for channel in color.tolist()]
-            yield {"type": "disk", "pose": _pose(camera, basis.radius), "color": color}
+            radiance = {"type": "rgb", "value": [channel / area for channel in color.tolist()]}
+            pose = pose_of(camera, basis.radius)
+            yield {"type": "disk", "to_world": pose, "emitter": {"type": "area", "radiance": radiance}}
     elif isinstance(basis, Projector):
         write_map(folder / PATTERN, coefficients.view(basis.pixels, basis.pixels, 3))
+        pattern = {"filename": PATTERN, "filter_type": "nearest", "wrap_mode": "clamp"}
         camera = PerspectiveCamera(basis.polar, basis.azimuth, 1.0, distance=basis.distance)
-        scale, degrees = albedo_scale * basis.distance**2, math.degrees(basis.fov)
-        yield {"type": "projector", "file": PATTERN, "degrees": degrees, "scale": scale, "pose": _pose(camera, 1.0)}
+        yield projector(pose_of(camera), math.degrees(basis.fov), pattern, albedo_scale * basis.distance**2)
 
 
-def _pose(camera: Camera, scale: float) -> str:
-    """Mitsuba's cameras and projectors look along +z and have x to the left."""
-    pose = camera.pose()
-    pose[:3] *= [-scale, scale, -1, 1]
-    return " ".join(f"{value:.17g}" for value in pose.ravel())
-
-
-def _sensor(camera: Camera) -> dict[str, Any]:
-    """Mitsuba's orthographic camera sees [-1, 1] in x and y."""
-    if isinstance(camera, PerspectiveCamera):
-        return {"degrees": math.degrees(camera.angle), "pose": _pose(camera, 1.0)}
-    return {"degrees": None, "pose": _pose(camera, camera.width / 2)}
-
-
-def _write_parts(folder: Path, mesh: Mesh, settings: ImageSettings) -> Iterator[dict[str, str | None]]:
-    """A shape for each texture, and one for the faces without: part_0.ply and so on, with its texture_0.png."""
-    normals = corner_normals(mesh, settings.normals)
-    for number, index in enumerate(np.unique(mesh.texture_ids)):
-        here, file, texture = mesh.texture_ids == index, f"part_{number}.ply", f"texture_{number}.png"
-        colors = decode(torch.from_numpy(mesh.corner_colors[here]), settings.encoding).numpy()
-        corners = [mesh.vertices[mesh.faces[here]], normals[here], mesh.corner_uvs[here], colors]
-        _write_ply(folder / file, np.concatenate(corners, axis=-1).reshape(-1, 11))
-        if index >= 0:
-            Image.fromarray(mesh.textures[index]).save(folder / texture)
-        yield {"file": file, "texture": texture if index >= 0 else None}
-
-
-def _write_ply(path: Path, corners: np.ndarray) -> None:
-    """Corners (3 F, 11) of faces, three after three, with a position, normal, uv and linear color each."""
+def _write_part(folder: Path, number: int, part: Part, encoding: str) -> Scene:
+    """A shape of part_0.ply and so on, with its texture_0.png."""
     import trimesh
 
-    attributes = dict(zip("uvrgb", corners[:, 6:].astype(np.float32).T, strict=True))
-    faces = np.arange(len(corners)).reshape(-1, 3)
-    part = trimesh.Trimesh(
-        corners[:, :3], faces, vertex_normals=corners[:, 3:6], vertex_attributes=attributes, process=False
-    )
-    part.export(path, vertex_normal=True)
+    file, texture = f"part_{number}.ply", f"texture_{number}.png"
+    corners = np.concatenate([part.uvs, part.colors], axis=-1).reshape(-1, 5).astype(np.float32)
+    trimesh.Trimesh(
+        part.positions.reshape(-1, 3),
+        np.arange(len(corners)).reshape(-1, 3),
+        vertex_normals=part.normals.reshape(-1, 3),
+        vertex_attributes=dict(zip("uvrgb", corners.T, strict=True)),
+        process=False,
+    ).export(folder / file, vertex_normal=True)
+    albedo: Scene = {"type": "mesh_attribute", "name": "vertex_color"}
+    if part.texture is not None:
+        Image.fromarray(part.texture).save(folder / texture)
+        albedo = {"type": "bitmap", "filename": texture, "raw": encoding == "linear"}
+    surface = {"type": "twosided", "material": {"type": "diffuse", "reflectance": albedo}}
+    return {"type": "ply", "filename": file, "flip_tex_coords": True, "bsdf": surface}
