@@ -119,6 +119,10 @@ def build_scene(
     bounces, rasterizer: as for `renderer.render`, or a rasterizer that was chosen. operators: where rendered views are
     kept.
     InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
+
+    >>> scene = build_scene([("solid:orange", "orange"), ("solid:apple", "apple")], 32, views=3, backgrounds=[0.2, 0.8])
+    >>> len(scene), scene.labels[0]
+    (12, 'orange')
     """
     settings, device = ImageSettings(size, samples, encoding, normals, shadows, bounces), as_device(device)
     require_range("exposure", exposure, 0, FACTOR)

@@ -36,10 +36,14 @@ def load_classifier(
 
     weights: a local file; None for those that the source brings or downloads. InputError for an unknown name, for
     weights that are missing, damaged or another network's, and where a package or the network is wanting.
+
+    >>> load_classifier("torchvision:squeezenet1_1", "absent.pt")
+    Traceback (most recent call last):
+    renderer.errors.InputError: weights=absent.pt does not exist: give the path of a file of weights
     """
     source, colon, model = name.partition(":")
     if source + colon not in sources:
-        choices = [f"{each}NAME" if each.endswith(":") else each for each in sources]
+        choices = [f"{source}NAME" if source.endswith(":") else source for source in sources]
         raise InputError(f"classifier={name} is not known: choose one of {', '.join(choices)}")
     load = sources[source + colon]
     path = None if weights is None else Path(weights)

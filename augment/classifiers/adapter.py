@@ -1,4 +1,4 @@
-"""What makes a network attackable: one module that takes images as the renderer makes them, and names its classes."""
+"""The adapter of a classifier: one module that takes images as the renderer makes them, and names its classes."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class Classifier(nn.Module):
         self.size = size
         self.classes = tuple(classes)
         self.name = name
-        if repeated := [each for each, count in Counter(self.classes).items() if count > 1]:
+        if repeated := [name for name, count in Counter(self.classes).items() if count > 1]:
             raise InputError(f"classifier={name} has several classes {repeated[0]!r}: make their names differ")
         if not self.classes:
             raise InputError(f"classifier={name} has no classes: name them, in the order of its logits")
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
-        """InputError for images of another size, and for a callable that fails or gives no logits, such that are not
-        finite or none with a gradient."""
+        """InputError for images of another size, and for a callable that fails or returns something else than finite
+        logits with a gradient."""
         if images.shape[1:] != (3, self.size, self.size):
             raise InputError(
                 f"classifier={self.name} takes images (N, 3, {self.size}, {self.size}), not {tuple(images.shape)}: "
@@ -50,13 +50,13 @@ class Classifier(nn.Module):
         logits = self._call(images)
         expected = (len(images), len(self.classes))
         if not isinstance(logits, Tensor) or logits.shape != expected:
-            found = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-            raise InputError(f"classifier={self.name} gives {found}: make it return logits {expected}")
+            returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
+            raise InputError(f"classifier={self.name} returned {returned}: make it return logits {expected}")
         if not logits.is_floating_point() or not logits.isfinite().all():
-            raise InputError(f"classifier={self.name} gives logits that are not finite real numbers: mend its weights")
+            raise InputError(f"classifier={self.name} returned NaN or infinite logits: check its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
             raise InputError(
-                f"classifier={self.name} gives logits without a gradient: compute them in torch, undetached"
+                f"classifier={self.name} returned logits without a gradient: compute them in torch, undetached"
             )
         return logits
 
@@ -66,9 +66,9 @@ class Classifier(nn.Module):
         except Exception as error:
             if isinstance(error, InputError) or is_out_of_memory(error):
                 raise
-            said = " ".join(f"{type(error).__name__}: {error}".split())
+            message = " ".join(f"{type(error).__name__}: {error}".split())
             raise InputError(
-                f"classifier={self.name} fails on float32 images {tuple(images.shape)} ({said}): make it take these"
+                f"classifier={self.name} fails on float32 images {tuple(images.shape)} ({message}): make it take these"
             ) from error
 
     def train(self, mode: bool = True) -> Self:
@@ -114,10 +114,11 @@ def nearest(name: str, choices: Iterable[str]) -> str:
 
     Those that hold it as a word come first, then those that hold it at all, the shortest first.
     """
-    name, by_lower_case = name.lower(), {each.lower(): each for each in choices}
+    name, by_lower_case = name.lower(), {choice.lower(): choice for choice in choices}
     containing = sorted(
-        (each for each in by_lower_case if name in each), key=lambda each: (name not in each.split(), len(each))
+        (choice for choice in by_lower_case if name in choice),
+        key=lambda choice: (name not in choice.split(), len(choice)),
     )
     similar = difflib.get_close_matches(name, by_lower_case, n=3, cutoff=0)
-    each_once = dict.fromkeys([*containing, *similar])
-    return ", ".join(by_lower_case[each] for each in list(each_once)[:3])
+    best = list(dict.fromkeys([*containing, *similar]))[:3]
+    return ", ".join(by_lower_case[choice] for choice in best)

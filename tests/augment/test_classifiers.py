@@ -116,13 +116,13 @@ MISUSES = [
     pytest.param(lambda x: x.mean((2, 3)), (2, 4, 8, 8), "takes images (N, 3, 8, 8)", id="channels"),
     pytest.param(lambda x: x.mean((2, 3)), (3, 8, 8), "takes images (N, 3, 8, 8)", id="one image"),
     pytest.param(
-        lambda x: x.mean((1, 2, 3)), (2, 3, 8, 8), "gives (2,): make it return logits (2, 3)", id="no classes"
+        lambda x: x.mean((1, 2, 3)), (2, 3, 8, 8), "returned (2,): make it return logits (2, 3)", id="no classes"
     ),
-    pytest.param(lambda x: x[:, :2, 0, 0], (2, 3, 8, 8), "gives (2, 2): make it return logits (2, 3)", id="classes"),
-    pytest.param(lambda x: [x], (2, 3, 8, 8), "gives list: make it return logits", id="list"),
+    pytest.param(lambda x: x[:, :2, 0, 0], (2, 3, 8, 8), "returned (2, 2): make it return logits (2, 3)", id="classes"),
+    pytest.param(lambda x: [x], (2, 3, 8, 8), "returned list: make it return logits", id="list"),
     pytest.param(lambda x: x.detach().mean((2, 3)), (2, 3, 8, 8), "logits without a gradient", id="detached"),
-    pytest.param(lambda x: x.mean((2, 3)) / 0, (2, 3, 8, 8), "gives logits that are not finite", id="infinite"),
-    pytest.param(lambda x: x.mean((2, 3)) * 1j, (2, 3, 8, 8), "gives logits that are not finite real", id="complex"),
+    pytest.param(lambda x: x.mean((2, 3)) / 0, (2, 3, 8, 8), "returned NaN or infinite", id="infinite"),
+    pytest.param(lambda x: x.mean((2, 3)) * 1j, (2, 3, 8, 8), "returned NaN or infinite", id="complex"),
     pytest.param(lambda x: x @ x.double(), (2, 3, 8, 8), "fails on float32 images (2, 3, 8, 8) (Runtime", id="double"),
     pytest.param(lambda x: x.no_such_name, (2, 3, 8, 8), "'Tensor' object has no attribute", id="a mistake in it"),
 ]
