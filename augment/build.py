@@ -1,8 +1,8 @@
-"""A scene from meshes in one call."""
+"""A scene from meshes in one call, with the settings of scene, renderer and local lights."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ from torch import Tensor
 from augment.backgrounds import load_background, load_backgrounds
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
-from renderer.cache import OperatorCache
-from renderer.camera import orbit_cameras
+from renderer.cache import OperatorCache, cache_folder
+from renderer.camera import MOST_VIEWS, orbit_cameras
 from renderer.errors import FACTOR, InputError, as_device, require_range
 from renderer.image import ImageSettings
 from renderer.io.lights import read_light
@@ -21,14 +21,14 @@ from renderer.light.basis import with_local_lights
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light
 from renderer.mesh import Mesh, normalize
-from renderer.rasterizer import Rasterizer, choose
-from renderer.subdivision import subdivide
+from renderer.rasterizer import choose
+from renderer.subdivision import MOST_VERTICES, subdivide
 
 
 @dataclass
 class ProjectorSettings:
-    """A `Projector`, its angles in degrees. pattern: where attacks begin, in shares of its power: a gray value or an
-    image file."""
+    """A `Projector`, with angles in degrees. pattern: where attacks begin, in fractions of its power: a gray value or
+    an image file."""
 
     pixels: int = 16
     polar: float = 45.0
@@ -40,12 +40,12 @@ class ProjectorSettings:
 
     def build(self) -> tuple[Projector, Tensor]:
         """The basis, and the pattern (pixels², 3)."""
-        require_range("scene.projector.polar", self.polar, 0, 180)
-        require_range("scene.projector.azimuth", self.azimuth, -360, 360)
-        require_range("scene.projector.fov", self.fov, 0.1, 170)
+        require_range("polar", self.polar, 0, 180)
+        require_range("azimuth", self.azimuth, -360, 360)
+        require_range("fov", self.fov, 0.1, 170)
         polar, azimuth, fov = map(math.radians, (self.polar, self.azimuth, self.fov))
         basis = Projector(self.pixels, polar, azimuth, self.distance, fov, self.power)
-        pattern = load_background(self.pattern, self.pixels, "scene.projector.pattern").expand(3, -1, -1)
+        pattern = load_background(self.pattern, self.pixels, "pattern").expand(3, -1, -1)
         return basis, self.power * pattern.flatten(1).T
 
 
@@ -70,16 +70,70 @@ class LampsSettings:
             start = torch.tensor(self.start, dtype=torch.float32).expand(len(positions), 3)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise InputError(
-                f"scene.lamps: give positions [x, y, z] and, as start, a number or [r, g, b]s ({error})"
+                f"lamps: give positions [x, y, z] and, as start, a number or [r, g, b]s ({error})"
             ) from error
         basis = Lamps(positions, self.power, self.radius)
-        if not ((start >= 0) & (start <= self.power)).all():  # NaN is neither
-            raise InputError(f"scene.lamps.start={self.start}: give powers from 0 to scene.lamps.power={self.power:g}")
+        if not ((start >= 0) & (start <= self.power)).all():  # NaN is not
+            raise InputError(f"start={self.start}: give powers from 0 to power={self.power:g}")
         return basis, basis.project_nonnegative(start)
+
+
+@dataclass
+class SceneSettings:
+    """What `build_scene` shows, and how; the schema of a command's `scene`, too.
+
+    meshes: a file, `solid:NAME`, or a mapping with the keys of `ObjectSettings`, each. backgrounds: gray values or
+    image files. views: cameras on a circle around each mesh; None where something else tells. polar: degrees off +z.
+    azimuth: of the first view, degrees off +x towards +y. width: of the image in world units; a mesh spans [-1, 1].
+    fov: degrees between the image's sides, as of a camera at that distance; None for parallel rays. vertices: subdivide
+    meshes until they have more. light: what `renderer.load_light` takes or, in Python, coefficients (49, 3). exposure:
+    multiplies it. projector, lamps: local lights beside it. ground: color of a table under each mesh, RGB as displayed.
+    """
+
+    meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
+    backgrounds: list[Any] = field(default_factory=lambda: [0.5])
+    views: int | None = 1
+    polar: float = 60.0
+    azimuth: float = 0.0
+    width: float = 2.0
+    fov: float | None = None
+    vertices: int = 0
+    light: str = "grace"
+    exposure: float = 1.0
+    projector: ProjectorSettings | None = None
+    lamps: LampsSettings | None = None
+    ground: list[float] | None = None
+
+    def __post_init__(self) -> None:
+        require_range("exposure", self.exposure, 0, FACTOR)
+        require_range("views", self.views, 1, MOST_VIEWS)
+        require_range("vertices", self.vertices, 0, MOST_VERTICES)
+        require_range("polar", self.polar, 0, 180)
+        require_range("azimuth", self.azimuth, -360, 360)
+        require_range("fov", self.fov, 0.1, 150)
+
+
+@dataclass
+class RendererSettings:
+    """How `build_scene` renders; the schema of a command's `renderer`, too.
+
+    rasterizer: auto, opengl, numba or numpy; or in Python, one that was chosen. samples: per pixel side. encoding,
+    normals, shadows, bounces: as for `renderer.render`. cache: the folder of rendered views, "auto", or None.
+    """
+
+    rasterizer: str = "auto"
+    samples: int = 2
+    encoding: str = "linear"
+    normals: str = "smooth"
+    shadows: bool = False
+    bounces: int = 0
+    cache: str | None = "auto"
 
 
 Shown = str | Path | Mesh
 Member = ObjectSettings | tuple[Shown, str]
+SCENE = {item.name for item in fields(SceneSettings)} - {"meshes", "views"}
+RENDERER = {item.name for item in fields(RendererSettings)} - {"cache"}
 
 
 def build_scene(
@@ -88,58 +142,51 @@ def build_scene(
     views: int = 1,
     *,
     shared: bool = False,
-    backgrounds: Sequence[float | str | Path] = (0.5,),
-    light: str | Tensor = "grace",
-    exposure: float = 1.0,
-    projector: ProjectorSettings | None = None,
-    lamps: LampsSettings | None = None,
-    ground: Sequence[float] | None = None,
-    polar: float = 60.0,
-    azimuth: float = 0.0,
-    width: float = 2.0,
-    fov: float | None = None,
-    vertices: int = 0,
-    samples: int = 2,
-    encoding: str = "linear",
-    normals: str = "smooth",
-    shadows: bool = False,
-    bounces: int = 0,
-    rasterizer: str | Rasterizer = "auto",
+    scene: SceneSettings | None = None,
+    renderer: RendererSettings | None = None,
     operators: OperatorCache | None = None,
     device: torch.device | str = "cpu",
+    **options: Any,
 ) -> Scene:
-    """Every mesh from a ring of views over every background, at `size` pixels per side.
+    """Every mesh from a circle of views over every background, at `size` pixels per side.
 
-    meshes: (file, solid:NAME or `Mesh`; the name of its class) each, or `ObjectSettings`. shared: the views of an
-    example share one light, shape or color; otherwise each is an example. backgrounds: gray values or image files.
-    light: coefficients or what `renderer.load_light` takes; exposure multiplies it. projector, lamps: that shine as
-    well. ground: the color of a table under each mesh (`on_ground`). polar: degrees off +z; azimuth: of the first
-    view, off +x. width: width of the image in world units. fov: degrees between its sides, None of an
-    orthographic camera. vertices: subdivide until there are more. samples, encoding, normals, shadows,
-    bounces, rasterizer: as for `renderer.render`, or a rasterizer that was chosen. operators: where rendered views are
-    kept.
+    meshes: pairs of a file, solid:NAME or `Mesh`, and the name of its class; or `ObjectSettings`. shared: the views of
+    an example share one light, shape or color; otherwise each view is an example. scene, renderer: all further choices
+    (their own `meshes` and `views` are ignored). options: fields of either, which take precedence. operators: the cache
+    of rendered views; by default the renderer's `cache`, or without `renderer`, the memory.
     InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
 
-    >>> scene = build_scene([("solid:orange", "orange"), ("solid:apple", "apple")], 32, views=3, backgrounds=[0.2, 0.8])
+    >>> meshes = [("solid:orange", "orange"), ("solid:apple", "apple")]
+    >>> scene = build_scene(meshes, size=32, views=3, backgrounds=[0.2, 0.8], polar=70.0, samples=1)
     >>> len(scene), scene.labels[0]
     (12, 'orange')
     """
-    settings, device = ImageSettings(size, samples, encoding, normals, shadows, bounces), as_device(device)
-    require_range("exposure", exposure, 0, FACTOR)
-    sky = (load_light(light) if isinstance(light, str) else light) * exposure
-    basis, lights = with_local_lights(sky, [each.build() for each in (projector, lamps) if each is not None])
-    angle = None if fov is None else math.radians(fov)
+    if unknown := sorted(options.keys() - SCENE - RENDERER):
+        raise TypeError(f"build_scene() got an unexpected keyword argument {unknown[0]!r}")
+    if operators is None:
+        operators = OperatorCache(cache_folder(renderer.cache)) if renderer else OperatorCache()
+    shown = replace(scene or SceneSettings(), views=views, **_among(options, SCENE))
+    drawn = replace(renderer or RendererSettings(), **_among(options, RENDERER))
+    settings = ImageSettings(size, drawn.samples, drawn.encoding, drawn.normals, drawn.shadows, drawn.bounces)
+    environment: Any = load_light(shown.light) if isinstance(shown.light, str) else shown.light
+    local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
+    basis, lights = with_local_lights(environment * shown.exposure, local)
+    fov = None if shown.fov is None else math.radians(shown.fov)
     return Scene.grid(
-        [on_ground(_object(member, vertices), ground) for member in meshes],
-        orbit_cameras(views, width, math.radians(polar), math.radians(azimuth), angle),
-        load_backgrounds(backgrounds, size),
-        lights.to(device),
+        [on_ground(_object(member, shown.vertices), shown.ground) for member in meshes],
+        orbit_cameras(views, shown.width, math.radians(shown.polar), math.radians(shown.azimuth), fov),
+        load_backgrounds(shown.backgrounds, size),
+        lights.to(as_device(device)),
         settings,
-        choose(rasterizer) if isinstance(rasterizer, str) else rasterizer,
+        choose(drawn.rasterizer) if isinstance(drawn.rasterizer, str) else drawn.rasterizer,
         operators,
         shared=shared,
         basis=basis,
     )
+
+
+def _among(options: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if name in names}
 
 
 def _object(member: Member, vertices: int) -> SceneObject:

@@ -33,8 +33,8 @@ class CameraEffectSettings:
 
     def __post_init__(self) -> None:
         for name, most in (("pattern_fraction", 1), ("white_balance", 5), ("blur", BLUR_RADIUS / 2), ("noise", 1)):
-            require_range(f"augment.vary.camera.{name}", getattr(self, name), 0, most)
-        require_limits("augment.vary.camera.pattern_fill", self.pattern_fill, 0, 1)
+            require_range(name, getattr(self, name), 0, most)
+        require_limits("pattern_fill", self.pattern_fill, 0, 1)
 
     @property
     def changes(self) -> bool:

@@ -45,8 +45,8 @@ class RandomLightSettings:
     radius: float | None = None
 
     def __post_init__(self) -> None:
-        require_range("augment.random_light.amplitude", self.amplitude, 1 / FACTOR, FACTOR)
-        require_range("augment.random_light.radius", self.radius, 1 / FACTOR, FACTOR)
+        require_range("amplitude", self.amplitude, 1 / FACTOR, FACTOR)
+        require_range("radius", self.radius, 1 / FACTOR, FACTOR)
 
 
 @dataclass
@@ -94,16 +94,16 @@ class AugmentationSettings:
     attack: TrainingAttackSettings = field(default_factory=TrainingAttackSettings)
 
     def __post_init__(self) -> None:
-        require_choice("augment.arm", self.arm, ARMS)
-        require_choice("augment.init", self.init, INITS)
-        require_range("augment.examples", self.examples, 0, MOST_EXAMPLES)
-        require_range("augment.every", self.every, 1, MOST_EVERY)
+        require_choice("arm", self.arm, ARMS)
+        require_choice("init", self.init, INITS)
+        require_range("examples", self.examples, 0, MOST_EXAMPLES)
+        require_range("every", self.every, 1, MOST_EVERY)
         if self.arm == "random" or self.init == "random":
             for name, settings in self.attack.parameters.items():
                 if name != Lighting.name and settings.radius is None:
-                    raise InputError(f"augment.attack.{name}.radius=null has no random draw: set a radius")
+                    raise InputError(f"attack.{name}.radius is None, which has no random draw: set a radius")
         if self.warm_start and self.vary.instances:
-            raise InputError("augment.warm_start=true goes on with the last shapes: set augment.vary.instances=false")
+            raise InputError("warm_start=True keeps the last attack's shapes: set vary.instances=False")
 
     @property
     def renders(self) -> bool:
@@ -180,7 +180,9 @@ class AugmentationService:
     def __post_init__(self) -> None:
         settings = self.settings
         if self.scene is None and settings.renders:
-            raise InputError(f"augment.arm={settings.arm} renders augment.examples={settings.examples}: give a scene")
+            raise InputError(
+                f"scene is None, and arm={settings.arm} renders {settings.examples} examples: give a scene"
+            )
 
     @classmethod
     def from_meshes(
@@ -239,7 +241,7 @@ class AugmentationService:
             return
         if len(state["values"]) != len(self.labels):
             raise InputError(
-                f"augment.examples: the checkpoint continues {len(state['values'])} examples and the scene has "
+                f"the checkpoint continues {len(state['values'])} examples and the scene has "
                 f"{len(self.labels)}; resume with the settings of the run"
             )
         self._last_values = state["values"].to(self.labels.device)
@@ -328,7 +330,16 @@ def choose_attack_examples(
     with as_found(model), torch.no_grad():
         images = [problem.scene.render(conditions, rows)[:, 0] for conditions in (before, after)]
         predictions = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
-    return AttackExamples(*images, before.light, after.light, *predictions, labels[rows], problem.scene.basis)
+    return AttackExamples(
+        images[0],
+        images[1],
+        before.light,
+        after.light,
+        predictions[0],
+        predictions[1],
+        labels[rows],
+        problem.scene.basis,
+    )
 
 
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:

@@ -57,10 +57,10 @@ class VariationSettings:
 
     def __post_init__(self) -> None:
         for name, most in (("shift", 1), ("azimuth", 180), ("directional_fraction", 1)):
-            require_range(f"augment.vary.{name}", getattr(self, name), 0, most)
-        require_limits("augment.vary.fill_light", self.fill_light, 0, 1)
+            require_range(name, getattr(self, name), 0, most)
+        require_limits("fill_light", self.fill_light, 0, 1)
         for name in ("scale", "exposure"):
-            require_limits(f"augment.vary.{name}", getattr(self, name), 1 / FACTOR, FACTOR)
+            require_limits(name, getattr(self, name), 1 / FACTOR, FACTOR)
 
     @property
     def moves(self) -> bool:
@@ -159,7 +159,7 @@ def _images(folder: Path, count: int, size: int, draws: torch.Generator) -> Tens
     """(count, 3, size, size), drawn with repetition."""
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
-        raise InputError(f"augment.vary.backgrounds={folder} holds no image: give a folder of .jpg or .png files")
+        raise InputError(f"backgrounds={folder} holds no image: give a folder of .jpg or .png files")
     chosen = torch.randint(len(files), (count,), generator=draws).tolist()
     return torch.stack([read_image(files[index], size) for index in chosen])
 

@@ -35,7 +35,7 @@ def test_grays_have_one_channel_unless_there_is_an_image(wide):
 
 @pytest.mark.parametrize("choice", [-0.1, 1.01, 255, math.nan, None, [0.5]])
 def test_grays_outside_0_to_1_and_what_is_no_background_are_refused(choice):
-    with pytest.raises(InputError, match=r"scene.backgrounds=.*give gray values in \[0, 1\] or image files"):
+    with pytest.raises(InputError, match=r"backgrounds=.*give gray values in \[0, 1\] or image files"):
         load_backgrounds([0.5, choice], 4)
 
 
@@ -44,5 +44,5 @@ def test_an_unreadable_background_is_named(tmp_path):
     broken.write_bytes(b"no image")
     faults = {broken: "cannot be read .*", tmp_path / "absent.png": "does not exist", tmp_path: "is no file"}
     for path, fault in faults.items():
-        with pytest.raises(InputError, match=f"scene.backgrounds: {path} {fault}: give an image file or a gray value"):
+        with pytest.raises(InputError, match=f"backgrounds: {path} {fault}: give an image file or a gray value"):
             load_background(str(path), 4)

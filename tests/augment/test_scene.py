@@ -249,7 +249,7 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
     [
         ("solid:orangutan", "solid:orangutan: No solid is called 'orangutan': use 'orange'"),
         ("solid", "No solid is called ''"),
-        ("solid:orange:" + 30 * "9", rf"solid:orange:{30 * '9'}: seed is"),
+        ("solid:orange:" + 30 * "9", rf"solid:orange:{30 * '9'}: seed="),
         ("solid:orange:red", "solid:orange:red: the seed must be a whole number"),
         ("solid:orange:-1", "must be a whole number"),
         ("solid:orange:1:2", "must be a whole number"),

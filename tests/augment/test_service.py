@@ -205,7 +205,7 @@ def test_a_random_init_is_the_random_arms_light(serve, model):
 
 
 def test_a_checkpoint_of_another_number_of_examples_is_refused(serve):
-    with pytest.raises(InputError, match=r"augment\.examples: the checkpoint continues 3 examples and the scene has"):
+    with pytest.raises(InputError, match=r"the checkpoint continues 3 examples and the scene has"):
         serve(warm_start=True).load_state_dict({"values": torch.zeros(3, 147)})
 
 
@@ -225,9 +225,9 @@ def test_a_label_beyond_the_classes_of_the_network_is_refused(model, arm):
         ({"examples": -1}, "examples=-1"),
         (
             {"warm_start": True, "vary": VariationSettings(instances=True)},
-            "warm_start=true goes on with the last shapes",
+            "warm_start=True keeps",
         ),
-        ({"arm": "random", "attack": TrainingAttackSettings(geometry=StepSettings())}, "geometry.radius=null has no"),
+        ({"arm": "random", "attack": TrainingAttackSettings(geometry=StepSettings())}, "geometry.radius is None"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings, message):

@@ -221,5 +221,5 @@ def test_settings_out_of_range_are_refused(name, value):
 
 
 def test_a_folder_without_images_is_refused(scene, tmp_path):
-    with pytest.raises(InputError, match=f"augment.vary.backgrounds={tmp_path} holds no image: give a folder"):
+    with pytest.raises(InputError, match=f"backgrounds={tmp_path} holds no image: give a folder"):
         drawn(scene, backgrounds=str(tmp_path))
