@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
 from train.command_line.configuration import as_dict, composed, dotted, read_settings
-from train.laboratory.settings import LabSettings
+from train.lab.folder import LabSettings
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 SETTINGS = {

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from train.laboratory.patterns import FAMILIES, TWO_COLORED, checkers, draw_color, draw_pattern, ramp, spots, stripes
+from train.lab.patterns import FAMILIES, TWO_COLORED, checkers, draw_color, draw_pattern, spots, stripes
 
 SEEDS = range(8)
 each_seed = pytest.mark.parametrize("seed", SEEDS)
@@ -43,7 +43,7 @@ def test_a_family_mixes_two_colors_one_of_which_is_darkness_in_some(family, seed
 
 
 @each_seed
-def test_stripes_light_the_share_of_their_duty_cycle(seed):
+def test_stripes_light_their_duty_cycle(seed):
     twin = np.random.default_rng(seed)
     period, _, duty = twin.uniform(0.12, 0.5), twin.uniform(), twin.uniform(0.3, 0.7)
     lit = stripes(lattice(7 * period, 700), np.random.default_rng(seed))
@@ -61,17 +61,13 @@ def test_checkers_light_one_half_and_change_at_every_edge_in_either_direction(se
         assert (lit + moved == 1).mean() > 0.99  # but for rounding at the edges
 
 
-def test_a_ramp_rises_from_zero_to_one_over_its_width():
-    np.testing.assert_allclose(ramp(np.array([-2, -0.5, -0.25, 0, 0.5, 2]), 1.0), [0, 0, 0.25, 0.5, 1, 1])
-
-
 def test_half_divides_the_image_by_a_straight_line_through_the_object():
-    shares = [draw_pattern("half", np.random.default_rng(seed), 64).any(axis=-1).mean() for seed in range(50)]
+    fractions = [draw_pattern("half", np.random.default_rng(seed), 64).any(axis=-1).mean() for seed in range(50)]
     # A line at a distance of 0.12 from the middle of the square cuts off 0.5 - 0.06 √2 of it at least.
-    assert 0.5 - 0.06 * math.sqrt(2) - 0.02 < min(shares) < 0.5 < max(shares) < 0.5 + 0.06 * math.sqrt(2) + 0.02
+    assert 0.5 - 0.06 * math.sqrt(2) - 0.02 < min(fractions) < 0.5 < max(fractions) < 0.5 + 0.06 * math.sqrt(2) + 0.02
 
 
 def test_spots_light_about_a_half_on_average():
     """Discs of 0.7 of the image's area in all leave exp(-0.7) dark, and more where they reach beyond its edge."""
-    shares = [spots(lattice(2, 60) - 1, np.random.default_rng(seed)).mean() for seed in range(60)]
-    assert 0.4 < np.mean(shares) < 1 - math.exp(-0.7) + 0.02
+    fractions = [spots(lattice(2, 60) - 1, np.random.default_rng(seed)).mean() for seed in range(60)]
+    assert 0.4 < np.mean(fractions) < 1 - math.exp(-0.7) + 0.02

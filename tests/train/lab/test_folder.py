@@ -9,8 +9,7 @@ from PIL import Image
 
 from renderer.errors import InputError
 from renderer.shapes import LOOK_ALIKES, SOLIDS
-from train.laboratory.folder import read_subject, write_laboratory
-from train.laboratory.settings import LabSettings
+from train.lab.folder import LabSettings, read_subject, write_laboratory
 from train.photographs.folder import find_photographs, load_photographs
 
 pytest.importorskip("mitsuba")
@@ -19,7 +18,7 @@ MESHES = ["solid:orange:7", {"mesh": "solid:orange:8", "albedo_scale": 0.5}, "so
 
 
 def settings(out: Path, **changes) -> LabSettings:
-    small = {"lights": 4, "patterns": ["stripes", "half"], "size": 8, "samples": 4, "bounces": 2}
+    small = {"setups": 4, "patterns": ["stripes", "half"], "size": 8, "spp": 4, "bounces": 2}
     return LabSettings(**{"out": str(out), "meshes": MESHES, **small, **changes})
 
 
@@ -45,16 +44,16 @@ def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_its_source(
     assert len(images.unique(dim=0)) == 8
 
 
-def test_each_light_shows_one_object_of_the_label_and_one_other_which_take_turns(laboratory):
-    by_light = {}
+def test_each_setup_shows_one_object_of_the_label_and_one_other_which_take_turns(laboratory):
+    by_setup = {}
     for row in rows(laboratory):
-        by_light.setdefault(int(row["light"]), []).append((row["mesh"], row["source_tag"], row["brightness"]))
+        by_setup.setdefault(int(row["setup"]), []).append((row["mesh"], row["source_tag"], row["brightness"]))
     pairs = [("solid:orange:7", "solid:lemon:7"), ("solid:orange:8", "solid:pear:7")] * 2
-    for light, (pair, source) in enumerate(zip(pairs, ["stripes"] * 2 + ["half"] * 2, strict=True)):
-        meshes, sources, brightness = zip(*sorted(by_light[light]), strict=True)
+    for setup, (pair, source) in enumerate(zip(pairs, ["stripes"] * 2 + ["half"] * 2, strict=True)):
+        meshes, sources, brightness = zip(*sorted(by_setup[setup]), strict=True)
         assert set(meshes) == set(pair) and set(sources) == {source} and len(set(brightness)) == 1
         assert 0.2 <= float(brightness[0]) <= 2.5
-    assert len(by_light) == 4
+    assert len(by_setup) == 4
 
 
 def test_the_same_settings_write_the_same_bytes_and_another_seed_writes_others(laboratory, tmp_path):
@@ -66,8 +65,8 @@ def test_the_same_settings_write_the_same_bytes_and_another_seed_writes_others(l
     assert (tmp_path / "0" / "photos.csv").read_bytes() == (laboratory / "photos.csv").read_bytes()
 
 
-def test_nothing_but_the_object_tells_the_label_from_a_look_alike(tmp_path):
-    """One and the same mesh under both labels: the photographs under a light are the same, byte for byte."""
+def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
+    """One and the same mesh under both labels: the photographs of a setup are the same, byte for byte."""
     meshes = ["solid:orange:7", {"mesh": "solid:orange:7", "label": "other_orange"}]
     write_laboratory(settings(tmp_path, meshes=meshes))
     for path in (tmp_path / "orange").iterdir():
@@ -76,7 +75,7 @@ def test_nothing_but_the_object_tells_the_label_from_a_look_alike(tmp_path):
 
 def test_the_settings_and_versions_lie_beside_the_photographs(laboratory):
     described = json.loads((laboratory / "lab.json").read_text())
-    assert described["meshes"] == MESHES and described["lights"] == 4 and described["seed"] == 0
+    assert described["meshes"] == MESHES and described["setups"] == 4 and described["seed"] == 0
     assert {"python", "mitsuba", "numpy", "torch"} == described["versions"].keys()
 
 
@@ -94,29 +93,18 @@ def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_els
     assert read_subject({"mesh": f"solid:{name}", "label": "pear"}, 0).label == "pear"
 
 
+OUTSIDE = r"meshes\[0\]: the label '.*x' names the photographs' folder"
 REFUSED = [
-    ({"meshes": []}, "meshes: name at least one of label=orange and one of something else"),
-    ({"meshes": ["solid:orange"]}, "meshes: name at least one of label=orange and one of something else"),
-    ({"meshes": ["solid:lemon"]}, "meshes: name at least one of label=orange and one of something else"),
-    ({"meshes": [{"mesh": "solid:orange", "label": "../x"}]}, r"meshes\[0\]: the label '../x' is no folder's name"),
-    (
-        {"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]},
-        r"meshes\[0\]: the label 'other_../../x' is ",
-    ),
+    ({"meshes": ["solid:orange"]}, "meshes: name at least one of label=orange and one of another class"),
+    ({"meshes": ["solid:lemon"]}, "meshes: name at least one of label=orange and one of another class"),
+    ({"meshes": [{"mesh": "solid:orange", "label": "../x"}]}, OUTSIDE),
+    ({"meshes": [{"mesh": "solid:orange", "label": "other_../../x"}]}, OUTSIDE),
     ({"meshes": ["solid:orange", "fruit.glb"]}, r"meshes\[1\]: fruit.glb has no label: give {mesh: fruit.glb, label: "),
-    ({"meshes": [{"mesh": "solid:orange", "gian": 2}]}, r"meshes\[0\].gian: Key 'gian' not in 'ObjectSettings'"),
-    ({"meshes": ["solid:lime"]}, "No solid is called 'lime': use"),
-    ({"meshes": [{"mesh": "fruit.glb", "label": "apple"}]}, "fruit.glb does not exist: give the path of a mesh file"),
-    ({"lights": 5}, "lights=5 must be a positive multiple of the 2 patterns"),
-    ({"lights": 0}, "lights=0 must be a positive multiple"),
+    ({"setups": 5}, "setups=5 must be a positive multiple of the 2 patterns"),
     ({"patterns": []}, "must be a positive multiple of the 0 patterns"),
     ({"patterns": ["stripe"]}, "patterns=stripe: choose one of solid, gradient, stripes"),
     ({"brightness": [2.0, 1.0]}, r"brightness=\[2.0, 1.0\]: give \[least, most\]"),
-    ({"brightness": [1.0]}, r"brightness=\[1.0\]: give \[least, most\]"),
-    ({"brightness": [1.0, 1e30]}, r"brightness=\[1.0, 1e\+30\]: give \[least, most\], both from 1e-05 to 100000"),
-    ({"exposure": 0.0}, "exposure=0.0 must be at least 1e-05"),
     ({"size": 0}, "size=0 must be at least 1"),
-    ({"seed": -1}, "seed=-1 must be at least 0"),
 ]
 
 
@@ -137,7 +125,7 @@ def test_a_folder_that_holds_something_is_left_alone(laboratory):
 def test_environments_stand_beside_patterns_and_name_the_source(tmp_path):
     np.save(tmp_path / "noon.npy", np.ones((8, 16, 3), np.float32))
     out = tmp_path / "lab"
-    write_laboratory(settings(out, patterns=["solid"], environments=[str(tmp_path / "noon.npy")], lights=2))
+    write_laboratory(settings(out, patterns=["solid"], environments=[str(tmp_path / "noon.npy")], setups=2))
     assert sorted({row["source_tag"] for row in rows(out)}) == ["noon", "solid"]
 
 
@@ -145,4 +133,4 @@ def test_environments_stand_beside_patterns_and_name_the_source(tmp_path):
 def test_an_environment_that_nothing_emits_is_refused(tmp_path, value):
     np.save(tmp_path / "odd.npy", np.full((8, 16, 3), value, np.float32))
     with pytest.raises(InputError, match=r"odd\.npy is negative somewhere or dark above"):
-        write_laboratory(settings(tmp_path / "lab", patterns=[], environments=[str(tmp_path / "odd.npy")], lights=2))
+        write_laboratory(settings(tmp_path / "lab", patterns=[], environments=[str(tmp_path / "odd.npy")], setups=2))

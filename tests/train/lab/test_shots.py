@@ -3,9 +3,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from train.laboratory import shots as laboratory_shots
-from train.laboratory.patterns import FAMILIES, draw_pattern
-from train.laboratory.shots import FIELD_OF_VIEW, draw_shots
+from train.lab import shots as lab_shots
+from train.lab.patterns import FAMILIES, draw_pattern
+from train.lab.shots import FOV, draw_shots
 
 FAMILY_NAMES = list(FAMILIES)
 
@@ -14,11 +14,11 @@ FAMILY_NAMES = list(FAMILIES)
 def shots():
     """With coarse patterns."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(laboratory_shots, "draw_pattern", partial(draw_pattern, resolution=8))
-        return list(draw_shots(120, FAMILY_NAMES, (0.2, 2.5), seed=3))
+        patch.setattr(lab_shots, "draw_pattern", partial(draw_pattern, resolution=8))
+        return list(draw_shots(120, FAMILY_NAMES, (0.2, 2.5), seed=3, environments={}))
 
 
-def test_every_family_has_as_many_lights_evenly_from_dim_to_bright(shots):
+def test_every_family_has_as_many_setups_evenly_from_dim_to_bright(shots):
     assert [shot.family for shot in shots] == [name for name in FAMILY_NAMES for _ in range(20)]
     for start in range(0, 120, 20):
         brightness = np.array([shot.brightness for shot in shots[start : start + 20]])
@@ -27,7 +27,7 @@ def test_every_family_has_as_many_lights_evenly_from_dim_to_bright(shots):
 
 
 def test_shots_follow_from_the_seed_and_differ_from_each_other():
-    shots, again, other = (list(draw_shots(12, FAMILY_NAMES, (0.2, 2.5), seed)) for seed in (3, 3, 4))
+    shots, again, other = (list(draw_shots(12, FAMILY_NAMES, (0.2, 2.5), seed, {})) for seed in (3, 3, 4))
     for shot, same in zip(shots, again, strict=True):
         for name, value in vars(shot).items():
             np.testing.assert_array_equal(value, getattr(same, name), name)
@@ -38,7 +38,7 @@ def test_the_camera_looks_down_at_an_object_that_fits_its_view(shots):
     for shot in shots:
         back = shot.camera - shot.aim
         assert 18 <= np.degrees(np.arcsin(back[2] / np.linalg.norm(back))) <= 60
-        assert 1.2 <= np.linalg.norm(back) * np.tan(np.radians(FIELD_OF_VIEW / 2)) <= 1.9
+        assert 1.2 <= np.linalg.norm(back) * np.tan(np.radians(FOV / 2)) <= 1.9
         assert np.abs(shot.aim - shot.center).max() <= 0.25
 
 
@@ -52,9 +52,9 @@ def test_the_projector_stands_above_on_the_cameras_side(shots):
 
 def test_an_object_is_turned_without_mirroring_and_tilted_by_at_most_60_degrees(shots):
     for shot in shots:
-        np.testing.assert_allclose(shot.turn @ shot.turn.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(shot.turn) == pytest.approx(1)
-        assert shot.turn[2, 2] >= 0.5 - 1e-9
+        np.testing.assert_allclose(shot.rotation @ shot.rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(shot.rotation) == pytest.approx(1)
+        assert shot.rotation[2, 2] >= 0.5 - 1e-9
 
 
 def test_light_from_around_and_the_table_are_dark_and_tinted(shots):

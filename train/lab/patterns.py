@@ -1,4 +1,4 @@
-"""What the projector shows: families of patterns, each drawn at random in color, scale, angle and place.
+"""Families of projected patterns, each drawn at random in color, scale, angle and position.
 
 Points are (..., 2) in the projector's image, which spans [-1, 1]; an object in its middle spans about [-0.3, 0.3]. A
 family gives each point a weight in [0, 1] between two colors of light, linear RGB with a largest channel of at most 1.
@@ -14,32 +14,33 @@ import torch
 from renderer.image import decode
 
 RESOLUTION = 512  # pixels per side of a projected image
-TWO_COLORED = ("gradient", "stripes", "checkers")  # the others have darkness beside their color
+TWO_COLORED = ("gradient", "stripes", "checkers")  # the other families have darkness beside their color
 
 
 def draw_pattern(family: str, rng: np.random.Generator, resolution: int = RESOLUTION) -> np.ndarray:
     """An image (resolution, resolution, 3) float32 of the family, linear RGB in [0, 1]."""
     first, second = draw_color(rng), draw_color(rng) * rng.uniform() * (family in TWO_COLORED)
-    middles = (np.arange(resolution) + 0.5) / resolution * 2 - 1
-    points = np.stack(np.meshgrid(middles, middles, indexing="xy"), axis=-1) @ _turn(rng.uniform(0, 2 * math.pi))
+    centers = (np.arange(resolution) + 0.5) / resolution * 2 - 1
+    angle = rng.uniform(0, 2 * math.pi)
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    points = np.stack(np.meshgrid(centers, centers, indexing="xy"), axis=-1) @ rotation
     weight = FAMILIES[family](points, rng)[..., None]
     return (second + weight * (first - second)).astype(np.float32)
 
 
 def draw_color(rng: np.random.Generator) -> np.ndarray:
-    """(3,) linear RGB, the largest channel 1: any hue, from white to pure by even steps of the sRGB values."""
-    sent = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(), 1.0)
-    return decode(torch.tensor(sent, dtype=torch.float64), "srgb").numpy()
+    """(3,) linear RGB, the largest channel 1: any hue, from white to pure in even steps of the sRGB values."""
+    srgb = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(), 1.0)
+    return decode(torch.tensor(srgb, dtype=torch.float64), "srgb").numpy()
 
 
 def solid_color(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """One everywhere."""
     return np.ones(points.shape[:-1])
 
 
 def gradient(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A ramp along x about the middle."""
-    return ramp(points[..., 0], rng.uniform(0.6, 1.6))
+    return np.clip(points[..., 0] / rng.uniform(0.6, 1.6) + 0.5, 0, 1)
 
 
 def stripes(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -59,7 +60,7 @@ def half(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def spots(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Discs of one size at random places, over about half of the image."""
+    """Discs of one size at random positions, over about half of the image."""
     radius = rng.uniform(0.08, 0.25)
     centers = rng.uniform(-1, 1, (round(2.8 / (math.pi * radius**2)), 2))
     lit = np.zeros(points.shape[:-1], dtype=bool)
@@ -79,15 +80,5 @@ FAMILIES: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
 
 
 def square_wave(phase: np.ndarray, duty: float = 0.5) -> np.ndarray:
-    """1 for the share `duty` of each unit of phase, then 0."""
+    """1 for the fraction `duty` of each unit of phase, then 0."""
     return (phase % 1 < duty).astype(float)
-
-
-def ramp(along: np.ndarray, width: float) -> np.ndarray:
-    """From 0 to 1 over `width` about 0."""
-    return np.clip(along / width + 0.5, 0, 1)
-
-
-def _turn(angle: float) -> np.ndarray:
-    """(2, 2) rotation."""
-    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])

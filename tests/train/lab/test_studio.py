@@ -9,20 +9,19 @@ import trimesh
 from renderer.errors import InputError
 from renderer.mesh import Mesh
 from renderer.shapes import solid
-from train.laboratory.props import corner_normals, split_parts
-from train.laboratory.shots import FIELD_OF_VIEW, Shot, draw_shots
-from train.laboratory.studio import ROUGHNESS, photograph
+from train.lab.shots import FOV, Shot, draw_shots
+from train.lab.studio import ROUGHNESS, crease_normals, photograph, split_parts
 
 pytest.importorskip("mitsuba")
 
 
 def frontal(**changes) -> Shot:
     """A camera and a projector in front of an upright object, in white light on a black table."""
-    [shot] = draw_shots(1, ["solid"], (1, 1), seed=0)
+    [shot] = draw_shots(1, ["solid"], (1, 1), seed=0, environments={})
     center, front = np.array([0, 0, 1.0]), np.array([0, -6.0, 1.0])
     plain = {
         "pattern": np.ones((4, 4, 3), np.float32), "ambient": np.zeros(3), "table": np.zeros(3), "projector": front,
-        "camera": front, "center": center, "aim": center, "turn": np.eye(3), "scale": 1.0,
+        "camera": front, "center": center, "aim": center, "rotation": np.eye(3), "scale": 1.0,
     }  # fmt: skip
     return replace(shot, **plain | changes)
 
@@ -44,14 +43,14 @@ def directions(shot: Shot, size: int) -> np.ndarray:
     """(size, size, 3) from the camera through the pixels' middles."""
     ahead = (shot.aim - shot.camera) / np.linalg.norm(shot.aim - shot.camera)
     right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
-    reach = np.tan(np.radians(FIELD_OF_VIEW / 2)) * ((np.arange(size) + 0.5) / size * 2 - 1)
+    reach = np.tan(np.radians(FOV / 2)) * ((np.arange(size) + 0.5) / size * 2 - 1)
     return ahead + reach[None, :, None] * right - reach[:, None, None] * np.cross(right, ahead)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
     """Beyond an object too small to see. A projector lights the planes that face it evenly: by 1 / z² at depth z."""
-    [shot] = draw_shots(1, ["solid"], (1.5, 1.5), seed)
+    [shot] = draw_shots(1, ["solid"], (1.5, 1.5), seed, {})
     shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
     image = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 8, 4096, bounces=1, seed=0)
 
@@ -103,9 +102,9 @@ def test_right_angles_stay_sharp_and_round_surfaces_are_smooth(divisions):
     for _ in range(divisions):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
     mesh = Mesh.plain(vertices, faces)
-    np.testing.assert_array_equal(corner_normals(mesh), mesh.face_normals()[:, None].repeat(3, axis=1))
+    np.testing.assert_array_equal(crease_normals(mesh), mesh.face_normals()[:, None].repeat(3, axis=1))
     mesh = Mesh.plain(ball.vertices, ball.faces)
-    np.testing.assert_allclose(corner_normals(mesh), mesh.vertices[mesh.faces], atol=0.02)
+    np.testing.assert_allclose(crease_normals(mesh), mesh.vertices[mesh.faces], atol=0.02)
 
 
 def test_parts_are_the_faces_of_each_texture_and_of_none():
