@@ -14,7 +14,7 @@ from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ENCODINGS, ImageSettings
 from renderer.io.texture_bake import with_added_albedo
-from renderer.mesh import Mesh, concatenate
+from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 
 EPS = torch.finfo(torch.float64).eps
@@ -114,20 +114,6 @@ def test_a_texture_multiplies_the_corner_color(encoding):
     np.testing.assert_allclose(albedo, np.tile(expected, (9, 1)), rtol=16 * EPS)
 
 
-def test_concatenated_meshes_keep_their_colors():
-    """A red, a green and a blue third side by side; the red and the blue are textures."""
-    red, blue = (np.full((2, 2, 3), rgb, dtype=np.uint8) for rgb in ([255, 0, 0], [0, 0, 255]))
-    thirds = [poster(red), Mesh.plain(ALL_OF_IT, HALVES, (0, 1, 0)), poster(blue)]
-    mesh = concatenate(
-        [
-            replace(part, vertices=part.vertices / [3, 1, 1] + [x, 0, 0])
-            for part, x in zip(thirds, (-2 / 3, 0, 2 / 3), strict=True)
-        ]
-    )
-    albedo = surface_albedo(mesh, view(mesh, 3), "linear")
-    np.testing.assert_allclose(albedo, np.tile(np.eye(3), (3, 1)), rtol=0, atol=4 * EPS)
-
-
 # ---------------------------------------------------------------------------- as a parameter
 
 TEXTURED = [(patchwork(), OrthographicCamera(1.0, 0.4, 1.7)), (poster(random_texture(3, 4)), ABOVE)]
@@ -135,7 +121,7 @@ TEXTURED = [(patchwork(), OrthographicCamera(1.0, 0.4, 1.7)), (poster(random_tex
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize(("mesh", "camera"), TEXTURED)
-def test_the_meshs_own_textures_as_parameters_give_its_surface(mesh, camera, encoding):
+def test_the_textures_of_a_mesh_as_parameters_give_its_albedo(mesh, camera, encoding):
     fragments = view(mesh, 6, 3, camera)
     textures = [torch.from_numpy(linear_of(texture / 255, encoding)) for texture in mesh.textures]
     albedo = textured_albedo(mesh, fragments, textures, encoding)
@@ -158,20 +144,6 @@ def test_texels_that_no_sample_sees_have_a_gradient_of_exactly_zero_and_the_othe
     assert not gradient[:, 4:].any() and gradient[:, :4].any()
     expected = 9 * torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64)
     torch.testing.assert_close(gradient.sum((0, 1)), expected, rtol=32 * EPS, atol=0)
-
-
-def test_textures_in_float32_have_gradients_in_float32():
-    mesh, camera = TEXTURED[0]
-    fragments = view(mesh, 6, 2, camera)
-    full = [draw(*texture.shape) for texture in mesh.textures]
-    results = []
-    for dtype in (torch.float32, torch.float64):
-        textures = [texture.float().to(dtype).requires_grad_(True) for texture in full]
-        albedo = textured_albedo(mesh, fragments, textures, "linear")
-        results.append((albedo, *torch.autograd.grad(albedo.sum(), textures)))
-    for short, exact in zip(*results, strict=True):
-        torch.testing.assert_close(short.double(), exact, rtol=16 * torch.finfo(torch.float32).eps, atol=0)
-    assert [gradient.dtype for gradient in results[0][1:]] == [torch.float32] * 2
 
 
 def test_albedo_per_face_is_that_of_the_face_that_a_sample_sees_and_its_gradient_counts_the_samples():
@@ -218,7 +190,7 @@ def middling(colors_differ: bool) -> Mesh:
 
 
 @pytest.mark.parametrize("albedo_scale", [1.0, 0.5, 1.2])
-def test_what_is_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped(albedo_scale):
+def test_albedo_added_to_a_face_is_added_at_its_samples_where_nothing_is_clamped(albedo_scale):
     mesh = middling(True)
     fragments, added = view(mesh, 16, 2), 0.1 * (draw(len(mesh.faces), 3) - 0.5)
     expected = surface_albedo(mesh, fragments, "linear") * albedo_scale + face_albedo(added, fragments)
@@ -237,7 +209,7 @@ def test_a_painted_albedo_stays_within_zero_and_one_or_what_it_was(albedo_scale)
     assert most.min() >= 1 - 4 * EPS and most.max() <= albedo_scale * (1 + 4 * EPS)
 
 
-def test_the_derivative_by_what_is_added_is_that_of_finite_differences():
+def test_the_derivative_by_the_added_albedo_is_that_of_finite_differences():
     mesh = patchwork()
     fragments = view(mesh, 6)
     added = (0.3 * (draw(len(mesh.faces), 3) - 0.5)).requires_grad_()
@@ -245,7 +217,7 @@ def test_the_derivative_by_what_is_added_is_that_of_finite_differences():
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_the_gain_that_is_left_is_no_larger_than_the_lightest_color_needs(encoding):
+def test_the_remaining_albedo_scale_is_no_larger_than_the_lightest_color_needs(encoding):
     """So that a dark texture, which a large gain brightens, loses little to 8 bits."""
     texture = random_texture(16, 16) // 3
     mesh, added = poster(texture, color=(0.9, 0.5, 0.7)), np.zeros((2, 3))
@@ -256,7 +228,7 @@ def test_the_gain_that_is_left_is_no_larger_than_the_lightest_color_needs(encodi
 
 
 @pytest.mark.parametrize(("encoding", "albedo_scale"), [("linear", 1.0), ("linear", 0.5), ("srgb", 2.0)])
-def test_colors_and_textures_hold_what_was_added(encoding, albedo_scale):
+def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale):
     """Colors at corners to float32; texels, in which no colors vary, to half of a step of 8 bits, encoded."""
     mesh = patchwork()
     even = mesh.corner_colors[:, :1].repeat(3, axis=1)

@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from renderer.camera import OrthographicCamera, orbit_cameras
+from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
 from renderer.rasterizer import choose
@@ -123,12 +123,6 @@ def test_merging_adds_up_the_albedo_of_a_face_in_a_pixel(size, samples):
     assert torch.equal(gradient, torch.full_like(albedo, 1 / samples**2))
 
 
-def test_each_view_is_what_it_is_alone():
-    mesh, settings, cameras = open_shell(), ImageSettings(6, 2), orbit_cameras(3, 2.0)
-    for camera, view in zip(cameras, build_fragments(*mesh, cameras, settings, RASTERIZER), strict=True):
-        assert_same(view, fragments_of(mesh, settings, camera))
-
-
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_closed_mesh_covers_the_same_samples_without_its_far_faces(camera):
     settings = ImageSettings(16, 4)
@@ -157,10 +151,3 @@ def test_a_mesh_outside_the_image_has_no_fragments(closed):
     assert fragments.barycentric.shape == (0, 3) and fragments.positions().shape == (0, 2)
     pixel, face, albedo = fragments.merge(torch.zeros(0, 3))
     assert (len(pixel), len(face), albedo.shape) == (0, 0, (0, 3))
-
-
-def test_all_of_it_moves_to_another_device():
-    fragments = fragments_of(dented_sphere(), ImageSettings(4, 2))
-    moved = fragments.to("meta")
-    for name, value in vars(moved).items():
-        assert value.is_meta if isinstance(value, torch.Tensor) else value == getattr(fragments, name)
