@@ -2,14 +2,15 @@
 
 import csv
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont, ImageOps
+from PIL import Image, ImageFont, ImageOps
 
-from renderer.io.tiles import CAPTION_SIZE, GAP, INK, MARGIN, PAPER, TITLE_HEIGHT, TITLE_SIZE, Tile
+from renderer.io.tiles import CAPTION_SIZE, PAPER, Tile, draw_grid
 from train.photographs.metrics import OVERALL, RATES, Roc
 from train.photographs.predictions import Prediction, escaped, outcomes
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 PER_SECTION, COLUMNS = 40, 10
 IMAGE, FRAME = 96, 4  # px: the side of an enlarged image, and the width of its frame
-CELL = IMAGE + 2 * FRAME + GAP
 COLORS = {"true positives": "#2e9e5b", "false negatives": "#d03b3b", "false positives": "#e8a317"}
 Item = TypeVar("Item")
 
@@ -35,18 +35,16 @@ def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor, label
     pixels = dict(zip(paths, images.permute(0, 2, 3, 1).numpy(), strict=True))
     positives = sum(item.photograph.label == label for item in predictions)
     totals = positives, positives, len(predictions) - positives
-    strips = []
+    grids = []
     for (name, color), group, total in zip(COLORS.items(), outcomes(predictions, label), totals, strict=True):
         title = f"{label}: {len(group)} {name} of {total}"
         if len(group) > PER_SECTION:
             title += f" ({PER_SECTION} shown, evenly by probability)"
-        items = evenly(group, PER_SECTION)
-        strips.append(_strip(title, [_tile(pixels[item.photograph.path], caption(item), color) for item in items]))
-    sheet = Image.new("RGB", (2 * MARGIN + COLUMNS * CELL - GAP, 2 * MARGIN + sum(s.height for s in strips)), PAPER)
-    top = MARGIN
-    for strip in strips:
-        sheet.paste(strip, (MARGIN, top))
-        top += strip.height
+        tiles = [_tile(pixels[item.photograph.path], caption(item), color) for item in evenly(group, PER_SECTION)]
+        grids.append(draw_grid([tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)], heading=title))
+    sheet = Image.new("RGB", (max(grid.width for grid in grids), sum(grid.height for grid in grids)), PAPER)
+    for grid, bottom in zip(grids, accumulate(grid.height for grid in grids), strict=True):
+        sheet.paste(grid, (0, bottom - grid.height))
     return sheet
 
 
@@ -65,27 +63,15 @@ def caption(prediction: Prediction) -> tuple[str, ...]:
     return predicted, f"{prediction.true_probability:.0%} {prediction.photograph.label}"
 
 
-def _strip(title: str, tiles: Sequence[Image.Image]) -> Image.Image:
-    """A title over rows of tiles."""
-    height = max((tile.height for tile in tiles), default=0) + GAP
-    rows = -(-len(tiles) // COLUMNS)
-    strip = Image.new("RGB", (COLUMNS * CELL, TITLE_HEIGHT + rows * height + GAP), PAPER)
-    ImageDraw.Draw(strip).text((0, 0), title, INK, ImageFont.load_default(TITLE_SIZE))
-    for index, tile in enumerate(tiles):
-        row, column = divmod(index, COLUMNS)
-        strip.paste(tile, (column * CELL, TITLE_HEIGHT + row * height))
-    return strip
-
-
-def _tile(pixels: np.ndarray, lines: Sequence[str], color: str) -> Image.Image:
+def _tile(pixels: np.ndarray, lines: Sequence[str], color: str) -> Tile:
     enlarged = Image.fromarray(pixels).resize((IMAGE, IMAGE), Image.Resampling.NEAREST)
     framed = np.asarray(ImageOps.expand(enlarged, FRAME, color))
-    return Tile(framed, tuple(map(_shortened, lines))).captioned()
+    return Tile(framed, tuple(map(_shortened, lines)))
 
 
 def _shortened(text: str) -> str:
     """The longest start of the text that fits under a tile, with an ellipsis if it is cut."""
-    width, font = CELL - 4, ImageFont.load_default(CAPTION_SIZE)
+    width, font = IMAGE + 2 * FRAME, ImageFont.load_default(CAPTION_SIZE)
     if font.getlength(text) <= width:
         return text
     while text and font.getlength(text + "…") > width:

@@ -1,13 +1,11 @@
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageDraw, ImageFont
-from PIL.PngImagePlugin import PngInfo
 
-from augment.attacks.figure import SIDE, Panel, prediction_caption, read_figure, save_figure
+from augment.attacks.figure import SIDE, Panel, prediction_caption, save_figure
 from renderer.io.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 
 PAPER = 255
@@ -116,46 +114,6 @@ def test_the_largest_differences_are_told_in_numbers(tmp_path):
     sheet = draw(tmp_path / "report.png", *(Panel(shown, [()]) for shown in (before, before + 0.125)))
     assert contains(sheet[-3 * MARGIN :], written("largest 0.125", INK))
     assert contains(sheet[-3 * MARGIN :], written("shown 8 times", FAINT))
-
-
-def test_what_is_read_back_is_what_was_shown(tmp_path):
-    """Of two views of two sizes: the light's spheres are larger than the images."""
-    said = ("87% plum", "<pear>")
-    sides = [panel(seed=seed, caption=said, spheres=random_images(2, 300, seed + 2)) for seed in (0, 1)]
-    save_figure(*sides, tmp_path / "report.png")
-    columns = dict(read_figure(tmp_path / "report.png"))
-    assert list(columns) == ["initial", "adversarial", "difference", "initial light", "adversarial light"]
-    for title, images, scale in [
-        ("initial", sides[0].images, 6),
-        ("adversarial", sides[1].images, 6),
-        ("initial light", sides[0].spheres, 1),
-        ("adversarial light", sides[1].spheres, 1),
-    ]:
-        for tile, image in zip(columns[title], images, strict=True):
-            expected = (image * 255).round().byte().permute(1, 2, 0).numpy().repeat(scale, 0).repeat(scale, 1)
-            assert np.array_equal(tile.image, expected)
-            assert tile.caption == (() if "light" in title else said)
-    assert [tile.caption[0].partition(" ")[0] for tile in columns["difference"]] == ["largest", "largest"]
-
-
-@pytest.mark.parametrize("left, width", [(0, 9), (-9, 4), (8, 0), ("0", 1), (0, 10**9)])
-def test_an_image_that_tells_of_tiles_it_has_not_is_refused(tmp_path, left, width):
-    tile = {"left": left, "top": 0, "width": width, "height": 8, "caption": []}
-    info = PngInfo()
-    info.add_text("columns", json.dumps([{"title": "initial", "tiles": [tile]}]))
-    Image.new("RGB", (8, 8)).save(tmp_path / "other.png", pnginfo=info)
-    with pytest.raises(ValueError, match="no image of an attack"):
-        read_figure(tmp_path / "other.png")
-
-
-@pytest.mark.parametrize("text", [None, "", "[", "[1]"])
-def test_an_image_that_tells_of_no_tiles_is_refused(tmp_path, text):
-    info = PngInfo()
-    if text is not None:
-        info.add_text("columns", text)
-    Image.new("RGB", (8, 8)).save(tmp_path / "other.png", pnginfo=info)
-    with pytest.raises(ValueError, match="no image of an attack"):
-        read_figure(tmp_path / "other.png")
 
 
 @pytest.mark.parametrize(
