@@ -8,13 +8,12 @@ from pathlib import Path
 
 import train.command_line.entry_points as command
 from augment.classifiers import Classifier
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError
 from train.command_line.outputs import writable_folder
 from train.networks import load_classifier, load_run
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.run_folder.files import sole_writer
 from train.runtime import MixedPrecision, choose_device, choose_precision
-from train.settings import LARGEST_SIZE
 
 
 @dataclass
@@ -29,17 +28,14 @@ class Settings:
     label: str
     out: str
     skip_unreadable: bool
-    size: int | None
     precision: str
     device: str
 
     def __post_init__(self):
-        require_range("size", self.size, 1, LARGEST_SIZE)
         if (self.run is None) == (self.classifier is None):
             raise InputError("give one network: run=FOLDER, or classifier=NAME")
-        for key in ("size", "model"):
-            if self.classifier and (given := getattr(self, key)):
-                raise InputError(f"{key}={given} is for run=FOLDER: a classifier has its own, leave it out")
+        if self.classifier and self.model:
+            raise InputError(f"model={self.model} is for run=FOLDER: a classifier has its own, leave it out")
 
 
 def main(settings: Settings) -> None:
@@ -66,7 +62,7 @@ def main(settings: Settings) -> None:
 def _load(settings: Settings) -> Classifier:
     if settings.run is None:
         return load_classifier(settings.classifier, settings.weights)
-    return load_run(settings.run, settings.weights, settings.size, settings.model)
+    return load_run(settings.run, settings.weights, settings.model)
 
 
 if __name__ == "__main__":

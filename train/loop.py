@@ -264,30 +264,24 @@ class Trainer:
         log.scalars(metrics, self.epoch)
         success = diagnostics.get("attack_success")
         console.info(
-            "epoch %d/%d  train loss %.3f accuracy %.3f  validation accuracy %.3f%s  %.0f s (attack %.1f s)",
-            self.epoch,
-            self.settings.epochs,
-            metrics["train/loss"],
-            metrics["train/accuracy"],
-            validated["accuracy"],
-            "" if success is None else f"  attack success {success:.2f}",
-            sum(seconds[name] for name in PHASES),
-            seconds["attack"],
+            f"epoch {self.epoch}/{self.settings.epochs}  train loss {metrics['train/loss']:.3f} accuracy "
+            f"{metrics['train/accuracy']:.3f}  validation accuracy {validated['accuracy']:.3f}"
+            f"{'' if success is None else f'  attack success {success:.2f}'}"
+            f"  {sum(seconds[name] for name in PHASES):.0f} s (attack {seconds['attack']:.1f} s)"
         )
 
     def _require_finite(self, loss: float, epoch: int) -> None:
         """InputError naming what is NaN or infinite, before any of it is kept."""
-        network = self.model.network
+        network, settings = self.model.network, self.settings
         tensors = {f"weight {name}": value for name, value in network.state_dict().items()}
         tensors |= {f"gradient of {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
-        tensors["loss"] = torch.tensor(loss)
-        finite = torch.stack([value.isfinite().all().to(self.device) for value in tensors.values()]).tolist()
+        tensors["loss"] = torch.tensor(loss, device=self.device)
+        finite = torch.stack([value.isfinite().all() for value in tensors.values()]).tolist()
         if not all(finite):
             name = list(tensors)[finite.index(False)]
             raise InputError(
-                f"train.learning_rate={self.settings.learning_rate} with train.weight_decay="
-                f"{self.settings.weight_decay} made the {name} NaN or infinite in epoch {epoch}: set lower ones; the "
-                "checkpoint before, if any, is kept"
+                f"train.learning_rate={settings.learning_rate} with train.weight_decay={settings.weight_decay} made "
+                f"the {name} NaN or infinite in epoch {epoch}: set lower ones; the checkpoint before, if any, is kept"
             )
 
     # --------------------------------------------------------------------------------- checkpoints

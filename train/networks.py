@@ -29,7 +29,6 @@ DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may as
 DROPOUT_LEVELS = 2**16
 PUBLISHED = "model.safetensors"
 SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
-SIZE = 32  # of images, for networks of version 1, whose files do not say
 _WITHOUT_AUXILIARY = {"aux_logits": False, "init_weights": True}
 _OPTIONS = {"googlenet": _WITHOUT_AUXILIARY, "inception_v3": _WITHOUT_AUXILIARY}
 
@@ -62,10 +61,7 @@ class WideResNet(nn.Module):
             raise InputError(f"{shape}: depth is 10, 16, 22, 28, ... and width at least 1")
         parameters = 9 * (depth - 4) // 3 * width**2 * 16**2 * (1 + 4 + 16)
         if depth > DEEPEST or parameters > MOST_PARAMETERS:
-            raise InputError(
-                f"{shape} make {parameters:.1g} parameters: the largest depth is {DEEPEST}, and {MOST_PARAMETERS:g} "
-                "parameters"
-            )
+            raise InputError(f"{shape}: {parameters:.1g} parameters are too many; {MOST_PARAMETERS:g} are the limit")
         if not 0 <= dropout < 1:
             raise InputError(f"model.dropout={dropout} must be at least 0 and below 1")
         channels, blocks = [16, 16 * width, 32 * width, 64 * width], (depth - 4) // 6
@@ -166,7 +162,11 @@ def build_network(
     if name.startswith(TORCHVISION):
         network: nn.Module = Normalized(_torchvision_network(name, len(classes), size), mean, std)
     elif name.startswith(PYTHON):
-        network = _python_network(name, classes, size)
+        network, its_size, its_classes = call_python(name.removeprefix(PYTHON), f"model={name}")
+        if its_size != size:
+            raise InputError(f"model={name} is for images of {its_size} pixels per side, and the data has {size}")
+        if list(its_classes) != list(classes):
+            raise InputError(f"model={name} has other classes than the data, or in another order: {classes[0]!r} first")
     else:
         raise InputError(
             f"model={name} is not known: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION"
@@ -180,8 +180,8 @@ def build_network(
         ) from error
     expected = (2, len(classes))
     if not isinstance(logits, Tensor) or logits.shape != expected:
-        found = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-        raise InputError(f"model={name} gives {found} for 2 images: make it return logits {expected}")
+        actual = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
+        raise InputError(f"model={name} gives {actual} for 2 images: make it return logits {expected}")
     return network
 
 
@@ -195,18 +195,6 @@ def _torchvision_network(name: str, classes: int, size: int) -> nn.Module:
         return models.get_model(architecture, weights=None, num_classes=classes, **options)
     except (ValueError, AssertionError) as error:  # a transformer whose patches do not fill the image
         raise InputError(f"model={name} takes no images of {size} pixels per side ({error}): choose another") from error
-
-
-def _python_network(name: str, classes: Sequence[str], size: int) -> nn.Module:
-    network, its_size, its_classes = call_python(name.removeprefix(PYTHON), f"model={name}")
-    if its_size != size:
-        raise InputError(f"model={name} is for images of {its_size} pixels per side, and the data has {size}")
-    if list(its_classes) != list(classes):
-        raise InputError(
-            f"model={name} has other classes than the data, or in another order: return its {len(classes)}, "
-            f"{classes[0]!r} first"
-        )
-    return network
 
 
 def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
@@ -226,31 +214,18 @@ def load_classifier(name: str, weights: str | Path | None = None) -> Classifier:
     return classifiers.load_classifier(name, weights, {**classifiers.SOURCES, "run:": load_run})
 
 
-def load_run(
-    run: str | Path, weights: str | Path | None = None, size: int | None = None, model: str | None = None
-) -> Classifier:
+def load_run(run: str | Path, weights: str | Path | None = None, model: str | None = None) -> Classifier:
     """The network that `load_selected` finds for a run's folder, one under pretrained/, or a file of either.
 
-    InputError for weights=, since the run holds its own. size: of images, for a network of version 1, whose file does
-    not say; None: 32. InputError where it does say.
     model: the python:package.module:function that makes it, where one does: code runs because the user names it, never
-    because a file does.
+    because a file does. InputError for weights=, since the run holds its own.
     """
     if weights is not None:
         raise InputError(
             f"weights={weights} is not for classifier=run:{run}, which has weights of its own: leave it out"
         )
     path, state = load_selected(Path(run))
-    shape = dict(state["architecture"])
-    shape.pop("version", None)
-    stored_size, encoding = shape.pop("size", None), shape.pop("encoding", "linear")
-    if stored_size is not None and not (isinstance(stored_size, int) and 1 <= stored_size <= LARGEST_SIZE):
-        raise InputError(f"checkpoint {path} says size={stored_size!r}, not pixels per side up to {LARGEST_SIZE}")
-    if encoding not in ENCODINGS:
-        raise InputError(f"checkpoint {path} says encoding={encoding!r}, not {' or '.join(ENCODINGS)}")
-    if size and stored_size and size != stored_size:
-        raise InputError(f"size={size}: {path} was trained on images of {stored_size} pixels per side; leave size out")
-    size = stored_size or size or SIZE
+    shape = {key: value for key, value in state["architecture"].items() if key != "version"}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         raise InputError(
@@ -258,13 +233,15 @@ def load_run(
             "do; an attack takes it as classifier=python: with a function that loads its weights"
         )
     try:
-        classes = tuple(map(str, shape.pop("classes")))
-        if not classes:
-            raise ValueError("it has no classes")
+        size, classes, encoding = shape.pop("size"), tuple(map(str, shape.pop("classes"))), shape.pop("encoding")
+        if not (isinstance(size, int) and 1 <= size <= LARGEST_SIZE and classes and encoding in ENCODINGS):
+            raise ValueError(f"size {size!r}, {len(classes)} classes, encoding {encoding!r}")
         network = build_network(classes, size, **shape)
-    except (TypeError, ValueError, KeyError, AttributeError, RuntimeError) as error:
-        raise InputError(f"checkpoint {path} is from another architecture than can be built: {error}") from error
-    load_weights(network, state["model"], path)
+    except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
+        raise InputError(
+            f"checkpoint {path} is from another architecture than can be built ({in_one_line(error)}): use another one"
+        ) from error
+    _load_weights(network, state["model"], path)
     return Classifier(network, size, classes, f"run:{run}")
 
 
@@ -278,7 +255,7 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
 
 
-def load_weights(network: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
+def _load_weights(network: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
     """Fill the network; InputError naming the file where the weights belong to another architecture."""
     try:
         network.load_state_dict(weights)
@@ -296,13 +273,12 @@ def start_from(network: nn.Module, description: Mapping[str, Any], run: Path) ->
     description: the network's (see `describe`). InputError where the other has other classes, another size or shape.
     """
     path, state = load_selected(run)
-    defaults = {"name": WIDERESNET, "size": SIZE}
-    stored, description = defaults | state["architecture"], {**defaults, **description}
+    stored, description = ({"name": WIDERESNET, **each} for each in (state["architecture"], description))
     for key in SHAPE:
         if stored.get(key, description.get(key)) != description.get(key):
             other = "other classes" if key == "classes" else f"{key} {stored[key]}, not {description[key]}"
             raise InputError(f"train.init_from={run} was trained with {other}: give this run the same")
-    load_weights(network, state["model"], path)
+    _load_weights(network, state["model"], path)
 
 
 def publish(path: Path, state: Mapping[str, Any], **facts: object) -> None:

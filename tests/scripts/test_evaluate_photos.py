@@ -55,13 +55,6 @@ def test_a_network_is_scored_at_the_size_that_it_was_trained_at(evaluate, run, p
     assert float(first[header.index("orange_log_odds")]) == pytest.approx(float(logits[1] - logits[0]), abs=1e-4)
 
 
-def test_another_size_than_the_networks_is_one_sentence(evaluate, run, capsys):
-    assert evaluate(f"run={run}", "size=32") == USER_ERROR
-    told = capsys.readouterr().err
-    assert told.startswith("error: size=32: ") and "trained on images of 64 pixels per side" in told
-    assert not (run.parent / "out").exists()
-
-
 OWN = """
 import torch
 
@@ -90,11 +83,11 @@ def test_any_network_of_ones_own_is_scored_at_its_size_and_on_its_classes(evalua
     [
         ([], "give one network"),
         (["run=a", "classifier=python:own:build"], "give one network"),
-        (["classifier=python:own:build", "size=32"], "size=32 is for run=FOLDER"),
+        (["classifier=python:own:build", "model=python:own:build"], "model=python:own:build is for run=FOLDER"),
         (["classifier=python:nowhere:build"], "there is no module nowhere"),
         (["run=a", "weights=b"], "weights=b is not for classifier=run:a"),
     ],
-    ids=["none", "two", "size", "unknown", "weights"],
+    ids=["none", "two", "model", "unknown", "weights"],
 )
 def test_a_network_that_cannot_be_meant_is_one_sentence(evaluate, capsys, overrides, said):
     assert evaluate(*overrides) == USER_ERROR

@@ -278,16 +278,6 @@ def test_other_networks_come_back_from_their_file_code_only_where_it_is_named(tm
             load_run(tmp_path)
 
 
-def test_a_network_that_does_not_say_its_size_has_32_or_the_one_asked_for(network, tmp_path):
-    save(
-        tmp_path / BEST, {"model": network.state_dict(), "architecture": {"classes": CLASSES, "depth": 10, "width": 1}}
-    )
-    assert load_run(tmp_path).size == 32
-    assert load_run(tmp_path, size=64).size == 64
-    with pytest.raises(InputError, match=r"size=32: .* was trained on images of 48 pixels per side"):
-        load_run(write(tmp_path, network), size=32)
-
-
 @pytest.mark.parametrize(
     "name, weights, message",
     [
@@ -306,7 +296,7 @@ def test_a_classifier_that_cannot_be_loaded_is_one_sentence(name, weights, messa
 @pytest.mark.parametrize(
     "changes",
     [
-        {"version": "2"}, {"version": 99}, {"size": "32"}, {"size": 0}, {"size": 10**9}, {"encoding": ["srgb"]},
+        {"version": "2"}, {"version": 99}, {"size": None}, {"size": 0}, {"size": 10**9}, {"encoding": ["srgb"]},
         {"classes": 3}, {"classes": []}, {"classes": ["fig", "lime"]}, {"depth": "10"}, {"depth": 11}, {"width": 2},
         {"depth": 6 * 10**9 + 4}, {"width": 10**9}, {"heads": 3}, {"mean": "a"}, {"mean": [0.5]},
     ],
