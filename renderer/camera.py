@@ -85,7 +85,12 @@ class Camera(ABC):
 
 @dataclass(frozen=True)
 class OrthographicCamera(Camera):
-    """A parallel projection; its angles and lengths are `Camera`'s."""
+    """A parallel projection; its angles and lengths are `Camera`'s.
+
+    >>> camera = OrthographicCamera(polar=math.pi / 2, azimuth=0.0, width=2.0)  # on +x
+    >>> camera.project(np.array([[0.0, 1.0, 0.5]]))[:, :2].round(6).tolist()  # x right, y up
+    [[1.0, 0.5]]
+    """
 
     @property
     def distance(self) -> float:  # type: ignore[override]
@@ -102,7 +107,12 @@ class OrthographicCamera(Camera):
 
 @dataclass(frozen=True)
 class PerspectiveCamera(Camera):
-    """A pinhole at a distance; from far away, an orthographic camera of the same field of view sees the same."""
+    """A pinhole at a distance; from far away, an orthographic camera of the same field of view sees the same.
+
+    >>> camera = PerspectiveCamera(polar=math.pi / 2, azimuth=0.0, width=2.0, distance=4.0)
+    >>> camera.project(np.array([[2.0, 0.5, 0.0]]))[0, 0].round(6).item()  # half as far away, so twice as large
+    1.0
+    """
 
     distance: float = field(kw_only=True)  # type: ignore[misc]  # each has its own, where orthographic cameras share one
 
@@ -141,6 +151,11 @@ def orbit_cameras(
 
     fov: the angle between opposite sides of the image, in radians, which says how far off perspective cameras
     are; None of orthographic ones.
+
+    >>> [round(math.degrees(camera.azimuth)) for camera in orbit_cameras(views=4, width=2.0)]
+    [0, 90, 180, 270]
+    >>> orbit_cameras(views=1, width=2.0, fov=math.radians(30))[0].distance.__round__(3)
+    3.732
     """
     require_range("views", views, 1, MOST_VIEWS)
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]

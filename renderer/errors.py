@@ -15,6 +15,10 @@ class InputError(ValueError):
     """Bad input. The message is one sentence that names the file or key at fault and says what to do.
 
     Entry points print it without a traceback and exit with status 2.
+
+    >>> require_range("samples", 0, 1, 64)
+    Traceback (most recent call last):
+    renderer.errors.InputError: samples=0 must be at least 1 and at most 64
     """
 
 

@@ -28,6 +28,9 @@ class ImageSettings:
 
     shadows: of the mesh on itself. bounces: how often light goes on from one surface to another, which includes
     shadows. InputError: a number out of range, an unknown choice.
+
+    >>> ImageSettings(size=224, samples=2, encoding="srgb", bounces=1).global_illumination
+    True
     """
 
     size: int = 32

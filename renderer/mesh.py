@@ -31,6 +31,10 @@ class Mesh:
     textures       tuple of (H, W, 3) uint8, sRGB-encoded, row 0 at the top
 
     InputError: arrays of other shapes, faces of vertices that are not there.
+
+    >>> square = Mesh.plain([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], color=(1, 0.5, 0))
+    >>> square.face_areas().tolist(), square.face_normals()[0].tolist(), square.closed
+    ([0.5, 0.5], [0.0, 0.0, 1.0], False)
     """
 
     vertices: np.ndarray
@@ -161,6 +165,10 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     up: "y" turns the y axis up to z, "z" leaves the mesh as it is, and "auto" takes y for glTF, z otherwise.
     InputError: missing, unreadable or corrupt file, unknown format or `up`; materials or images that it names and that
     are missing or unreadable; no faces, faces that name missing vertices, coordinates that are not finite, zero area.
+
+    >>> renderer.export_mesh(renderer.solid("cup"), "cup.glb")
+    >>> load_mesh("cup.glb").faces.shape == renderer.solid("cup").faces.shape
+    True
     """
     from renderer.io.meshes import read_parts
 
@@ -184,6 +192,9 @@ def normalize(mesh: Mesh) -> Mesh:
 
     The same point is the average of the vertices weighted with the areas around them (the paper's appendix).
     InputError where there is no positive area, which `load_mesh` ensures.
+
+    >>> float(np.abs(normalize(renderer.solid("bottle")).vertices).max())
+    1.0
     """
     if not mesh.face_areas().sum() > 0:
         raise InputError("the mesh has a surface of zero area: give one with faces of some extent")

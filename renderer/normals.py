@@ -115,6 +115,17 @@ class _Unit(torch.autograd.Function):
         return tangential / length.masked_fill(length == 0, torch.inf)
 
 
+def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
+    """Components of two unit vectors at right angles to unit vectors (x, y, z) and to each other, of arrays or tensors.
+
+    sign: ±1 each, by which z is not −1: the axes jump where it changes. Source: Duff et al. 2017, "Building an
+    orthonormal basis, revisited".
+    """
+    a = -1 / (sign + z)
+    b = x * y * a
+    return [[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]]
+
+
 def _length(vectors: Tensor) -> Tensor:
     """(N,) of (3, N): torch's norm takes fifty times as long along so short an axis."""
     return vectors.square().sum(0).sqrt()

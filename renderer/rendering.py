@@ -63,7 +63,6 @@ def render(
     one by vertices and albedo keeps shadows and bounces of environment light.
     InputError: NaN, shapes that do not fit, unknown choices.
 
-    >>> import renderer
     >>> apple, camera = renderer.normalize(renderer.solid("apple")), renderer.OrthographicCamera(1.0, 0.0, width=2.2)
     >>> light = renderer.load_light("grace").requires_grad_()
     >>> image = renderer.render(apple, camera, light, size=16, rasterizer="numpy")
@@ -159,7 +158,6 @@ def precompute_transfer(
 
     `operator.image(light, background)` equals the image of `render`, to rounding. Keywords as there.
 
-    >>> import renderer
     >>> pear, cameras = renderer.normalize(renderer.solid("pear")), renderer.orbit_cameras(2, width=2.2)
     >>> operators = renderer.precompute_transfer(pear, cameras, size=16, rasterizer="numpy")
     >>> lights = torch.stack([renderer.load_light("grace"), renderer.load_light("st_peters")])

@@ -1,7 +1,16 @@
 """Diffuse shading of a view's fragments, differentiable in the vertices, the light and the albedo.
 
-Visibility and texture coordinates are held fixed (the paper's Section 3 and appendices B.3 and D), so the derivative
-sees how normals turn and not how outlines move. For the light alone, `renderer.transfer` is faster.
+The radiance of a pixel is the box filter over its s² samples i, of albedo ρ and unit normal n:
+
+    L = 1/s² Σ_i ρ_i E(n_i),    E(n) = Σ_lm A_l U_lm Y_lm(n),    A_l = π, 2π/3, π/4, 0, −π/24, 0, π/64, ...
+
+E is the irradiance of a diffuse surface (Ramamoorthi and Hanrahan 2001; the paper's appendix B.2). Bands of even degree
+from 2 on are one homogeneous polynomial p of degree d on the sphere, whose value follows from its slope by Euler's
+theorem, p(n) = n · ∇p(n) / d. So one product of monomials with the slope's coefficients gives both E and ∂E/∂n, of
+which the part tangent to the sphere, (∇E − n (n · ∇E)) / |normal|, is the derivative by the normal (appendix D).
+
+Visibility and texture coordinates are held fixed (Section 3 and appendix B.3): the derivative by the vertices contains
+how normals turn and not how outlines move. For the light alone, `renderer.transfer` is faster.
 """
 
 from __future__ import annotations

@@ -24,7 +24,12 @@ STEP = 0.1  # longest edge along a profile, in world units
 
 
 def solid(name: str, seed: int = 0) -> Mesh:
-    """The instance that `seed` picks of the solid `name`; InputError for a name that is in neither registry."""
+    """The instance that `seed` picks of the solid `name`; InputError for a name that is in neither registry.
+
+    >>> orange = solid("orange", seed=3)
+    >>> orange.faces.shape, orange.closed
+    ((5120, 3), True)
+    """
     require_range("seed", seed, 0, 2**63 - 1)
     known = SOLIDS | LOOK_ALIKES
     if name not in known:

@@ -20,6 +20,11 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
     New vertices are the middles of edges, shared by the faces that share the edge, so that a closed mesh stays closed;
     colors (as they are stored, sRGB-encoded) and texture coordinates are interpolated. The old vertices keep their
     indices, and the quarters of face f are the faces 4f to 4f + 3. A mesh with enough vertices comes back as it is.
+
+    >>> table = renderer.solid("table")
+    >>> finer = subdivide(table, vertices=1000)
+    >>> len(finer.vertices) > 1000, len(finer.faces) % len(table.faces)
+    (True, 0)
     """
     require_range("vertices", vertices, 0, MOST_VERTICES)
     while len(mesh.vertices) <= vertices:

@@ -52,6 +52,15 @@ class TransferOperator:
     under an open sky (`Basis.nonzero`), and all in a view with shadows.
     settings: of the image that they are pixels of. basis: of the lights.
     sparse: of three channels, added to the others: what a pattern's pixels reach; None where that is not little.
+
+    >>> pear = renderer.normalize(renderer.solid("pear"))
+    >>> [operator] = renderer.precompute_transfer(pear, renderer.orbit_cameras(1, width=2.2), 16, rasterizer="numpy")
+    >>> light = renderer.load_light("grace")
+    >>> radiance = operator.radiance(light)  # linear in the light, before clamping
+    >>> torch.allclose(operator.radiance(2 * light), 2 * radiance)
+    True
+    >>> operator.light_gradient(torch.ones_like(radiance)).shape
+    torch.Size([49, 3])
     """
 
     transfer: Float[Tensor, "channels K P"]

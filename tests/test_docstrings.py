@@ -2,15 +2,19 @@
 
 import doctest
 import importlib
-from types import FunctionType
+from types import FunctionType, ModuleType
 
 import pytest
 import torch
 from torch import Tensor
 
 import augment
+import renderer
 
-PUBLIC = {name: getattr(augment, name) for name in augment.__all__}
+PUBLIC = {
+    f"{package.__name__}.{name}": getattr(package, name) for package in (renderer, augment) for name in package.__all__
+}
+MODULES = {value.__name__ if isinstance(value, ModuleType) else value.__module__ for value in PUBLIC.values()}
 FUNCTIONS = [name for name, value in PUBLIC.items() if isinstance(value, FunctionType)]
 
 
@@ -28,14 +32,15 @@ def result() -> augment.AttackResult:
     return augment.attack(classifier, scene, settings=settings)
 
 
-@pytest.mark.parametrize("module", sorted({value.__module__ for value in PUBLIC.values()}))
-def test_examples_run(module, result):
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_examples_run(module, result, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
-    names = {"augment": augment, "torch": torch, "nn": torch.nn, "result": result}
+    names = {"augment": augment, "renderer": renderer, "torch": torch, "nn": torch.nn, "result": result}
     failures, _ = doctest.testmod(importlib.import_module(module), extraglobs=names, optionflags=flags)
     assert not failures
 
 
-@pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "attack"])
+@pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "augment.attack"])
 def test_every_public_function_has_an_example(name):
     assert ">>>" in PUBLIC[name].__doc__

@@ -35,6 +35,10 @@ def export_mesh(
     .ply: z up, colors of 8 bits. The format has no standard texture, so that vertices get their texel's color, times
     their own in linear light: between them the texture is lost, unless the mesh is subdivided.
     InputError where the suffix is another or the file cannot be written.
+
+    >>> apple, cameras = renderer.normalize(renderer.solid("apple")), renderer.orbit_cameras(views=3, width=2.2)
+    >>> export_mesh(apple, "apple.glb", cameras=cameras)
+    >>> export_mesh(apple, "apple.ply", normals="flat")
     """
     path = Path(path)
     glb = partial(_glb, cameras=cameras, first=first)

@@ -19,6 +19,11 @@ def save_light(path: Path, coefficients: Tensor, basis: EnvironmentBasis | Local
     eight bits beside it, in which white is its power.
 
     `read_light` reads float32 back to the bit. InputError: another shape, NaN, or a file that cannot be written.
+
+    >>> light = renderer.load_light("grace")
+    >>> save_light(Path("light.json"), light)
+    >>> torch.equal(renderer.load_light("light.json"), light)
+    True
     """
     require_bounded(coefficients=coefficients)
     if coefficients.shape != (basis.size, 3):

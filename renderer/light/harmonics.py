@@ -2,6 +2,10 @@
 
 Index l² + l + m, m = -l..l. No Condon-Shortley sign: Y₁ = √(3/4π) (y, z, x). The polynomial form has no polar
 angles, so it stays exact at the poles, where the paper's (appendix B.1) derivatives are not finite.
+
+>>> up, degree = torch.tensor([0.0, 0.0, 1.0]), 1
+>>> [round(value, 4) for value in basis(up, degree).tolist()]  # Y₀₀, then y, z, x
+[0.2821, 0.0, 0.4886, 0.0]
 """
 
 from __future__ import annotations

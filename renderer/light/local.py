@@ -11,6 +11,7 @@ from torch import Tensor
 from renderer.camera import OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.light.basis import Basis, LightPaths, LocalBasis, SumBasis, parts_of
+from renderer.normals import tangent_axes
 
 SHARES, RAYS = 4, 8  # neighboring samples look at other points of a disc, in turns of so many, at so many each
 LARGEST = 256  # pixels per side of a projector
@@ -69,7 +70,7 @@ class Lamps(LocalBasis):
         distance = self.radius * ((ray + (share + 0.5) / SHARES) / RAYS).sqrt()
         angle = ray * math.pi * (3 - math.sqrt(5)) + share * 2 * math.pi / SHARES
         across = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2).to(positions)
-        return positions[:, None] + torch.einsum("sra,laj->slrj", across, _axes_across(F.normalize(positions, dim=1)))
+        return positions[:, None] + torch.einsum("sra,laj->slrj", across, _disc_axes(F.normalize(positions, dim=1)))
 
     def _irradiance(self, toward: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
         """(...) at surfaces of unit normals (..., 3) from power 1 that is `toward` (..., 3) from there, of lamps at
@@ -81,14 +82,11 @@ class Lamps(LocalBasis):
         return received * ((toward * F.normalize(positions, dim=-1)).sum(-1) / squared.sqrt()).clamp(min=0)
 
 
-def _axes_across(back: Tensor) -> Tensor:
-    """(L, 2, 3) at right angles to unit vectors (L, 3) and to each other (Duff et al. 2017), smooth but where a disc is
-    halfway to straight below."""
-    x, y, z = back.unbind(1)
-    sign = torch.where(z < -0.5, -1.0, 1.0).to(back)
-    share = -1 / (sign + z)
-    first = torch.stack([1 + sign * x * x * share, sign * x * y * share, -sign * x], dim=1)
-    return torch.stack([first, torch.stack([x * y * share, sign + y * y * share, -y], dim=1)], dim=1)
+def _disc_axes(normals: Tensor) -> Tensor:
+    """(L, 2, 3) axes of discs with unit normals (L, 3), continuous but where a disc faces 30° off straight down."""
+    x, y, z = normals.unbind(1)
+    sign = torch.where(z < -0.5, -1.0, 1.0).to(normals)
+    return torch.stack([torch.stack(axis, dim=1) for axis in tangent_axes(x, y, z, sign)], dim=1)
 
 
 def moved(basis: Basis, positions: Tensor) -> Basis:

@@ -1,27 +1,51 @@
 """The nearest light that something could emit: harmonics whose radiance is nowhere negative.
 
-A quadratic program with a constraint for every direction, solved by exchange: radiance is held non-negative in a
-finite set of directions, and where the nearest such light still dips below zero, directions are added until it dips
-nowhere (Hettich and Kortanek 1993, "Semi-infinite programming: theory, methods, and applications", section 7).
+Of coefficients v (K,), the projection x solves the quadratic program with a constraint for every direction ω,
+
+    min |x − v|² / 2    such that    Y(ω) · x ≥ 0 for all ω,
+
+and optionally low ≤ x ≤ high (a ball in the maximum norm). With the harmonics of finitely many directions as rows of
+R, and multipliers μ ≥ 0, its Karush-Kuhn-Tucker conditions are
+
+    x = v + Rᵀ μ,    R x ≥ 0,    μ · R x = 0,
+
+which is least distance programming, solved exactly by non-negative least squares (Lawson and Hanson 1974, chapter 23).
+A ball |x − c| ≤ r adds λ (x − c) on the left, λ ≥ 0 and λ (|x − c| − r) = 0: then x is the projection, without the
+ball, of c + (v − c) / (1 + λ). As long as the active rows stay the same, x is affine in t = 1 / (1 + λ), so Newton
+steps on t find |x − c| = r.
+
+The exchange method (Hettich and Kortanek 1993, "Semi-infinite programming", section 7) begins without directions and
+adds those in which the solution is negative, the bottoms of its dips, until it has none. Dips are found on a grid and
+refined by Newton's method on the sphere.
 """
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 from torch import Tensor
 
 from renderer.light.convex import Ball
-from renderer.light.radiance_dips import Array, dips
+from renderer.light.harmonics import bands, gradient_matrices, monomial_coefficients, per_degree
+from renderer.normals import tangent_axes
+
+Array = NDArray[Any]
 
 TOLERANCE = 1e-4  # of a light's largest radiance, that it may dip below zero
-_FOUND = TOLERANCE / 10  # dips that are looked for: in a flat valley, a deeper one may lie between two that are found
+_DEPTH = TOLERANCE / 10  # of dips that are looked for: in a flat valley, a deeper one may lie between two found ones
 _ROUNDS = 50  # seven are usual
 _ON_SPHERE = 1e-7  # of the radius
-_STEPS = 10  # to come as near to a sphere; two are usual
+_STEPS = 10  # Newton steps on t; two are usual
 _TINY = 1e-300
+_SUBDIVISIONS = 4  # of the grid: nodes are 0.07 radians apart
+_CANDIDATES = 0.04, 1e-3  # of the largest radiance, above zero and above the neighbors: nodes that may be near a dip
+_LARGEST_STEP = 0.1  # in radians
+_NEWTON_STEPS = 2  # down to the bottom of a dip
 
 
 def project_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
@@ -37,13 +61,13 @@ def project_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
     return torch.from_numpy(nearest).view(lights.mT.shape).to(lights).mT
 
 
-def _programs(lights: Tensor, within: Ball | None) -> "Sequence[_Programme]":
+def _programs(lights: Tensor, within: Ball | None) -> "Sequence[_Program]":
     """One of each light, if a sphere holds its channels together, and else one of each channel."""
     wanted = _by_channel(lights)
     if within is None:
-        return [_Programme(light) for light in wanted]
+        return [_Program(light) for light in wanted]
     if within.norm == "linf":
-        return [_Programme(*each) for each in zip(wanted, *map(_by_channel, within.ends), strict=True)]
+        return [_Program(*each) for each in zip(wanted, *map(_by_channel, within.ends), strict=True)]
     shape = len(lights), lights.shape[2], lights.shape[1]
     of_lights = zip(wanted.reshape(shape), _by_channel(within.center).reshape(shape), strict=True)
     return [_InSphere(light, center, within.radius) for light, center in of_lights]
@@ -54,103 +78,184 @@ def _by_channel(lights: Tensor) -> Array:
     return lights.detach().mT.flatten(0, -2)[:, None].cpu().double().numpy()
 
 
-class _Programme:
-    """The lights (C, K) nearest to those wanted, between ends, and non-negative in the directions that are held."""
+class _Program:
+    """The lights (C, K) nearest to those wanted, between bounds, and non-negative in the active directions."""
 
     def __init__(self, wanted: Array, low: Array | float = -np.inf, high: Array | float = np.inf):
         self.wanted, self.nearest = wanted, wanted.clip(low, high)
         self.low, self.high = np.broadcast_to(low, wanted.shape), np.broadcast_to(high, wanted.shape)
-        self._held = [wanted[:0]] * len(wanted)  # harmonics (M, K) in the directions, of each light
+        self._active = [wanted[:0]] * len(wanted)  # R (M, K) of each light
 
-    def hold(self, rows: Sequence[Array]) -> None:
-        """Solve it with further directions (M, K) of each light; those that turn out to hold nothing are let go."""
-        self._held = [np.concatenate(pair) for pair in zip(self._held, rows, strict=True)]
-        self.nearest, self._held = self._solved()
+    def add(self, rows: Sequence[Array]) -> None:
+        """Solve it with further rows (M, K) of each light; rows whose multiplier is zero are dropped."""
+        self._active = [np.concatenate(pair) for pair in zip(self._active, rows, strict=True)]
+        self.nearest, self._active = self._solved()
 
     def _solved(self) -> tuple[Array, list[Array]]:
         return self._nearest_to(self.wanted)
 
     def _nearest_to(self, lights: Array) -> tuple[Array, list[Array]]:
-        each = zip(lights, self._held, self.low, self.high, strict=True)
-        nearest, held = zip(*(_nearest_held(*light) if len(light[1]) else light[:2] for light in each), strict=True)
-        return np.stack(nearest), list(held)
+        each = zip(lights, self._active, self.low, self.high, strict=True)
+        nearest, active = zip(*(_least_distance(*light) if len(light[1]) else light[:2] for light in each), strict=True)
+        return np.stack(nearest), list(active)
 
 
-class _InSphere(_Programme):
-    """The same, of lights that together lie within an L2 distance of a center.
-
-    With a multiplier λ for the sphere, what is nearest to lights v is nearest, without it, to c + (v - c) / (1 + λ). As
-    long as the same directions hold, that is straight in the share 1 / (1 + λ) of the way: hence Newton's steps.
-    """
+class _InSphere(_Program):
+    """The same for lights that together lie within an L2 distance of a center; t = 1 / (1 + λ), from `_least` to 1."""
 
     def __init__(self, wanted: Array, center: Array, radius: float):
         super().__init__(wanted)
         self._center, self._radius, self._offset = center, radius, wanted - center
-        self._least = self._share = min(radius / max(float(np.linalg.norm(self._offset)), _TINY), 1.0)
-        self.nearest = self._place()
+        self._least = self._t = min(radius / max(float(np.linalg.norm(self._offset)), _TINY), 1.0)
+        self.nearest = self._target()
 
     def _place(self) -> Array:
-        return self.wanted if self._share == 1 else self._center + self._share * self._offset
+        return self.wanted if self._t == 1 else self._center + self._t * self._offset
 
     def _solved(self) -> tuple[Array, list[Array]]:
         for _ in range(_STEPS):
-            place = self._place()
-            nearest, held = self._nearest_to(place)
-            gone = nearest - self._center
-            distance = float(np.linalg.norm(gone))
+            target = self._target()
+            nearest, active = self._nearest_to(target)
+            displacement = nearest - self._center
+            distance = float(np.linalg.norm(displacement))
             left = self._radius - distance
-            if abs(left) <= _ON_SPHERE * self._radius or (self._share == 1 and left > 0):
+            if abs(left) <= _ON_SPHERE * self._radius or (self._t == 1 and left > 0):
                 break
-            courses, forces, changes = zip(*map(_course, self._offset, nearest - place, held), strict=True)
-            along = np.stack(courses)
-            speed, slope = float((along * along).sum()), float((along * gone).sum())
+            motions, multipliers, changes = zip(*map(_motion, self._offset, nearest - target, active), strict=True)
+            along = np.stack(motions)
+            speed, slope = float((along * along).sum()), float((along * displacement).sum())
             root = math.sqrt(max(slope**2 + speed * left * (self._radius + distance), 0))
-            step = min(max((root - slope) / max(speed, _TINY), self._least - self._share), 1 - self._share)
-            self._share += step
-            if np.all(np.concatenate(forces) + step * np.concatenate(changes) >= 0):  # the same directions hold there
-                gone = gone + step * along
+            step = min(max((root - slope) / max(speed, _TINY), self._least - self._t), 1 - self._t)
+            self._t += step
+            if np.all(np.concatenate(multipliers) + step * np.concatenate(changes) >= 0):  # the same rows stay active
+                displacement = displacement + step * along
                 break
-        return self._center + gone * min(1, self._radius / max(float(np.linalg.norm(gone)), _TINY)), held
+        return self._center + displacement * min(
+            1, self._radius / max(float(np.linalg.norm(displacement)), _TINY)
+        ), active
 
 
-def _course(offset: Array, added: Array, rows: Array) -> tuple[Array, Array, Array]:
-    """Where the nearest light (K,) goes as what is wanted goes along an offset (K,), as long as the same directions
-    (M, K) hold it; and with which multipliers (M,), whose sum with the rows is added, it is held, and their change."""
-    change, forces = np.linalg.lstsq(rows.T, np.stack([-offset, added], axis=1))[0].T
-    return offset + rows.T @ change, forces, change
+def _motion(offset: Array, added: Array, rows: Array) -> tuple[Array, Array, Array]:
+    """(derivative of x by t (K,), multipliers (M,), their derivative by t) while the rows (M, K) stay active.
+
+    offset: v − c. added: Rᵀ μ, of which the multipliers are found.
+    """
+    change, multipliers = np.linalg.lstsq(rows.T, np.stack([-offset, added], axis=1))[0].T
+    return offset + rows.T @ change, multipliers, change
 
 
-def _exchange(programs: Sequence[_Programme]) -> None:
-    """Hold them where they dip, until they dip nowhere."""
+def _exchange(programs: Sequence[_Program]) -> None:
+    """Add the directions of dips as constraints until there are no dips."""
     for _ in range(_ROUNDS):
         lights = np.concatenate([program.nearest for program in programs])
         wanted = np.concatenate([program.wanted for program in programs])
-        dim = 1e-6 * np.linalg.norm(wanted, axis=1)  # radiance of which a share is but the rounding of what is given
-        owner, rows = dips(lights, dim, _FOUND)
+        dim = 1e-6 * np.linalg.norm(wanted, axis=1)  # below it, a dip is the rounding of the input
+        owner, rows = _dips(lights, dim, _DEPTH)
         channels = len(lights) // len(programs)
         dipping = np.unique(owner // channels)
         for index in dipping:
-            own = range(index * channels, (index + 1) * channels)
-            programs[index].hold([rows[owner == light] for light in own])
+            channel = range(index * channels, (index + 1) * channels)
+            programs[index].add([rows[owner == light] for light in channel])
         programs = [programs[index] for index in dipping]
         if not programs:
             break
 
 
-def _nearest_held(wanted: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """The x (K,) nearest to `wanted` with rows · x ≥ 0 between the ends, and those of the rows that hold it.
+def _least_distance(wanted: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """The x (K,) nearest to `wanted` with rows · x ≥ 0 and low ≤ x ≤ high, and the rows of positive multipliers.
 
-    Least distance programming by non-negative least squares (Lawson and Hanson 1974, chapter 23), in units of `wanted`.
+    With G x ≥ h for all constraints together: nnls minimizes |E u − f| for E = [Gᵀ; hᵀ], f = (0, ..., 0, 1) and u ≥ 0,
+    and its residual r gives x = −r_j / r_(K+1) (Lawson and Hanson's algorithm LDP), relative to `wanted`.
     """
-    size, unit, ended = len(wanted), np.linalg.norm(wanted), np.isfinite(low)
-    axes = np.eye(size)[ended]
+    size, unit, bounded = len(wanted), np.linalg.norm(wanted), np.isfinite(low)
+    axes = np.eye(size)[bounded]
     sides = np.concatenate([rows, axes, -axes])
-    bounds = np.concatenate([-rows @ wanted, (low - wanted)[ended], (wanted - high)[ended]])
+    bounds = np.concatenate([-rows @ wanted, (low - wanted)[bounded], (wanted - high)[bounded]])
     dual = np.concatenate([sides.T, bounds[None] / unit])
     multipliers, _ = nnls(dual, np.eye(size + 1)[size])
     residual = dual @ multipliers
     residual[size] -= 1
-    if residual[size] > -(_FOUND**2):  # the ends leave no more room than rounding
+    if residual[size] > -(_DEPTH**2):  # the bounds leave no room beyond rounding
         return wanted.clip(low, high), rows
     nearest = wanted - residual[:size] / residual[size] * unit
     return nearest.clip(low, high), rows[multipliers[: len(rows)] > 0]
+
+
+def _dips(lights: Array, dim: Array, depth: float) -> tuple[Array, Array]:
+    """(the light (D,), of (R, K), and the harmonics (D, K) in the direction of the bottom) of each of D dips.
+
+    depth: the least depth of a dip, of the light's largest radiance. dim: (R,) largest radiance that counts as none.
+    """
+    degree = math.isqrt(lights.shape[1]) - 1
+    directions, harmonics, neighbors = _grid(degree)
+    radiance = lights @ harmonics
+    largest = np.abs(radiance).max(1)
+    near_zero, near_lowest = (factor * largest for factor in _CANDIDATES)
+    owner, node = np.nonzero(radiance < np.where(largest > dim, near_zero, -np.inf)[:, None])
+    for neighbor in neighbors:
+        lower = radiance[owner, node] <= radiance[owner, neighbor[node]] + near_lowest[owner]
+        owner, node = owner[lower], node[lower]
+    expansion = (lights @ _derivatives(degree)).reshape(len(lights), 3 + 9, -1)[owner]
+    bottom = directions[node]
+    for _ in range(_NEWTON_STEPS):
+        bottom = _lower(bottom, expansion)
+    rows = _harmonics(bottom, degree)
+    deep = (rows * lights[owner]).sum(1) < -depth * largest[owner]
+    return owner[deep], rows[deep]
+
+
+def _lower(directions: Array, expansion: Array) -> Array:
+    """A Newton step down from directions (D, 3) along the principal axes of the radiance's curvature on the sphere.
+
+    expansion: (D, 3 + 9, K), coefficients of each light's first and second derivatives.
+    """
+    derivatives = expansion @ _harmonics(directions, math.isqrt(expansion.shape[2]) - 1)[..., None]
+    gradient, hessian = derivatives[:, :3], derivatives[:, 3:].reshape(-1, 3, 3)
+    x, y, z = directions.T
+    tangents = np.array(tangent_axes(x, y, z, np.copysign(1, z))).transpose(2, 0, 1)
+    radial = directions[:, None] @ gradient
+    curvature, turn = np.linalg.eigh(tangents @ hessian @ tangents.mT - radial * np.eye(2))
+    axes = turn.mT @ tangents
+    slope = (axes @ gradient)[..., 0]
+    steepness = np.maximum(np.abs(curvature), np.linalg.norm(slope, axis=1, keepdims=True) / _LARGEST_STEP)
+    moved = directions - ((slope / np.maximum(steepness, 1e-300))[:, None] @ axes)[:, 0]
+    return moved / np.linalg.norm(moved, axis=1, keepdims=True)
+
+
+def _harmonics(directions: Array, degree: int) -> Array:
+    """(D, K): on the sphere, polynomials homogeneous of the degree and of the one below; `select_rows` of a few."""
+    powers, coefficients = _polynomials(degree)
+    rising = np.ones((degree + 1, *directions.T.shape))
+    for power in range(degree):
+        rising[power + 1] = rising[power] * directions.T
+    x, y, z = rising.transpose(1, 0, 2)
+    return (x[powers[0]] * y[powers[1]] * z[powers[2]]).T @ coefficients
+
+
+@per_degree
+def _polynomials(degree: int) -> tuple[Array, Array]:
+    """(powers (3, J) of x, y and z in each monomial, the harmonics' coefficients (J, K))."""
+    totals = range(degree, max(degree - 2, -1), -1)
+    powers = [(a, b, total - a - b) for total in totals for a in range(total, -1, -1) for b in range(total - a, -1, -1)]
+    homogeneous = [monomial_coefficients(total) * ((bands(total) - total) % 2 == 0) for total in totals]
+    coefficients = [F.pad(part, (0, (degree + 1) ** 2 - part.shape[1])) for part in homogeneous]
+    return np.array(powers).T, torch.cat(coefficients).numpy()
+
+
+@per_degree
+def _derivatives(degree: int) -> Array:
+    """(K, (3 + 9) K): maps a light's coefficients to those of its first and second derivatives by x, y and z."""
+    first = gradient_matrices(degree)
+    second = (first[:, None] @ first).flatten(0, 1)
+    return torch.cat([first, second]).flatten(0, 1).T.contiguous().numpy()
+
+
+@per_degree
+def _grid(degree: int) -> tuple[Array, Array, Array]:
+    """(directions (N, 3), harmonics (K, N), indices (6, N) of the neighbors) of an icosphere's vertices."""
+    from trimesh.creation import icosphere  # trimesh takes half a second
+
+    sphere = icosphere(_SUBDIVISIONS)
+    around = [[*near, *near[:1]][:6] for near in sphere.vertex_neighbors]  # twelve vertices have five
+    directions = np.array(sphere.vertices)
+    return directions, np.ascontiguousarray(_harmonics(directions, degree).T), np.array(around).T

@@ -43,6 +43,11 @@ def load_light(light: str) -> Tensor:
     A map is scaled to the mean luminance of the grace probe, since maps come in any unit, and may be negative in
     places, as series are that were written as a map; coefficients stay as they are.
     InputError for an unknown name, a missing file or one that holds no light.
+
+    >>> load_light("grace").shape
+    torch.Size([49, 3])
+    >>> bool((load_light("uniform")[1:] == 0).all())  # the same radiance from everywhere
+    True
     """
     suffix = Path(light).suffix.lower()
     if light in _PUBLISHED_PROBES:

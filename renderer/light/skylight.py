@@ -99,6 +99,10 @@ def coefficients(
     (4e-4 where they are smallest: in haze, with the sun on the horizon). The derivatives are off by up to 0.1 % in
     zenith and azimuth and 0.5 % in turbidity, two to three times that at the domain's ends. InputError: outside it.
     fit: another one than the committed, as `fit_polynomials` returns it.
+
+    >>> noon, evening = coefficients(0.5, 0.0, 3.0), coefficients(1.4, 0.0, 3.0)
+    >>> noon.shape, bool(noon[0].sum() > evening[0].sum())  # index 0: the mean radiance
+    (torch.Size([49, 3]), True)
     """
     parameters = torch.broadcast_tensors(*_checked(zenith, azimuth, turbidity))
     return _FittedSky.apply(*parameters, _committed_fit() if fit is None else fit)

@@ -1,7 +1,15 @@
 """Light that bounces between the surfaces of a mesh: radiosity (Goral et al. 1984), per coefficient of the light.
 
-A patch is one side of some small faces that lie together and face alike, or of a piece of a large one. Its irradiance
-is found as that of a pixel which shows just the patch.
+With albedo ρ_i, patch i sends the radiance B_i (size,) per unit of each coefficient,
+
+    B_i = ρ_i / π (S_i + Σ_j F_ij B_j),
+
+where S_i is the irradiance from the part of the sky that the patch sees and F_ij the irradiance of i per unit radiance
+of j: the solid angle of j times the cosine, by rays. Both are constants of the shape, so B is linear in the light, and
+N bounces are N − 1 substitutions of B on the right, from B = ρ S / π on. A pixel adds Σ_j F_pixel,j B_j.
+
+A patch is one side of several small faces that lie in one cell of a grid and face the same way, or of a piece of a
+large face. Its S and F are those of a pixel that shows the patch alone, so the code of `rays` serves both.
 """
 
 import math
