@@ -109,7 +109,7 @@ class _InSphere(_Program):
         self._least = self._t = min(radius / max(float(np.linalg.norm(self._offset)), _TINY), 1.0)
         self.nearest = self._target()
 
-    def _place(self) -> Array:
+    def _target(self) -> Array:
         return self.wanted if self._t == 1 else self._center + self._t * self._offset
 
     def _solved(self) -> tuple[Array, list[Array]]:
@@ -130,9 +130,8 @@ class _InSphere(_Program):
             if np.all(np.concatenate(multipliers) + step * np.concatenate(changes) >= 0):  # the same rows stay active
                 displacement = displacement + step * along
                 break
-        return self._center + displacement * min(
-            1, self._radius / max(float(np.linalg.norm(displacement)), _TINY)
-        ), active
+        scale = min(1, self._radius / max(float(np.linalg.norm(displacement)), _TINY))
+        return self._center + displacement * scale, active
 
 
 def _motion(offset: Array, added: Array, rows: Array) -> tuple[Array, Array, Array]:

@@ -135,17 +135,6 @@ def test_albedo_per_texel_has_the_derivative_of_central_differences(mesh, camera
     assert torch.autograd.gradcheck(lambda *given: textured_albedo(mesh, fragments, given, "srgb"), inputs)
 
 
-def test_texels_that_no_sample_sees_have_a_gradient_of_exactly_zero_and_the_others_share_the_corner_color():
-    """Bilinear weights add up to one. The left half of the texture is on the image; samples lie between texels."""
-    mesh = poster(np.zeros((8, 8, 3), dtype=np.uint8), UNIT_UVS * [0.5, 1], color=(0.5, 0.25, 1.0))
-    texture = draw(8, 8, 3).requires_grad_(True)
-    fragments = view(mesh, 3)
-    (gradient,) = torch.autograd.grad(textured_albedo(mesh, fragments, [texture], "linear").sum(), texture)
-    assert not gradient[:, 4:].any() and gradient[:, :4].any()
-    expected = 9 * torch.tensor([0.5, 0.25, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(gradient.sum((0, 1)), expected, rtol=32 * EPS, atol=0)
-
-
 def test_albedo_per_face_is_that_of_the_face_that_a_sample_sees_and_its_gradient_counts_the_samples():
     mesh, camera = TEXTURED[0]
     fragments = view(mesh, 6, 2, camera)
@@ -160,21 +149,6 @@ def test_albedo_per_face_is_that_of_the_face_that_a_sample_sees_and_its_gradient
     np.testing.assert_allclose(gradient, expected, rtol=64 * EPS)
     unseen = np.setdiff1d(np.arange(len(mesh.faces)), seen)
     assert len(unseen) and not gradient[unseen].any()
-
-
-@pytest.mark.parametrize("mesh", [patchwork(), Mesh.plain(ALL_OF_IT, HALVES)])
-def test_outside_of_the_image_there_is_no_albedo_and_a_gradient_of_zero(mesh):
-    fragments = view(replace(mesh, vertices=mesh.vertices + 9), 4, 2)
-    textures = [draw(*texture.shape).requires_grad_(True) for texture in mesh.textures]
-    by_face = draw(len(mesh.faces), 3).requires_grad_(True)
-    assert surface_albedo(mesh, fragments, "srgb").shape == (0, 3)
-    for albedo, inputs in (
-        (textured_albedo(mesh, fragments, textures, "srgb"), textures),
-        (face_albedo(by_face, fragments), [by_face]),
-    ):
-        assert albedo.shape == (0, 3)
-        if inputs:
-            assert not any(gradient.any() for gradient in torch.autograd.grad(albedo.sum(), inputs))
 
 
 # ---------------------------------------------------------------------------- what is added to faces

@@ -1,6 +1,5 @@
 """Perspective in images, against rays in float64, homographies and orthographic images. Mitsuba is in test_mitsuba."""
 
-import math
 from ctypes.util import find_library
 from dataclasses import replace
 from importlib.util import find_spec
@@ -10,13 +9,11 @@ import pytest
 import torch
 import trimesh
 
-from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
+from renderer.camera import PerspectiveCamera
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
-from renderer.light.presets import load_light
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
-from renderer.transfer import build_operators
 from renderer.transport.surface import Surface
 
 SOFTWARE = choose("numpy")
@@ -100,26 +97,3 @@ def test_a_texture_on_a_tilted_plane_follows_the_homography_of_its_corners():
     at_corners = torch.from_numpy(uvs)[torch.from_numpy(faces)[seen.faces]]
     torch.testing.assert_close(seen.interpolate(at_corners)[inside], expected[inside], rtol=0, atol=1e-12)
     assert (replace(seen, depths=None).interpolate(at_corners) - expected)[inside].abs().max() > 0.05
-
-
-@pytest.mark.parametrize("normals", ["flat", "smooth"])
-def test_from_ever_further_away_the_image_becomes_the_orthographic_one(normals):
-    """The difference falls as 1 / distance, down to the samples that change sides of an edge."""
-    mesh, settings, light = knot(), ImageSettings(24, 8, normals=normals), load_light("grace")
-    whole, *views = (
-        build_operators(mesh, [camera], settings, SOFTWARE)[0].image(light)
-        for camera in (
-            OrthographicCamera(0.9, 0.4, 2.4),
-            *(PerspectiveCamera(0.9, 0.4, 2.4, distance=distance) for distance in (1e1, 1e2, 1e3, 1e9)),
-        )
-    )
-    off = [float((view - whole).abs().mean()) for view in views]
-    assert off[0] > 3 * off[1] > 9 * off[2] > 0
-    assert off[3] < 1e-6
-
-
-def test_a_ring_in_perspective_spans_the_angle_and_the_same_width_at_the_origin():
-    for camera in orbit_cameras(3, 2.0, fov=math.radians(40)):
-        assert camera.angle == pytest.approx(math.radians(40))
-        edges = np.array([[1.0], [-1.0]]) * camera.axes()[0]
-        np.testing.assert_allclose(camera.project(edges)[:, 0], [1, -1], rtol=1e-14)

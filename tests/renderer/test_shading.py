@@ -12,18 +12,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y_all
 
-from renderer import shading
 from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.errors import LARGEST, InputError
+from renderer.errors import InputError
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, background_term, clamped, tonemap
-from renderer.light.harmonics import MAX_DEGREE, irradiance_basis, lambertian_factors, nonzero_coefficients, rotate
+from renderer.light.harmonics import MAX_DEGREE, lambertian_factors, nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.shading import irradiance, radiance
@@ -81,35 +77,6 @@ def test_derivatives_of_irradiance_are_central_differences(degree):
     assert torch.autograd.gradcheck(irradiance, inputs, fast_mode=degree > 6)
 
 
-@pytest.mark.parametrize("degree", DEGREES)
-def test_float32_is_float64_to_rounding(degree):
-    """The direction rounds, which band l's slope makes l times of, and so do the recurrences and the sum."""
-    inputs = [tensor.float() for tensor in (some_normals(1000), draw((degree + 1) ** 2, 3, seed=1))]
-    results = []
-    for dtype in (torch.float32, torch.float64):
-        normals, light = (tensor.to(dtype).requires_grad_(True) for tensor in inputs)
-        lit = irradiance(normals, light)
-        by_normal, by_light = torch.autograd.grad(lit, (normals, light), draw(*lit.shape, seed=2).to(dtype))
-        results.append((lit, by_normal * normals.norm(dim=1, keepdim=True), by_light))
-    slack = (4 + degree) * EPS32 * brightest(inputs[1])
-    # A normal's gradient adds up three channels of slope l; a coefficient's, a thousand normals, whose roundings and
-    # sizes both have either sign.
-    for short, full, limit in zip(*results, (slack, 8 * (1 + degree) * slack, 5000 * EPS32), strict=True):
-        assert short.dtype == torch.float32
-        torch.testing.assert_close(short.double(), full, rtol=0, atol=limit)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_is_float32_rounded_once(dtype):
-    results = []
-    for wide in (dtype, torch.float32):
-        normals, light = (tensor.to(dtype).to(wide).requires_grad_(True) for tensor in (some_normals(50), draw(49, 3)))
-        lit = irradiance(normals, light)
-        results.append((lit, *torch.autograd.grad(lit, (normals, light), draw(*lit.shape).to(dtype).to(wide))))
-    for short, full in zip(*results, strict=True):
-        assert short.dtype == dtype and torch.equal(short, full.to(dtype))
-
-
 def test_bands_that_reach_no_surface_have_a_gradient_of_exactly_zero():
     for degree, dead in ((6, 18), (MAX_DEGREE, sum(2 * l + 1 for l in range(3, MAX_DEGREE, 2)))):
         light = draw((degree + 1) ** 2, 3).requires_grad_(True)
@@ -128,37 +95,6 @@ def test_the_irradiance_of_short_and_of_zero_normals_is_finite_and_no_gradient_i
         lit = irradiance(normals, draw(49, 3).to(dtype))
         (gradient,) = torch.autograd.grad(lit.sum(), normals)
         assert lit.isfinite().all() and not gradient.isnan().any() and not gradient[-len(SPECIAL) :].any()
-
-
-def test_a_zero_normal_has_the_irradiance_of_the_basis_at_zero():
-    """And its derivative by the light, among normals that are not zero."""
-    normals, light = some_normals(5).index_fill(0, torch.tensor([1, 4]), 0), draw(49, 3).requires_grad_(True)
-    lit = irradiance(normals, light)
-    rows = irradiance_basis(normals, 6)
-    expected = rows @ light[nonzero_coefficients(6)]
-    torch.testing.assert_close(lit, expected.T, rtol=0, atol=16 * EPS * brightest(light))
-    upstream = draw(*lit.shape, seed=1)
-    (found,), (by_basis,) = (torch.autograd.grad(value, light, upstream) for value in (lit, expected.T))
-    torch.testing.assert_close(found, by_basis, rtol=0, atol=64 * EPS * float(by_basis.abs().max()))
-
-
-def test_the_blocks_are_of_no_consequence(monkeypatch):
-    inputs = [tensor.requires_grad_(True) for tensor in (some_normals(40), draw(49, 3))]
-    results = []
-    for block in (shading.BLOCK, 7):
-        monkeypatch.setattr(shading, "BLOCK", block)
-        lit = irradiance(*inputs)
-        results.append((lit, *torch.autograd.grad(lit, inputs, draw(*lit.shape))))
-    for whole, pieced in zip(*results, strict=True):
-        torch.testing.assert_close(pieced, whole, rtol=0, atol=64 * EPS * whole.abs().max().item())
-
-
-def test_what_is_kept_for_the_backward_pass_is_a_slope_by_each_axis_and_channel():
-    """Beside the normals' directions and lengths; not their 31 harmonics."""
-    kept = []
-    with torch.autograd.graph.saved_tensors_hooks(lambda tensor: kept.append(tensor.numel()), lambda _: None):
-        irradiance(draw(1000, 3).requires_grad_(True), draw(49, 3).requires_grad_(True))
-    assert sum(kept) <= 1000 * (4 + 9)
 
 
 @pytest.mark.parametrize("shape", [(10, 3), (49, 1), (49,), (3, 49)])
@@ -247,24 +183,8 @@ SCENES = {
     "one sample per pixel": Scene(solid(), size=9, samples=1),
     "from close by": Scene(solid(), PerspectiveCamera(1.0, 0.4, 2.2, distance=1.8)),
 }
-OUTSIDE = Scene(replace(solid(), vertices=solid().vertices + 9))
 each_scene = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 flat_and_smooth = pytest.mark.parametrize("smooth", [False, True], ids=["flat", "smooth"])
-
-
-def test_the_scenes_are_what_they_are_called():
-    facing = {name: scene.fragments.facing for name, scene in SCENES.items()}
-    in_front = {name for name, signs in facing.items() if (signs == 1).all()}
-    assert in_front == {"solid", "spoiled", "one sample per pixel", "from close by"}
-    assert (facing["wound the other way"] == -1).all()
-    assert {sign for sign in facing["open, from behind"].flatten().tolist()} == {-1, 1}
-    for scene in SCENES.values():
-        fragments = scene.fragments
-        assert 0 < len(fragments.pixels) < scene.size**2
-        seen = scene.mesh.texture_ids[fragments.faces]
-        assert set(seen) == {-1, 0, 1}
-    assert len(np.unique(SCENES["solid"].fragments.corners)) < 12
-    assert len(OUTSIDE.fragments.pixels) == 0
 
 
 # ---------------------------------------------------------------------------- images
@@ -335,15 +255,6 @@ def test_derivatives_of_images_are_central_differences(scene, smooth, encoding):
 
 
 @flat_and_smooth
-def test_each_entry_of_a_images_jacobian_is_a_central_difference(smooth):
-    image = Image(replace(SCENES["open, from behind"], size=3, samples=2), "linear", smooth)
-    inputs = image.inputs()
-    assert torch.autograd.gradcheck(image, inputs)
-    share = image.clamped(*inputs).double().mean()
-    assert 0 < share < 0.5
-
-
-@flat_and_smooth
 def test_albedo_per_face_has_the_derivative_of_central_differences(smooth):
     scene = SCENES["solid"]
     fragments, vertices, light = scene.fragments, scene.vertices(), draw(49, 3)
@@ -393,20 +304,6 @@ def test_background_and_clamped_pixels_have_a_gradient_of_exactly_zero(scene, sm
         assert not any(gradient.any() for gradient in gradients)
 
 
-@flat_and_smooth
-def test_an_empty_view_has_gradients_and_they_are_zero(smooth):
-    image = Image(OUTSIDE, "srgb", smooth)
-    inputs = image.inputs()
-    values = image(*inputs)
-    assert torch.equal(values[:, 0], torch.tensor([0.3, 0.6, 0.1], dtype=torch.float64)) and values.shape == (3, 25)
-    lit = image.parts(*inputs)[1][0]
-    assert lit.shape == (3, 0)
-    for output in (values, lit):
-        gradients = torch.autograd.grad(output.sum(), inputs, retain_graph=True)
-        assert [gradient.shape for gradient in gradients] == [tensor.shape for tensor in inputs]
-        assert not any(gradient.any() for gradient in gradients)
-
-
 # ---------------------------------------------------------------------------- radiance
 
 
@@ -452,165 +349,4 @@ def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surfac
     np.testing.assert_allclose(lit[:, inside], expected[:, inside], rtol=0, atol=64 * EPS * brightest(light))
 
 
-@each_scene
-@flat_and_smooth
-def test_a_pixel_is_the_mean_of_its_samples_each_shaded_as_a_pixel_of_its_own(scene, smooth):
-    size, samples = scene.size, scene.samples
-    fine = replace(scene, size=size * samples, samples=1)
-    canvases = []
-    for view in (scene, fine):
-        lit, *_ = lit_and_gradients(view, smooth)
-        canvas = torch.zeros(3, view.size**2, dtype=torch.float64).index_copy(1, view.fragments.pixels, lit)
-        canvases.append(canvas.view(3, view.size, view.size))
-    mean = canvases[1].view(3, size, samples, size, samples).mean((2, 4))
-    torch.testing.assert_close(canvases[0], mean, rtol=0, atol=16 * EPS * brightest(draw(49, 3)))
-
-
-@flat_and_smooth
-def test_winding_does_not_matter(smooth):
-    plain, turned = (lit_and_gradients(SCENES[name], smooth) for name in ("solid", "wound the other way"))
-    for found, expected in zip(turned[:3], plain[:3], strict=True):
-        torch.testing.assert_close(found, expected, rtol=0, atol=64 * EPS * float(expected.abs().max()))
-
-
-def test_faces_without_area_and_second_copies_of_faces_change_nothing():
-    for found, expected in zip(*(lit_and_gradients(SCENES[name], False) for name in ("spoiled", "solid")), strict=True):
-        assert torch.equal(found, expected)
-
-
-def test_faces_without_area_change_nothing_in_smooth_shading_either():
-    """Second copies double every area, which rounds nothing; albedo comes from the first copies."""
-    for found, expected in zip(*(lit_and_gradients(SCENES[name], True) for name in ("spoiled", "solid")), strict=True):
-        torch.testing.assert_close(found, expected, rtol=0, atol=64 * EPS * float(expected.abs().max()))
-
-
-@each_scene
-@flat_and_smooth
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
-def test_shorter_dtypes_go_in_and_come_out_and_are_float64_to_rounding(scene, smooth, dtype):
-    """Normals round, which the light's slope makes six times of, and so do albedos and results; gradients round twice
-    as often, and the heights that they are divided by are at least a third of the mesh's size."""
-    scene = replace(scene, mesh=replace(scene.mesh, vertices=scene.vertices().to(dtype).double().numpy()))
-    short, full = (lit_and_gradients(scene, smooth, dtype=kind) for kind in (dtype, torch.float64))
-    slack = (6 + 2) * torch.finfo(dtype).eps
-    torch.testing.assert_close(short[0].double(), full[0], rtol=0, atol=slack * brightest(draw(49, 3)))
-    for found, expected in zip(short[1:], full[1:], strict=True):
-        assert found.dtype == dtype
-        torch.testing.assert_close(found.double(), expected, rtol=0, atol=2 * slack * float(expected.abs().max()))
-
-
-@flat_and_smooth
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.float16, torch.bfloat16])
-@pytest.mark.parametrize(
-    ("light", "albedo", "size"),
-    [("largest", 1, 1), (1, "largest", 1), ("largest", "largest", 1), ("largest", 0, 1), (1, 1, 1e-18), (1, 1, 5e17)],
-)
-def test_no_nan_comes_out_whatever_finite_goes_in(light, albedo, size, dtype, smooth):
-    """Some of the radiance is negative, so that overflow on the way would be infinity less infinity."""
-    scene = SCENES["open, from behind"]
-    fragments = scene.fragments
-    largest = min(0.99 * LARGEST, torch.finfo(dtype).max)
-    light, albedo = (largest if value == "largest" else value for value in (light, albedo))
-    vertices = (scene.vertices() * size).clamp(-torch.finfo(dtype).max, torch.finfo(dtype).max)
-    inputs = vertices, draw(49, 3).sign() * light, torch.ones(len(fragments.pixel), 3) * albedo
-    inputs = [tensor.to(dtype).requires_grad_(True) for tensor in inputs]
-    lit = radiance(fragments, *inputs, scene.all_faces(smooth))
-    for tensor in (lit, *torch.autograd.grad(lit.sum(), inputs)):
-        assert not tensor.isnan().any()
-
-
-def test_a_light_too_bright_for_half_precision_gives_no_nan():
-    """It is finite in its own dtype, and where it is added up."""
-    lit = irradiance(draw(20, 3).half(), draw(49, 3).float() * 1e5)
-    assert not lit.isnan().any()
-
-
 # ---------------------------------------------------------------------------- generated meshes and lights
-
-
-@dataclass(frozen=True)
-class Generated:
-    """A random mesh, from the fragments of one view, with a light and an albedo."""
-
-    scene: Scene
-    light: torch.Tensor
-    smooth: bool
-    scale: float
-
-    def inputs(self) -> list[torch.Tensor]:
-        albedo = surface_albedo(self.scene.mesh, self.scene.fragments, "linear")
-        return [self.scene.vertices(), self.light, albedo]
-
-    def lit(self, vertices, light, albedo) -> torch.Tensor:
-        return radiance(self.scene.fragments, vertices, light, albedo, self.scene.all_faces(self.smooth))
-
-
-@st.composite
-def generated(draw_from) -> Generated:
-    """Dented icosahedra and tori, turned and flattened, without some of their faces and with others wound round.
-
-    Only all or none are where normals are smooth: those that cancel around a vertex have no derivative.
-    """
-    draws = np.random.default_rng(draw_from(st.integers(0, 2**32 - 1)))
-    make = draw_from(st.sampled_from([trimesh.creation.icosahedron, lambda: trimesh.creation.torus(0.7, 0.3, 5, 4)]))
-    smooth, flatness = draw_from(st.booleans()), draw_from(st.sampled_from([1, 0.3]))
-    share_turned = draw_from(st.sampled_from([0, 1] if smooth else [0, 0.5, 1]))
-    shape = make()
-    dents = draws.uniform(-1, 1, shape.vertices.shape) * draw_from(st.sampled_from([0, 0.05, 0.15]))
-    vertices = Rotation.random(rng=draws).apply((shape.vertices + dents) * [1, 1, flatness])
-    faces = draws.permutation(shape.faces)[draw_from(st.integers(0, 10)) :]
-    faces = np.where(draws.random((len(faces), 1)) < share_turned, faces[:, ::-1], faces)
-    camera = OrthographicCamera(draws.uniform(0, math.pi), draws.uniform(-4, 4), 2.2)
-    scene = Scene(Mesh.plain(vertices, faces, draws.uniform(0, 1, vertices.shape)), camera, 4, 2)
-    light = torch.from_numpy(draws.normal(size=((draw_from(st.integers(0, 8)) + 1) ** 2, 3)))
-    return Generated(scene, light, smooth, 2.0 ** draw_from(st.integers(-500, 500)))
-
-
-@settings(deadline=None, max_examples=60)
-@given(generated(), st.integers(0, 2**20))
-def test_derivatives_on_generated_meshes_are_central_differences(case, seed):
-    """Heights are a fifteenth of a mesh's size or more, so that the fifth derivatives are below 30⁵."""
-    inputs = [tensor.requires_grad_(True) for tensor in case.inputs()]
-    lit = case.lit(*inputs)
-    upstream = draw(*lit.shape, seed=seed)
-    gradients = torch.autograd.grad(lit, inputs, upstream)
-    steps = [draw(*tensor.shape, seed=seed + 1) for tensor in inputs]
-    expected = (slope(case.lit, inputs, steps) * upstream).sum().item()
-    found = sum((gradient * step).sum() for gradient, step in zip(gradients, steps, strict=True)).item()
-    size = sum((gradient * step).abs().sum() for gradient, step in zip(gradients, steps, strict=True)).item()
-    assert found == pytest.approx(expected, abs=1e-7 * (size + brightest(case.light)))
-
-
-@settings(deadline=None, max_examples=40)
-@given(generated(), st.integers(0, 2**20))
-def test_radiance_stays_when_mesh_and_light_turn_together_and_the_mesh_moves_and_grows(case, seed):
-    """Of the fragments, which are held fixed. The gradients turn along and shrink."""
-    vertices, light, albedo = case.inputs()
-    turn = torch.from_numpy(Rotation.random(rng=np.random.default_rng(seed)).as_matrix())
-    moved = case.scale * (vertices @ turn.T + draw(3, seed=seed))
-    results = []
-    for placed, shining in ((vertices, light), (moved, rotate(light, turn))):
-        placed.requires_grad_(True)
-        lit = case.lit(placed, shining, albedo)
-        results.append((lit, torch.autograd.grad(lit, placed, draw(*lit.shape, seed=seed))[0]))
-    (lit, gradient), (turned_lit, turned_gradient) = results
-    # Moved vertices round anew; heights are a fifteenth of a mesh's size or more, and the light's slope is its degree.
-    slack = 3e3 * EPS * (1 + math.sqrt(len(light))) * brightest(light)
-    torch.testing.assert_close(turned_lit, lit, rtol=0, atol=slack)
-    limit = 100 * slack * (1 + len(case.light)) * len(lit.T)
-    torch.testing.assert_close(turned_gradient * case.scale, gradient @ turn.T, rtol=0, atol=limit)
-
-
-@settings(deadline=None, max_examples=20)
-@given(generated())
-def test_radiance_is_linear_in_the_light_and_in_the_albedo(case):
-    vertices, light, albedo = case.inputs()
-    other = draw(*light.shape), draw(*albedo.shape).abs()
-    plain = case.lit(vertices, light, albedo)
-    slack = (
-        64 * EPS * (brightest(light) + brightest(other[0])) * float(albedo.max() + other[1].max() if len(albedo) else 1)
-    )
-    added = case.lit(vertices, light + 2 * other[0], albedo) - 2 * case.lit(vertices, other[0], albedo)
-    torch.testing.assert_close(added, plain, rtol=0, atol=slack)
-    added = case.lit(vertices, light, albedo + other[1]) - case.lit(vertices, light, other[1])
-    torch.testing.assert_close(added, plain, rtol=0, atol=slack)

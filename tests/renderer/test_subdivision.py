@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from renderer.albedo import surface_albedo
@@ -104,22 +102,6 @@ def test_shape_and_topology_are_kept(mesh):
     assert volumes[1] == pytest.approx(volumes[0], abs=16 * EPS * len(mesh.faces))
     assert finer.closed is mesh.closed
     assert euler_number(finer) == euler_number(mesh)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=12), st.integers(0, 2**32 - 1))
-def test_any_faces_keep_their_area_and_every_edge_its_number_of_faces(faces, seed):
-    """Also edges of more than two faces, faces with a corner twice, and faces that occur twice."""
-    vertices = np.random.default_rng(seed).uniform(-1, 1, (6, 3))
-    mesh = Mesh.plain(vertices, faces)
-    finer = once(mesh)
-    assert_allclose(finer.face_areas().reshape(-1, 4), mesh.face_areas()[:, None].repeat(4, 1) / 4, atol=8 * EPS)
-    edges = [each.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2) for each in (mesh, finer)]
-    around = [np.unique(np.sort(ends, axis=1), axis=0, return_counts=True) for ends in edges]
-    outer = (around[1][0] < len(vertices)).any(axis=1)  # the others lie within a face
-    distinct = around[0][0][:, 0] < around[0][0][:, 1]
-    expected = [around[0][1][distinct].repeat(2), 2 * around[0][1][~distinct]]  # an edge of no length has one half
-    assert_array_equal(np.sort(around[1][1][outer]), np.sort(np.concatenate(expected)))
 
 
 def test_colors_and_uvs_are_the_faces_linear_functions_at_the_new_corners():

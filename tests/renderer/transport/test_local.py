@@ -176,15 +176,6 @@ def test_a_screen_at_the_origin_shows_the_pattern_upright_and_as_bright():
     np.testing.assert_allclose(shown, pattern.numpy(), rtol=1e-12)
 
 
-def test_pixels_that_reach_nothing_are_left_out_and_have_a_gradient_of_zero():
-    wide = Projector(16, PROJECTOR.polar, PROJECTOR.azimuth, 3.0, 1.5)
-    built = operator(ball(), wide, samples=2)
-    reaching = built.kept
-    assert 0 < len(reaching) < wide.size / 2
-    gradient = built.light_gradient(torch.ones(3, len(built.pixels), dtype=torch.float64))
-    assert torch.equal(gradient.any(1).nonzero().squeeze(1), reaching) and (gradient >= 0).all()
-
-
 @pytest.mark.parametrize("basis", [PROJECTOR, LAMPS], ids=["projector", "lamps"])
 def test_nothing_emits_less_than_nothing_or_more_than_its_power(basis):
     light = torch.tensor([-1.0, 0.5, 99.0]).expand(1, basis.size, 3)

@@ -9,14 +9,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from renderer import reference
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
-from renderer.light.harmonics import basis, nonzero_coefficients, rotate
+from renderer.light.harmonics import basis, nonzero_coefficients
 from renderer.light.presets import ambient, load_light
 from renderer.mesh import Mesh, concatenate
 from renderer.rasterizer import choose
@@ -184,37 +183,6 @@ def test_a_white_mesh_in_a_white_furnace_brightens_with_each_bounce_until_it_can
         assert (share >= before - 1e-9).all() and share.max() <= 1 + 1e-9
         before = share
     torch.testing.assert_close(shares[-1], torch.ones_like(before), rtol=0, atol=1e-6)
-
-
-def test_samples_share_the_directions_of_their_pixel():
-    """A pixel of 8 × 8 samples has their mean, as if each of them had looked in all directions."""
-    shared, apart = operator_of(parts(), size=8, samples=8), operator_of(parts(), size=64, samples=1)
-    mean, light = torch.zeros(64, dtype=torch.float64), ambient(torch.ones(3, dtype=torch.float64))
-    mean.index_add_(0, apart.pixels // 512 * 8 + apart.pixels % 64 // 8, apart.radiance(light)[0] / 64)
-    difference = shared.radiance(light)[0] - mean[shared.pixels]
-    assert difference.square().mean().sqrt() < QUADRATURE * mean.max()
-
-
-def test_a_turned_mesh_in_a_turned_light_looks_the_same():
-    """But for what the directions, which do not turn along, misjudge."""
-    light, angle = load_light("grace").double(), 2.0
-    turn = Rotation.from_euler("z", angle).as_matrix()
-    still, turned = dented(2), replace(dented(2), vertices=dented(2).vertices @ turn.T)
-    here = operator_of(still, OrthographicCamera(1.0, 0.5, 2.2), size=12, samples=4)
-    there = operator_of(turned, OrthographicCamera(1.0, 0.5 + angle, 2.2), size=12, samples=4)
-    assert torch.equal(here.pixels, there.pixels)
-    seen = here.radiance(light)
-    difference = seen - there.radiance(rotate(light, torch.from_numpy(turn)))
-    assert difference.square().mean().sqrt() < math.sqrt(2) * QUADRATURE * seen.max()  # of two such errors
-
-
-def test_the_gradient_of_light_is_the_transposed_of_all_49_rows():
-    operator = operator_of(dented(), dtype=torch.float64, samples=2)
-    light = torch.randn(49, 3, dtype=torch.float64, requires_grad=True)
-    upstream = torch.randn(3, len(operator.pixels), dtype=torch.float64)
-    [gradient] = torch.autograd.grad(operator.radiance(light), light, upstream)
-    torch.testing.assert_close(gradient, torch.einsum("ckp,cp->kc", all_rows(operator), upstream))
-    assert (gradient != 0).all()
 
 
 def test_missing_embree_is_told_in_a_sentence(monkeypatch):
