@@ -77,7 +77,7 @@ class OperatorStack:
         """shown: (N,) int64, the operator of each image. The operators are of one dtype and basis, on the CPU."""
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
         slots, self._slots = _rank_among_equals(shown)
-        kept = torch.cat([operator.kept for operator in operators]).unique()
+        kept = torch.cat([operator.nonzero for operator in operators]).unique()
         padded = F.pad(kept, (0, len(kept) % 2))  # with any coefficient
         parts = (pixels, *_stack(operators, pixels, kept), shown, slots, padded)
         self._sparse, self._first = _joined(operators, pixels, device)
@@ -147,7 +147,7 @@ def _stack(operators: Sequence[TransferOperator], pixels: Tensor, kept: Tensor) 
     albedo = like.new_ones(len(operators), 3, len(pixels))
     coverage = like.new_zeros(len(operators), 1, len(pixels))
     for row, operator in enumerate(operators):
-        rows, columns = torch.searchsorted(kept, operator.kept)[:, None], torch.searchsorted(pixels, operator.pixels)
+        rows, columns = torch.searchsorted(kept, operator.nonzero)[:, None], torch.searchsorted(pixels, operator.pixels)
         if channels == 1:
             transfer[row][:, rows, columns], albedo[row][:, columns] = operator.transfer, operator.albedo
         else:

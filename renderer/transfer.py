@@ -1,4 +1,4 @@
-"""A scene as a linear operator on its light: (mesh, camera) → T, rasterized once and multiplied ever after.
+"""A scene as a linear operator on its light: (mesh, camera) → T, rasterized once and multiplied for every light.
 
 Before clamping, every pixel of a diffuse mesh is linear in the lighting coefficients U (the paper's appendix B.2):
 radiance = Uᵀ T. The box filter, the texture and the albedo fold into T exactly, and so do shadows
@@ -35,23 +35,23 @@ if TYPE_CHECKING:
 
 DEGREE = HARMONICS.degree
 COEFFICIENTS = HARMONICS.size
-TENSORS = ("transfer", "albedo", "coverage", "pixels", "kept")  # of an operator
+TENSORS = ("transfer", "albedo", "coverage", "pixels", "nonzero")  # of a TransferOperator
 BLOCK = 2**16  # pixels filtered at a time: bounds the memory
 
 
 @dataclass(frozen=True)
 class TransferOperator:
-    """What is kept of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
+    """The transfer matrix of one (mesh, view): linear radiance per unit light, weighted with coverage. Of one dtype.
 
-    transfer: three channels of K kept coefficients and P covered pixels; or one, a third of the size and the time,
+    transfer: three channels of K nonzero coefficients and P covered pixels; or one, a third of the size and the time,
     where no pixel mixes albedos (one sample per pixel, or a mesh of one color).
-    albedo: what the one channel is multiplied with; ones where there are three.
-    coverage: in (0, 1], the share of a pixel's samples that the mesh covers.
+    albedo: multiplies the one channel; ones where there are three.
+    coverage: in (0, 1], the fraction of a pixel's samples that the mesh covers.
     pixels: row-major indices of the covered pixels; row 0 is the top of the image.
-    kept: ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
-    under an open sky (`Basis.nonzero`), and all in a view with shadows.
-    settings: of the image that they are pixels of. basis: of the lights.
-    sparse: of three channels, added to the others: what a pattern's pixels reach; None where that is not little.
+    nonzero: ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
+    under an open sky (`EnvironmentBasis.nonzero`), and all in a view with shadows.
+    settings: of the image. basis: of the lights.
+    sparse: of three channels, added to the dense transfer: that of patterns, most of whose entries are zero; or None.
 
     >>> pear = renderer.normalize(renderer.solid("pear"))
     >>> [operator] = renderer.precompute_transfer(pear, renderer.orbit_cameras(1, width=2.2), 16, rasterizer="numpy")
@@ -67,7 +67,7 @@ class TransferOperator:
     albedo: Float[Tensor, "3 P"]
     coverage: Float[Tensor, " P"]
     pixels: Int[Tensor, " P"]
-    kept: Int[Tensor, " K"]
+    nonzero: Int[Tensor, " K"]
     settings: ImageSettings
     basis: Basis = HARMONICS
     sparse: SparseTransfer | None = None
@@ -77,7 +77,7 @@ class TransferOperator:
     ) -> Float[Tensor, "*lights 3 size size"]:
         """Images in [0, 1], differentiable in the lights.
 
-        background: see `renderer.image.as_background`. InputError: as `radiance`, and for a background that is none.
+        background: see `renderer.image.as_background`. InputError: as `radiance`, or a background of another shape.
         """
         behind = as_background(background, self.settings.size, lights)
         coverage = self.coverage.to(lights)
@@ -116,7 +116,7 @@ class TransferOperator:
             product = linear(upstream * self.albedo, self._shared)
         else:
             product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
-        gradient = self._places @ product.mT
+        gradient = self._scatter @ product.mT
         if self.sparse is not None:
             upstream = upstream.flatten(0, -3) if upstream.dim() > 2 else upstream[None]
             entries, image = _repeated(self.sparse, len(upstream))
@@ -129,7 +129,7 @@ class TransferOperator:
         sparse = self.sparse and self.sparse.to(device)
         return replace(self, **{name: getattr(self, name).to(device) for name in TENSORS}, sparse=sparse)
 
-    # Kept, since at 32² even an index or a look at a dtype counts.
+    # Cached, since at 32² even an index or a comparison of dtypes counts.
 
     @cached_property
     def _shared(self) -> Tensor | None:
@@ -137,9 +137,9 @@ class TransferOperator:
         return self.transfer[0] if len(self.transfer) == 1 else None
 
     @cached_property
-    def _places(self) -> Tensor:
-        """(size, K): puts the kept coefficients in their places, with exact zeros in the others."""
-        return torch.eye(self.basis.size).to(self.transfer)[:, self.kept]
+    def _scatter(self) -> Tensor:
+        """(size, K): scatters the nonzero coefficients among all, with exact zeros elsewhere."""
+        return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
 
 
 class _Radiance(torch.autograd.Function):
@@ -155,20 +155,20 @@ class _Radiance(torch.autograd.Function):
 
 
 def _radiance(operator: TransferOperator, lights: Tensor) -> Tensor:
-    kept = lights.index_select(-2, operator.kept).to(operator.transfer.dtype)
+    nonzero = lights.index_select(-2, operator.nonzero).to(operator.transfer.dtype)
     if operator._shared is not None:
-        product = (kept.mT @ operator._shared).mul_(operator.albedo)
+        product = (nonzero.mT @ operator._shared).mul_(operator.albedo)
     else:
-        product = torch.einsum("...kc,ckp->...cp", kept, operator.transfer)
+        product = torch.einsum("...kc,ckp->...cp", nonzero, operator.transfer)
     if operator.sparse is not None:
-        each = lights.to(product.dtype).reshape(-1, *lights.shape[-2:])
-        entries, image = _repeated(operator.sparse, len(each))
-        product = product + entries.radiance(each, image, product.shape[-1]).reshape(product.shape)
+        batch = lights.to(product.dtype).reshape(-1, *lights.shape[-2:])
+        entries, image = _repeated(operator.sparse, len(batch))
+        product = product + entries.radiance(batch, image, product.shape[-1]).reshape(product.shape)
     return product.to(lights.dtype)
 
 
 def _repeated(entries: SparseTransfer, images: int) -> tuple[SparseTransfer, Tensor]:
-    """(the entries for each of several images, (N,) which one each is of)."""
+    """(the entries repeated for each image, (N,) the image of each)."""
     every = torch.arange(len(entries.function), device=entries.function.device)
     image = torch.arange(images, device=every.device).repeat_interleave(len(every))
     return entries if images == 1 else entries.taken(every.repeat(images)), image
@@ -203,22 +203,17 @@ def build_operators(
 
 
 class OperatorBuilder:
-    """Operators of one mesh in lights of one basis; see `build_operators`. What the views share is made once."""
+    """Builds the operators of one mesh for one basis; see `build_operators`. Views share rays and radiosity."""
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis, dtype: torch.dtype):
         require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
-        self._mesh, self._settings, self._albedo_scale, self._basis, self._dtype = (
-            mesh,
-            settings,
-            albedo_scale,
-            basis,
-            dtype,
-        )
+        self._mesh, self._settings, self._albedo_scale = mesh, settings, albedo_scale
+        self._basis, self._dtype = basis, dtype
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
         self._rays = self._transport.rays if self._transport else Rays(mesh)
 
     def operator(self, fragments: Fragments) -> TransferOperator:
-        """Of one view that has been rasterized."""
+        """The operator of one rasterized view."""
         albedo = surface_albedo(self._mesh, fragments, self._settings.encoding) * self._albedo_scale
         colors = self._transport and self._transport.colors
         factor = None if colors else _pixel_albedo(fragments, albedo, self._dtype)
@@ -227,7 +222,8 @@ class OperatorBuilder:
         else:
             albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
         surface, pixels = Surface.of(self._mesh, fragments, self._settings), len(fragments.pixels)
-        transfers, kept, sparse = [torch.empty(albedo.shape[1], 0, pixels, dtype=self._dtype)], [torch.arange(0)], None
+        transfers, nonzero = [torch.empty(albedo.shape[1], 0, pixels, dtype=self._dtype)], [torch.arange(0)]
+        sparse = None
         for where, part in parts_of(self._basis):
             if isinstance(part, LocalBasis):
                 entries = local_transfer(self._rays, surface, albedo, part)
@@ -237,21 +233,21 @@ class OperatorBuilder:
                     continue
                 transfer, reaching = entries.dense(pixels)
             else:
-                transfer, reaching = self._distant_transfer(surface, albedo, part)
+                transfer, reaching = self._environment_transfer(surface, albedo, part)
             transfers.append(transfer.to(self._dtype))
-            kept.append(where.start + reaching)
+            nonzero.append(where.start + reaching)
         return TransferOperator(
             transfer=torch.cat(transfers, dim=1),
             albedo=factor.T.to(self._dtype).contiguous(),
             coverage=fragments.coverage.to(self._dtype),
             pixels=fragments.pixels,
-            kept=torch.cat(kept),
+            nonzero=torch.cat(nonzero),
             settings=self._settings,
             basis=self._basis,
             sparse=sparse,
         )
 
-    def _distant_transfer(self, surface: Surface, albedo: Tensor, basis: EnvironmentBasis) -> tuple[Tensor, Tensor]:
+    def _environment_transfer(self, surface: Surface, albedo: Tensor, basis: EnvironmentBasis) -> tuple[Tensor, Tensor]:
         """((C, K, P), the K coefficients that reach a pixel (K,)); albedo: (S, C), at the samples."""
         transfer = _box_filter(surface, albedo, basis, self._dtype)
         change = self._transport.change(surface, albedo) if self._transport else None

@@ -133,7 +133,7 @@ class OfLight(Parameter):
         self, scene: Scene, settings: StepSettings, where: slice, basis: EnvironmentBasis | LocalBasis, physical: bool
     ):
         """where: the coefficients of the basis among the scene's."""
-        self.basis, self.physical, self._where = basis, physical or not basis.signed, where
+        self.basis, self.physical, self._where = basis, physical or not basis.allow_negative, where
         start = scene.lights[:, where]
         super().__init__(scene, (basis.project_nonnegative(start) if self.physical else start).flatten(1), settings)
 

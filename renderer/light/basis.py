@@ -1,4 +1,4 @@
-"""What lights are made of. An image is linear in any light of fixed place, so that each of these has operators."""
+"""Bases of light. An image is linear in the coefficients of a light of fixed position, so each basis has operators."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ from renderer.light.harmonics import MAX_DEGREE, basis, irradiance_basis, nonzer
 class LightBasis(ABC):
     """`size` functions of light; a light is a coefficient (size, 3) of each, RGB. Equal ones have equal fields.
 
-    name: in files and messages. signed: whether coefficients that nothing can emit are of use, too.
+    name: in files and messages. allow_negative: whether negative light may be asked for.
     """
 
     name: ClassVar[str]
-    signed: ClassVar[bool] = False
+    allow_negative: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -29,19 +29,19 @@ class LightBasis(ABC):
 
     @abstractmethod
     def project_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        """The light (..., size, 3) nearest to the coefficients that something can emit.
+        """The nearest coefficients (..., size, 3) of light that can be emitted.
 
-        within: for coefficients (A, size, 3), a ball that it is to lie in; its centers are such lights.
+        within: for coefficients (A, size, 3), a ball in which the result lies; its centers can be emitted.
         """
 
 
 class EnvironmentBasis(LightBasis):
-    """Light from so far away that all of a scene is in the same."""
+    """Light from infinitely far away, the same at each point of a scene."""
 
     @property
     @abstractmethod
     def nonzero(self) -> Tensor:
-        """(K,) ascending indices of those that reach a diffuse surface under an open sky."""
+        """(K,) ascending indices of the functions that reach a diffuse surface under an open sky."""
 
     @abstractmethod
     def irradiance(self, normals: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ class EnvironmentBasis(LightBasis):
 
     @abstractmethod
     def radiance(self, directions: Tensor) -> Tensor:
-        """(N, size) that comes from unit directions (N, 3), per unit of each coefficient."""
+        """(N, size) from unit directions (N, 3), per unit of each coefficient."""
 
 
 class LightPaths(NamedTuple):
@@ -64,10 +64,7 @@ class LightPaths(NamedTuple):
 
 
 class LocalBasis(LightBasis):
-    """Light from places, which throws shadows. Outside of it there is none, so that no coefficient is negative.
-
-    power: the largest coefficient.
-    """
+    """Light from sources within the scene, which casts shadows. Coefficients are in [0, power]."""
 
     power: float
 
@@ -93,29 +90,30 @@ class SumBasis:
         return "+".join(part.name for part in self.parts)
 
     @property
-    def signed(self) -> bool:
-        return any(part.signed for part in self.parts)
+    def allow_negative(self) -> bool:
+        return any(part.allow_negative for part in self.parts)
 
     @property
     def size(self) -> int:
         return sum(part.size for part in self.parts)
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
-        """That of each."""
-        own = coefficients.split([part.size for part in self.parts], dim=-2)
-        return torch.cat([part.project_nonnegative(each) for part, each in zip(self.parts, own, strict=True)], dim=-2)
+        """The projection of each part."""
+        split = coefficients.split([part.size for part in self.parts], dim=-2)
+        parts = zip(self.parts, split, strict=True)
+        return torch.cat([part.project_nonnegative(values) for part, values in parts], dim=-2)
 
 
 Basis = EnvironmentBasis | LocalBasis | SumBasis
 
 
 def parts_of(basis: Basis) -> list[tuple[slice, EnvironmentBasis | LocalBasis]]:
-    """(the coefficients of, each) basis that is no sum, in order."""
-    found, first = [], 0
+    """(rows of coefficients, basis) of each part of a sum, or of the basis itself."""
+    parts, first = [], 0
     for part in basis.parts if isinstance(basis, SumBasis) else (basis,):
-        found.append((slice(first, first + part.size), part))
+        parts.append((slice(first, first + part.size), part))
         first += part.size
-    return found
+    return parts
 
 
 @dataclass(frozen=True)
@@ -126,7 +124,7 @@ class Harmonics(EnvironmentBasis):
     degree: int = 6
 
     name = "harmonics"
-    signed = True
+    allow_negative = True
 
     def __post_init__(self) -> None:
         require_range("the degree of harmonics", self.degree, 0, MAX_DEGREE)
@@ -157,9 +155,9 @@ class Harmonics(EnvironmentBasis):
 HARMONICS = Harmonics()
 
 
-def with_local_lights(sky: Tensor, placed: Sequence[tuple[LocalBasis, Tensor]]) -> tuple[Basis, Tensor]:
+def with_local_lights(sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]) -> tuple[Basis, Tensor]:
     """(basis, coefficients (size, 3)) of the sky in harmonics and of lights in the scene, each with its own."""
-    if not placed:
+    if not lights:
         return HARMONICS, sky
-    coefficients = [own.to(sky) for _, own in placed]
-    return SumBasis((HARMONICS, *(basis for basis, _ in placed))), torch.cat([sky, *coefficients])
+    coefficients = [values.to(sky) for _, values in lights]
+    return SumBasis((HARMONICS, *(basis for basis, _ in lights))), torch.cat([sky, *coefficients])

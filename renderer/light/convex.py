@@ -1,4 +1,4 @@
-"""Convex sets that values are to lie in, and the nearest points of what two of them share."""
+"""Projections onto a ball, a box and their intersection."""
 
 from __future__ import annotations
 
@@ -46,31 +46,31 @@ def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) 
 
     With a multiplier λ for the ball, what is nearest to values v is the box's nearest to c + (v - c) / (1 + λ), and
     the farther on the way, the farther from the center. How far is found by secants of the squared distance over the
-    squared share of the way, which is straight between the corners that the box cuts off.
+    squared fraction of the way, which is straight between the corners that the box cuts off.
     """
     offset, squared = values - ball.center, ball.radius**2
 
-    def at(share: Tensor) -> tuple[Tensor, Tensor]:
-        nearest = torch.where(share < 1, ball.center + share.sqrt() * offset, values).clamp(low, high)
+    def at(fraction: Tensor) -> tuple[Tensor, Tensor]:
+        nearest = torch.where(fraction < 1, ball.center + fraction.sqrt() * offset, values).clamp(low, high)
         return nearest, _square(nearest - ball.center)
 
-    share = (squared / _square(offset)).clamp(max=1)  # a box's nearest points are no farther
-    nearest, distance = at(share)
-    other, its_distance = torch.zeros_like(share), torch.zeros_like(distance)
+    fraction = (squared / _square(offset)).clamp(max=1)  # a box's nearest points are no farther
+    nearest, distance = at(fraction)
+    other, other_distance = torch.zeros_like(fraction), torch.zeros_like(distance)
     rounding = 8 * torch.finfo(values.dtype).eps * squared
     for _ in range(_SECANTS):
         left = squared - distance
-        going = (share < 1) & (share != other) & (left > rounding)
+        going = (fraction < 1) & (fraction != other) & (left > rounding)
         if not going.any():
             break
-        slope = ((distance - its_distance) / (share - other)).clamp(min=torch.finfo(values.dtype).tiny)
-        tried = torch.where(going, share + left / slope, share).clamp(max=1)
-        found, found_distance = at(tried)
-        inside = found_distance <= squared + rounding
-        other = torch.where(inside, share, tried)
-        its_distance = torch.where(inside, distance, found_distance)
-        share, distance = torch.where(inside, tried, share), torch.where(inside, found_distance, distance)
-        nearest = torch.where(inside, found, nearest)
+        slope = ((distance - other_distance) / (fraction - other)).clamp(min=torch.finfo(values.dtype).tiny)
+        trial = torch.where(going, fraction + left / slope, fraction).clamp(max=1)
+        candidate, trial_distance = at(trial)
+        inside = trial_distance <= squared + rounding
+        other = torch.where(inside, fraction, trial)
+        other_distance = torch.where(inside, distance, trial_distance)
+        fraction, distance = torch.where(inside, trial, fraction), torch.where(inside, trial_distance, distance)
+        nearest = torch.where(inside, candidate, nearest)
     return nearest
 
 

@@ -16,8 +16,8 @@ from renderer.mesh import Mesh
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 
-SPARSE = 1 / 16  # of all entries, below which those that are not zero are multiplied one by one in less time,
-SMALL = 2**16  # unless they are no more than this
+SPARSE = 1 / 16  # fraction of nonzero entries below which multiplying them one by one takes less time,
+SMALL = 2**16  # unless the dense matrix has no more entries than this
 
 
 class SparseTransfer(NamedTuple):
@@ -30,28 +30,29 @@ class SparseTransfer(NamedTuple):
 
     def dense(self, pixels: int) -> tuple[Tensor, Tensor]:
         """((C, K, P), the K functions that reach a pixel (K,))."""
-        kept, row = self.function.unique(return_inverse=True)
-        whole = self.weight.new_zeros(self.weight.shape[1], len(kept) * pixels)
-        return whole.index_copy_(1, row * pixels + self.pixel, self.weight.T).unflatten(1, (len(kept), pixels)), kept
+        functions, row = self.function.unique(return_inverse=True)
+        whole = self.weight.new_zeros(self.weight.shape[1], len(functions) * pixels)
+        dense = whole.index_copy_(1, row * pixels + self.pixel, self.weight.T).unflatten(1, (len(functions), pixels))
+        return dense, functions
 
     def few(self, pixels: int) -> bool:
-        """Whether it takes less time to multiply them than all of `dense`."""
+        """Whether multiplying the entries takes less time than multiplying `dense`."""
         whole = len(self.function.unique()) * pixels
         return whole > SMALL and len(self.function) < SPARSE * whole
 
     def taken(self, entries: Tensor) -> SparseTransfer:
         """Some of the entries (M,), or the same more than once."""
-        return SparseTransfer(*(each[entries] for each in self))
+        return SparseTransfer(*(field[entries] for field in self))
 
     def to(self, device: torch.device | str) -> SparseTransfer:
-        return SparseTransfer(*(each.to(device) for each in self))
+        return SparseTransfer(*(field.to(device) for field in self))
 
     def radiance(self, lights: Tensor, image: Tensor, pixels: int) -> Tensor:
         """(B, 3, P) of B images in a light each, (B, size, 3): entries, of three channels, are of image (N,).
         Differentiable in the lights."""
         arriving = lights.flatten(0, 1).index_select(0, image * lights.shape[1] + self.function) * self.weight
-        seen = arriving.new_zeros(len(lights) * pixels, 3).index_add(0, image * pixels + self.pixel, arriving)
-        return seen.unflatten(0, (len(lights), pixels)).mT
+        summed = arriving.new_zeros(len(lights) * pixels, 3).index_add(0, image * pixels + self.pixel, arriving)
+        return summed.unflatten(0, (len(lights), pixels)).mT
 
     def light_gradient(self, upstream: Tensor, image: Tensor, size: int) -> Tensor:
         """(B, size, 3) of `radiance`, from a gradient by it (B, 3, P)."""
@@ -96,8 +97,8 @@ def unoccluded(rays: Rays, surface: Surface, paths: LightPaths) -> LightPaths:
         origins = surface.points[paths.point] + rays.offset * planes
         directions, lengths = unit_vectors((paths.source - origins).T)
         above = (directions.T * planes).sum(1) > 0
-        free = above & (rays.meet(origins, directions.T, lengths) < 0)
-    return LightPaths(*(each[free] for each in paths))
+        free = above & (rays.first_hit(origins, directions.T, lengths) < 0)
+    return LightPaths(*(field[free] for field in paths))
 
 
 class LocalLightView:

@@ -26,7 +26,7 @@ from renderer.fragments import Fragments
 from renderer.light.basis import EnvironmentBasis
 from renderer.mesh import Mesh
 from renderer.subdivision import refine
-from renderer.transport.rays import Looks, Rays, sphere
+from renderer.transport.rays import RayHits, Rays, sphere
 from renderer.transport.surface import Surface
 
 DIRECTIONS = 2**9  # over the whole sphere, in which a patch looks
@@ -36,14 +36,14 @@ MIDDLE = [[-1.0, -1.0], [1.0, -1.0], [0.0, 2.0]]  # a triangle around the only s
 
 @dataclass(frozen=True)
 class Patches:
-    """N patches of a mesh's F pieces. view: a pixel for each patch, with the middles of its pieces as samples (S,).
+    """N patches of a mesh's F pieces. view: a pixel for each patch, with the centers of its pieces as samples (S,).
 
-    shares: (S, 1), of a piece's area in its patch. of_side: (2, F), the patches of each piece's front and back.
+    fractions: (S, 1), of a piece in the area of its patch. of_side: (2, F), the patches of each piece's front and back.
     """
 
     pieces: Mesh
     view: Fragments
-    shares: Tensor
+    fractions: Tensor
     of_side: Tensor
 
     @staticmethod
@@ -72,22 +72,22 @@ class Patches:
             face=torch.arange(len(piece)),
             sample=torch.zeros_like(piece),
         )
-        shares = areas / totals.clamp(min=torch.finfo(areas.dtype).tiny)[pixel]
+        fractions = areas / totals.clamp(min=torch.finfo(areas.dtype).tiny)[pixel]
         of_side = torch.from_numpy(patch).view(len(sides), -1).expand(2, -1)
-        return Patches(pieces, view, shares[:, None], of_side)
+        return Patches(pieces, view, fractions[:, None], of_side)
 
     def mean(self, values: Tensor) -> Tensor:
         """(N, D) of values (S, D) at the samples."""
         summed = values.new_zeros(len(self.view.pixels), values.shape[1])
-        return summed.index_add_(0, self.view.pixel, values * self.shares)
+        return summed.index_add_(0, self.view.pixel, values * self.fractions)
 
-    def seen(self, looks: Looks, weights: Tensor) -> csr_matrix:
-        """(B, N) the weights (B, D) of directions, by the patch that is met there."""
+    def weights_by_patch(self, hits: RayHits, weights: Tensor) -> csr_matrix:
+        """(B, N) sums of the weights (B, D) of directions over the patch that is hit there."""
         pixel, direction = torch.nonzero(weights, as_tuple=True)
-        met = looks.met[pixel, direction]
-        behind = (self._normals[met] * looks.directions[direction]).sum(1) > 0
-        places = pixel.numpy(), self.of_side[behind.long(), met].numpy()
-        return csr_matrix((weights[pixel, direction].numpy(), places), (len(weights), len(self.view.pixels)))
+        face = hits.face[pixel, direction]
+        behind = (self._normals[face] * hits.directions[direction]).sum(1) > 0
+        entries = pixel.numpy(), self.of_side[behind.long(), face].numpy()
+        return csr_matrix((weights[pixel, direction].numpy(), entries), (len(weights), len(self.view.pixels)))
 
     @cached_property
     def _normals(self) -> Tensor:
@@ -95,7 +95,7 @@ class Patches:
 
 
 class Radiosity:
-    """What the patches of a mesh send per unit of each coefficient of a basis, after one bounce or several.
+    """The radiance B that the patches of a mesh send per unit of each coefficient of a basis.
 
     colors: whether any patch is not gray.
     """
@@ -114,25 +114,24 @@ class Radiosity:
             arriving = torch.from_numpy(links @ self._sent.flatten(1).numpy()).view(-1, *self._sent.shape[1:])
             self._sent = from_sky.expand_as(self._sent).index_add(0, receiving, arriving) * reflected
 
-    def gather(self, looks: Looks, weights: Tensor, channel: int) -> Tensor:
-        """(B, size) radiance of what pixels meet, summed over directions with weights (B, D)."""
+    def gather(self, hits: RayHits, weights: Tensor, channel: int) -> Tensor:
+        """(B, size) radiance that pixels receive from patches, summed over directions with weights (B, D)."""
         sent = self._sent[..., channel if self.colors else 0].numpy()
-        return torch.from_numpy(self.patches.seen(looks, weights) @ sent)
+        return torch.from_numpy(self.patches.weights_by_patch(hits, weights) @ sent)
 
 
 def _first_bounce(patches: Patches, rays: Rays, basis: EnvironmentBasis) -> tuple[Tensor, Tensor, csr_matrix]:
-    """(N, size, 1) irradiance of the patches from the sky alone; those (M,) that see others, and how much of the
-    radiance of each (M, N) is their irradiance."""
+    """S (N, size, 1), the irradiance of the patches from the sky; the M patches that see others; their F (M, N)."""
     surface = Surface(patches.view, torch.from_numpy(patches.pieces.vertices))
     from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
     from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
     directions = sphere(DIRECTIONS)
     receiving, links, radiance = [], [], basis.radiance(directions)
-    for looks in rays.looks(surface, directions):
-        weights = looks.blocked() * patches.shares[looks.sample, 0]
-        from_sky[looks.pixels] -= weights @ radiance
-        receiving.append(looks.pixels)
-        links.append(patches.seen(looks, weights))
+    for hits in rays.hits(surface, directions):
+        weights = hits.blocked() * patches.fractions[hits.sample, 0]
+        from_sky[hits.pixels] -= weights @ radiance
+        receiving.append(hits.pixels)
+        links.append(patches.weights_by_patch(hits, weights))
     if not links:
         return from_sky[..., None], torch.arange(0), csr_matrix((0, len(from_sky)))
     return from_sky[..., None], torch.cat(receiving), vstack(links, format="csr")

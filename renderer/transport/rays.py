@@ -1,8 +1,8 @@
 """Rays from a view's samples among the faces of a mesh, cast by Embree (Wald et al. 2014).
 
-All pixels look in the same directions, which are dealt out among the samples of each: so an edge of shadow, of albedo
-or of the mesh is averaged as any other, and a pixel costs as many rays however many samples it has. Pixels from which
-no other surface is to be seen, all of a convex mesh, cast none.
+All pixels use the same directions and divide them among their samples: so edges of shadow, of albedo and of the mesh
+are averaged alike, and the cost of a pixel does not depend on its number of samples. Pixels that can see no other
+surface, such as all of a convex mesh, cast no rays.
 """
 
 import math
@@ -27,42 +27,42 @@ BLOCK = 2**17  # directions of pixels at a time: bounds the memory
 
 
 @dataclass(frozen=True)
-class Looks:
-    """What B pixels (B,), numbered among a view's, see of their own mesh in D directions, (B, D) each.
+class RayHits:
+    """The faces of the mesh that B of a view's pixels see in D directions; sample, weight, face: (B, D).
 
-    directions: (D, 3). sample: the one that looks, of the view's. weight: of the radiance from there in the pixel's
-    irradiance: solid angle × cosine × the number of the pixel's samples. met: the face that the ray meets, -1 where
-    there is none.
+    pixels: (B,), indices among the view's. directions: (D, 3). sample: from which the ray starts. weight: of the
+    radiance from there in the pixel's irradiance, solid angle × cosine × the number of the pixel's samples. face: the
+    first that the ray hits, -1 for none.
     """
 
     pixels: Tensor
     directions: Tensor
     sample: Tensor
     weight: Tensor
-    met: Tensor
+    face: Tensor
 
     def blocked(self) -> Tensor:
-        """The weight where anything is met, else zero."""
-        return self.weight.masked_fill(self.met < 0, 0)
+        """The weight of the rays that hit a face, zero for the others."""
+        return self.weight.masked_fill(self.face < 0, 0)
 
 
 class Rays:
-    """Rays among the faces of one mesh. InputError, when a ray is cast, where Embree is not installed.
+    """Rays among the faces of one mesh. InputError, when the first ray is cast, where Embree is not installed.
 
-    offset: of where a ray starts above its surface.
+    offset: how far above its surface a ray starts.
     """
 
     def __init__(self, mesh: Mesh):
         self.offset = OFFSET * float(np.abs(mesh.vertices).max())
         self._mesh = mesh
 
-    def looks(self, surface: Surface, directions: Tensor) -> Iterator[Looks]:
-        """Those of a view's pixels that see any other surface, some at a time, in directions (D, 3) of a `sphere`.
+    def hits(self, surface: Surface, directions: Tensor) -> Iterator[RayHits]:
+        """Blocks of a view's pixels that may see another surface, in directions (D, 3) of a `sphere`.
 
-        No ray is cast into a sample's own face, on which smooth normals shade the light nevertheless.
+        No ray is cast below the plane of a sample's face, from where smooth normals may still be lit.
         """
         fragments = surface.fragments
-        pixels = self._overlooked(surface)
+        pixels = self._pixels_to_cast(surface)
         if not len(pixels):
             return
         planes, normals = surface.planes, surface.normals
@@ -75,9 +75,11 @@ class Rays:
             cosine = torch.einsum("bdi,di->bd", normals[sample], directions).clamp(min=0)
             above = torch.einsum("bdi,di->bd", planes[sample], directions)
             cast = torch.nonzero((cosine > 0) & (above > 0), as_tuple=True)
-            met = self.meet(surface.points[sample[cast]] + self.offset * planes[sample[cast]], directions[cast[1]])
-            met = torch.full_like(sample, -1).index_put_(cast, met)
-            yield Looks(some, directions, sample, cosine * of_pixel * solid_angle, met)
+            face = self.first_hit(
+                surface.points[sample[cast]] + self.offset * planes[sample[cast]], directions[cast[1]]
+            )
+            face = torch.full_like(sample, -1).index_put_(cast, face)
+            yield RayHits(some, directions, sample, cosine * of_pixel * solid_angle, face)
 
     @cached_property
     def _scene(self) -> Any:
@@ -87,24 +89,23 @@ class Rays:
     def _outermost(self) -> Tensor:
         return torch.from_numpy(_outermost(self._mesh.vertices[np.unique(self._mesh.faces)])).double()
 
-    def _overlooked(self, surface: Surface) -> Tensor:
-        """The pixels with a sample on a face above whose plane the mesh rises; all of them, where to find out would
-        take longer than to cast the rays."""
+    def _pixels_to_cast(self, surface: Surface) -> Tensor:
+        """The pixels with a sample on a face above whose plane other vertices lie; all pixels, where that test would
+        take longer than the rays."""
         fragments, planes = surface.fragments, surface.face_planes
         if len(planes) * len(self._outermost) > COMPARISONS:
             return torch.arange(len(fragments.pixels))
         parts = planes.split(max(1, 8 * BLOCK // len(self._outermost)))
-        reach = torch.cat([(part @ self._outermost.T).amax(1) for part in parts])
+        highest = torch.cat([(part @ self._outermost.T).amax(1) for part in parts])
         corners = surface.vertices[fragments.corners[:, 0]]
-        rises = reach - (planes * corners).sum(1) > self.offset
+        rises = highest - (planes * corners).sum(1) > self.offset
         return fragments.pixel[rises[fragments.face]].unique()
 
-    def meet(self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """(N,) the face that each ray of (N, 3) meets first, -1 where there is none. lengths: (N,) of the rays."""
+    def first_hit(self, origins: Tensor, directions: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """(N,) the first face that each ray (N, 3) hits, -1 for none. lengths: (N,) of the rays."""
         rays = [origins, directions] if lengths is None else [origins, directions, lengths]
-        return torch.from_numpy(
-            self._scene.run(*(np.ascontiguousarray(each.numpy(), np.float32) for each in rays))
-        ).long()
+        faces = self._scene.run(*(np.ascontiguousarray(array.numpy(), np.float32) for array in rays))
+        return torch.from_numpy(faces).long()
 
 
 @per_degree
@@ -118,12 +119,12 @@ def sphere(count: int) -> Tensor:
 
 @per_degree
 def _shuffled(count: int) -> Tensor:
-    """0 to count - 1 in an order that has nothing to do with that of `sphere`, for all to be everywhere in a pixel."""
+    """A fixed permutation of 0 to count - 1, so that each sample gets directions from all over the sphere."""
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))
 
 
 def _outermost(vertices: np.ndarray) -> np.ndarray:
-    """Vertices (N, 3) in whose convex hull all of them are: those of the hull itself, unless they lie in a plane."""
+    """Vertices (N, 3) with the same convex hull: those on the hull, or all where they lie in a plane."""
     from scipy.spatial import ConvexHull, QhullError  # takes long to import
 
     try:

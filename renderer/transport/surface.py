@@ -1,4 +1,4 @@
-"""The surface that a view shows."""
+"""The visible surface at the samples of a view."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,7 @@ from renderer.shading import smooth_normals
 
 @dataclass(frozen=True)
 class Surface:
-    """What the S samples of a view lie on, in float64; found when asked for, and differentiable in the vertices (V, 3).
+    """Points and normals at the S samples of a view, in float64, as they are needed; differentiable in vertices (V, 3).
 
     smooth_faces: (F, 3), all faces of the mesh, to shade with interpolated vertex normals.
     """
@@ -38,7 +38,7 @@ class Surface:
 
     @cached_property
     def face_planes(self) -> Tensor:
-        """(G, 3) the same of each face in sight."""
+        """(G, 3) the same of each visible face."""
         return face_normals(self.vertices, self.fragments.corners) * self.fragments.facing
 
     @cached_property

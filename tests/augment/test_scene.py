@@ -49,7 +49,7 @@ def random_operator(seed: int, count: int) -> TransferOperator:
         albedo=torch.ones(3, count),
         coverage=coverage,
         pixels=torch.randperm(SIZE**2, generator=draws)[:count].sort().values,
-        kept=NONZERO,
+        nonzero=NONZERO,
         settings=ImageSettings(size=SIZE),
     )
 
@@ -449,7 +449,7 @@ def test_a_scene_of_shadowed_and_open_meshes_shows_each_as_its_operator_does():
     expected, kept = [], set()
     for item in items:
         for operator in build_operators(load_object(item).mesh, cameras, settings, RASTERIZER):
-            kept.add(len(operator.kept))
+            kept.add(len(operator.nonzero))
             for gray in GRAYS:
                 expected.append(operator.image(lights[len(expected)], gray))
     assert kept == {49, 31}

@@ -419,7 +419,7 @@ def wide_patches(mesh: Mesh) -> tuple[wide.Patches, np.ndarray]:
     made, directions = radiosity.Patches.of(mesh), rays.sphere(radiosity.DIRECTIONS)
     view, pieces, caster = made.view, made.pieces, rays.Rays(made.pieces)
     surface = Surface(view, torch.from_numpy(pieces.vertices))
-    looks = list(caster.looks(surface, directions))
+    looks = list(caster.hits(surface, directions))
     patches = wide.Patches(
         corners=extended(pieces.vertices[pieces.faces]),
         albedo=extended(pieces.corner_colors[:, 0]),

@@ -178,9 +178,6 @@ def test_saved_coefficients_come_back_to_the_bit_and_unscaled(tmp_path):
     torch.testing.assert_close(load_light(str(tmp_path / "rows.json")), light, rtol=0, atol=0)
 
 
-ROWS = [[1, 0.5, -2]] * 49
-
-
 def test_ambient_light_gives_every_normal_pi_times_its_color():
     color = torch.tensor([0.2, 0.5, 1.5], dtype=torch.float64)
     lit = irradiance(ambient(color), random_directions(50))

@@ -39,7 +39,7 @@ def operator_of(mesh: Mesh, camera=ABOVE, dtype=torch.float64, **settings) -> Tr
 def all_rows(operator: TransferOperator) -> torch.Tensor:
     """(C, 49, P) float64."""
     transfer = (operator.transfer * operator.albedo[:, None]).double()
-    return transfer.new_zeros(3, 49, transfer.shape[2]).index_copy(1, operator.kept, transfer)
+    return transfer.new_zeros(3, 49, transfer.shape[2]).index_copy(1, operator.nonzero, transfer)
 
 
 def sky_share(operator: TransferOperator) -> torch.Tensor:
@@ -89,13 +89,13 @@ def test_a_convex_mesh_keeps_the_operator_of_direct_light_to_the_bit(mesh, norma
     for bounces in (0, 2):
         shaped = operator_of(mesh, camera, bounces=bounces, normals=normals)
         assert torch.equal(shaped.transfer, direct.transfer)
-        assert torch.equal(shaped.kept, nonzero_coefficients(6))
+        assert torch.equal(shaped.nonzero, nonzero_coefficients(6))
 
 
 def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monkeypatch):
     monkeypatch.setattr(rays, "COMPARISONS", 0)
-    assert torch.equal(operator_of(CONVEX["a ball"]).kept, nonzero_coefficients(6))
-    assert len(operator_of(dented()).kept) == 49
+    assert torch.equal(operator_of(CONVEX["a ball"]).nonzero, nonzero_coefficients(6))
+    assert len(operator_of(dented()).nonzero) == 49
 
 
 @pytest.mark.parametrize("bounces", [0, 1])
