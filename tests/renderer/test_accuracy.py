@@ -427,7 +427,7 @@ def wide_patches(mesh: Mesh) -> tuple[wide.Patches, np.ndarray]:
         face=view.faces[view.face].numpy(),
         side=view.facing[view.face, 0].numpy(),
         patch=view.pixel.numpy(),
-        share=extended(made.shares[:, 0].numpy()),
+        share=extended(made.fractions[:, 0].numpy()),
         looking=np.concatenate([each.pixels.numpy() for each in looks]),
         dealt=np.concatenate([each.sample.numpy() for each in looks]),
         of_side=made.of_side.numpy(),
