@@ -16,7 +16,6 @@ from renderer.normals import face_normals, vertex_normals
 
 EPS = torch.finfo(torch.float64).eps
 ONE = torch.tensor([[0, 1, 2]])
-DTYPES = [torch.float32, torch.float16, torch.bfloat16]
 
 
 def draw(*shape: int, seed: int = 0) -> torch.Tensor:

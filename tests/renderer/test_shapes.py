@@ -1,3 +1,4 @@
+import colorsys
 from collections import Counter
 
 import numpy as np
@@ -72,6 +73,38 @@ def test_a_solid_has_faces_of_some_area_about_the_unit_box_in_display_colors(nam
     assert mesh.corner_colors.min() >= 0 and mesh.corner_colors.max() <= 1
 
 
+def mean_hue(mesh):
+    """Degrees, of the mean color."""
+    mean = np.average(mesh.corner_colors.mean(axis=1), axis=0, weights=mesh.face_areas())
+    return 360 * colorsys.rgb_to_hsv(*mean.tolist())[0]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_lemons_are_yellow_and_longer_than_wide_and_peaches_between_red_and_yellow(seed):
+    lemon, peach = solid("lemon", seed), solid("peach", seed)
+    assert 42 < mean_hue(lemon) < 65 and 0 < mean_hue(peach) < 40
+    width, depth, length = np.ptp(lemon.vertices, axis=0)
+    assert 1.15 * max(width, depth) < length < 1.6 * min(width, depth)
+
+
+def test_a_ball_is_a_sphere_of_one_color_or_has_a_pale_seam_on_green():
+    balls = [solid("ball", seed) for seed in range(20)]
+    plain = [ball for ball in balls if ball.one_color]
+    assert 4 < len(plain) < 16
+    for ball in balls:
+        np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=1), 0.95)
+        seam = (ball.corner_colors[..., 2] > 0.7).mean()
+        assert ball.one_color or (0.02 < seam < 0.2 and 50 < mean_hue(ball) < 90)
+
+
+def spheroid(mesh):
+    """Least-squares semi-axes (a, a, c) of the mesh's vertices."""
+    squares = mesh.vertices**2
+    design = np.stack([squares[:, 0] + squares[:, 1], squares[:, 2]], axis=1)
+    equatorial, polar = np.linalg.lstsq(design, np.ones(len(design)), rcond=None)[0] ** -0.5
+    return np.array([equatorial, equatorial, polar])
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_an_orange_is_an_oblate_sphere_with_small_dents_and_a_dark_navel_on_top(seed):
     mesh = solid("orange", seed)
@@ -89,3 +122,26 @@ def test_an_orange_is_an_oblate_sphere_with_small_dents_and_a_dark_navel_on_top(
     brightness = mesh.corner_colors.mean(axis=(1, 2))
     near_top = (np.hypot(centers[:, 0], centers[:, 1]) < 0.08) & (centers[:, 2] > 0)
     assert brightness[near_top].max() < 0.8 * brightness.mean()
+
+
+def test_a_tables_volume_is_that_of_its_board_and_legs():
+    mesh = solid("table")
+    board, leg, cells = 14 * 10, 9, 14 * 10 * 10
+    box = np.ptp(mesh.vertices, axis=0).prod()
+    expected = box * (board + 4 * leg) / cells
+    assert enclosed_volume(mesh.vertices, mesh.faces) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_bottles_label_and_cap_end_sharply():
+    mesh = solid("bottle")
+    height = mesh.vertices[mesh.faces, 2].mean(axis=1)
+    cap, label = height > 0.8 - 1e-9, (height > -0.75) & (height < -0.15)
+    colors = [np.unique(mesh.corner_colors[part].reshape(-1, 3), axis=0) for part in (cap, label, ~(cap | label))]
+    assert [len(part) for part in colors] == [1, 1, 1]
+    assert len(np.unique(np.concatenate(colors), axis=0)) == 3
+
+
+def test_a_cup_is_hollow():
+    mesh = solid("cup")
+    height = mesh.vertices[np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]) < 1e-6, 2]
+    assert len(height) == 2 and height.max() < 0.8 * mesh.vertices[:, 2].max()
