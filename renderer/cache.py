@@ -1,7 +1,8 @@
-"""What was rendered once, kept on disk from run to run: each file under a hash of all that went into it.
+"""Rendered tensors on disk, from run to run: each file under a hash of all that went into it.
 
-A file is a checksum and then the tensors in the safetensors format. It is parsed only if the checksum holds, so damage
-of any kind means that it is made anew, as does any change to the renderer's code.
+A file is a checksum and then the tensors in the safetensors format. It is parsed only if the checksum holds. So a
+damaged file is computed anew, as is everything after a change to the renderer's code; any file may be deleted at any
+time, and processes may share the folder.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from renderer.camera import Camera
-from renderer.fragments import Fragments, build_fragments
+from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
@@ -30,7 +30,7 @@ from renderer.transport.local import SparseTransfer
 
 
 def cache_folder(choice: str | None) -> Path | None:
-    """The folder that `renderer.cache` chooses: "auto" is the user's (XDG_CACHE_HOME or ~/.cache), None is none.
+    """The folder that `renderer.cache` chooses: "auto" is the user's (XDG_CACHE_HOME or ~/.cache), None is no cache.
 
     None as well where "auto" finds no home.
     """
@@ -43,14 +43,14 @@ def cache_folder(choice: str | None) -> Path | None:
 def content_key(*parts: object) -> str:
     """SHA-256, in hexadecimal, of arrays (type, shape and bytes), plain values, and sequences and data classes of such.
 
-    TypeError for anything else, since a key that misses a change would be worse than none.
+    TypeError for anything else, since a key that misses a change would be worse than no key.
     """
     digest = hashlib.sha256()
-    _feed(digest, parts)
+    _update(digest, parts)
     return digest.hexdigest()
 
 
-def _feed(digest: hashlib._Hash, part: object) -> None:
+def _update(digest: hashlib._Hash, part: object) -> None:
     if is_dataclass(part):
         part = (type(part).__name__, *(getattr(part, field.name) for field in fields(part)))
     if isinstance(part, np.ndarray):
@@ -59,7 +59,7 @@ def _feed(digest: hashlib._Hash, part: object) -> None:
     elif isinstance(part, tuple | list):
         digest.update(f"{len(part)} parts;".encode())
         for item in part:
-            _feed(digest, item)
+            _update(digest, item)
     elif isinstance(part, str | bytes | int | float | torch.dtype):
         digest.update(f"{part!r};".encode())
     else:
@@ -67,20 +67,19 @@ def _feed(digest: hashlib._Hash, part: object) -> None:
 
 
 def source_key(*packages: Path) -> str:
-    """Hash of the Python files in folders, and of the versions of what they compute with."""
+    """Hash of the Python files in folders, and of the versions of torch and NumPy."""
     files = [(path.relative_to(folder).as_posix(), path) for folder in packages for path in folder.rglob("*.py")]
     return content_key(torch.__version__, np.__version__, *((name, path.read_bytes()) for name, path in sorted(files)))
 
 
-COUNTS = ("faces", "unseen_faces", "closed")  # of a view, kept with its operator
 RENDERER = source_key(Path(__file__).parent)  # on import, so that it is the code that runs
 
 
 class TensorCache:
-    """Named tensors in files of a folder, under keys that tell their contents. Processes may share the folder.
+    """Named tensors in files of a folder, under content keys.
 
-    folder: made when first written to; None keeps nothing. problem: why nothing can be kept, None as long as it can;
-    that stops no run, since everything can be made again.
+    folder: made when first written to; None: nothing is written. problem: why nothing can be written, or None; that
+    stops no run, since everything can be computed again.
     """
 
     def __init__(self, folder: Path | None = None):
@@ -88,7 +87,7 @@ class TensorCache:
         self.problem: str | None = None
 
     def read(self, key: str) -> dict[str, Tensor] | None:
-        """What was written under the key; None where there is none, or where not every bit of it is as it was."""
+        """The tensors that were written under the key; None where there are none, or where a bit has changed."""
         if self.folder is None:
             return None
         try:
@@ -99,7 +98,7 @@ class TensorCache:
         return safetensors.torch.load(tensors) if checksum == _checksum(key, tensors) else None
 
     def write(self, key: str, tensors: Mapping[str, Tensor]) -> None:
-        """Keep CPU tensors. Another process sees the old file or the new one, and `read` passes over a torn one."""
+        """Write CPU tensors. Another process sees the old file or the new one, and `read` passes over a torn one."""
         if self.folder is None or self.problem:
             return
         content = safetensors.torch.save(dict(tensors))
@@ -120,15 +119,12 @@ def _checksum(key: str, content: bytes) -> bytes:
 
 
 class OperatorCache(TensorCache):
-    """Transfer operators, one file per mesh and view, so that 5 views find those that a run with 10 has built.
+    """Transfer operators, a file per mesh and view: 5 views find those that a run with 10 has built.
 
-    tally: of all `views` asked for, how many were `built`, how many `closed` meshes they show, whose back faces are not
-    drawn, and how many `faces` they have, with the `unseen_faces`, which cover no sample.
+    views: how many were asked for; built: how many of them were computed.
     """
 
-    def __init__(self, folder: Path | None = None):
-        super().__init__(folder)
-        self.tally: Counter[str] = Counter()
+    views = built = 0
 
     def operators(
         self,
@@ -143,28 +139,20 @@ class OperatorCache(TensorCache):
         """`transfer.build_operators`, to the bit, but only the views that are not on disk are built."""
         scene = content_key(RENDERER, mesh, settings, rasterizer.name, float(albedo_scale), basis, dtype)
         keys = {camera: content_key(scene, camera) for camera in cameras}
-        views = {camera: view for camera, key in keys.items() if (view := self.read(key)) is not None}
-        missing = [camera for camera in keys if camera not in views]
+        operators = {}
+        for camera, key in keys.items():
+            if (tensors := self.read(key)) is not None:
+                names = SparseTransfer._fields if "weight" in tensors else ()
+                sparse = SparseTransfer(*map(tensors.pop, names)) if names else None
+                operators[camera] = TransferOperator(**tensors, settings=settings, basis=basis, sparse=sparse)
+        missing = [camera for camera in keys if camera not in operators]
         if missing:
             fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, rasterizer, closed=mesh.closed)
             builder = OperatorBuilder(mesh, settings, albedo_scale, basis, dtype)
-            for camera, seen in zip(missing, fragments, strict=True):
-                operator = builder.operator(seen)
-                views[camera] = _pack(mesh, seen, operator)
-                self.write(keys[camera], views[camera])
-        self.tally.update(views=len(views), built=len(missing))
-        for view in views.values():
-            self.tally.update(dict(zip(COUNTS, view["counts"].tolist(), strict=True)))
-        return [_unpack(views[camera], settings, basis) for camera in cameras]
-
-
-def _pack(mesh: Mesh, seen: Fragments, operator: TransferOperator) -> dict[str, Tensor]:
-    counts = torch.tensor([len(mesh.faces), len(mesh.faces) - len(seen.faces), mesh.closed])
-    dense = {name: getattr(operator, name) for name in TENSORS}
-    few = {} if operator.sparse is None else operator.sparse._asdict()
-    return dense | few | {"counts": counts}
-
-
-def _unpack(view: Mapping[str, Tensor], settings: ImageSettings, basis: Basis) -> TransferOperator:
-    few = SparseTransfer(*(view[name] for name in SparseTransfer._fields)) if "weight" in view else None
-    return TransferOperator(**{name: view[name] for name in TENSORS}, settings=settings, basis=basis, sparse=few)
+            for camera, view in zip(missing, fragments, strict=True):
+                operators[camera] = operator = builder.operator(view)
+                sparse_tensors = operator.sparse._asdict() if operator.sparse else {}
+                self.write(keys[camera], {name: getattr(operator, name) for name in TENSORS} | sparse_tensors)
+        self.views += len(keys)
+        self.built += len(missing)
+        return [operators[camera] for camera in cameras]

@@ -164,25 +164,21 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         console.info("operators: none are kept, since views are rasterized in every epoch")
         return scene
     cache: OperatorCache = choices["operators"]
-    tally, covered = cache.tally, sum(len(stack.pixels) for stack in scene.stacks) / len(scene.stacks)
+    covered = sum(len(stack.pixels) for stack in scene.stacks) / len(scene.stacks)
     console.info(
         "operators: %d views for %d examples, %d from the cache, %d built (%.2f s)%s",
-        tally["views"],
+        cache.views,
         len(scene),
-        tally["views"] - tally["built"],
-        tally["built"],
+        cache.views - cache.built,
+        cache.built,
         time.perf_counter() - start,
         f"; not kept: {cache.problem}" if cache.problem else "",
     )
     console.info(
-        "skipped: rasterization in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background), "
-        "%.0f %% of the faces (seen by no sample), back faces in %d of %d views (closed meshes)",
+        "skipped: rasterization in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background)",
         COEFFICIENTS - len(nonzero_coefficients(DEGREE)),
         COEFFICIENTS,
         100 * (1 - covered / scene.settings.size**2),
-        100 * tally["unseen_faces"] / tally["faces"],
-        tally["closed"],
-        tally["views"],
     )
     return scene
 

@@ -300,7 +300,7 @@ def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterized
         cache = OperatorCache(tmp_path)
         images.append(render(built(items, orbit_cameras(3, 2), SETTINGS, cache), random_lights(18)))
         assert rasterized == calls
-    assert (cache.tally["views"], cache.tally["built"]) == (6, 0)
+    assert (cache.views, cache.built) == (6, 0)
     assert torch.equal(*images)
 
 
