@@ -35,8 +35,8 @@ from torchvision import transforms
 from augment import AugmentationService, AugmentationSettings
 from augment.service import TrainingAttackSettings
 from benchmarks.common import machine, write_csv
+from train import checkpoint
 from train.networks import Dropout, WideResNet
-from train.run_folder import checkpoint
 
 EPOCH_IMAGES = 45_000  # that a whole epoch of CIFAR-100 trains on: nine tenths of its training set
 GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -4,14 +4,12 @@ import re
 import sys
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from train import cli  # isort: skip (first, since the others take seconds to import)
 
-import train.command_line.entry_points as command
 from augment.attacks.adversary import read_adversary
 from augment.attacks.attack import logits_of
 from augment.attacks.evaluate import Sweep
 from augment.attacks.files import LINES
-from augment.attacks.parameters import PARAMETERS
 from renderer.errors import InputError
 from renderer.rasterizer import choose
 from train.attacks.curve import FIGURE, TABLE, curve, format_curve, write_curve
@@ -20,16 +18,13 @@ from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack, format_reloaded
 from train.attacks.transfers import format_transfers, load_others, write_transfers
-from train.command_line.configuration import read_settings
-from train.command_line.outputs import writable_folder
+from train.errors import writable_folder
 from train.networks import load_classifier
-from train.run_folder.files import sole_writer
+from train.run_folder import sole_writer, write_config
 from train.runtime import choose_device
 
 
-def main(config: DictConfig) -> None:
-    config = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
-    settings = read_settings(AttackExperimentSettings, config)
+def main(settings: AttackExperimentSettings) -> None:
     adversary = read_adversary(Path(settings.reload)) if settings.reload else None
     if adversary is None:
         settings.attack.require_parameters()
@@ -65,27 +60,16 @@ def main(config: DictConfig) -> None:
         if sweeps:
             write_curve(curve(sweeps), {kind: each.norm for kind, each in settings.attack.parameters.items()}, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
-        OmegaConf.save(config, out / "config.yaml")
+        write_config(out, settings)
 
 
-@command.one_sentence_errors
-def _several_kinds(argument: str) -> str:
-    """Hydra's form, attack=[lighting,geometry], of attack=lighting+geometry."""
-    key, _, kinds = argument.partition("=")
-    if key != "attack":
-        return argument
-    names = [name for name in re.split(r"[+,\s]+", kinds.strip("[]")) if name]
-    if unknown := [name for name in names if name not in PARAMETERS]:
-        raise InputError(f"attack={unknown[0]} is not known: choose from {', '.join(PARAMETERS)}, several joined by +")
-    return f"attack=[{','.join(names)}]"
-
-
-def _arguments(given: list[str]) -> list[str]:
-    """As Hydra reads them; what is reloaded is not attacked, unless that is asked for."""
-    keys = {argument.partition("=")[0] for argument in given}
-    return [*map(_several_kinds, given), *(["attack=[]"] if "reload" in keys and "attack" not in keys else [])]
+def as_overrides(arguments: list[str]) -> list[str]:
+    """attack=lighting+geometry in Hydra's form, attack=[lighting,geometry]; a reloaded adversary is not attacked,
+    unless attack= asks for it."""
+    keys = {argument.partition("=")[0] for argument in arguments}
+    parameters = [re.sub(r"^attack=([^\[].*)$", lambda m: f"attack=[{m[1].replace('+', ',')}]", a) for a in arguments]
+    return [*parameters, *(["attack=[]"] if "reload" in keys and "attack" not in keys else [])]
 
 
 if __name__ == "__main__":
-    sys.argv[1:] = _arguments(sys.argv[1:])
-    command.script(main)
+    cli.script(main, AttackExperimentSettings, as_overrides(sys.argv[1:]))

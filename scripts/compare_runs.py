@@ -1,10 +1,12 @@
 """Markdown tables of finished runs, side by side: python scripts/compare_runs.py 'runs=[runs/a,runs/b]'"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import train.command_line.entry_points as command
-from augment.utils import progress
+from train import cli  # isort: skip (first, since the others take seconds to import)
+
+from omegaconf import MISSING
+
 from renderer.errors import InputError
 from train.report.compare import format_comparison
 from train.report.summary import summarize
@@ -12,24 +14,22 @@ from train.report.summary import summarize
 
 @dataclass
 class Settings:
-    """conf/compare_runs.yaml."""
+    runs: list[str] = MISSING  # finished run folders
+    exclude: list[str] = field(default_factory=list)  # sources of photographs to leave out of the averages
+    photographs: str = "photographs"  # the sub-folder of scores to compare, by its name in evaluate.photos
 
-    runs: list[str]
-    exclude: list[str]
-    photographs: str
-
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.runs:
             raise InputError("runs is empty: give the folders of one run or more, as in runs=[runs/a,runs/b]")
         folders = [Path(run).resolve() for run in self.runs]
-        if twice := [run for run, folder in zip(self.runs, folders, strict=True) if folders.count(folder) > 1]:
-            raise InputError(f"runs names {twice[0]} twice, as if it were another seed: name each run once")
+        if repeated := [run for run, folder in zip(self.runs, folders, strict=True) if folders.count(folder) > 1]:
+            raise InputError(f"runs names {repeated[0]} twice, as if it were another seed: name each run once")
 
 
 def main(settings: Settings) -> None:
-    runs = [summarize(Path(run)) for run in progress(settings.runs, "runs")]
+    runs = [summarize(Path(run)) for run in settings.runs]
     print(format_comparison(runs, settings.exclude, settings.photographs))
 
 
 if __name__ == "__main__":
-    command.script(main, Settings)
+    cli.script(main, Settings)

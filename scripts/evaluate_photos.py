@@ -6,42 +6,45 @@ classifier= takes any other network, by a name that scripts/attack.py knows.
 from dataclasses import dataclass
 from pathlib import Path
 
-import train.command_line.entry_points as command
-from augment.classifiers import Classifier
+from train import cli  # isort: skip (first, since the others take seconds to import)
+
+from omegaconf import MISSING
+
 from renderer.errors import InputError
-from train.command_line.outputs import writable_folder
+from train.errors import writable_folder
 from train.networks import load_classifier, load_run
 from train.photographs.scoring import evaluate_photographs, format_summary
-from train.run_folder.files import sole_writer
+from train.run_folder import sole_writer
 from train.runtime import MixedPrecision, choose_device, choose_precision
 
 
 @dataclass
 class Settings:
-    """conf/evaluate_photos.yaml."""
+    run: str | None = None  # a run folder, or a folder under pretrained/
+    model: str | None = None  # python:package.module:function, if such a function made the run's network
+    classifier: str | None = None  # instead of run, any other network, by a name that conf/attack.yaml explains
+    weights: str | None = None  # the classifier's local weights file, if it brings none
+    photos: str = MISSING  # a folder of class folders, or of images of `label`
+    label: str = "orange"  # the class whose recall and false alarms count, and that of a flat folder's images
+    out: str = "runs/photographs/${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # the folder of the scores
+    skip_unreadable: bool = False  # skip broken photographs
+    precision: str = "auto"  # auto (bfloat16 where the hardware has it) | bfloat16 | float32
+    device: str = "auto"  # auto | cpu | cuda | cuda:N
 
-    run: str | None
-    model: str | None
-    classifier: str | None
-    weights: str | None
-    photos: str
-    label: str
-    out: str
-    skip_unreadable: bool
-    precision: str
-    device: str
-
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (self.run is None) == (self.classifier is None):
             raise InputError("give one network: run=FOLDER, or classifier=NAME")
         if self.classifier and self.model:
-            raise InputError(f"model={self.model} is for run=FOLDER: a classifier has its own, leave it out")
+            raise InputError(f"model={self.model} is for run=FOLDER: leave it out, since a classifier has its own")
 
 
 def main(settings: Settings) -> None:
     device = choose_device(settings.device)
-    network = _load(settings)
-    network.label(settings.label)  # refused here, where the network has a name
+    if settings.run is None:
+        network = load_classifier(settings.classifier, settings.weights)
+    else:
+        network = load_run(settings.run, settings.weights, settings.model)
+    network.label(settings.label)  # or InputError that names the network
     model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
     with sole_writer("out", out):
@@ -55,15 +58,8 @@ def main(settings: Settings) -> None:
             skip_unreadable=settings.skip_unreadable,
             device=device,
         )
-    print(format_summary(summary))
-    print(f"\ntable, scores and image: {settings.out}")
-
-
-def _load(settings: Settings) -> Classifier:
-    if settings.run is None:
-        return load_classifier(settings.classifier, settings.weights)
-    return load_run(settings.run, settings.weights, settings.model)
+    print(f"{format_summary(summary)}\n\ntable, scores and image: {out}")
 
 
 if __name__ == "__main__":
-    command.script(main, Settings)
+    cli.script(main, Settings)

@@ -3,44 +3,41 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import train.command_line.entry_points as command
+from train import cli  # isort: skip (first, since the others take seconds to import)
+
+from omegaconf import MISSING
+
 from renderer.errors import InputError, require_range
 from renderer.light.environment import check_map_name, negative_fraction, to_map, write_map
 from renderer.light.presets import load_light
-from train.command_line.outputs import writable_file
-
-LARGEST_HEIGHT = 8192  # of a map that fits in memory: 3 GB
+from train.configuration import keyed
+from train.errors import writable_file
 
 
 @dataclass
 class Settings:
-    """conf/export_light.yaml."""
+    light: str = MISSING  # grace | eucalyptus | st_peters | uniform | a map (.npy, .hdr, .exr) | coefficients (.json)
+    out: str = MISSING  # the map's file: .hdr (negative radiance becomes 0), .exr or .npy
+    height: int = 256  # rows; there are twice as many columns
 
-    light: str
-    out: str
-    height: int
-
-    def __post_init__(self):
-        require_range("height", self.height, 1, LARGEST_HEIGHT)
+    def __post_init__(self) -> None:
+        require_range("height", self.height, 1, 8192)  # a map of that height takes 3 GB
 
 
 def main(settings: Settings) -> None:
-    light, out = load_light(settings.light), Path(settings.out)
-    writable_file(out, "out")
-    try:
+    light, out = load_light(settings.light), writable_file(settings.out, "out")
+    with keyed("out"):
         check_map_name(out)
-    except InputError as error:
-        raise InputError(f"out: {error}") from error
     if out.exists() and Path(settings.light).exists() and out.samefile(settings.light):
         raise InputError(f"out={out} is the light itself, which would be lost: choose another file")
     radiance = to_map(light, settings.height)
     write_map(out, radiance)
-    fate = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"
+    negative = "stored as 0" if out.suffix.lower() == ".hdr" else "kept"
     print(
         f"{out}: {radiance.shape[1]} × {radiance.shape[0]} texels, radiance {radiance.min():.3g} to "
-        f"{radiance.max():.3g}; {negative_fraction(radiance):.2%} of it is negative and {fate}"
+        f"{radiance.max():.3g}; {negative_fraction(radiance):.2%} of it is negative and {negative}"
     )
 
 
 if __name__ == "__main__":
-    command.script(main, Settings)
+    cli.script(main, Settings)

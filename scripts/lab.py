@@ -1,6 +1,7 @@
 """Path-trace photographs of oranges and hard negatives under a projector: python scripts/lab.py out=lab"""
 
-from train.command_line.entry_points import script
+from train import cli  # isort: skip (first, since the others take seconds to import)
+
 from train.lab.folder import LabSettings, write_laboratory
 
 
@@ -10,4 +11,4 @@ def main(settings: LabSettings) -> None:
 
 
 if __name__ == "__main__":
-    script(main, LabSettings)
+    cli.script(main, LabSettings)

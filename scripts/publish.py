@@ -7,19 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from train.command_line.entry_points import script
-from train.command_line.outputs import writable_folder
+from train import cli  # isort: skip (first, since the others take seconds to import)
+
+from omegaconf import MISSING
+
+from train import checkpoint
+from train.errors import writable_folder
 from train.networks import PUBLISHED, PYTHON, load_run, publish
 from train.report.summary import summarize
-from train.run_folder import checkpoint
 
 
 @dataclass
 class Settings:
-    """conf/publish.yaml."""
-
-    run: str
-    out: str
+    run: str = MISSING  # a finished run folder
+    out: str = MISSING  # the folder of the weights
 
 
 def main(settings: Settings) -> None:
@@ -51,4 +52,4 @@ def without_folders(value: Any) -> Any:
 
 
 if __name__ == "__main__":
-    script(main, Settings)
+    cli.script(main, Settings)

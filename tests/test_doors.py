@@ -17,12 +17,12 @@ from renderer.errors import InputError
 from renderer.io.lights import save_light
 from renderer.light.environment import read_map, write_map
 from renderer.light.presets import load_light, probe
+from train.checkpoint import BEST, save
 from train.data import load_npz
 from train.networks import PUBLISHED, WideResNet, describe, load_run, publish
 from train.photographs.folder import Photograph, find_photographs, load_photographs
 from train.photographs.predictions import PREDICTIONS, Prediction, read_predictions, write_predictions
-from train.run_folder.checkpoint import BEST, save
-from train.run_folder.files import read_config, read_json, read_numbers
+from train.run_folder import read_config, read_json, read_numbers
 
 CLASSES = ["fig", "lime"]
 

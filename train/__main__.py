@@ -1,65 +1,68 @@
 """`python -m train`: train an arm, score it, and print the table. See conf/train.yaml for every setting."""
 
+import os
 import re
 import shlex
 import sys
 from collections.abc import Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import cast
+
+from train import cli  # isort: skip (first, since the others take seconds to import)
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-import train.command_line.entry_points as command
 from augment import utils
-from train.command_line.configuration import read_settings
-from train.command_line.overrides import quoted
+from renderer.errors import InputError
+from train import console
+from train.configuration import as_override, compose, keyed, quoted, read_settings
 from train.data import DataSet
+from train.errors import writable_file, writable_folder
 from train.report.page import report_of
 from train.report.summary import format_table, summarize
 from train.run import load_data, prepare, write_images
-from train.run_folder.files import sole_writer
-from train.run_folder.logs import console
+from train.run_folder import sole_writer
 from train.runtime import Interrupted, broadcast, first_process_first, process_group
 from train.settings import ExperimentSettings
-from train.sweep import check_launcher, run_cell
+from train.sweep import run_cell, sweep
 
-NAMED_MODEL = re.compile(r"^model=(?!\{)")  # by its name alone
+NAMED_MODEL = re.compile(r"^model=(?!\{)")  # short for model.name=
+LOG = "train.log"
+SWEEP_FLAGS = {"--multirun", "-m"}
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="train")
-@command.one_sentence_errors
 def main(config: DictConfig) -> None:
-    hydra_config = HydraConfig.get()
-    folder = Path(hydra_config.runtime.output_dir)
-    if utils.rank() == 0:
-        broadcast(str(folder))
+    folder = Path(HydraConfig.get().runtime.output_dir)
     config.run = str(folder)
-    if hydra_config.mode == RunMode.MULTIRUN:
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
         run_cell(config, folder)
-    else:
-        run_arms(config, folder)
+        return
+    with cli.errors():  # here, too, or Hydra adds a line
+        run_arms(read_settings(ExperimentSettings, config), folder)
 
 
-def run_arms(config: DictConfig, folder: Path) -> None:
+def run_arms(settings: ExperimentSettings, folder: Path) -> None:
     """Train the arms to compare with and the arm itself, and print their table."""
-    OmegaConf.resolve(config)  # before any copy is made, since a copy would read the clock again
-    data = load_data(read_settings(ExperimentSettings, config))
-    choices = {folder / str(arm): {"augment": {"arm": arm}} for arm in config.compare}
-    configs = {path: cast(DictConfig, OmegaConf.merge(config, choice)) for path, choice in choices.items()}
-    arms = {path: read_settings(ExperimentSettings, arm) for path, arm in (configs | {folder: config}).items()}
+    arms = {}
+    for arm in settings.compare:
+        with keyed("compare"):
+            arms[folder / arm] = replace(settings, augment=replace(settings.augment, arm=arm))
+    arms[folder] = settings
+    data = load_data(settings)
     with sole_writer("run", *arms) if utils.rank() == 0 else nullcontext():
         with first_process_first():
             if utils.rank() == 0:
-                write_images(arms[folder], data.size)
+                write_images(settings, data.size)
         _train_arms(arms, data, folder)
 
 
 def _train_arms(arms: Mapping[Path, ExperimentSettings], data: DataSet, folder: Path) -> None:
-    runs = {path: prepare(arm, data, path) for path, arm in arms.items()}  # all first: a mistake in any shows at once
+    runs = {path: prepare(settings, data, path) for path, settings in arms.items()}  # all first, to meet every mistake
     for path, train_and_score in runs.items():
         console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")
         try:
@@ -73,23 +76,42 @@ def _train_arms(arms: Mapping[Path, ExperimentSettings], data: DataSet, folder: 
 
 
 def resume_command(folder: Path) -> str:
-    """The command that goes on with this run."""
-    start = f"torchrun --nproc_per_node={utils.world_size()} -m train" if utils.world_size() > 1 else "python -m train"
-    overrides = [
-        override for override in HydraConfig.get().overrides.task if not override.startswith(("run=", "train.resume="))
-    ]
-    return shlex.join([*start.split(), *overrides, f"run={folder}", "train.resume=true"])
+    """The command that resumes this run."""
+    count = utils.world_size()
+    command = ["torchrun", f"--nproc_per_node={count}", "-m", "train"] if count > 1 else ["python", "-m", "train"]
+    overrides = HydraConfig.get().overrides.task
+    kept = [override for override in overrides if not override.startswith(("run=", "train.resume="))]
+    return shlex.join([*command, *kept, f"run={folder}", "train.resume=true"])
 
 
 def start() -> None:
-    """`main` in this process, or in each that torchrun starts; all take the first one's folder, and it alone writes."""
-    command.one_sentence_errors(check_launcher)(sys.argv[1:])
-    with process_group():
-        if utils.rank() > 0:
-            console.setLevel("WARNING")
-            sys.argv.append(f"run={quoted(broadcast())}")
-        sys.argv[1:] = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
-        command.run_command(main, "train")
+    """Run `main` in this process, or in each that torchrun starts; all take the first one's folder."""
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # or Hydra prints its errors itself, in several lines
+    with cli.errors(), process_group():
+        arguments = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
+        sys.argv[1:] = arguments = [as_override(argument) for argument in arguments]
+        flags = {argument for argument in arguments if argument.startswith("-")}
+        overrides = [argument for argument in arguments if argument not in flags]
+        if flags and "TORCHELASTIC_RUN_ID" in os.environ:
+            raise InputError(
+                "torchrun trains one run in several processes: start a sweep with python -m train --multirun"
+            )
+        if flags & SWEEP_FLAGS:
+            sweep(main, overrides)
+            return
+        if not flags:
+            if utils.rank() > 0:
+                console.setLevel("WARNING")
+            folder = broadcast(_run_folder(overrides) if utils.rank() == 0 else "")
+            sys.argv.append(f"run={quoted(folder)}")
+        main()
+
+
+def _run_folder(overrides: list[str]) -> str:
+    """The folder of the run, which is still to be made; InputError where settings are wrong or it cannot be written."""
+    run = read_settings(ExperimentSettings, compose("train", overrides)).run
+    writable_file(writable_folder(run, "run") / LOG, "run")
+    return run
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ from torch import Tensor
 from augment.classifiers.adapter import class_index
 from augment.utils import generator
 from renderer.errors import InputError
+from train import console
 from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
-from train.run_folder.logs import console
 
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # not names of classes
 ARRAYS = ("train_images", "train_labels", "test_images", "test_labels", "classes")

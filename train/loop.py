@@ -16,12 +16,12 @@ from augment.service import AugmentationService, Renders
 from augment.utils import Phases, eval_mode, progress, stream_seed
 from renderer.errors import InputError, in_one_line, is_out_of_memory
 from renderer.image import to_bytes, to_unit
+from train import checkpoint, console
 from train.batches import Round, batch_count, put_last, rounds_of_epoch, training_batches, with_room
+from train.checkpoint import random_state, restore_random_state
 from train.data import Split
 from train.recipe import SCHEDULES, MovingAverage, TrainSettings, augmentation, soup, training_loss
-from train.run_folder import checkpoint
-from train.run_folder.checkpoint import random_state, restore_random_state
-from train.run_folder.logs import PHASES, Log, console
+from train.run_folder import PHASES, Log
 from train.runtime import (
     PRECISIONS,
     GraphedModel,

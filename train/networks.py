@@ -22,7 +22,7 @@ from augment.classifiers.python_function import call_python
 from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
 from renderer.image import ENCODINGS, LARGEST_SIZE
-from train.run_folder.checkpoint import BEST, VERSION, checked, load
+from train.checkpoint import BEST, VERSION, checked, load
 
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
 DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything

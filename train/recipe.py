@@ -77,19 +77,19 @@ class TrainSettings:
     def __post_init__(self) -> None:
         choices = {"schedule": SCHEDULES, "flips": FLIPS, "augmentation": AUGMENTATIONS, "compile": COMPILE}
         for name, known in choices.items():
-            require_choice(f"train.{name}", getattr(self, name), known)
+            require_choice(name, getattr(self, name), known)
         for name, largest in LARGEST.items():
-            require_range(f"train.{name}", getattr(self, name), 1, largest)
+            require_range(name, getattr(self, name), 1, largest)
         for name in ("momentum", "label_smoothing", "ema_decay"):
             if not 0 <= getattr(self, name) < 1:
-                raise InputError(f"train.{name}={getattr(self, name)} must be at least 0 and below 1")
+                raise InputError(f"{name}={getattr(self, name)} must be at least 0 and below 1")
         for name in ("ranking", "distillation", "weight_decay"):
-            require_range(f"train.{name}", getattr(self, name), 0, FACTOR)
+            require_range(name, getattr(self, name), 0, FACTOR)
         for name in ("distillation", "soup"):
             if getattr(self, name) and not self.init_from:
-                raise InputError(f"train.{name} needs a network to begin with: set train.init_from")
+                raise InputError(f"{name} needs a network to begin with: set train.init_from")
         if not 0 < self.learning_rate <= FACTOR:
-            raise InputError(f"train.learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
+            raise InputError(f"learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
 
 
 # ------------------------------------------------------------------------------------- loss and averaged weights

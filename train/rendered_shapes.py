@@ -28,8 +28,8 @@ from renderer.light.presets import ambient, directional
 from renderer.mesh import Mesh, normalize
 from renderer.rasterizer import Rasterizer, choose
 from renderer.shapes import SOLIDS, solid
+from train import console
 from train.data import DataSet, Split
-from train.run_folder.logs import console
 
 CLASSES = tuple(sorted(SOLIDS))
 SETTINGS = ImageSettings(samples=4)

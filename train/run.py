@@ -1,14 +1,11 @@
 """One run from its settings: data, network, augmentation service, training, scores on the test set and photographs."""
 
-import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
-from omegaconf import OmegaConf
 
 from augment import utils
 from augment.build import build_scene
@@ -22,19 +19,16 @@ from renderer.errors import InputError, require_choice
 from renderer.image import LARGEST_SIZE
 from renderer.light.harmonics import nonzero_coefficients
 from renderer.transfer import COEFFICIENTS, DEGREE
-from train.command_line.configuration import as_dict
-from train.command_line.entry_points import NO_ROOM
+from train import checkpoint, console
 from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
+from train.errors import NO_ROOM
 from train.loop import Trainer, evaluate
 from train.networks import build_network, describe, start_from
 from train.photographs.folder import find_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.rendered_shapes import load_shapes, write_held_out
-from train.run_folder import checkpoint
-from train.run_folder.continuation import INPUTS, fingerprints, require_same_inputs, require_same_settings
-from train.run_folder.files import CONFIG, write_whole
-from train.run_folder.logs import NoLog, RunLog, console
+from train.run_folder import NoLog, RunLog, require_same_inputs, require_same_settings, write_config
 from train.runtime import (
     MixedPrecision,
     choose_device,
@@ -194,29 +188,14 @@ def _open_folder(trainer: Trainer, settings: ExperimentSettings) -> None:
             raise InputError(
                 f"run={folder} holds a run already: set train.resume=true to go on, or choose another run="
             )
-        config = OmegaConf.structured(settings)
-        require_same_settings(folder, config)
-        require_same_inputs(folder, config)
+        require_same_settings(folder, settings)
+        require_same_inputs(folder, settings)
         trainer.resume()
     elif settings.train.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
     if utils.rank() == 0:
-        _write_config(settings, trainer)
-
-
-def _write_config(settings: ExperimentSettings, trainer: Trainer) -> None:
-    config = OmegaConf.structured(settings)
-    resolved = as_dict(config, resolve=True)
-    resolved[INPUTS] = fingerprints(config)
-    resolved["hardware"] = {"device": str(trainer.device), "precision": trainer.model.precision}
-    resolved["versions"] = {
-        "python": platform.python_version(),
-        "torch": str(torch.__version__),
-        "torchvision": version("torchvision"),
-        "numpy": version("numpy"),
-    }
-    trainer.folder.mkdir(parents=True, exist_ok=True)
-    write_whole(trainer.folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(resolved)).encode())
+        hardware = {"device": str(trainer.device), "precision": trainer.model.precision}
+        write_config(folder, settings, hardware=hardware)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from augment import utils
 from renderer.errors import InputError, as_device, require_choice
-from train.run_folder.logs import console
+from train import console
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
 PRECISIONS = ("auto", "bfloat16", "float32")

@@ -1,4 +1,4 @@
-"""conf/train.yaml as dataclasses: the types, ranges and keys that a run accepts."""
+"""The schema of conf/train.yaml: the types, ranges, keys and defaults of a run."""
 
 import re
 from dataclasses import dataclass, field, fields, replace
@@ -16,7 +16,7 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.rasterizer import choose
 from renderer.subdivision import MOST_VERTICES
-from train.command_line.configuration import read_settings
+from train.configuration import read_settings
 from train.networks import WIDERESNET
 from train.recipe import TrainSettings
 
@@ -43,10 +43,10 @@ class DataSettings:
     images: str | None = None
 
     def __post_init__(self) -> None:
-        require_range("data.size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
-        require_range("data.seed", self.seed, 0, LARGEST_SEED)
+        require_range("size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
+        require_range("seed", self.seed, 0, LARGEST_SEED)
         for name in ("train_per_class", "test_per_class"):
-            require_range(f"data.{name}", getattr(self, name), 1, MOST_IMAGES)
+            require_range(name, getattr(self, name), 1, MOST_IMAGES)
 
 
 @dataclass
@@ -55,9 +55,9 @@ class SceneSettings:
     ObjectSettings' keys.
     """
 
-    meshes: list[Any] = field(default_factory=list)
-    backgrounds: list[Any] = field(default_factory=list)
-    views: int | None = None
+    meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
+    backgrounds: list[Any] = field(default_factory=lambda: [0.5])
+    views: int | None = 1
     polar: float = 60.0
     azimuth: float = 0.0
     width: float = 2.0
@@ -70,12 +70,12 @@ class SceneSettings:
     ground: list[float] | None = None
 
     def __post_init__(self) -> None:
-        require_range("scene.exposure", self.exposure, 1 / FACTOR, FACTOR)
-        require_range("scene.views", self.views, 1, MOST_VIEWS)
-        require_range("scene.vertices", self.vertices, 0, MOST_VERTICES)
-        require_range("scene.polar", self.polar, 0, 180)
-        require_range("scene.azimuth", self.azimuth, -360, 360)
-        require_range("scene.fov", self.fov, 0.1, 150)
+        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
+        require_range("views", self.views, 1, MOST_VIEWS)
+        require_range("vertices", self.vertices, 0, MOST_VERTICES)
+        require_range("polar", self.polar, 0, 180)
+        require_range("azimuth", self.azimuth, -360, 360)
+        require_range("fov", self.fov, 0.1, 150)
 
     @property
     def choices(self) -> dict[str, Any]:
@@ -85,13 +85,16 @@ class SceneSettings:
 
 @dataclass
 class TrainingSceneSettings(SceneSettings):
-    """hard_negatives: like meshes, of what `label` is to be told from; of no class, unless a mapping names one."""
+    """hard_negatives: like meshes, of other classes than `label`; of no class, unless a mapping names one."""
 
+    meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0", "solid:orange:1"])
+    backgrounds: list[Any] = field(default_factory=lambda: [0.0, 0.25, 0.5, 0.75, 1.0])
+    views: int | None = None
     hard_negatives: list[Any] = field(default_factory=list)
 
     @property
     def objects(self) -> int:
-        """How many; none where there is no mesh that hard negatives could be told from."""
+        """The number of meshes and hard negatives; 0 without a mesh."""
         return len(self.meshes) + len(self.hard_negatives) if self.meshes else 0
 
 
@@ -105,9 +108,9 @@ class RendererSettings:
     """
 
     rasterizer: str = "auto"
-    samples: int = 8
+    samples: int = 2
     encoding: str = "linear"
-    normals: str = "flat"
+    normals: str = "smooth"
     shadows: bool = False
     bounces: int = 0
     cache: str | None = "auto"
@@ -140,23 +143,22 @@ class ModelSettings:
 
 @dataclass
 class EvaluationSettings:
-    """photos: a folder of photographs to score the network on, or several by name. skip_unreadable: pass over those
-    that are broken.
-    """
+    """photos: a folder of photographs to score the network on, or several by name. skip_unreadable: skip those that are
+    broken."""
 
     photos: Any = None  # str | dict[str, str] | None, a union that OmegaConf has no type for
     skip_unreadable: bool = False
 
     def __post_init__(self) -> None:
-        given = self.photos
-        named = isinstance(given, dict) and all(isinstance(folder, str) for folder in given.values())
-        if not (given is None or isinstance(given, str) or named):
-            raise InputError(f"evaluate.photos={given} must be a folder, or a mapping of names to folders")
+        photos = self.photos
+        named = isinstance(photos, dict) and all(isinstance(folder, str) for folder in photos.values())
+        if not (photos is None or isinstance(photos, str) or named):
+            raise InputError(f"photos={photos} must be a folder, or a mapping of names to folders")
         for name in self.folders:
             if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
                 raise InputError(
-                    f"evaluate.photos.{name}: name a sub-folder of the run, of letters, digits, _ and -, and none of "
-                    f"{', '.join(RESERVED)}"
+                    f"photos: {name} must be a name of letters, digits, _ and -, and none of {', '.join(RESERVED)}, "
+                    "since it becomes a sub-folder of the run"
                 )
 
     @property
@@ -171,14 +173,14 @@ class ExperimentSettings:
     """A whole run. run: its folder; sweep: that of a sweep. label: the class under study. compare: arms beside it."""
 
     run: str = ""
-    sweep: str = ""
+    sweep: str = "runs/sweep"
     seed: int = 0
     label: str = "orange"
     compare: list[str] = field(default_factory=list)
     data: DataSettings = field(default_factory=DataSettings)
     augment: AugmentationSettings = field(default_factory=AugmentationSettings)
     scene: TrainingSceneSettings = field(default_factory=TrainingSceneSettings)
-    renderer: RendererSettings = field(default_factory=RendererSettings)
+    renderer: RendererSettings = field(default_factory=lambda: RendererSettings(samples=8, normals="flat"))
     model: ModelSettings = field(default_factory=ModelSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
     evaluate: EvaluationSettings = field(default_factory=EvaluationSettings)
@@ -209,13 +211,13 @@ class ExperimentSettings:
 
 
 def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
-    """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own."""
-    own, keys = f"{key}[{index}]", dict(item) if isinstance(item, dict) else {"mesh": item}
+    """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own class."""
+    entry, keys = f"{key}[{index}]", dict(item) if isinstance(item, dict) else {"mesh": item}
     props: Any = keys.pop("props", [])
-    if not (isinstance(props, list) and all(isinstance(each, dict) for each in props)):
-        raise InputError(f"{own}.props: give a list of mappings, as in [{{mesh: solid:cup, at: [0.9, 0]}}]")
+    if not (isinstance(props, list) and all(isinstance(prop, dict) for prop in props)):
+        raise InputError(f"{entry}.props: give a list of mappings, as in [{{mesh: solid:cup, at: [0.9, 0]}}]")
     props = [
-        read_settings(PropSettings, OmegaConf.create(each), f"{own}.props[{number}]")
-        for number, each in enumerate(props)
+        read_settings(PropSettings, OmegaConf.create(prop), f"{entry}.props[{number}]")
+        for number, prop in enumerate(props)
     ]
-    return replace(read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), own), props=props)
+    return replace(read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), entry), props=props)

@@ -11,8 +11,8 @@ from PIL import Image
 
 from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
-from train.command_line.entry_points import USER_ERROR
 
+USER_ERROR = 2
 ROOT = Path(__file__).parents[2]
 SMALL = [
     f"classifier=run:{ROOT / 'pretrained' / 'none'}", "attack.force=true", "attack.max_steps=2", "device=cpu",

@@ -8,17 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
 
 from benchmarks import training
-from train.command_line.configuration import composed, read_settings
+from train.configuration import compose, read_settings
 from train.settings import ExperimentSettings
 
 ROOT = Path(__file__).parents[2]
-
-
-def settings(name: str, *overrides: str) -> OmegaConf:
-    return composed(name, overrides)
 
 
 STUB = """#!{python}
@@ -77,9 +72,8 @@ def test_reproducing_measures_then_trains_and_compares_each_experiment(tmp_path,
         assert train[4:6] == ["augment=none,random,adversarial", "seed=0,1,2,3,4"]
         assert train[-2:] == [f"sweep=runs/{experiment}", "train.checkpoint_every=5"]
         assert compare[0] == "scripts/compare_runs.py"
-        compared = settings("compare_runs", *compare[1:])
-        assert compared.runs == [f"runs/{experiment}/augment-none+seed-{seed}" for seed in (0, 1)]
-        assert compared.exclude == []
+        folders = [f"runs/{experiment}/augment-none+seed-{seed}" for seed in (0, 1)]
+        assert compare[1:] == [f"runs=[{','.join(folders)}]", "photographs=photographs", "exclude=[]"]
         assert (tmp_path / f"runs_{experiment}.md").read_text().startswith(f"# experiment={experiment}\n")
 
 
@@ -87,7 +81,7 @@ def test_reproducing_measures_then_trains_and_compares_each_experiment(tmp_path,
 def test_every_arm_that_is_reproduced_is_a_valid_run(tmp_path, machine):
     _, (_, *calls), _ = reproduce(tmp_path, machine, **GIVEN)
     for train, arm in itertools.product(calls[::2], ("none", "random", "adversarial")):
-        config = settings("train", train[3], f"augment={arm}", "seed=4", *train[6:])
+        config = compose("train", [train[3], f"augment={arm}", "seed=4", *train[6:]])
         run = read_settings(ExperimentSettings, config)
         assert (run.augment.arm, run.seed, run.data.path) == (arm, 4, "cifar100.npz")
         assert run.scene.meshes == ["a.glb", {"mesh": "b.glb", "albedo_scale": 3.0}] and run.evaluate.photos == "photos"
@@ -102,9 +96,8 @@ def test_fine_tuned_networks_are_valid_runs_that_end_in_a_page_of_both_folders(t
         single = [
             each.split(",")[0] if each.startswith(("seed=", "augment=", "train.dist")) else each for each in train
         ]
-        run = read_settings(ExperimentSettings, settings("train", *single[3:]))
+        run = read_settings(ExperimentSettings, compose("train", [*single[3:]]))
         assert run.train.init_from == "pretrained/none" and run.train.checkpoint_every == 5
         assert run.evaluate.photos == {"photographs": "photos", "laboratory": "lab"}
-    compared = [settings("compare_runs", *call[1:]).photographs for call in calls[trainings:]]
-    assert compared == ["laboratory", "photographs"]
+    assert [call[2] for call in calls[trainings:]] == ["photographs=laboratory", "photographs=photographs"]
     assert (tmp_path / f"runs_{experiment}.md").read_text().startswith(f"# experiment={experiment}\n")

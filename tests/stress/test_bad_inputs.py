@@ -26,8 +26,8 @@ from hypothesis import strategies as st
 from augment import utils
 from augment.backgrounds import load_background
 from renderer import InputError, load_light, load_mesh
+from train import checkpoint
 from train.data import load_folder, load_npz
-from train.run_folder import checkpoint
 
 from .conftest import RENDERER, TRAINING, Hang, run_here
 

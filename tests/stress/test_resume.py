@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from train.run_folder import checkpoint
-from train.run_folder.logs import METRICS, read_metrics
+from train import checkpoint
+from train.run_folder import METRICS, read_metrics
 
 from .conftest import PATIENCE, TRAINING, Process, end, run_here, start_command
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
-from train.command_line.configuration import composed, read_settings
+from train.configuration import compose, read_settings
 from train.run import load_data, run
+from train.run_folder import write_config
 from train.settings import ExperimentSettings
 
 CLASSES = ["apple", "orange", "pear"]
@@ -74,37 +74,33 @@ def photos(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny_config(tiny_npz) -> Callable[..., DictConfig]:
-    """The real configuration, small; arguments are further overrides."""
-    return lambda *overrides: composed("train", [*TINY, f"data.path={tiny_npz}", *overrides])
+def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
+    """The settings of the real configuration, small; arguments are further overrides."""
 
+    def read(*overrides: str) -> ExperimentSettings:
+        return read_settings(ExperimentSettings, compose("train", [*TINY, f"data.path={tiny_npz}", *overrides]))
 
-@pytest.fixture(scope="session")
-def tiny(tiny_config) -> Callable[..., ExperimentSettings]:
-    """The settings of `tiny_config`."""
-    return lambda *overrides: read_settings(ExperimentSettings, tiny_config(*overrides))
+    return read
 
 
 @pytest.fixture(scope="session")
 def finished(tiny, photos, tmp_path_factory) -> Path:
     """The folder of a finished adversarial run, scored on photographs."""
     folder = tmp_path_factory.mktemp("runs") / "finished"
-    config = tiny(f"evaluate.photos={photos}")
-    run(config, load_data(config), folder)
+    settings = tiny(f"evaluate.photos={photos}")
+    run(settings, load_data(settings), folder)
     return folder
 
 
 @pytest.fixture(scope="session")
-def made_up_run(tiny_config) -> Callable[..., Path]:
+def made_up_run(tiny) -> Callable[..., Path]:
     """Makes a folder with what a finished run of two epochs writes, but for its checkpoints.
 
     photographs: the summaries of evaluations by the name of their sub-folder.
     """
 
     def make(folder: Path, arm: str = "none", photographs: dict | None = None, *overrides: str) -> Path:
-        folder.mkdir()
-        config = OmegaConf.to_container(tiny_config(f"augment={arm}", "seed=0", *overrides), resolve=True)
-        OmegaConf.save(OmegaConf.create({**config, "versions": {"python": "3.11"}}), folder / "config.yaml")
+        write_config(folder, tiny(f"augment={arm}", "seed=0", *overrides))
         seconds = {"attack": 0.5, "attack_classifier": 0.25, "training": 3.0, "evaluation": 1.0, "input_output": 0.5}
         lines = [
             {"epoch": epoch, **{f"seconds/{phase}": epoch * value for phase, value in seconds.items()}}

@@ -19,12 +19,11 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from augment import utils
-from train import loop
-from train.command_line.configuration import read_settings
+from train import checkpoint, loop
+from train.configuration import read_settings
 from train.networks import WideResNet
 from train.run import load_data, run
-from train.run_folder import checkpoint
-from train.run_folder.logs import read_metrics
+from train.run_folder import read_metrics
 from train.runtime import Interrupted, SyncBatchNormCPU, any_process, process_group, replicated, summed
 from train.settings import ExperimentSettings
 
@@ -79,13 +78,13 @@ def train_two_steps(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tiny_config, tmp_path_factory) -> Path:
+def folder(tiny, tmp_path_factory) -> Path:
     """What two processes wrote, one task after the other; for the runs, a configuration at a learning rate so low that
     rounding does not grow."""
     folder = tmp_path_factory.mktemp("distributed")
     for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
-        config = tiny_config("train.learning_rate=0.001", *overrides)
-        OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / f"{name}.yaml")
+        settings = tiny("train.learning_rate=0.001", *overrides)
+        OmegaConf.save(OmegaConf.structured(settings), folder / f"{name}.yaml")
     in_two_processes(all_tasks, folder)
     return folder
 

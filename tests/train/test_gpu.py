@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from train import checkpoint
 from train.loop import Trainer
 from train.run import load_data, run
-from train.run_folder import checkpoint
-from train.run_folder.logs import read_metrics
+from train.run_folder import read_metrics
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 

@@ -12,12 +12,12 @@ from torch import nn
 from augment.service import Renders
 from augment.utils import Phases
 from renderer.errors import InputError
+from train import checkpoint
 from train.data import Split
 from train.loop import Trainer, evaluate
 from train.networks import WideResNet
 from train.recipe import TrainSettings, cosine
-from train.run_folder import checkpoint
-from train.run_folder.logs import RunLog, read_metrics
+from train.run_folder import RunLog, read_metrics
 from train.runtime import MixedPrecision
 
 ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}

@@ -12,6 +12,7 @@ from torch import nn
 from torchvision.models import resnet18
 
 from renderer.errors import InputError
+from train.checkpoint import BEST, save
 from train.networks import (
     PUBLISHED,
     Dropout,
@@ -24,7 +25,6 @@ from train.networks import (
     publish,
     start_from,
 )
-from train.run_folder.checkpoint import BEST, save
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
 DATA = Path(__file__).parents[3] / "shared" / "data"

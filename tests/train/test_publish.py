@@ -6,8 +6,8 @@ from safetensors import safe_open
 
 from renderer.errors import InputError
 from scripts.publish import Settings, main
+from train import checkpoint
 from train.networks import PUBLISHED, load_run
-from train.run_folder import checkpoint
 
 
 def test_a_published_network_loads_and_its_file_holds_settings_and_scores_without_paths(finished, tmp_path):

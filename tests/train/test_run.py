@@ -5,7 +5,6 @@ import re
 import shutil
 import signal
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +15,11 @@ from omegaconf import OmegaConf
 
 from augment.labels import complementary_label
 from renderer.errors import InputError
-from train import loop
-from train.command_line.configuration import composed, read_settings
+from train import checkpoint, loop
 from train.data import DataSet
 from train.networks import load_run
 from train.run import load_data, prepare, run
-from train.run_folder import checkpoint
-from train.run_folder.continuation import require_same_settings
-from train.run_folder.logs import read_metrics
+from train.run_folder import read_metrics, require_same_settings
 from train.runtime import Interrupted
 from train.settings import ExperimentSettings
 
@@ -203,14 +199,14 @@ def test_resuming_with_other_settings_is_refused_by_name_and_changes_nothing(
     change = change.format(other=shutil.copy(tiny_npz, tmp_path / "other.npz"))
     key, _, asked = change.partition("=")
     settings = tiny("train.resume=true", change)
-    with pytest.raises(InputError, match=rf"was trained with {key}=\S+, and train.resume=true asks for {asked}"):
+    with pytest.raises(InputError, match=rf"was trained with {key}=\S+, not {asked}"):
         prepare(settings, load_data(settings), finished)
     assert files_in(finished) == before
 
 
-def test_resuming_for_more_epochs_and_under_other_circumstances_is_no_change(tiny_config, finished):
+def test_resuming_for_more_epochs_and_under_other_circumstances_is_no_change(tiny, finished):
     for changes in (["train.epochs=4"], ["train.threads=1", "renderer.cache=null", "train.checkpoint_every=2"]):
-        require_same_settings(finished, tiny_config("train.resume=true", *changes))
+        require_same_settings(finished, tiny("train.resume=true", *changes))
 
 
 # ---------------------------------------------------------------------------------------- full disks
@@ -226,10 +222,10 @@ def fail_with(number: int):
 @pytest.mark.parametrize(
     "writer, done",
     [
-        pytest.param("train.run_folder.logs.RunLog._show", 0, id="TensorBoard"),
-        pytest.param("train.run_folder.logs.RunLog.renders", 0, id="renders"),
-        pytest.param("train.run_folder.logs.RunLog.scalars", 0, id="metrics"),
-        pytest.param("train.run_folder.files.os.fsync", 0, id="checkpoint"),
+        pytest.param("train.run_folder.RunLog._show", 0, id="TensorBoard"),
+        pytest.param("train.run_folder.RunLog.renders", 0, id="renders"),
+        pytest.param("train.run_folder.RunLog.scalars", 0, id="metrics"),
+        pytest.param("train.run_folder.os.fsync", 0, id="checkpoint"),
         pytest.param("train.run.evaluate_photographs", 1, id="photographs"),
     ],
 )
@@ -247,7 +243,7 @@ def test_a_full_disk_is_one_error_wherever_it_is_met_and_the_run_can_go_on(tiny,
 def test_a_configuration_that_does_not_fit_leaves_the_old_one_whole(tiny, finished, tmp_path, monkeypatch):
     shutil.copytree(finished, tmp_path / "run")
     before = (tmp_path / "run" / "config.yaml").read_bytes()
-    monkeypatch.setattr("train.run_folder.files.os.fsync", fail_with(errno.ENOSPC))
+    monkeypatch.setattr("train.run_folder.os.fsync", fail_with(errno.ENOSPC))
     with pytest.raises(InputError, match=r"make room and go on with train\.resume=true"):
         train(tiny("train.resume=true"), tmp_path / "run")
     assert (tmp_path / "run" / "config.yaml").read_bytes() == before
@@ -459,34 +455,3 @@ def test_a_run_whose_operators_are_on_disk_rasterizes_nothing_and_trains_the_sam
         train(settings, tmp_path / name)
         assert rasterized == calls
     assert_same_weights(tmp_path / "second" / checkpoint.LAST, tmp_path / "first" / checkpoint.LAST)
-
-
-# ---------------------------------------------------------------------------------------- experiments
-
-
-def settings_of(*overrides: str) -> ExperimentSettings:
-    return read_settings(ExperimentSettings, composed("train", ["run=here", *overrides]))
-
-
-@pytest.mark.parametrize("experiment", ["demo", "cpu", "paper"])
-def test_every_experiment_is_a_configuration_that_runs_on_other_data_too(tiny_npz, experiment):
-    """The command line's data set wins over the experiment's, and no photographs are asked for."""
-    settings = settings_of(f"experiment={experiment}", "data=npz", f"data.path={tiny_npz}")
-    assert settings.evaluate.photos is None
-    assert len(load_data(settings).train) == 60
-
-
-def test_training_takes_the_attacks_of_scripts_attack_and_the_papers_where_none_is_named():
-    """The keys that were there before any other kind set the paper's step on the light."""
-
-    def kinds(*overrides: str) -> dict:
-        return {name: asdict(each) for name, each in settings_of(*overrides).augment.attack.parameters.items()}
-
-    paper = {"norm": "linf", "radius": None, "step": "unit", "step_size": 0.05}
-    assert kinds() == kinds("experiment=paper") == {"lighting": paper}
-    assert kinds("augment.attack.step=sign", "augment.attack.step_size=0.1") == {
-        "lighting": paper | {"step": "sign", "step_size": 0.1}
-    }
-    alone = composed("attack", ["attack=[geometry,lighting]"]).attack
-    both = kinds("attack@augment.attack=[geometry,lighting]", "augment.attack.geometry.radius=0.01")
-    assert both == {"lighting": dict(alone.lighting), "geometry": dict(alone.geometry) | {"radius": 0.01}}

@@ -45,18 +45,15 @@ class AttackCommandSettings(AttackSettings):
 
 @dataclass
 class AttackSceneSettings(SceneSettings):
-    """One view of a solid orange before gray, unless told otherwise. search: how many cameras to try where the
-    classifier does not recognize the mesh; see `train.attacks.search`."""
+    """search: how many cameras to try where the classifier does not recognize the mesh; see `train.attacks.search`."""
 
-    meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
-    backgrounds: list[Any] = field(default_factory=lambda: [0.5])
     views: int = 1
-    search: int = 0
+    search: int = 10
 
     def __post_init__(self) -> None:
         if not self.meshes or not self.backgrounds:
-            raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
-        require_range("scene.search", self.search, 0, MOST_VIEWS)
+            raise InputError("meshes and backgrounds must not be empty: name one mesh and one background")
+        require_range("search", self.search, 0, MOST_VIEWS)
         super().__post_init__()
 
 
@@ -91,7 +88,7 @@ class AttackExperimentSettings:
     attack: AttackCommandSettings = field(default_factory=AttackCommandSettings)
     transfer: TransferSettings = field(default_factory=TransferSettings)
     scene: AttackSceneSettings = field(default_factory=AttackSceneSettings)
-    renderer: RendererSettings = field(default_factory=RendererSettings)
+    renderer: RendererSettings = field(default_factory=lambda: RendererSettings(shadows=True))
 
     def __post_init__(self) -> None:
         require_range("seed", self.seed, 0, LARGEST_SEED)

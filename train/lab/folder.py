@@ -19,12 +19,12 @@ from renderer.errors import FACTOR, InputError, require_choice, require_limits, 
 from renderer.image import LARGEST_SIZE, encode
 from renderer.light.environment import read_panorama
 from renderer.shapes import LOOK_ALIKES
-from train.command_line.outputs import writable_folder
+from train.errors import writable_folder
 from train.lab.patterns import FAMILIES
 from train.lab.shots import Shot, draw_shots
 from train.lab.studio import Part, photograph, split_parts
 from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
-from train.run_folder.files import LOCK, sole_writer
+from train.run_folder import LOCK, sole_writer
 from train.settings import LARGEST_SEED, read_object
 
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel

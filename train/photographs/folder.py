@@ -16,7 +16,7 @@ from augment.classifiers.adapter import class_index, nearest
 from augment.utils import progress, require_memory
 from renderer.errors import InputError, in_one_line, require_file
 from renderer.io.images import read_square
-from train.run_folder.logs import console
+from train import console
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", ".tiff", ".gif")
 MACS = "__MACOSX"  # macOS puts this folder into archives

@@ -6,11 +6,10 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from augment.attacks.parameters import PARAMETERS
-from train.command_line.configuration import as_dict, composed, dotted, is_within
-from train.command_line.overrides import quoted
+from train.configuration import compose, dotted, is_within, quoted
 
 CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "inputs", "out", "train.resume", "data.images")
 DATA = ("cifar100", "npz", "folder")  # besides the default
@@ -27,12 +26,12 @@ def attack_command(config: DictConfig) -> str:
 
 def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapping[str, Any]) -> str:
     """Also of a run from another version, whose keys this one may lack; they are left out."""
-    kinds = [kind for kind in PARAMETERS if kind in attack]
+    kinds = [kind for kind in PARAMETERS if attack.get(kind) is not None]
     chosen = [f"{group}=[{','.join(kinds)}]"] if kinds else []
     if config.get("data", {}).get("name") in DATA:
         chosen.append(f"data={config.data.name}")
-    defaults = dict(dotted(as_dict(composed(name, chosen))))
-    own = dict(dotted(as_dict(config)))
+    defaults = dict(dotted(OmegaConf.to_container(compose(name, chosen))))
+    own = dict(dotted(OmegaConf.to_container(config)))
     if own.get("evaluate.photos") and own.get("evaluate.photos") == own.get("data.images"):
         del own["evaluate.photos"]  # the run's own renders, which it makes again
     changed = {key: value for key, value in own.items() if key in defaults and value != defaults[key]}

@@ -23,7 +23,7 @@ from train.photographs.metrics import (
 )
 from train.photographs.predictions import PREDICTIONS, Prediction, read_predictions
 from train.report.summary import RunSummary, name_among
-from train.run_folder.logs import PHASES
+from train.run_folder import PHASES
 from train.settings import PHOTOGRAPHS
 from train.tables import Table, format_interval
 

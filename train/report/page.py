@@ -18,7 +18,8 @@ from PIL import Image
 
 from renderer.errors import InputError
 from renderer.io.images import read_square
-from train.command_line.entry_points import one_sentence
+from train.attack_examples import SUFFIX, Side, read_attack_examples
+from train.errors import one_sentence
 from train.photographs.metrics import OVERALL, Roc, find_metric, metric_title
 from train.photographs.predictions import PREDICTIONS, Prediction, outcomes, read_predictions
 from train.photographs.sheet import COLORS, caption, evenly
@@ -47,9 +48,7 @@ from train.report.summary import (
     spread_tables,
     varied_settings,
 )
-from train.run_folder.attack_examples import SUFFIX, Side, read_attack_examples
-from train.run_folder.files import CONFIG, read_config
-from train.run_folder.logs import PHASES
+from train.run_folder import CONFIG, PHASES, read_config
 from train.settings import PHOTOGRAPHS
 from train.tables import Table, as_text
 

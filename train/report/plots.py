@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from train.attack_examples import Side
 from train.photographs.metrics import Roc
 from train.photographs.sheet import draw_roc
 from train.report.summary import Score
-from train.run_folder.attack_examples import Side
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

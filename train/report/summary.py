@@ -14,13 +14,11 @@ from omegaconf import DictConfig
 from augment.attacks.files import LINES
 from augment.service import ARMS
 from renderer.errors import InputError, in_one_line
+from train import checkpoint
 from train.photographs.metrics import METRICS, find_metric, metric_title
 from train.photographs.scoring import SUMMARY
-from train.run_folder import checkpoint
-from train.run_folder.continuation import decisive_settings
-from train.run_folder.files import CONFIG, FAILURE, read_config, read_json, state
-from train.run_folder.logs import METRICS as METRICS_FILE
-from train.run_folder.logs import PHASES, read_metrics
+from train.run_folder import CONFIG, FAILURE, PHASES, decisive_settings, read_config, read_json, read_metrics, state
+from train.run_folder import METRICS as METRICS_FILE
 from train.tables import Table, format_interval
 
 DEPTH = 4  # folders below the one that is named

@@ -19,7 +19,7 @@ from renderer.light.presets import probe
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
-from train.command_line.configuration import composed, read_settings
+from train.configuration import compose, read_settings
 from train.settings import read_object
 
 CPU = torch.device("cpu")
@@ -45,7 +45,7 @@ def configured(*overrides: str) -> AttackExperimentSettings:
     """The real configuration; arguments are further overrides."""
     small = ["renderer.rasterizer=numpy", "renderer.cache=null", "attack.checks=false", "attack.max_steps=8"]
     small += ["attack.margin=0", "attack.rounded=false"]
-    return read_settings(AttackExperimentSettings, composed("attack", [*small, *overrides]))
+    return read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
 
 
 STANDING = {  # the light of a kind that is placed in the scene, a little of it from the start

@@ -18,7 +18,7 @@ from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
-from train.command_line.configuration import composed, read_settings
+from train.configuration import compose, read_settings
 from train.settings import read_object
 
 CLASSES = ("orange", "lime", "sky")
@@ -32,7 +32,7 @@ def attacked(*overrides: str) -> AttackResult:
         "attack.force=true",
         "attack.allow_negative=true",
     ]
-    settings = read_settings(AttackExperimentSettings, composed("attack", [*small, *overrides]))
+    settings = read_settings(AttackExperimentSettings, compose("attack", [*small, *overrides]))
     by_color = Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES, "by_color")
     return attack_mesh(read_object("solid:orange:0", "orange", 0), settings, by_color, torch.device("cpu"))
 

@@ -13,7 +13,7 @@ from renderer.errors import InputError
 from train.attacks.experiment import attacks
 from train.attacks.search import LENS, LIGHT_GRAY, _candidates, overrides, search
 from train.attacks.settings import AttackExperimentSettings
-from train.command_line.configuration import composed, read_settings
+from train.configuration import compose, read_settings
 from train.settings import read_object
 
 CPU = torch.device("cpu")
@@ -22,7 +22,7 @@ CHANGED = ("polar", "azimuth", "width", "fov", "light", "exposure")
 
 def configured(*more: str) -> AttackExperimentSettings:
     small = ["renderer.rasterizer=numpy", "renderer.cache=null", "attack.checks=false", "attack.max_steps=1"]
-    return read_settings(AttackExperimentSettings, composed("attack", [*small, "attack.allow_negative=true", *more]))
+    return read_settings(AttackExperimentSettings, compose("attack", [*small, "attack.allow_negative=true", *more]))
 
 
 def bright_and_small(images: Tensor) -> Tensor:

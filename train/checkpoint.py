@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,55 +11,79 @@ import torch
 from torch import Tensor, cuda, get_rng_state, set_rng_state
 
 from renderer.errors import InputError
-from train.run_folder.files import write_whole
 
 LAST, PREVIOUS, BEST = "last.pt", "previous.pt", "best.pt"
 HASH = "sha256"
-VERSION = 2  # of what is stored as a network's architecture; 1 had neither size nor normalization nor encoding
+VERSION = 2  # of the stored architecture; version 1 had neither size nor normalization nor encoding
+
+
+def write_whole(path: Path, content: bytes | memoryview, previous: Path | None = None) -> None:
+    """Write a file so that at any moment, also after a loss of power, either the old or the new one is there.
+
+    previous: where the old file is kept. OSError that names the path where the disk refuses it; the old file stays.
+    """
+    temporary = path.with_suffix(".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        if previous and path.exists():
+            os.replace(path, previous)
+        os.replace(temporary, path)
+        if os.name == "posix":  # make the renaming last
+            descriptor = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> None:
-    """Write tensors and plain values as `write_whole` does."""
+    """Write tensors and plain values with `write_whole`."""
     content = io.BytesIO()
     torch.save({**state, HASH: content_hash(state)}, content)
     write_whole(path, content.getbuffer(), previous)
 
 
 def load(path: Path) -> dict[str, Any]:
-    """What `save` wrote, on the CPU; InputError for a file that is not there, not a checkpoint or not as written."""
+    """The state that `save` wrote, on the CPU; InputError for a file that is missing, damaged or not a checkpoint."""
     if not path.is_file():
         raise InputError(f"checkpoint {path} does not exist: give a run folder that holds one")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        whole = isinstance(state, dict) and state.pop(HASH, None) == content_hash(state)
-    except Exception as error:  # torch raises many kinds for a damaged or foreign file
-        raise InputError(f"checkpoint {path} is damaged or no checkpoint; use another one of the run") from error
-    if not isinstance(state, dict) or "model" not in state or not isinstance(state.get("architecture"), dict):
-        raise InputError(f"checkpoint {path} lacks its model or architecture: give one that `python -m train` wrote")
-    if not whole:
-        raise InputError(f"checkpoint {path} is damaged: its content is not what its hash says; use another one")
+        if not isinstance(state, dict) or state.pop(HASH, None) != content_hash(state):
+            raise ValueError("its content does not match its hash")
+    except Exception as error:  # torch raises many types for a damaged or foreign file
+        raise InputError(f"checkpoint {path} is damaged or not a checkpoint; use another one of the run") from error
     return checked(state, path)
 
 
 def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The state; InputError for what anyone may have written, with a right hash: weights that are none, or of later."""
-    weights, version = state["model"], state["architecture"].get("version", 1)
+    """The state; InputError where it lacks finite weights or an architecture, or comes from a later version."""
+    weights, architecture = state.get("model"), state.get("architecture")
+    if not isinstance(architecture, dict):
+        raise InputError(f"checkpoint {path} has no architecture: give one that `python -m train` wrote")
+    version = architecture.get("version", 1)
     if not isinstance(version, int) or version > VERSION:
-        raise InputError(f"checkpoint {path} was written by a later version ({version!r}): install that one")
+        raise InputError(f"checkpoint {path} was written by a later version ({version!r}): install that version")
     if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise InputError(f"checkpoint {path} holds other things than weights under model: use another one")
+        raise InputError(f"checkpoint {path} has no weights under model: use another one")
     if not_finite := [name for name, value in weights.items() if not value.isfinite().all()]:
         raise InputError(f"checkpoint {path} has NaN or infinity in {not_finite[0]}: use another one")
     return state
 
 
 def exists(folder: Path) -> bool:
-    """Whether there is a run to go on with."""
+    """Whether the folder holds a checkpoint to resume from."""
     return any((folder / name).exists() for name in (LAST, PREVIOUS))
 
 
 def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
-    """The run's newest checkpoint that is whole, and what was wrong with a newer one; InputError where none is."""
+    """The run's newest undamaged checkpoint, and the fault of a newer one; InputError where there is none."""
     try:
         return load(folder / LAST), None
     except InputError as error:
@@ -93,12 +118,12 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
 
 
 def random_state() -> dict[str, Tensor | list[Tensor]]:
-    """The CPU's and, where there are any, the GPUs'."""
+    """The state of the CPU's random generator and of each GPU's."""
     return {"cpu": get_rng_state(), "cuda": cuda.get_rng_state_all() if cuda.is_available() else []}
 
 
 def restore_random_state(state: Mapping[str, Any]) -> None:
-    """What `random_state` gave, on as many GPUs as there were and are."""
+    """Restore a `random_state`, on as many GPUs as both machines have."""
     set_rng_state(state["cpu"])
     for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
         cuda.set_rng_state(values, device)

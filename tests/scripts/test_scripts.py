@@ -1,0 +1,141 @@
+"""The scripts' settings and outputs."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from train.checkpoint import BEST, save
+from train.networks import WideResNet, describe, load_run
+from train.run_folder import LOCK, sole_writer
+
+USER_ERROR = 2
+CLASSES = ["fig", "lime", "orange"]
+
+
+@pytest.fixture
+def here(tmp_path) -> Path:
+    """A folder with a network for images of 64 pixels in 1.10, and photographs in 2024."""
+    torch.manual_seed(0)
+    network = WideResNet(len(CLASSES), 10, 1, 0.0)
+    described = describe(network, CLASSES, size=64, encoding="linear", depth=10, width=1, dropout=0.0)
+    (tmp_path / "1.10").mkdir()
+    save(tmp_path / "1.10" / BEST, {"model": network.state_dict(), "architecture": described})
+    rng = np.random.default_rng(0)
+    for name in ("2024/orange", "2024/other_\udcff"):
+        (tmp_path / name).mkdir(parents=True)
+        pixels = rng.integers(0, 256, (64, 64, 3)).astype(np.uint8)
+        Image.fromarray(pixels).save(tmp_path / name / "a.png")
+    (tmp_path / "file").touch()
+    return tmp_path
+
+
+EVALUATE = ["evaluate_photos", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
+EXPORT = ["export_light", "light=grace", "height=4"]
+
+
+def test_a_network_is_scored_at_its_size_on_photographs_whose_names_are_numbers_or_no_utf_8(call, here, capsys):
+    assert call(*EVALUATE, "out=1e3") == 0
+    assert "1 images of orange, 1 of other things" in capsys.readouterr().out
+    assert {path.name for path in (here / "1e3").iterdir()} == {
+        *("photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK)
+    }
+    assert json.loads((here / "1e3" / "summary.json").read_text())["size"] == 64
+    header, *rows = (here / "1e3" / "photographs.csv").read_text(encoding="utf-8").splitlines()
+    assert any(row.startswith(r"other_\udcff/a.png,") for row in rows)
+    (first,) = (row.split(",") for row in rows if row.startswith("orange/a.png,"))
+    image = np.asarray(Image.open(here / "2024" / "orange" / "a.png")).transpose(2, 0, 1).copy()
+    with torch.no_grad():
+        logits = load_run(here / "1.10")(torch.from_numpy(image)[None] / 255)[0]
+    log_odds = float(logits[2] - logits[:2].logsumexp(0))
+    assert float(first[header.split(",").index("orange_log_odds")]) == pytest.approx(log_odds, abs=1e-4)
+
+
+OWN = """
+import torch
+
+class Redness(torch.nn.Module):
+    def forward(self, images):
+        red = images[:, 0].mean((1, 2)) - 0.5
+        return torch.stack([-red, red], 1)
+
+def build():
+    return Redness(), 16, ["lime", "orange"]
+"""
+
+
+def test_a_network_that_a_python_function_makes_is_scored_at_its_size_and_on_its_classes(call, tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    for name, color in {"lime": (0, 255, 0), "orange": (255, 128, 0)}.items():
+        (tmp_path / "lit" / name).mkdir(parents=True)
+        Image.new("RGB", (40, 30), color).save(tmp_path / "lit" / name / "one.png")
+    assert call("evaluate_photos", "classifier=python:own:build", "photos=lit", "device=cpu", "out=out") == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["size"], summary["recall"]["value"], summary["false_alarms"]["value"]) == (16, 1, 0)
+
+
+WRONG = [
+    ([*EVALUATE, "skip_unreadable=maybe"], "Error merging override skip_unreadable=maybe: Value 'maybe' is not"),
+    ([*EVALUATE, "photos=[a,b]"], "Error merging override photos=[a,b]: "),
+    ([*EVALUATE, "label=pear"], "classifier=run:1.10: 'pear' is not a class of the model"),
+    ([*EVALUATE, "classifier=python:own:build"], "give one network"),
+    ([*EVALUATE, "run=null"], "give one network"),
+    ([*EVALUATE, "run=null", "classifier=python:own:build", "model=python:a:b"], "model=python:a:b is for"),
+    ([*EVALUATE, "run=null", "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
+    ([*EVALUATE, "weights=b"], "weights=b is not for classifier=run:1.10"),
+    ([*EVALUATE, "out=file"], "out=file cannot be written to (Not a directory): choose another folder"),
+    ([*EVALUATE, "out=/dev/full/out"], "out=/dev/full/out cannot be written to"),
+    (["compare_runs"], "runs is not set: give runs=..."),
+    (["compare_runs", "runs=[]"], "runs is empty"),
+    (["compare_runs", "runs=runs/a"], "Error merging override runs=runs/a: "),
+    (["compare_runs", "runs=[a,b,./a]"], "runs names a twice"),
+    (["compare_runs", "runs=[[a]]"], "runs[0]: give a plain value"),
+    (["compare_runs", "runs=[2024]"], "2024 holds no finished run"),
+    (["compare_runs", "--multirun"], "--multirun is not an option"),
+    (["report", "runs=[]"], "runs is empty"),
+    (["report", "a", f"out={'x' * 300}"], "out=xxx"),
+    ([*EXPORT, "height=1000000000", "out=a.hdr"], "height=1000000000 must be at least 1 and at most 8192"),
+    ([*EXPORT, "out=a.jpg"], "out: "),
+    ([*EXPORT, "out=/proc/none/out.hdr"], "out=/proc/none/out.hdr cannot be written"),
+    (["publish", "run=[a]", "out=out"], "Error merging override run=[a]: "),
+    (["publish", "run=1.10", "out=file/out"], "out=file/out cannot be written to"),
+    (["fit_skylight", "zenith_degree=-1", "out=a.safetensors"], "zenith_degree=-1 must be at least 0"),
+    (["fit_skylight", "out=photo.png"], "out=photo.png: name a .safetensors file"),
+    (["fit_skylight", "out=2024"], "out=2024 cannot be written (it is not a regular file): choose another file"),
+    (["lab", "size=0", "out=a"], "size=0 must be at least 1"),
+    (["lab", "out=file/out"], "out=file/out cannot be written to"),
+]
+
+
+@pytest.mark.parametrize(("command", "message"), WRONG, ids=[" ".join([c[0], *c[-2:]]) for c, _ in WRONG])
+def test_a_mistake_is_one_line_and_status_2_before_the_work(call, here, capsys, command, message):
+    before = sorted(here.rglob("*"))
+    assert call(*command) == USER_ERROR
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.startswith(f"error: {message}") and printed.err.count("\n") == 1
+    assert sorted(here.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", [EVALUATE, ["attack", "classifier=run:1.10"], ["lab"]], ids=lambda given: given[0])
+def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
+    with sole_writer("out", here / "out"):
+        assert call(*command, "out=out") == USER_ERROR
+    assert capsys.readouterr().err.startswith("error: out=out is being written by another process")
+    assert not (here / "out").exists()
+
+
+def test_a_light_is_not_written_over_itself(call, here, capsys):
+    assert call("export_light", "light=grace", "height=8", "out=a.npy") == 0
+    (here / "b.npy").symlink_to("a.npy")
+    whole = (here / "a.npy").read_bytes()
+    assert call("export_light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
+    assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself, which would be lost")
+    assert (here / "a.npy").read_bytes() == whole
+
+
+def test_help_shows_every_setting(call, capsys):
+    assert call("evaluate_photos", "--help") == 0
+    assert "photos: ???" in capsys.readouterr().out

@@ -1,0 +1,129 @@
+import errno
+import os
+import pickle
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from renderer.errors import InputError
+from train import checkpoint
+from train.checkpoint import BEST, LAST, PREVIOUS, content_hash, load, load_newest, save
+
+STATE = {
+    "model": {"weight": torch.arange(6.0).reshape(2, 3), "steps": torch.tensor(3)},
+    "architecture": {"classes": ["fig", "lime"]},
+    "epoch": 3,
+    "history": [{"epoch": 1, "train/loss": 0.25}],
+    "random": [torch.arange(500)],
+}
+
+
+class Harmful:
+    def __reduce__(self):
+        return os.mkdir, ("harm",)
+
+
+def test_a_checkpoint_is_read_as_it_was_written(tmp_path):
+    save(tmp_path / LAST, STATE)
+    loaded = load(tmp_path / LAST)
+    assert loaded.keys() == STATE.keys() and content_hash(loaded) == content_hash(STATE)
+    assert torch.equal(loaded["model"]["weight"], STATE["model"]["weight"])
+    assert os.listdir(tmp_path) == [LAST]
+
+
+@pytest.mark.parametrize("function", ["fsync", "replace"])
+def test_a_full_disk_leaves_the_old_checkpoint_whole_and_the_error_names_the_new_one(tmp_path, monkeypatch, function):
+    save(tmp_path / LAST, STATE)
+    before = (tmp_path / LAST).read_bytes()
+
+    def fail(*arguments):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint.os, function, fail)
+        with pytest.raises(OSError, match="No space left on device") as full:
+            save(tmp_path / LAST, STATE | {"epoch": 4}, tmp_path / PREVIOUS)
+    assert full.value.errno == errno.ENOSPC and full.value.filename == str(tmp_path / LAST)
+    assert os.listdir(tmp_path) == [LAST] and (tmp_path / LAST).read_bytes() == before
+    save(tmp_path / LAST, STATE | {"epoch": 4})
+    assert load(tmp_path / LAST)["epoch"] == 4
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        pytest.param(Path.unlink, id="missing"),
+        pytest.param(lambda path: path.write_bytes(b""), id="empty"),
+        pytest.param(lambda path: path.write_bytes(path.read_bytes()[:2000]), id="truncated"),
+        pytest.param(lambda path: path.write_text("a note"), id="text"),
+        pytest.param(lambda path: path.write_bytes(pickle.dumps({"model": 1})), id="pickle"),
+        pytest.param(lambda path: torch.save(Harmful(), path), id="code"),
+        pytest.param(lambda path: torch.save(torch.zeros(3), path), id="tensor"),
+        pytest.param(lambda path: torch.save({"state_dict": {}}, path), id="foreign"),
+        pytest.param(lambda path: save(path, {"model": {}}), id="no architecture"),
+        pytest.param(lambda path: save(path, STATE | {"model": {"weight": 1}}), id="no weights"),
+        pytest.param(lambda path: save(path, STATE | {"model": {"weight": torch.tensor(torch.nan)}}), id="NaN"),
+        pytest.param(lambda path: save(path, STATE | {"architecture": {"version": 99}}), id="later version"),
+    ],
+)
+def test_a_file_without_a_usable_network_is_refused_by_name_and_runs_no_code(tmp_path, monkeypatch, spoil):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / BEST
+    save(path, STATE)
+    spoil(path)
+    with pytest.raises(InputError, match=rf"^checkpoint {re.escape(str(path))} [^\n]+$"):
+        load(path)
+    assert not Path("harm").exists()
+
+
+def test_a_flipped_byte_is_noticed_or_changes_nothing(tmp_path):
+    """The zip archive inside has bytes that nobody reads; all others are under the hash."""
+    path = tmp_path / LAST
+    save(path, STATE)
+    whole, noticed = path.read_bytes(), 0
+    for place in range(0, len(whole), len(whole) // 200):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x40]) + whole[place + 1 :])
+        try:
+            assert content_hash(load(path)) == content_hash(STATE)
+        except InputError:
+            noticed += 1
+    assert noticed > 100
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"a": [1, 2], "b": torch.zeros(2)},
+        {"a": [1, 3], "b": torch.zeros(3)},
+        {"a": [1, 2, 3], "b": torch.zeros(3)},
+        {"a": [[1], 2], "b": torch.zeros(3)},
+        {"a": [1, 2], "b": torch.zeros(3, dtype=torch.float64)},
+        {"a": [1, 2], "b": torch.zeros(3, 1)},
+        {"a": [1, 2.0], "b": torch.zeros(3)},
+        {"a": [1, 2], "c": torch.zeros(3)},
+        {"a": [1, 2], "b": -torch.zeros(3)},
+    ],
+)
+def test_different_contents_have_different_hashes(other):
+    assert content_hash(other) != content_hash({"a": [1, 2], "b": torch.zeros(3)})
+
+
+def test_the_hash_does_not_depend_on_memory_layout():
+    images = torch.rand(2, 3, 4, 4)
+    assert content_hash(images) == content_hash(images.contiguous(memory_format=torch.channels_last))
+
+
+def test_the_newest_undamaged_checkpoint_is_loaded_and_the_fault_of_a_newer_one_reported(tmp_path):
+    for epoch in (1, 2):
+        save(tmp_path / LAST, STATE | {"epoch": epoch}, tmp_path / PREVIOUS)
+    state, fault = load_newest(tmp_path)
+    assert (state["epoch"], fault) == (2, None)
+    for spoil in (lambda path: path.write_bytes(path.read_bytes()[:-100]), Path.unlink):
+        spoil(tmp_path / LAST)
+        state, fault = load_newest(tmp_path)
+        assert state["epoch"] == 1 and f"checkpoint {tmp_path / LAST}" in fault
+    (tmp_path / PREVIOUS).unlink()
+    with pytest.raises(InputError, match=r"last.pt does not exist"):
+        load_newest(tmp_path)

@@ -1,0 +1,186 @@
+"""Configurations: what Hydra or a dataclass refuses is one sentence with the key, and every default has one owner."""
+
+import re
+from dataclasses import dataclass, field
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from augment.variation import VariationSettings
+from renderer.errors import InputError, require_range
+from train.attacks.settings import AttackExperimentSettings
+from train.configuration import as_override, compose, dotted, quoted, read_settings
+from train.lab.folder import LabSettings
+from train.run import load_data, prepare
+from train.settings import ExperimentSettings
+
+
+@pytest.mark.parametrize(
+    ("command", "kind", "overrides", "by_the_clock_or_required"),
+    [
+        ("train", ExperimentSettings, ["experiment=paper", "data=shapes"], {"run", "data.images"}),
+        ("attack", AttackExperimentSettings, ["attack=[]"], {"out"}),
+        ("lab", LabSettings, [], {"meshes"}),
+    ],
+)
+def test_the_dataclasses_have_the_defaults_of_the_configuration(command, kind, overrides, by_the_clock_or_required):
+    config = dict(dotted(OmegaConf.to_container(compose(command, overrides))))
+    schema = dict(dotted(OmegaConf.to_container(OmegaConf.structured(kind))))
+    assert {key for key in config if config[key] != schema.get(key, "missing")} == by_the_clock_or_required
+
+
+def test_the_papers_experiment_renders_a_fixed_grid():
+    settings = read_settings(ExperimentSettings, compose("train", ["experiment=paper", "run=here"]))
+    assert settings.augment.vary == VariationSettings() and settings.scene.hard_negatives == []
+
+
+@pytest.mark.parametrize("experiment", ["best", "cpu", "demo", "fast", "harden", "paper"])
+def test_every_experiment_takes_other_data(experiment):
+    overrides = [f"experiment={experiment}", "data=npz", "data.path=a.npz", "train.init_from=b", "run=here"]
+    settings = read_settings(ExperimentSettings, compose("train", overrides))
+    assert (settings.data.name, settings.data.path, settings.evaluate.photos) == ("npz", "a.npz", None)
+
+
+def test_the_demonstration_is_scored_on_the_images_that_it_renders():
+    settings = read_settings(ExperimentSettings, compose("train", ["run=here"]))
+    assert settings.evaluate.photos == settings.data.images == "here/rendered_images"
+
+
+def test_training_takes_the_parameters_of_the_attack_command_and_the_papers_where_none_is_named():
+    def parameters(*overrides: str) -> dict:
+        return read_settings(ExperimentSettings, compose("train", overrides)).augment.attack.parameters
+
+    light = parameters("augment.attack.step=sign", "augment.attack.step_size=0.1")
+    assert [*light] == ["lighting"] and (light["lighting"].step, light["lighting"].step_size) == ("sign", 0.1)
+    attack = read_settings(
+        AttackExperimentSettings, compose("attack", ["attack=[geometry,lighting]"])
+    ).attack.parameters
+    assert parameters("attack@augment.attack=[geometry,lighting]") == attack
+
+
+# ------------------------------------------------------------------------------------ refusals
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        (["data=npz", "data.pth=x"], "Could not override 'data.pth'"),
+        (["data=mnist"], "In 'train': Could not find 'data/mnist' Available options in 'data': cifar100 folder npz sh"),
+        (["scene.meshes=[~/a.obj]"], "LexerNoViableAltException: scene.meshes=[~/a.obj]"),
+        (["train.epochs=[1"], "train.epochs=[1: no viable alternative at input '[1'"),
+        (["seed=0,1"], "Ambiguous value for argument 'seed=0,1'"),
+        (["~seed"], "~seed: a setting cannot be removed"),
+        (["run="], "run is empty: give a name"),
+        (["+train.epoch=3"], "train.epoch: Key 'epoch' not in 'TrainSettings'"),
+        (["data=npz"], "data.path is not set: give data.path=..."),
+        (["data=npz", "data.path=${nowhere}"], "data.path: Interpolation key 'nowhere' not found"),
+        (["train=3"], "train: Merge error: int is not a subclass of TrainSettings. value: 3"),
+        (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
+        (["augment.attack.step_size=abc"], "augment.attack.step_size: Value 'abc'"),
+        (["evaluate.skip_unreadable=perhaps"], "evaluate.skip_unreadable: Value 'perhaps'"),
+        (["scene.meshes=solid:orange"], "scene.meshes: Invalid value assigned"),
+        (["scene.projector=[]"], "scene.projector: Cannot merge DictConfig with ListConfig"),
+        (["compare=[[none]]"], "compare[0]: give a plain value, not a list or mapping"),
+        ([f"scene.exposure={10**400}"], "scene.exposure: int too large to convert to float"),
+        (["seed=-1"], "seed=-1 must be at least 0"),
+        (["train.epochs=0"], "train.epochs: epochs=0 must be at least 1"),
+        (["train.learning_rate=-1"], "train.learning_rate: learning_rate=-1.0 must be positive"),
+        (["data=folder", "data.path=a", "data.size=1"], "data.size: size=1 must be at least 5"),
+        (["scene.exposure=1e30"], "scene.exposure: exposure=1e+30 must be at least 1e-05 and at most 100000"),
+        (["scene.views=1000000000000"], "scene.views: views=1000000000000 must be at least 1 and at most 100000"),
+        (["evaluate.photos={a/b: /x}"], "evaluate.photos: photos: a/b must be a name of letters"),
+        (["evaluate.photos={renders: /x}"], "evaluate.photos: photos: renders must be a name of letters"),
+        (["evaluate.photos=[/x]"], "evaluate.photos: photos=['/x'] must be a folder, or a mapping"),
+    ],
+    ids=lambda given: given[-1] if isinstance(given, list) else "",
+)
+def test_a_wrong_setting_is_one_sentence_that_names_it(overrides, sentence):
+    with pytest.raises(InputError) as refusal:
+        read_settings(ExperimentSettings, compose("train", overrides))
+    assert str(refusal.value).startswith(sentence) and "\n" not in str(refusal.value)
+
+
+@dataclass
+class Inner:
+    size: int = 1
+
+    def __post_init__(self) -> None:
+        require_range("size", self.size, 1, 9)
+        if self.size == 5:
+            raise InputError("five of them are refused")
+
+
+@dataclass
+class Outer:
+    inner: Inner = field(default_factory=Inner)
+    optional: Inner | None = None
+
+
+@pytest.mark.parametrize("group", ["inner", "optional"])
+def test_the_check_of_a_nested_dataclass_gets_its_key(group):
+    for size, message in [(0, rf"a\.{group}\.size: size=0 must be"), (5, rf"a\.{group}: five of them")]:
+        with pytest.raises(InputError, match=f"^{message}"):
+            read_settings(Outer, OmegaConf.create({group: {"size": size}}), "a")
+    assert getattr(read_settings(Outer, OmegaConf.create({group: {"size": 3}})), group) == Inner(3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["data.validation=1.5"], "data.validation=1.5 must lie between 0 and 1"),
+        (["data.name=mnist"], "data.name=mnist: choose one of cifar100, npz, folder, shapes"),
+        (["augment.arm=adverserial"], "arm=adverserial: choose one of"),
+        (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12"),
+        (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable: Key 'lable'"),
+        (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
+        (["scene.meshes=['']"], "mesh is '': give a file or solid:NAME"),
+        (
+            ["scene.hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
+            "scene.hard_negatives[0] is of the class orange: name it in scene.meshes",
+        ),
+        (["train.compile=always"], "compile=always is for a GPU"),
+        (["train.device=cuda:99"], "device=cuda:99 is not available here"),
+        (["model.width=100000"], "width=100000 make"),
+        (["scene.light=graze"], "'graze' is not known"),
+        (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
+        (["renderer.samples=0"], "samples=0"),
+        (["renderer.rasterizer=opengll"], "opengll"),
+        (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab does not exist"),
+    ],
+    ids=lambda given: given[-1] if isinstance(given, list) else "",
+)
+def test_wrong_input_is_one_sentence_before_anything_is_written(tiny, tmp_path, overrides, message):
+    with pytest.raises(InputError, match=re.escape(message)) as refusal:
+        settings = tiny(*overrides)
+        prepare(settings, load_data(settings), tmp_path / "run")
+    assert "\n" not in str(refusal.value) and not (tmp_path / "run").exists()
+
+
+# ------------------------------------------------------------------------------------ names on the command line
+
+
+@given(st.text())
+def test_quoted_text_is_read_as_it_is(text):
+    (override,) = OverridesParser.create().parse_overrides([f"run={quoted(text)}"])
+    assert str(override.value()) == text
+
+
+@pytest.mark.parametrize(
+    ("argument", "override"),
+    [
+        ("photos=2024", "photos='2024'"),
+        ("evaluate.photos=1.10", "evaluate.photos='1.10'"),
+        ("+data.path=1e3", "+data.path='1e3'"),
+        ("out=true", "out='true'"),
+        ("run=schäl", "run='schäl'"),
+        ("run=a\udcff", "run='a\udcff'"),
+        ("out=a;b", "out='a;b'"),
+        *((same, same) for same in ["train.epochs=3", "photos=none", "photos=2024,2025", "run=a/b.c", "2024"]),
+        *((same, same) for same in ["run='ä'", "weights=null", "evaluate.photos={lab: 1}", "out=${run}/x", "out=~/a"]),
+    ],
+)
+def test_a_name_stays_text_whatever_it_looks_like_to_hydra(argument, override):
+    assert as_override(argument) == override

@@ -1,0 +1,64 @@
+import io
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from renderer.errors import InputError
+from train import errors
+from train.errors import one_sentence, writable_file, writable_folder
+
+
+def interpolation_error() -> Exception:
+    try:
+        return OmegaConf.create({"path": "${nowhere}"}).path
+    except Exception as error:
+        return error
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (InputError("light=x is not known"), "light=x is not known"),
+        (interpolation_error(), "path: Interpolation key 'nowhere' not found"),
+        (PermissionError(13, "Permission denied", "/a/b"), "/a/b cannot be read or written: Permission denied"),
+        (OSError(28, "No space left on device"), "there is no room for the output: No space left on device"),
+        (RuntimeError("[/gloo/x.cc:1] Connection closed by peer"), "another process of this run has ended: "),
+        (torch.distributed.DistBackendError("NCCL error"), "another process of this run has ended: "),
+        (UnicodeEncodeError("utf-8", "a\udcffb", 1, 2, "no"), r"'a\udcffb' has characters that this system"),
+        (MemoryError(), "memory ran out: ask for fewer or smaller images"),
+        (torch.OutOfMemoryError("x"), "memory ran out"),
+        (RuntimeError("can't allocate memory"), "memory ran out"),
+        (ZeroDivisionError(), None),
+        (RuntimeError("a mistake of the program"), None),
+    ],
+)
+def test_an_error_is_one_sentence_where_the_user_can_fix_it(error, sentence):
+    found = one_sentence(error)
+    assert (found is None) == (sentence is None)
+    assert found is None or (found.startswith(sentence) and "\n" not in found)
+
+
+def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").write_text("old")
+    for folder in ("there", "a/b", tmp_path / "c"):
+        writable_folder(folder, "out")
+    for file in ("there/file", "c/new"):
+        writable_file(file, "out")
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "there", tmp_path / "there" / "file"]
+    assert (tmp_path / "there" / "file").read_text() == "old"
+
+
+@pytest.mark.parametrize("name", ["/proc/none", "/dev/null/a", "/dev/full", "x" * 300])
+def test_an_output_that_cannot_be_written_is_refused_by_its_key(name):
+    for try_it in (writable_folder, writable_file):
+        with pytest.raises(InputError, match=r"^out=[^\n]* cannot be written [^\n]*: choose another (file|folder)$"):
+            try_it(name, "out")
+
+
+def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(errors.tempfile, "TemporaryFile", lambda dir: io.FileIO("/dev/full", "w"))
+    with pytest.raises(InputError, match=rf"out={tmp_path} cannot be written to \(No space left on device\)"):
+        writable_folder(tmp_path, "out")

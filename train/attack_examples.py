@@ -1,0 +1,88 @@
+"""A few successful attacks of an epoch as a file of at most half a megabyte."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from augment.service import SHOWN_EXAMPLES, AttackExamples
+from renderer.errors import InputError, in_one_line
+from renderer.image import to_bytes
+from renderer.light.light_sphere import light_sphere
+
+SUFFIX = ".safetensors"
+LARGEST_SIDE = 128  # pixels; larger images are reduced
+SPHERE = 64  # pixels per side of the ball that shows the light
+OTHER = "other things"  # the label of hard negatives that belong to no class
+
+
+@dataclass(frozen=True)
+class Side:
+    """An example before or after the attack: its image and a white ball in its light, (3, H, W) uint8, and what the
+    model predicts."""
+
+    image: Tensor
+    sphere: Tensor
+    predicted: str
+    confidence: float
+
+
+def write_attack_examples(path: Path, attack_examples: AttackExamples, classes: Sequence[str]) -> None:
+    """Images as bytes in the safetensors format; labels and predictions in its metadata."""
+    labels = [classes[index] if index >= 0 else OTHER for index in attack_examples.labels.tolist()]
+    tensors, predictions = {}, {"label": labels}
+    for name, images, lights, probabilities in [
+        ("before", attack_examples.images_before, attack_examples.lights_before, attack_examples.predictions_before),
+        ("after", attack_examples.images, attack_examples.lights, attack_examples.predictions),
+    ]:
+        images = images.detach().cpu()
+        if images.shape[-1] > LARGEST_SIDE:
+            images = interpolate(images, LARGEST_SIDE, mode="area")
+        tensors[f"images_{name}"] = to_bytes(images).contiguous()
+        spheres = [to_bytes(light_sphere(light, SPHERE, basis=attack_examples.basis)) for light in lights]
+        tensors[f"spheres_{name}"] = torch.stack(spheres)
+        best = probabilities.max(1)
+        predictions[name] = [classes[index] for index in best.indices.tolist()]
+        predictions[f"confidence_{name}"] = best.values.tolist()
+    path.write_bytes(save(tensors, {"predictions": json.dumps(predictions)}))  # save_file names no file in its errors
+
+
+def read_attack_examples(path: Path) -> list[tuple[str, Side, Side]]:
+    """The label of each example, and its sides before and after; InputError naming a damaged file."""
+    try:
+        if not path.is_file():
+            raise ValueError("there is no such file")
+        with safe_open(path, "pt") as file:
+            predictions = json.loads(file.metadata()["predictions"])
+            before, after = (
+                [
+                    _side(*row)
+                    for row in zip(
+                        file.get_tensor(f"images_{name}"),
+                        file.get_tensor(f"spheres_{name}"),
+                        predictions[name],
+                        predictions[f"confidence_{name}"],
+                        strict=True,
+                    )
+                ]
+                for name in ("before", "after")
+            )
+        if len(before) > SHOWN_EXAMPLES:
+            raise ValueError(f"{len(before)} examples")
+        return list(zip(map(str, predictions["label"]), before, after, strict=True))
+    except Exception as error:  # safetensors raises its own type
+        raise InputError(f"{path} is damaged or of another version ({in_one_line(error)})") from error
+
+
+def _side(image: Tensor, sphere: Tensor, predicted: object, confidence: object) -> Side:
+    for pixels in (image, sphere):
+        channels, height, width = pixels.shape
+        if pixels.dtype != torch.uint8 or channels != 3 or height != width or width > LARGEST_SIDE:
+            raise ValueError(f"an image of {pixels.dtype} {tuple(pixels.shape)}")
+    return Side(image, sphere, str(predicted), float(confidence))  # type: ignore[arg-type]

@@ -1,0 +1,89 @@
+"""How commands start: Ctrl-C in one line, errors in one sentence with exit status 2, a script's settings.
+
+Commands import this module before all others, which take seconds to import; no other module imports it.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+USER_ERROR = 2
+INTERRUPTED = "ended by SIGINT"
+_started = False  # whether a command runs, after all imports
+_interrupted = False
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """End at once while modules are imported, since some swallow KeyboardInterrupt; raise it later."""
+    global _interrupted
+    _interrupted = True
+    if not _started:
+        os.write(2, f"{INTERRUPTED}\n".encode())
+        os._exit(128 + signal.SIGINT)
+    raise KeyboardInterrupt
+
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's background jobs ignore SIGINT
+    signal.signal(signal.SIGINT, _interrupt)
+
+
+@contextmanager
+def errors() -> Iterator[None]:
+    """Print what the user can fix as one line, without a traceback, and exit with status 2.
+
+    Ctrl-C ends in one line and status 130. A reader of the output who has gone ends the command in silence with
+    status 141. Characters that the terminal lacks are printed as escapes.
+    """
+    global _started, _interrupted
+    from train.errors import one_sentence
+
+    _started, _interrupted = True, False
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        yield
+        print(end="", flush=True)  # a closed pipe is met here
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes at its end
+        sys.exit(128 + signal.SIGPIPE)
+    except (Exception, KeyboardInterrupt) as error:
+        if _interrupted or isinstance(error, KeyboardInterrupt):
+            print(INTERRUPTED, file=sys.stderr)
+            sys.exit(128 + signal.SIGINT)
+        sentence = one_sentence(error)
+        if sentence is None:
+            raise
+        print(f"error: {sentence}", file=sys.stderr)
+        sys.exit(USER_ERROR)
+
+
+def script(function: Callable[[Any], object], settings: type, arguments: Sequence[str] | None = None) -> None:
+    """Run a script of scripts/ with the settings on its command line, or in other arguments.
+
+    Their defaults are in conf/NAME.yaml or, without such a file, in the dataclass.
+    """
+    with errors():
+        from hydra.core.config_store import ConfigStore
+        from omegaconf import OmegaConf
+
+        import conf
+        from renderer.errors import InputError
+        from train.configuration import compose, read_settings
+
+        name, arguments = Path(sys.argv[0]).stem, sys.argv[1:] if arguments is None else arguments
+        if not (Path(conf.__path__[0]) / f"{name}.yaml").exists():
+            ConfigStore.instance().store(name, settings)
+        flags = [argument for argument in arguments if argument.startswith("-")]
+        if unknown := [flag for flag in flags if flag not in ("-h", "--help")]:
+            raise InputError(f"{unknown[0]} is not an option: give settings as key=value; --help shows them")
+        config = compose(name, [argument for argument in arguments if argument not in flags])
+        if flags:
+            print(f"{sys.modules['__main__'].__doc__}\nSettings, as key=value:\n\n{OmegaConf.to_yaml(config)}", end="")
+        else:
+            function(read_settings(settings, config))

@@ -1,0 +1,84 @@
+"""What the user can do about an error, in one sentence, and whether an output can be written."""
+
+import errno
+import tempfile
+from pathlib import Path
+
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from renderer.errors import InputError, is_out_of_memory
+from train.runtime import is_process_lost
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+LONGEST_NAME = 200  # characters
+HYDRAS_ADVICE = ("To append to your config", "See https:", "Config search path:")  # not for users of a command
+
+
+def one_sentence(error: BaseException) -> str | None:
+    """What the user can do about an error; None where the error is not the user's."""
+    match error:
+        case InputError():
+            return str(error)
+        case HydraException() | OmegaConfBaseException():
+            return _configuration_error(error)
+        case UnicodeEncodeError():
+            name = ascii(error.object[:LONGEST_NAME])
+            return f"{name} has characters that this system or library cannot write: rename it, or set PYTHONUTF8=1"
+        case OSError() if error.filename is not None:
+            return f"{error.filename} cannot be read or written: {error.strerror}"
+        case OSError() if error.errno in NO_ROOM:
+            return f"there is no room for the output: {error.strerror}"
+        case RuntimeError() if is_process_lost(error):
+            return "another process of this run has ended: fix what ended it, and go on with train.resume=true"
+        case RuntimeError() | MemoryError() if is_out_of_memory(error):
+            return "memory ran out: ask for fewer or smaller images, views or meshes, or for a smaller batch_size"
+    return None
+
+
+def _configuration_error(error: Exception) -> str:
+    """The text of Hydra or OmegaConf, which names the key or the override, without its advice."""
+    if isinstance(error, OmegaConfBaseException):
+        key, text = error.full_key, str(error).partition("\n")[0]
+    else:
+        key, text = getattr(error, "override", None), str(error)
+        for advice in HYDRAS_ADVICE:
+            text = text.partition(advice)[0]
+    text = " ".join(text.split()).removesuffix(".")
+    if isinstance(error.__cause__, OmegaConfBaseException) and "merging" in text:
+        text = f"{text}: {str(error.__cause__).partition(chr(10))[0]}"
+    return text if not key or key in text else f"{key}: {text}"
+
+
+def writable_folder(folder: str | Path, key: str) -> Path:
+    """The folder, which may be missing yet. InputError naming the key where no file can be written into it."""
+    try:
+        _try_folder(Path(folder))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{key}={folder} cannot be written to ({_reason(error)}): choose another folder") from error
+    return Path(folder)
+
+
+def writable_file(file: str | Path, key: str) -> Path:
+    """The file, which may be missing yet, as may its folder. InputError naming the key where it cannot be written."""
+    path = Path(file)
+    try:
+        if path.exists() and not path.is_file():
+            raise ValueError("it is not a regular file")
+        _try_folder(path.parent)
+        if path.exists():
+            path.open("ab").close()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{key}={file} cannot be written ({_reason(error)}): choose another file") from error
+    return path
+
+
+def _try_folder(folder: Path) -> None:
+    """Write a temporary file there, or to the nearest folder above that exists."""
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    with tempfile.TemporaryFile(dir=existing) as file:
+        file.write(bytes(2**16))
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)

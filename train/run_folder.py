@@ -1,0 +1,326 @@
+"""A run's folder: its one writer, its configuration and input files, its metrics and logs."""
+
+import hashlib
+import io
+import json
+import logging
+import os
+import platform
+import socket
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from filelock import FileLock, Timeout
+from omegaconf import DictConfig, OmegaConf
+from PIL import Image
+from torch import Tensor
+
+from augment.service import AttackExamples
+from renderer.errors import InputError, in_one_line
+from renderer.image import to_bytes
+from train.attack_examples import SUFFIX, write_attack_examples
+from train.checkpoint import write_whole
+from train.configuration import dotted, is_within
+from train.settings import ExperimentSettings
+
+CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
+LARGEST_CONFIG, LARGEST_FILE = 2**20, 2**28  # bytes; a run writes about 300 per epoch
+PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; other phases are parts of these
+logging.raiseExceptions = False  # on a full disk train.log lacks lines, and only the run's own error is shown
+
+# Settings that say where and how a run is made. They do not decide its result, nor name a sweep's cell.
+CIRCUMSTANCES = (
+    *("run", "sweep", "launcher", "compare", "hardware", "versions", "inputs", "renderer.cache"),
+    *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
+)
+INPUTS = (
+    "data.path",
+    "scene.meshes",
+    "scene.hard_negatives",
+    "scene.backgrounds",
+    "scene.light",
+    "augment.vary.environments",
+)
+
+# ------------------------------------------------------------------------------------ one writer
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[bool]:
+    """Whether this process alone holds the folder, among all machines that share it, until the block ends."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
+
+
+@contextmanager
+def sole_writer(key: str, *folders: Path) -> Iterator[None]:
+    """Hold the folders; InputError naming the key where another process writes to one. Empty folders are removed."""
+    with ExitStack() as stack:
+        for folder in folders:
+            if not stack.enter_context(locked(folder)):
+                raise InputError(
+                    f"{key}={folder} is being written by another process: wait for it, or choose another {key}="
+                )
+        try:
+            yield
+        finally:
+            for folder in folders:
+                if [path.name for path in folder.iterdir()] == [LOCK]:
+                    (folder / LOCK).unlink()
+                    folder.rmdir()
+
+
+def state(folder: Path) -> str:
+    """The state of a run that is not finished, in words."""
+    if not folder.exists():
+        return "not begun"
+    with locked(folder) as ours:
+        if not ours:
+            return "in training"
+    failure = folder / FAILURE
+    if failure.exists():
+        return f"failed: {failure.read_text(encoding='utf-8', errors='replace').strip()}"
+    return "interrupted"
+
+
+# ------------------------------------------------------------------------------------ files
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """InputError naming the file for whatever reading it raises."""
+    try:
+        yield
+    except Exception as error:
+        reason = in_one_line(error)
+        raise InputError(
+            f"{path} is damaged or not as `python -m train` wrote it ({reason}): use another run"
+        ) from error
+
+
+def _read(path: Path, largest: int = LARGEST_FILE) -> str:
+    if not path.is_file():
+        raise ValueError("there is no such file")
+    if path.stat().st_size > largest:
+        raise ValueError(f"it is larger than {largest} bytes")
+    return path.read_text(encoding="utf-8")
+
+
+def read_config(path: Path) -> DictConfig:
+    """A config.yaml that a run or an attack wrote; InputError naming a damaged file.
+
+    Files with aliases or interpolations are refused: a short alias can stand for more than memory holds, and an
+    interpolation would show the reader's environment.
+    """
+    with _named(path):
+        text = _read(path, LARGEST_CONFIG)
+        if "${" in text or any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise ValueError("it holds an alias or an interpolation")
+        plain = yaml.safe_load(text)
+        if not isinstance(plain, dict):
+            raise ValueError("it holds no keys")
+        return OmegaConf.create(plain)
+
+
+def write_config(folder: Path, settings: Any, **facts: object) -> None:
+    """Write config.yaml: a command's settings, a dataclass; facts found at the start; hashes of inputs; versions."""
+    folder.mkdir(parents=True, exist_ok=True)
+    packages = {name: version(name) for name in ("torchvision", "numpy")}
+    versions = {"python": platform.python_version(), "torch": str(torch.__version__), **packages}
+    content = {**asdict(settings), **facts, "inputs": fingerprints(settings), "versions": versions}
+    write_whole(folder / CONFIG, yaml.safe_dump(content, sort_keys=False, allow_unicode=True).encode())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file that holds an object; InputError naming a damaged file."""
+    with _named(path):
+        return _object(_read(path))
+
+
+def read_numbers(path: Path) -> list[dict[str, float]]:
+    """JSON lines, each an object of numbers; a last line that a crash cut short is skipped.
+
+    InputError naming a damaged file.
+    """
+    with _named(path):
+        lines = [_object(line) for line in _read(path).split("\n")[:-1]]
+        if any(not isinstance(value, int | float) for line in lines for value in line.values()):
+            raise ValueError("a value is not a number")
+        return lines
+
+
+def _object(text: str) -> dict[str, Any]:
+    parsed = json.loads(text)
+    if not isinstance(parsed, dict) or not parsed:
+        raise ValueError("it holds no object of keys and values")
+    return parsed
+
+
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """The lines of a run's metrics.jsonl: one per epoch, then the final scores; [] without the file."""
+    path = folder / METRICS
+    return read_numbers(path) if path.is_file() else []
+
+
+# ------------------------------------------------------------------------------------ resuming
+
+
+def decisive_settings(settings: ExperimentSettings | DictConfig) -> dict[str, object]:
+    """The settings that decide a run's result, by dotted key; paths inside the run's own folder begin with `<run>`."""
+    plain = OmegaConf.to_container(settings) if isinstance(settings, DictConfig) else asdict(settings)
+    run = str(plain.get("run"))
+
+    def relative(value: object) -> object:
+        inside = isinstance(value, str) and f"{value}/".startswith(f"{run}/")
+        return f"<run>{value.removeprefix(run)}" if inside else value
+
+    return {key: relative(value) for key, value in dotted(plain) if not is_within(key, CIRCUMSTANCES)}
+
+
+def require_same_settings(folder: Path, settings: ExperimentSettings, finished: bool = False) -> None:
+    """InputError where the run in the folder has other decisive settings than those asked for.
+
+    A run that goes on may get more epochs and another evaluation, unless it is finished.
+    """
+    defaults = decisive_settings(ExperimentSettings())
+    before, asked = defaults | decisive_settings(read_config(folder / CONFIG)), decisive_settings(settings)
+    for key in sorted(before.keys() | asked.keys()):
+        old, new = before.get(key), asked.get(key)
+        longer = key == "train.epochs" and isinstance(old, int) and isinstance(new, int) and new > old
+        if old != new and (finished or not (longer or key.startswith("evaluate."))):
+            raise InputError(
+                f"{folder} was trained with {key}={old}, not {new}: give the settings of {folder / CONFIG}, or another "
+                "folder with run= (sweep=)"
+            )
+
+
+def fingerprints(settings: Any) -> dict[str, str]:
+    """SHA-256 of every file, and of the names and sizes in every folder, that INPUTS name, by path."""
+    by_key = dict(dotted(asdict(settings)))
+    paths = {path for key in INPUTS for path in _paths(by_key.get(key)) if os.path.exists(path)}
+    return {path: _folder_hash(path) if os.path.isdir(path) else _file_hash(path) for path in sorted(paths)}
+
+
+def require_same_inputs(folder: Path, settings: ExperimentSettings) -> None:
+    """InputError naming an input file whose content has changed since the run in the folder began."""
+    before = read_config(folder / CONFIG).get("inputs") or {}
+    for path, fingerprint in fingerprints(settings).items():
+        if before.get(path, fingerprint) != fingerprint:
+            raise InputError(
+                f"{path} has changed since {folder} began: put it back, or start in another folder with run= (sweep=)"
+            )
+
+
+def _paths(value: Any) -> Iterator[str]:
+    """The texts in a setting that may be paths; of a mapping, its mesh and those of its props."""
+    match value:
+        case str():
+            yield value
+        case list():
+            for item in value:
+                yield from _paths(item)
+        case dict():
+            yield from _paths([value.get("mesh"), value.get("props")])
+
+
+def _folder_hash(path: str) -> str:
+    files = [file for file in Path(path).rglob("*") if file.is_file()]
+    sizes = sorted((str(file.relative_to(path)), file.stat().st_size) for file in files)
+    return hashlib.sha256(repr(sizes).encode(errors="surrogateescape")).hexdigest()
+
+
+def _file_hash(path: str) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# ------------------------------------------------------------------------------------ logs
+
+
+class RunLog:
+    """Writes a run folder's metrics.jsonl, TensorBoard events, renders and attack examples; OSError on a full disk.
+
+    history: the epochs' lines of the checkpoint that a run resumes from. They replace the file's lines, since later
+    epochs are trained again; TensorBoard is told to forget those, too.
+    """
+
+    def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
+        from tensorboard.compat.proto.event_pb2 import SessionLog  # half a second, which readers of metrics are spared
+
+        self._metrics = folder / METRICS
+        self._renders = folder / "renders"
+        self._board = folder / f"events.out.tfevents.{time.time():010.0f}.{socket.gethostname()}.{os.getpid()}"
+        self._epochs = len(history)
+        self._metrics.unlink(missing_ok=True)  # opening a pipe of that name would block
+        self._metrics.write_text("".join(json.dumps(line) + "\n" for line in history))
+        self._show(0, file_version="brain.Event:2")
+        self._show(self._epochs + 1, session_log=SessionLog(status=SessionLog.START))
+
+    def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
+        """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores.
+
+        TensorBoard shows the final scores one step after the last epoch, where a resumed run replaces them.
+        """
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        line = values if epoch is None else {"epoch": epoch, **values}
+        with open(self._metrics, "a") as file:
+            file.write(json.dumps(line) + "\n")
+        self._epochs = self._epochs if epoch is None else epoch
+        points = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+        self._show(epoch or self._epochs + 1, summary=Summary(value=points))
+
+    def renders(self, images: Tensor, epoch: int) -> None:
+        """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
+        from torchvision.utils import make_grid
+
+        grid = to_bytes(make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0))
+        png = io.BytesIO()
+        Image.fromarray(grid.permute(1, 2, 0).numpy()).save(png, "PNG", compress_level=1)
+        self._renders.mkdir(exist_ok=True)
+        (self._renders / f"epoch_{epoch:03d}.png").write_bytes(png.getvalue())
+        channels, height, width = grid.shape
+        image = Summary.Image(height=height, width=width, colorspace=channels, encoded_image_string=png.getvalue())
+        self._show(epoch, summary=Summary(value=[Summary.Value(tag="renders", image=image)]))
+
+    def attack_examples(self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int) -> None:
+        """A few successful attacks of the epoch, before and after, in renders/."""
+        self._renders.mkdir(exist_ok=True)
+        write_attack_examples(self._renders / f"epoch_{epoch:03d}{SUFFIX}", attack_examples, classes)
+
+    def _show(self, step: int, **content: object) -> None:
+        """Append a TensorBoard event at once; torch's SummaryWriter writes in a thread, whose errors are lost."""
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        with open(self._board, "ab") as file:
+            RecordWriter(file).write(Event(wall_time=time.time(), step=step, **content).SerializeToString())
+
+
+class NoLog:
+    """Stands in for a `RunLog` in processes of a run that write nothing."""
+
+    def _nothing(self, *_: object, **__: object) -> None:
+        pass
+
+    scalars = renders = attack_examples = _nothing
+
+
+Log = RunLog | NoLog
