@@ -17,12 +17,13 @@ from augment.objects import load_object
 from augment.utils import progress, stream_seed
 from renderer.errors import FACTOR, InputError, require_choice, require_limits, require_range
 from renderer.image import LARGEST_SIZE, encode
+from renderer.io.mitsuba import Part
 from renderer.light.environment import read_panorama
 from renderer.shapes import LOOK_ALIKES
 from train.errors import writable_folder
 from train.lab.patterns import FAMILIES
 from train.lab.shots import Shot, draw_shots
-from train.lab.studio import Part, photograph, split_parts
+from train.lab.studio import lab_parts, photograph
 from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
 from train.run_folder import LOCK, sole_writer
 from train.settings import LARGEST_SEED, read_object
@@ -151,7 +152,7 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
         )
     if Path(label).name != label or label == "..":
         raise InputError(f"meshes[{index}]: the label {label!r} names the photographs' folder: leave out slashes")
-    return Subject(label, settings.mesh, split_parts(load_object(settings).mesh, settings.albedo_scale, settings.mesh))
+    return Subject(label, settings.mesh, lab_parts(load_object(settings).mesh, settings.albedo_scale))
 
 
 def _label_of_solid(mesh: str) -> str:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from renderer.errors import InputError
 from renderer.mesh import Mesh
+from renderer.normals import corner_normals
 from renderer.shapes import solid
 from train.lab.shots import FOV, Shot, draw_shots
-from train.lab.studio import ROUGHNESS, crease_normals, photograph, split_parts
+from train.lab.studio import ROUGHNESS, SHARP, lab_parts, photograph
 
 pytest.importorskip("mitsuba")
 
@@ -52,7 +52,7 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
     """Beyond an object too small to see. A projector lights the planes that face it evenly: by 1 / z² at depth z."""
     [shot] = draw_shots(1, ["solid"], (1.5, 1.5), seed, {})
     shot = replace(shot, scale=1e-4, ambient=np.array([0.1, 0.2, 0.3]))
-    image = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 8, 4096, bounces=1, seed=0)
+    image = photograph(lab_parts(solid("orange"), 1.0), shot, 8, 4096, bounces=1, seed=0)
 
     rays = directions(shot, 8)
     places = shot.camera - rays * (shot.camera[2] / rays[..., 2:])
@@ -68,7 +68,7 @@ def test_the_table_reflects_projector_and_surroundings_as_formulas_say(seed):
 def test_a_texture_lies_upright_on_its_faces():
     red, green, blue, white = [220, 0, 0], [0, 220, 0], [0, 0, 220], [220, 220, 220]
     texture = np.array([[red, green], [blue, white]], dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
-    image = photograph(split_parts(card(texture), 1.0, "card"), frontal(), 16, 16, bounces=1, seed=0)
+    image = photograph(lab_parts(card(texture), 1.0), frontal(), 16, 16, bounces=1, seed=0)
     strong = image > image.max() / 2
     for row, column, expected in [(5, 5, red), (5, 10, green), (10, 5, blue), (10, 10, white)]:
         np.testing.assert_array_equal(strong[row, column], np.array(expected) > 0)
@@ -80,7 +80,7 @@ def test_a_card_reflects_its_linear_albedo_times_the_gain_and_the_brightness():
     gloss = 0.04 / (4 * ROUGHNESS**4)  # α is the roughness's square
     for albedo_scale, brightness in [(1, 1), (2, 1), (1, 0.5)]:
         shot = frontal(brightness=brightness)
-        image = photograph(split_parts(card(gray), albedo_scale, "card"), shot, 8, 16, bounces=1, seed=0)
+        image = photograph(lab_parts(card(gray), albedo_scale), shot, 8, 16, bounces=1, seed=0)
         assert image[3:5, 3:5].mean() == pytest.approx((0.216 * albedo_scale + gloss) * brightness, rel=0.05)
 
 
@@ -88,7 +88,7 @@ def test_an_object_stands_on_the_table():
     """A cube's front, lit by its surroundings, reaches from the table up to its height."""
     cube = trimesh.creation.box((2, 2, 2))
     shot = frontal(ambient=np.ones(3), brightness=1e-9)
-    image = photograph(split_parts(Mesh.plain(cube.vertices, cube.faces), 1, "cube"), shot, 32, 64, bounces=1, seed=0)
+    image = photograph(lab_parts(Mesh.plain(cube.vertices, cube.faces), 1), shot, 32, 64, bounces=1, seed=0)
     ray = directions(shot, 32)[:, 15]
     height = shot.camera[2] + ray[:, 2] * (5 / ray[:, 1])  # where it meets the plane of the front, y = -1
     clear = (height < 2) & (np.abs(height) > 0.04)  # not the row that the lower edge runs through
@@ -102,24 +102,26 @@ def test_right_angles_stay_sharp_and_round_surfaces_are_smooth(divisions):
     for _ in range(divisions):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
     mesh = Mesh.plain(vertices, faces)
-    np.testing.assert_array_equal(crease_normals(mesh), mesh.face_normals()[:, None].repeat(3, axis=1))
+    np.testing.assert_array_equal(corner_normals(mesh, "smooth", SHARP), mesh.face_normals()[:, None].repeat(3, axis=1))
     mesh = Mesh.plain(ball.vertices, ball.faces)
-    np.testing.assert_allclose(crease_normals(mesh), mesh.vertices[mesh.faces], atol=0.02)
+    np.testing.assert_allclose(corner_normals(mesh, "smooth", SHARP), mesh.vertices[mesh.faces], atol=0.02)
 
 
 def test_parts_are_the_faces_of_each_texture_and_of_none():
     red, blue = (np.full((1, 1, 3), color, dtype=np.uint8) for color in ([255, 0, 0], [0, 0, 255]))
     mesh = replace(card(red), texture_ids=np.array([-1, 1], dtype=np.int32), textures=(red, blue))
-    bare, textured = split_parts(mesh, 1.0, "card")
-    assert not bare.textured and len(bare.positions) == 1 and (bare.albedo == 1).all()
-    assert textured.textured and textured.albedo.tolist() == [[[0, 0, 1]]]
+    bare, textured = lab_parts(mesh, 1.0)
+    assert bare.texture is None and len(bare.positions) == 1 and (bare.colors == 1).all()
+    assert textured.texture.tolist() == [[[0, 0, 1]]]
 
 
-def test_a_texture_and_colors_of_vertices_at_once_are_refused():
-    mesh = card(np.zeros((1, 1, 3), dtype=np.uint8))
-    mesh = replace(mesh, corner_colors=np.linspace(0, 1, 18, dtype=np.float32).reshape(2, 3, 3))
-    with pytest.raises(InputError, match=r"card.glb has a texture and colors of its vertices, too: paint them into"):
-        split_parts(mesh, 1.0, "card.glb")
+def test_a_texture_on_colored_corners_is_their_product():
+    """A white texture on a red card: red, to the 8 bits that the texture is painted anew in."""
+    red = card(np.full((4, 4, 3), 255, dtype=np.uint8))
+    red = replace(red, corner_colors=np.tile(np.float32([1, 0.5, 0]), (2, 3, 1)))
+    [part] = lab_parts(red, 0.5)
+    assert part.texture is not None
+    np.testing.assert_allclose(part.texture[0, 0], [0.5, 0.5 * 0.2140, 0], atol=0.01)
 
 
 def test_a_table_under_an_environment_has_the_brightness_of_white_times_its_albedo_whatever_the_turn():
@@ -129,7 +131,7 @@ def test_a_table_under_an_environment_has_the_brightness_of_white_times_its_albe
     for seed in range(2):
         [shot] = draw_shots(1, [], (0.7, 0.7), seed, {"lamp": sky})
         shot = replace(shot, scale=1e-4)
-        image = photograph(split_parts(solid("orange"), 1.0, "orange"), shot, 8, 256, bounces=1, seed=0)
+        image = photograph(lab_parts(solid("orange"), 1.0), shot, 8, 256, bounces=1, seed=0)
         assert shot.family == "lamp"
         # The map is sampled by bilinear interpolation, which spreads the lamp over two texels.
         np.testing.assert_allclose(image, np.broadcast_to(0.7 * shot.table, image.shape), rtol=0.02)
@@ -140,10 +142,8 @@ def test_an_environment_lights_from_where_its_map_says():
     sky = np.zeros((32, 64, 3), np.float32)
     sky[:, 16:48] = 1.0
     shot = frontal(environment=sky, camera=np.array([6.0, 0, 1.0]), table=np.zeros(3))
-    front = photograph(split_parts(turned_card(), 1.0, "card"), shot, 8, 256, bounces=1, seed=0)
-    back = photograph(
-        split_parts(turned_card(), 1.0, "card"), replace(shot, camera=np.array([-6.0, 0, 1.0])), 8, 256, 1, 0
-    )
+    front = photograph(lab_parts(turned_card(), 1.0), shot, 8, 256, bounces=1, seed=0)
+    back = photograph(lab_parts(turned_card(), 1.0), replace(shot, camera=np.array([-6.0, 0, 1.0])), 8, 256, 1, 0)
     assert front[3:5, 3:5].mean() > 20 * back[3:5, 3:5].mean()
 
 
