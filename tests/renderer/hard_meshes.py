@@ -30,11 +30,11 @@ def painted(vertices: ArrayLike, faces: Sequence[Sequence[int]] | np.ndarray) ->
     return replace(Mesh.plain(vertices, faces), corner_colors=colors.repeat(3, axis=1).astype(np.float32))
 
 
-def sphere(subdivisions: int = 2) -> Mesh:
-    """A dented sphere of 20·4^subdivisions faces, of radius 0.8 to 1."""
+def sphere(subdivisions: int = 2, lowest: float = 0.8) -> Mesh:
+    """A dented sphere of 20·4^subdivisions faces, of radius `lowest` to 1."""
     shape = trimesh.creation.icosphere(subdivisions=subdivisions)
     rng = np.random.default_rng(1)
-    return painted(shape.vertices * rng.uniform(0.8, 1, (len(shape.vertices), 1)), shape.faces)
+    return painted(shape.vertices * rng.uniform(lowest, 1, (len(shape.vertices), 1)), shape.faces)
 
 
 def slivers(height: float, count: int, towards: np.ndarray) -> Mesh:
@@ -69,13 +69,6 @@ def box() -> Mesh:
 def opened(mesh: Mesh) -> Mesh:
     """Without its upper faces, so that the inside is seen."""
     return painted(mesh.vertices, mesh.faces[mesh.vertices[mesh.faces][:, :, 2].mean(axis=1) < 0.2])
-
-
-def lumpy() -> Mesh:
-    """A closed ball of 80 faces with dents, each of which sees its own other side."""
-    shape = trimesh.creation.icosphere(subdivisions=1)
-    depth = np.random.default_rng(0).uniform(0.5, 1, (len(shape.vertices), 1))
-    return painted(shape.vertices * depth, shape.faces)
 
 
 def heap() -> Mesh:
