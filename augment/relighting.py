@@ -1,4 +1,4 @@
-"""Images of objects whose geometry is fixed: their light alone changes, and nothing is rasterized again."""
+"""Images of objects in other light: stacked transfer operators, and nothing is rasterized again."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,10 +21,9 @@ Rows = list[int] | None
 
 @dataclass(frozen=True)
 class Layer:
-    """Pixels (P,) that a mesh covers in B images, `rows` of all, None for all of them in order.
+    """Covered pixels (P,) of B images, which are `rows` of a batch; None for all of it in order.
 
-    composite: (B, 3, P) linear radiance and what is behind it. coverage: (O, 1, P) of the O views, of which each image
-    has the one that `shown` (B,) says.
+    composite: (B, 3, P) linear radiance and background. coverage: (O, 1, P) of O views; `shown` (B,) is each image's.
     """
 
     rows: Rows
@@ -35,16 +34,16 @@ class Layer:
 
 
 def in_place(canvas: Tensor, layers: Sequence[Layer], covered: Sequence[Tensor]) -> Tensor:
-    """Canvases (N, 3, size²), which are overwritten, with the values (B, 3, P) of each layer where it is; it is
-    differentiable in these."""
+    """Canvases (N, 3, size²), overwritten at each layer's pixels by its values (B, 3, P), and differentiable in
+    these."""
     return _InPlace.apply(canvas, [(layer.rows, layer.pixels) for layer in layers], *covered)
 
 
 class _InPlace(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, canvas: Tensor, places: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
-        ctx.places = places
-        for (rows, pixels), values in zip(places, covered, strict=True):
+    def forward(ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
+        ctx.targets = targets
+        for (rows, pixels), values in zip(targets, covered, strict=True):
             if rows is None:
                 canvas.index_copy_(2, pixels, values)
             else:
@@ -55,22 +54,21 @@ class _InPlace(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, *(_taken(upstream, *place) for place in ctx.places)
+        return None, None, *(_gathered(upstream, *target) for target in ctx.targets)
 
 
-def _taken(images: Tensor, rows: Rows, pixels: Tensor) -> Tensor:
+def _gathered(images: Tensor, rows: Rows, pixels: Tensor) -> Tensor:
     if rows is None:  # of two axes, torch selects ten times as fast as of three
         return images.flatten(0, 1).index_select(1, pixels).unflatten(0, (-1, 3))
     return torch.stack([images[row].index_select(1, pixels) for row in rows])
 
 
 class OperatorStack:
-    """O operators, and N images that each show one of them in a light of its own.
+    """O transfer operators over a common set of pixels, and N images that show one of them each, in their own light.
 
-    Operators share nothing but the index of pixels that any of them covers; the other pixels are neither stored nor
-    shaded. pixels: (P,) int64. transfer: (O, 3 or 1, K, P), of the K coefficients that reach a pixel of any of them,
-    and a row of zeros where their number is odd: for 32 rows instead of 31 the gradient's product is twice as fast.
-    albedo: (O, 3, P). coverage: (O, 1, P).
+    pixels: (P,) int64, covered by any of the operators. transfer: (O, 3 or 1, K, P), of the K coefficients that are
+    nonzero in any of them, with a row of zeros if K is odd: with 32 rows instead of 31 the gradient's product is twice
+    as fast. albedo: (O, 3, P). coverage: (O, 1, P).
     """
 
     def __init__(self, operators: Sequence[TransferOperator], shown: Tensor, device: torch.device | str = "cpu"):
@@ -88,13 +86,13 @@ class OperatorStack:
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
         """Linear radiance (A, 3, P) of images (A,), each in its light (A, size, 3); differentiable in the lights.
 
-        Lights are laid out on a grid of the operators in use × their images, which leaves gaps where an image is not
-        wanted; operators that none of them shows are left alone.
+        Lights are laid out on a grid of operators × their images, with gaps for images that are not asked for.
+        Operators that none of the images shows are left out.
         """
         used, row = torch.unique(self.shown[images], return_inverse=True)
         if (images.diff() > 0).all():
             slot, slots = self._slot[images], self._slots
-        else:  # an image may be wanted more than once
+        else:  # an image may occur more than once
             slot, slots = _rank_among_equals(row)
         cell = row * slots + slot
         kept = lights.index_select(1, self._coefficients)
@@ -110,7 +108,7 @@ class OperatorStack:
         return radiance + entries.radiance(lights, image, len(self.pixels))
 
     def _entries(self, sparse: SparseTransfer, shown: Tensor) -> tuple[SparseTransfer, Tensor]:
-        """(the sparse entries of operators (A,), one after the other, (N,) which of the A each is of)."""
+        """(the sparse entries of operators (A,), one after the other; (N,) the row in A of each entry)."""
         first, count = self._first[shown], self._first[shown + 1] - self._first[shown]
         image = torch.arange(len(shown), device=shown.device).repeat_interleave(count)
         entry = torch.arange(len(image), device=shown.device) + (first - count.cumsum(0) + count)[image]
@@ -118,7 +116,7 @@ class OperatorStack:
 
 
 def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:
-    """(for each value (N,) how many equal ones come before it, how often the most frequent one occurs)."""
+    """((N,) how many equal values come before each value; how often the most frequent value occurs)."""
     order, counts = values.argsort(stable=True), values.bincount()
     first = (counts.cumsum(0) - counts)[values[order]]
     ranks = torch.empty_like(values).index_copy_(0, order, torch.arange(len(values), device=values.device) - first)
@@ -128,15 +126,15 @@ def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:
 def _joined(
     operators: Sequence[TransferOperator], pixels: Tensor, device: torch.device | str
 ) -> tuple[SparseTransfer | None, Tensor]:
-    """(the sparse entries of all operators, over common pixels, (O + 1,) where those of each begin)."""
-    counts, placed = [0], []
+    """(the sparse entries of all operators, over common pixels; (O + 1,) the first entry of each operator)."""
+    counts, parts = [0], []
     for operator in operators:
-        own = operator.sparse
-        counts.append(0 if own is None else len(own.function))
-        if own is not None:
-            places = torch.searchsorted(pixels, operator.pixels)
-            placed.append(own._replace(pixel=places[own.pixel]))
-    entries = joined(*placed)
+        sparse = operator.sparse
+        counts.append(0 if sparse is None else len(sparse.function))
+        if sparse is not None:
+            columns = torch.searchsorted(pixels, operator.pixels)
+            parts.append(sparse._replace(pixel=columns[sparse.pixel]))
+    entries = joined(*parts)
     return entries and entries.to(device), torch.tensor(counts, device=device).cumsum(0)
 
 
@@ -156,14 +154,14 @@ def _stack(operators: Sequence[TransferOperator], pixels: Tensor, kept: Tensor) 
     return transfer, albedo, coverage
 
 
-STACKED = 2**16  # pixels of the images whose operators are multiplied at once; more would only be copied about
+STACKED = 2**16  # pixels of the images in one stack; larger stacks are no faster
 
 
 class Relighting:
     """N images, each of an object from a camera over one of the backgrounds (B, 3 or 1, size²).
 
-    Equal views share an operator, and what a background adds to an image is kept. Operators are built when they are
-    first needed, a stack at a time.
+    Equal views share an operator, and background terms are cached. Operators are built when they are first needed, a
+    stack at a time.
     """
 
     def __init__(
@@ -188,11 +186,11 @@ class Relighting:
 
     @property
     def stacks(self) -> list[OperatorStack]:
-        """All of them, of which those that are missing are built now."""
+        """All stacks, built where they are missing."""
         return [self._stack(index)[0] for index in progress(range(self._count), "views")]
 
     def layers(self, light: Tensor, images: Tensor) -> Iterator[Layer]:
-        """Of images (A,), each in its light (A, size, 3); differentiable in it."""
+        """The layers of images (A,), each in its light (A, size, 3); differentiable in the light."""
         if self._count == 1:
             yield self._layer(0, None, light, images)
             return
@@ -202,28 +200,29 @@ class Relighting:
             yield self._layer(index, rows.tolist(), light[rows], images[rows])
 
     def _layer(self, index: int, rows: Rows, light: Tensor, images: Tensor) -> Layer:
-        stack, place, added = self._stack(index)
-        images = place[images]
-        seen = stack.radiance(light, images)
-        return Layer(rows, stack.pixels, seen + added[images], stack.coverage, stack.shown[images])
+        stack, rank, behind = self._stack(index)
+        images = rank[images]
+        composite = stack.radiance(light, images) + behind[images]
+        return Layer(rows, stack.pixels, composite, stack.coverage, stack.shown[images])
 
     def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         if index not in self._stacks:
-            self._stacks[index] = stack, _, added = self._build_stack(index)
+            self._stacks[index] = stack, _, behind = self._build_stack(index)
             if len(self._stacks) == 1:  # the others are as large
-                kept = (self._count - 1) * (stack.transfer.nbytes + stack.albedo.nbytes + added.nbytes)
-                views = f"{len(self._distinct)} views of {self._settings.size} pixels per side (scene.views)"
-                require_memory(views, kept, self._backgrounds.device)
+                rest = (self._count - 1) * (stack.transfer.nbytes + stack.albedo.nbytes + behind.nbytes)
+                views = f"{len(self._distinct)} views of {self._settings.size} pixels per side (views)"
+                require_memory(views, rest, self._backgrounds.device)
         return self._stacks[index]
 
     def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
-        """(some operators, (N,) each image's place among those that show them, what is behind these (A, C, P))."""
+        """(a stack; (N,) each image's rank among the A images of the stack; the background terms of these (A, C,
+        P))."""
         first = index * self._per_stack
         views, operators = self._distinct[first : first + self._per_stack], list[TransferOperator]()
         for number in dict.fromkeys(number for number, _ in views):
-            operators += self._build(self._objects[number], [camera for its, camera in views if its == number])
+            operators += self._build(self._objects[number], [camera for other, camera in views if other == number])
         here = self._operator // self._per_stack == index
         stack = OperatorStack(operators, (self._operator[here] - first).cpu(), self._backgrounds.device)
         backgrounds = self._backgrounds.index_select(2, stack.pixels)
-        added = background_term(stack.coverage[stack.shown], backgrounds[self._behind[here]], self._settings.encoding)
-        return stack, here.cumsum(0) - 1, added
+        behind = background_term(stack.coverage[stack.shown], backgrounds[self._behind[here]], self._settings.encoding)
+        return stack, here.cumsum(0) - 1, behind

@@ -1,4 +1,8 @@
-"""Images of objects that move, are painted or stand under moved lamps, view by view."""
+"""Images of objects whose vertices, colors or lamps change, view by view; a view is rasterized again as vertices move.
+
+Shadows and bounces of environment light are frozen at a shape close by (`FrozenTransport`); shadows of local lights are
+those of the moved shape itself (`renderer.transport.local`).
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,13 +26,13 @@ from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 
-NEAR = 0.001  # world units: shadows are found anew once a coordinate has moved by more since they were
+NEAR = 0.001  # world units: shadows and bounces are computed again once a coordinate has moved farther
 
 
 class FrozenTransport:
-    """What transport adds to the images of a mesh, per unit of each coefficient of light.
+    """The radiance that shadows and bounces add to views of a mesh, per unit of each coefficient of environment light.
 
-    It stays where it is in the image, as the outline does for derivatives, and goes with the albedo of its pixel.
+    It stays in place in the image, as the outline does for derivatives, and is scaled with the albedo of its pixel.
     """
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis):
@@ -36,15 +40,15 @@ class FrozenTransport:
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
         self._views: dict[Camera, tuple[Tensor, Tensor] | None] = {}
 
-    def fits(self, vertices: np.ndarray) -> bool:
+    def is_near(self, vertices: np.ndarray) -> bool:
         """Whether vertices (V, 3) are near the mesh's."""
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
-    def knows(self, camera: Camera) -> bool:
+    def has(self, camera: Camera) -> bool:
         return camera in self._views
 
     def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
-        """A view of the mesh, and its albedo there (S, 3)."""
+        """Add a view of the mesh, with its albedo at the samples (S, 3)."""
         surface = Surface.of(self.mesh, fragments.to("cpu"), self._settings)
         change = self._transport.change(surface, albedo.cpu().double()) if self._transport else None
         if change is None:
@@ -55,37 +59,14 @@ class FrozenTransport:
             self._views[camera] = canvas.to(albedo), _by_pixel(fragments, albedo)
 
     def radiance(self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
-        """(3, P) of a known view's fragments with albedo (S, 3) in a light (size, 3); differentiable in both."""
+        """(3, P) at the fragments of an added view, with albedo (S, 3) in light (size, 3); differentiable in both."""
         view = self._views[camera]
         if view is None:
             return light.new_zeros(3, len(fragments.pixels))
-        change, before = (each[..., fragments.pixels] for each in view)
+        change, before = (values[..., fragments.pixels] for values in view)
         added = torch.einsum("ckp,kc->cp", change.to(light), light)
         now = _by_pixel(fragments, albedo)[:, fragments.pixels]
         return added * torch.where(before > 0, now / before.masked_fill(before == 0, 1), 1).to(light)
-
-
-class FrozenTransports:
-    """The transport of a scene's objects in their own shapes, and of examples in the last that was not near these."""
-
-    def __init__(self, settings: ImageSettings, basis: Basis):
-        self._like = settings, basis
-        self._own: dict[int, FrozenTransport] = {}  # of objects
-        self._moved: dict[int, FrozenTransport] = {}  # of examples
-
-    def near(self, example: int, number: int, item: SceneObject, vertices: np.ndarray) -> FrozenTransport:
-        """That of a shape near the vertices (V, 3) of an example, which shows the object of a number."""
-        if number not in self._own:
-            self._own[number] = self._of(item, item.mesh)
-        if self._own[number].fits(vertices):
-            return self._own[number]
-        if example not in self._moved or not self._moved[example].fits(vertices):
-            self._moved[example] = self._of(item, replace(item.mesh, vertices=vertices))
-        return self._moved[example]
-
-    def _of(self, item: SceneObject, mesh: Mesh) -> FrozenTransport:
-        settings, basis = self._like
-        return FrozenTransport(mesh, settings, item.albedo_scale, basis)
 
 
 def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
@@ -95,11 +76,7 @@ def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
 
 
 class Reshading:
-    """What cameras see of objects, by their numbers; what they see of their own shapes is kept.
-
-    Shadows and bounces of distant light are those of a shape close by (`FrozenTransport`), shadows of light from places
-    are a shape's own (`LocalLightView`).
-    """
+    """Views of objects, which are given by their numbers; views of the unmoved objects are cached."""
 
     def __init__(
         self,
@@ -109,39 +86,39 @@ class Reshading:
         basis: Basis,
         like: Tensor,
     ):
-        """basis: what lights are coefficients of. like: of the dtype and on the device of the images."""
-        self._objects, self._settings, self._rasterizer, self._basis, self._like = (
-            objects,
-            settings,
-            rasterizer,
-            basis,
-            like,
-        )
-        self._own: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
-        self._transports = FrozenTransports(settings, basis)
+        """basis: of the lights' coefficients. like: has the dtype and the device of the images."""
+        self._objects, self._settings, self._rasterizer = objects, settings, rasterizer
+        self._basis, self._like = basis, like
+        self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
+        self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
         self._rays: dict[int, Rays] = {}
-        self._placed_views: dict[tuple[int, Camera], LocalLightView] = {}
+        self._unmoved_transport: dict[int, FrozenTransport] = {}  # of objects
+        self._moved_transport: dict[int, FrozenTransport] = {}  # of examples
 
     @cached_property
     def vertices(self) -> list[Tensor]:
-        """(V, 3) of each object in its own shape."""
+        """(V, 3) of each unmoved object."""
         return [torch.from_numpy(item.mesh.vertices).to(self._like) for item in self._objects]
 
-    def own(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
-        """Of an object in its own shape: what is seen, and the albedo there (S, 3)."""
-        view = number, camera
-        if view not in self._own:
-            self._own[view] = self._seen(number, camera, self._objects[number].mesh.vertices)
-        return self._own[view]
+    @cached_property
+    def _faces(self) -> list[Tensor]:
+        return [torch.from_numpy(item.mesh.faces).to(self._like.device) for item in self._objects]
 
-    def placed_view(self, number: int, camera: Camera) -> LocalLightView:
-        """Of an object in its own shape."""
-        view = number, camera
-        if view not in self._placed_views:
-            mesh, (fragments, _) = self._objects[number].mesh, self.own(*view)
+    def view(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
+        """Fragments of an unmoved object, and its albedo at the samples (S, 3)."""
+        key = number, camera
+        if key not in self._views:
+            self._views[key] = self._rasterized(number, camera, self._objects[number].mesh.vertices)
+        return self._views[key]
+
+    def local_view(self, number: int, camera: Camera) -> LocalLightView:
+        """An unmoved object in local light."""
+        key = number, camera
+        if key not in self._local_views:
+            mesh, (fragments, _) = self._objects[number].mesh, self.view(*key)
             rays = self._rays.setdefault(number, Rays(mesh))
-            self._placed_views[view] = LocalLightView(rays, mesh, fragments, self._settings)
-        return self._placed_views[view]
+            self._local_views[key] = LocalLightView(rays, mesh, fragments, self._settings)
+        return self._local_views[key]
 
     def radiance(
         self,
@@ -153,51 +130,62 @@ class Reshading:
         added: Tensor | None,
         positions: Tensor | None,
     ) -> tuple[Fragments, Tensor]:
-        """What a camera sees of an object in a light (size, 3), and its radiance (3, P), differentiable in all tensors.
+        """Fragments of an object, and its radiance (3, P) in a light (size, 3), differentiable in all tensors.
 
-        example: whose shapes follow each other closely. vertices (V, 3), places (L, 3) of lamps: None where they are as
-        they were. added: to each face's linear albedo, (F, 3).
+        example: whose shapes change little from call to call. vertices: (V, 3), and positions of lamps: (L, 3); None
+        where they have not moved. added: offsets of each face's linear albedo, (F, 3).
         """
         mesh, albedo_scale = self._objects[number].mesh, self._objects[number].albedo_scale
-        placed: Callable[[], LocalLightView]
+        local_view: Callable[[], LocalLightView]
         if vertices is None:
             vertices, shape = self.vertices[number], mesh.vertices
-            fragments, albedo = self.own(number, camera)
-            placed = partial(self.placed_view, number, camera)
+            fragments, albedo = self.view(number, camera)
+            local_view = partial(self.local_view, number, camera)
         else:
             shape = vertices.detach().cpu().double().numpy()
-            fragments, albedo = self._seen(number, camera, shape)
-            # once, where lights stand in the scene: a mesh is checked as it is made, and a step's is used by them alone
-            placed = cache(partial(self._moved_view, mesh, shape, fragments, vertices))
+            fragments, albedo = self._rasterized(number, camera, shape)
+            # only where the scene has local lights: a moved mesh is checked as it is made
+            local_view = cache(partial(self._moved_local_view, mesh, shape, fragments, vertices))
         if added is not None:
             albedo = painted_albedo(mesh, fragments, self._settings.encoding, albedo_scale, added)
         smooth_faces = self._faces[number] if self._settings.normals == "smooth" else None
         lights = [(part, light[where]) for where, part in parts_of(self._basis)]
 
         def indirect(albedo: Tensor, light: Tensor) -> Tensor:
-            return self._frozen(example, number, camera, shape).radiance(camera, fragments, albedo, light)
+            frozen = self._transport_near(example, number, camera, shape)
+            return frozen.radiance(camera, fragments, albedo, light)
 
         extra = indirect if self._settings.global_illumination else None
-        return fragments, view_radiance(fragments, vertices, albedo, lights, smooth_faces, placed, extra, positions)
+        return fragments, view_radiance(fragments, vertices, albedo, lights, smooth_faces, local_view, extra, positions)
 
-    def _moved_view(self, mesh: Mesh, positions: np.ndarray, fragments: Fragments, vertices: Tensor) -> LocalLightView:
-        return LocalLightView(Rays(replace(mesh, vertices=positions)), mesh, fragments, self._settings, vertices)
+    def _moved_local_view(
+        self, mesh: Mesh, shape: np.ndarray, fragments: Fragments, vertices: Tensor
+    ) -> LocalLightView:
+        return LocalLightView(Rays(replace(mesh, vertices=shape)), mesh, fragments, self._settings, vertices)
 
-    def _frozen(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
-        """Of a shape near the vertices of an example, and with the camera's view of it."""
-        frozen = self._transports.near(example, number, self._objects[number], vertices)
-        if not frozen.knows(camera):
-            frozen.add(camera, *self._seen(number, camera, frozen.mesh.vertices))
+    def _transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
+        """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""
+        mesh = self._objects[number].mesh
+        if number not in self._unmoved_transport:
+            self._unmoved_transport[number] = self._transport(number, mesh)
+        frozen = self._unmoved_transport[number]
+        if not frozen.is_near(vertices):
+            last = self._moved_transport.get(example)
+            frozen = (
+                last if last and last.is_near(vertices) else self._transport(number, replace(mesh, vertices=vertices))
+            )
+            self._moved_transport[example] = frozen
+        if not frozen.has(camera):
+            frozen.add(camera, *self._rasterized(number, camera, frozen.mesh.vertices))
         return frozen
 
-    def _seen(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
-        """What a camera sees of an object's vertices, wherever they are, and the albedo there (S, 3)."""
+    def _transport(self, number: int, mesh: Mesh) -> FrozenTransport:
+        return FrozenTransport(mesh, self._settings, self._objects[number].albedo_scale, self._basis)
+
+    def _rasterized(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
+        """Fragments of an object with these vertices, and its albedo at the samples (S, 3)."""
         item, settings = self._objects[number], self._settings
         closed = item.mesh.closed
         (fragments,) = build_fragments(vertices, item.mesh.faces, [camera], settings, self._rasterizer, closed=closed)
         fragments = fragments.to(self._like.device)
         return fragments, (surface_albedo(item.mesh, fragments, settings.encoding) * item.albedo_scale).to(self._like)
-
-    @cached_property
-    def _faces(self) -> list[Tensor]:
-        return [torch.from_numpy(item.mesh.faces).to(self._like.device) for item in self._objects]

@@ -1,4 +1,4 @@
-"""The one scene: rows of what is shown, rendered under conditions that an attack may change."""
+"""The scene: examples of objects, cameras and backgrounds, rendered under conditions that an attack may change."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ AT_ONCE = 2**24  # pixels of the images that are rendered at once: some 2 GB, wi
 
 @dataclass(frozen=True)
 class Example:
-    """A row of a scene: which object, from V cameras, before which background.
+    """A row of a scene: an object from V cameras before a background.
 
-    object, background: indices into the scene's. exposure: multiplies the light.
+    object, background: indices into the scene's lists. exposure: multiplies the light.
     """
 
     object: int
@@ -46,11 +46,11 @@ class Example:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What A examples are rendered under.
+    """The light, shape and colors that A examples are rendered with.
 
-    light: of the scene's basis. vertices: None where they are the meshes'. albedo: added to each face's linear albedo.
-    pixels: added to the values of the V images. positions: of the lamps, None where they are the basis'. Where meshes
-    differ in size, N and F are the largest's, and a smaller mesh has the first of them.
+    light: coefficients of the scene's basis. vertices: None for those of the meshes. albedo: added to each face's
+    linear albedo. pixels: added to the values of the V images. positions: of the lamps, None for those of the basis. N
+    and F are the largest mesh's; a smaller mesh has the first of them.
     """
 
     light: Float[Tensor, "A coefficients 3"]
@@ -64,11 +64,17 @@ class Conditions:
 class Scene:
     """E examples of V views each, over backgrounds (B, 3 or 1, size, size) of values in [0, 1].
 
-    Under a change of light alone nothing is rasterized after the first time: the operators of many views are stacked
-    (`Relighting`). Where vertices move, their view is rasterized anew each time (`Reshading`). lights: (E, size, 3), or
-    (size, 3) for all, where attacks begin; their dtype and device are those of the images. operators: where rendered
-    views are kept. basis: what lights are coefficients of; 49 harmonics, unless another is given. camera_effects: what
-    a camera makes of rendered images (A, V, 3, size, size) of examples (A,), differentiable; see `CameraEffects`.
+    While the light alone changes, nothing is rasterized after the first time: the transfer operators of many views are
+    stacked (`Relighting`). Where vertices move, a view is rasterized each time (`Reshading`). lights: (E, size, 3), or
+    (size, 3) for all, where attacks begin; images have their dtype and device. operators: the cache of rendered views.
+    basis: of the lights' coefficients, by default 49 harmonics. camera_effects: a differentiable function of rendered
+    images (A, V, 3, size, size) and their examples (A,); see `CameraEffects`.
+
+    >>> from augment.build import build_scene
+    >>> scene = build_scene([("solid:orange", "orange")], size=8, views=2)
+    >>> examples = torch.arange(len(scene))
+    >>> scene.render(scene.conditions(examples), examples).shape
+    torch.Size([2, 1, 3, 8, 8])
     """
 
     objects: Sequence[SceneObject]
@@ -83,7 +89,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         self._require_consistent()
-        self.examples = [self._seen_whole(example) for example in self.examples]
+        self.examples = [self._with_whole_object(example) for example in self.examples]
         self.backgrounds = self.backgrounds.to(self.lights)
         self.lights = self.lights.expand(len(self.examples), *self.lights.shape[-2:])
         self.views = len(self.examples[0].cameras)  # per example
@@ -93,38 +99,40 @@ class Scene:
         self._exposure = exposures.to(self.lights)[:, None, None]
         size, images = self.settings.size, len(self.examples) * self.views
         self.at_once = max(1, AT_ONCE // (self.views * size**2))  # examples
-        asked = f"{images} renders of {size} pixels per side (augment.examples, scene.views, scene.backgrounds)"
-        require_memory(asked, 24 * images * size**2, self.lights.device)
+        renders = f"{images} renders of {size} pixels per side (meshes × views × backgrounds)"
+        require_memory(renders, 24 * images * size**2, self.lights.device)
         self._relighting = self._relit_views()
         self._reshading = Reshading(self.objects, self.settings, self.rasterizer, self.basis, self.lights)
 
     def _require_consistent(self) -> None:
         if not self.examples:
-            raise InputError("nothing is to be rendered: name one mesh, one view and one background or more")
+            raise InputError("examples is empty: give at least one mesh, one view and one background")
         if self.lights.shape[-2:] != (self.basis.size, 3):
             raise InputError(
-                f"lights of shape {tuple(self.lights.shape)} is not of {self.basis}: give {self.basis.size} rows"
+                f"lights has shape {tuple(self.lights.shape)}: give {self.basis.size} rows, for {self.basis}"
             )
         behind, size = self.backgrounds, self.settings.size
         if not (behind.is_floating_point() and behind.shape[1:] in ((1, size, size), (3, size, size))):
-            raise InputError(f"backgrounds of {behind.dtype} {tuple(behind.shape)}: give images (B, 3, {size}, {size})")
+            raise InputError(
+                f"backgrounds has {behind.dtype} {tuple(behind.shape)}: give images (B, 3, {size}, {size})"
+            )
         if not (behind.min() >= 0 and behind.max() <= 1):
-            raise InputError("scene.backgrounds: give values in [0, 1]")
-        for name, given in (("object", self.objects), ("background", behind)):
-            if not all(0 <= getattr(example, name) < len(given) for example in self.examples):
-                raise InputError(f"examples name a {name} that is not among the {len(given)} of {name}s")
+            raise InputError("backgrounds: give values in [0, 1]")
+        for name, items in (("object", self.objects), ("background", behind)):
+            if not all(0 <= getattr(example, name) < len(items) for example in self.examples):
+                raise InputError(f"examples: an index of {name}s is not below {len(items)}")
 
     def _relit_views(self) -> Relighting:
-        # without the scene, which each epoch replaces, tied to itself
+        # a closure without `self`, which every epoch replaces: a cycle would keep old scenes in memory
         cache, settings, rasterizer = self.operators, self.settings, self.rasterizer
         basis, dtype = self.basis, self.lights.dtype
 
         def build(item: SceneObject, cameras: Sequence[Camera]) -> Sequence[TransferOperator]:
             return cache.operators(item.mesh, cameras, settings, rasterizer, item.albedo_scale, basis, dtype)
 
-        seen = [(example.object, camera) for example in self.examples for camera in example.cameras]
-        behind_images = self._background.repeat_interleave(self.views)
-        return Relighting(self.objects, seen, behind_images, self.backgrounds.flatten(2), settings, build)
+        views = [(example.object, camera) for example in self.examples for camera in example.cameras]
+        behind = self._background.repeat_interleave(self.views)
+        return Relighting(self.objects, views, behind, self.backgrounds.flatten(2), settings, build)
 
     @classmethod
     def grid(
@@ -140,8 +148,8 @@ class Scene:
         shared: bool = False,
         basis: Basis = HARMONICS,
     ) -> Scene:
-        """Every object from every camera over every background, in that order; or, where the views share what is
-        attacked, every object over every background from all cameras."""
+        """Every object from every camera over every background, in that order; or with `shared`, where the views share
+        one light or shape, every object over every background from all cameras."""
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = [Example(*row) for row in product(range(len(objects)), views, range(len(backgrounds)))]
         return cls(objects, examples, backgrounds, light, settings, rasterizer, operators or OperatorCache(), basis)
@@ -151,12 +159,12 @@ class Scene:
 
     @cached_property
     def cameras(self) -> list[tuple[Camera, ...]]:
-        """The V of each example."""
+        """The V cameras of each example."""
         return [example.cameras for example in self.examples]
 
     @cached_property
     def labels(self) -> list[str]:
-        """Of each example."""
+        """The class name of each example."""
         return [self.objects[example.object].label for example in self.examples]
 
     @cached_property
@@ -166,19 +174,19 @@ class Scene:
 
     @property
     def stacks(self) -> list[OperatorStack]:
-        """All operators, of which those that are missing are built now."""
+        """The stacked transfer operators of all views, built where they are missing."""
         return self._relighting.stacks
 
     def mesh(self, example: int) -> Mesh:
-        """What an example shows."""
+        """The mesh of an example."""
         return self.objects[self.examples[example].object].mesh
 
     def basis_under(self, conditions: Conditions, row: int) -> Basis:
-        """What the light of a row of conditions is of: lamps are where the conditions have them."""
+        """The light's basis for a row of conditions, with lamps at its positions."""
         return self.basis if conditions.positions is None else moved(self.basis, conditions.positions[row].detach())
 
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
-        """The scene's own, for some examples."""
+        """The unattacked conditions of some examples."""
         return Conditions(self.lights[examples])
 
     def render(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 size size"]:
@@ -197,13 +205,13 @@ class Scene:
 
     @torch.no_grad()
     def clamped_fraction(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, " A"]:
-        """Per example, the share of its covered pixels' values that the clamp changes."""
-        shares = self.lights.new_zeros(2, len(examples) * self.views)
+        """(A,) the fraction of its covered pixels' values that the clamp changes."""
+        counts_of_images = self.lights.new_zeros(2, len(examples) * self.views)
         for layer in self._layers(conditions, examples):
             covered = (layer.coverage[layer.shown] > 0).expand_as(layer.composite)
-            counts = torch.stack([clamped(layer.composite) & covered, covered]).sum((2, 3)).to(shares)
-            shares[:, slice(None) if layer.rows is None else layer.rows] += counts
-        changed, covered = shares.unflatten(1, (-1, self.views)).sum(2)
+            counts = torch.stack([clamped(layer.composite) & covered, covered]).sum((2, 3)).to(counts_of_images)
+            counts_of_images[:, slice(None) if layer.rows is None else layer.rows] += counts
+        changed, covered = counts_of_images.unflatten(1, (-1, self.views)).sum(2)
         return changed / covered.clamp(min=1)
 
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
@@ -216,13 +224,13 @@ class Scene:
         return self._reshaded(light, conditions, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
-        """By one product per stack of operators."""
+        """One product per stack of operators."""
         views = torch.arange(self.views, device=examples.device)
         images = (examples[:, None] * self.views + views).flatten()
         return self._relighting.layers(light.repeat_interleave(self.views, dim=0) if self.views > 1 else light, images)
 
     def _under_moved_lamps(self, light: Tensor, positions: Tensor, examples: Tensor) -> Iterator[Layer]:
-        """By the same products for all other light, and by the lamps' image after image."""
+        """The same products for all other light, and the lamps image by image."""
         where, lamps = next((where, part) for where, part in parts_of(self.basis) if isinstance(part, Lamps))
         rest = torch.cat([light[:, : where.start], torch.zeros_like(light[:, where]), light[:, where.stop :]], dim=1)
         for layer in self._relit(rest, examples):
@@ -231,10 +239,10 @@ class Scene:
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
                 shown = example.object, example.cameras[view]
-                placed, (fragments, albedo) = self._reshading.placed_view(*shown), self._reshading.own(*shown)
-                seen = placed.radiance(lamps, albedo, light[row, where], positions[row])
+                view_in_lamps, (fragments, albedo) = self._reshading.local_view(*shown), self._reshading.view(*shown)
+                radiance = view_in_lamps.radiance(lamps, albedo, light[row, where], positions[row])
                 covered = torch.searchsorted(layer.pixels, fragments.pixels)
-                added.append(seen.new_zeros(3, len(layer.pixels)).index_copy(1, covered, seen))
+                added.append(radiance.new_zeros(3, len(layer.pixels)).index_copy(1, covered, radiance))
             yield replace(layer, composite=layer.composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
@@ -246,14 +254,14 @@ class Scene:
             vertices = None if conditions.vertices is None else conditions.vertices[row, : len(mesh.vertices)]
             added = None if conditions.albedo is None else conditions.albedo[row, : len(mesh.faces)]
             positions = None if conditions.positions is None else conditions.positions[row]
-            fragments, seen = self._reshading.radiance(*shown, light[row], vertices, added, positions)
-            coverage = fragments.coverage.to(seen)[None]
-            there = self.backgrounds[example.background].flatten(1).index_select(1, fragments.pixels)
-            composite = seen + background_term(coverage, there, self.settings.encoding)
+            fragments, radiance = self._reshading.radiance(*shown, light[row], vertices, added, positions)
+            coverage = fragments.coverage.to(radiance)[None]
+            behind = self.backgrounds[example.background].flatten(1).index_select(1, fragments.pixels)
+            composite = radiance + background_term(coverage, behind, self.settings.encoding)
             yield Layer([image], fragments.pixels, composite[None], coverage[None], [0])
 
-    def _seen_whole(self, row: Example) -> Example:
-        """The row, whose cameras see all of its object, near and far."""
+    def _with_whole_object(self, row: Example) -> Example:
+        """The row with cameras whose depth range holds the whole object."""
         radius = self.objects[row.object].radius
         return replace(row, cameras=tuple(camera.seeing(radius) for camera in row.cameras))
 

@@ -59,12 +59,12 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
 
 
 def require_architecture(model: str, setting: str) -> None:
-    """InputError naming the setting, with the nearest names, where torchvision has no such classifier."""
+    """InputError naming the setting, with the nearest names, for a classifier that torchvision lacks."""
     from torchvision import models
 
     choices = models.list_models(module=models)
     if model not in choices:
-        raise InputError(f"{setting} is no classifier of torchvision: choose one, such as {nearest(model, choices)}")
+        raise InputError(f"{setting} is not a classifier of torchvision: choose one, such as {nearest(model, choices)}")
 
 
 def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
@@ -72,8 +72,8 @@ def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
     from torchvision.models import get_model_weights
 
     published = get_model_weights(model)
-    same_name = (each for each in published if weights and each.url.endswith(f"/{weights.name}"))
-    return next((each for each in same_name if each.meta["categories"]), published.DEFAULT)
+    same_name = (entry for entry in published if weights and entry.url.endswith(f"/{weights.name}"))
+    return next((entry for entry in same_name if entry.meta["categories"]), published.DEFAULT)
 
 
 def build_network(model: str, published: "WeightsEnum") -> nn.Module:
@@ -98,7 +98,7 @@ def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
     except Exception as error:  # no network, no room, another hash, a damaged copy from before
         reason = " ".join(str(error).split())
         raise InputError(
-            f"classifier={name} cannot be had from {published.url} ({reason}): give weights=FILE, a copy of that file"
+            f"classifier={name} cannot be downloaded ({reason}): give weights=FILE, a copy of {published.url}"
         ) from error
 
 
@@ -162,14 +162,14 @@ def _require_not_caffes(state: Mapping[str, Tensor], source: str | Path, name: s
 
 
 def read_weights(path: Path) -> Mapping[str, Tensor]:
-    """The state dict that `torch.save` wrote, on the CPU; InputError for a file that is missing or holds none."""
+    """A state dict that `torch.save` wrote, on the CPU; InputError for a missing file and for any other content."""
     if not path.is_file():
         raise InputError(f"weights={path} does not exist: give the path of a file of weights")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for a damaged or foreign file
         raise InputError(
-            f"weights={path} is damaged or no file of weights: save a state dict with torch.save"
+            f"weights={path} is damaged or not a file of weights: save a state dict with torch.save"
         ) from error
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
         raise InputError(f"weights={path} holds other things than weights: save the network's state_dict() alone")
@@ -181,7 +181,7 @@ def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | Path, na
     try:
         network.load_state_dict(state)
     except (RuntimeError, ValueError) as error:
-        said = textwrap.shorten(str(error), 300)
-        raise InputError(f"weights={source} are not of classifier={name} ({said}): give that network's") from error
+        reason = textwrap.shorten(str(error), 300)
+        raise InputError(f"weights={source} are not of classifier={name} ({reason}): give that network's") from error
     if bad := next((key for key, value in network.state_dict().items() if not value.isfinite().all()), None):
         raise InputError(f"weights={source}: {bad} holds NaN or infinity, give weights that are finite")

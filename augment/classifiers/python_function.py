@@ -1,4 +1,4 @@
-"""Networks of one's own: whatever a function of a Python module returns."""
+"""A user's own network, returned by a function of a Python module."""
 
 import importlib
 import sys
@@ -28,14 +28,14 @@ def load_python(name: str, weights: str | Path | None = None) -> Classifier:
 
 
 def call_python(name: str, setting: str) -> tuple[nn.Module, int, Sequence[str]]:
-    """What `package.module:function` returns; the setting that names it is named in errors."""
-    place, _, attribute = name.partition(":")
-    if not place or not attribute:
+    """The result of `package.module:function`; errors name the setting that it came from."""
+    module, _, attribute = name.partition(":")
+    if not module or not attribute:
         raise InputError(f"{setting} names no function: give {FORM}")
-    made = _made(place, attribute, setting)
-    if not (isinstance(made, tuple | list) and len(made) == 3):
-        raise InputError(f"{setting} returns {type(made).__name__}: return (module, size, classes)")
-    network, size, classes = made
+    result = _result(module, attribute, setting)
+    if not (isinstance(result, tuple | list) and len(result) == 3):
+        raise InputError(f"{setting} returns {type(result).__name__}: return (module, size, classes)")
+    network, size, classes = result
     if not isinstance(network, nn.Module):
         raise InputError(f"{setting} returns {type(network).__name__} first: return a torch.nn.Module")
     if not isinstance(size, int) or isinstance(size, bool) or size < 1:
@@ -45,30 +45,30 @@ def call_python(name: str, setting: str) -> tuple[nn.Module, int, Sequence[str]]
     return network, size, classes
 
 
-def _made(place: str, attribute: str, setting: str) -> Any:
-    """What the function returns. InputError that says where it or its module raised something else."""
+def _result(module_name: str, attribute: str, setting: str) -> Any:
+    """The function's result. InputError that says where the function or its module raised another error."""
     try:
-        return _function(place, attribute, setting)()
+        return _function(module_name, attribute, setting)()
     except InputError:
         raise
     except (Exception, SystemExit) as error:
         at = traceback.extract_tb(error.__traceback__)[-1]
-        said = " ".join(str(error).split())
+        message = " ".join(str(error).split())
         raise InputError(
-            f"{setting} raises {type(error).__name__} ({said}) in line {at.lineno} of {at.filename}: mend it"
+            f"{setting} raises {type(error).__name__} ({message}) in line {at.lineno} of {at.filename}: fix it"
         ) from error
 
 
-def _function(place: str, attribute: str, setting: str) -> Callable[[], Any]:
+def _function(module_name: str, attribute: str, setting: str) -> Callable[[], Any]:
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
-        module = importlib.import_module(place)
+        module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
-        if error.name is None or not f"{place}.".startswith(f"{error.name}."):
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise  # the module is there and lacks something that it imports itself
         raise InputError(f"{setting}: there is no module {error.name} in the current folder or installed") from error
     function = getattr(module, attribute, None)
     if not callable(function):
-        raise InputError(f"{setting}: {place} has no function {attribute}: name one")
+        raise InputError(f"{setting}: {module_name} has no function {attribute}: name one")
     return function

@@ -118,20 +118,6 @@ def test_renders_are_the_examples_composed_one_by_one(scene):
     torch.testing.assert_close(images, composed(scene, lights), **TOLERANCE)
 
 
-@pytest.mark.parametrize("examples", [[0], [11], [1, 2], [0, 4, 5, 9], [3, 6, 7, 8, 10], list(range(12))])
-def test_some_examples_are_rendered_as_all_are(scene, examples):
-    lights, chosen = random_lights(12), torch.tensor(examples)
-    torch.testing.assert_close(render(scene, lights[chosen], chosen), composed(scene, lights)[chosen], **TOLERANCE)
-
-
-def test_examples_are_meshes_by_views_by_backgrounds(scene):
-    assert scene.labels == ["orange"] * 6 + ["pear"] * 6
-    free = sorted(set(range(SIZE**2)) - set(scene.stacks[0].pixels.tolist()))
-    assert free
-    corner = render(scene, random_lights(12)).flatten(2)[:, :, free[0]]
-    torch.testing.assert_close(corner, torch.tensor(GRAYS * 4)[:, None].expand(12, 3), rtol=0, atol=0)
-
-
 def test_uncovered_pixels_and_dead_coefficients_have_gradients_of_exactly_zero(scene):
     lights = random_lights(12).requires_grad_(True)
     images = render(scene, lights)
@@ -194,21 +180,14 @@ def test_views_make_the_product_of_meshes_and_backgrounds_the_examples(examples,
     ("examples", "objects", "backgrounds", "views", "message"),
     [
         (100, 3, 5, None, r"augment\.examples=100 is not a multiple of 3 meshes × 5 backgrounds: .* multiple of 15"),
-        (4, 2, 5, None, "set it to a multiple of 10"),
         (None, 2, 5, None, r"augment\.examples=null makes as many renders as scene\.views says: set either"),
         (100, 2, 5, 9, r"2 meshes × 9 views × 5 backgrounds = 90: .*scene\.views=null"),
-        (100, 2, 5, 0, r"scene\.views=null"),
         (100, 0, 5, None, r"scene\.meshes and scene\.backgrounds must not be empty"),
-        (100, 2, 0, None, r"scene\.meshes and scene\.backgrounds must not be empty"),
     ],
 )
-def test_numbers_that_make_no_product_are_refused(examples, objects, backgrounds, views, message):
+def test_examples_that_are_no_product_are_refused(examples, objects, backgrounds, views, message):
     with pytest.raises(InputError, match=message):
         count_views(examples, objects, backgrounds, views)
-
-
-def same(a: TransferOperator, b: TransferOperator) -> bool:
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("transfer", "coverage", "pixels"))
 
 
 def built(items: list[ObjectSettings], cameras: list, settings: ImageSettings, *cache: OperatorCache) -> Scene:
@@ -218,14 +197,7 @@ def built(items: list[ObjectSettings], cameras: list, settings: ImageSettings, *
     return Scene.grid(objects, cameras, behind, probe("grace"), settings, RASTERIZER, *cache)
 
 
-@pytest.mark.parametrize(("spec", "name", "seed"), [("solid:plate", "plate", 0), ("solid:table:3", "table", 3)])
-def test_a_solid_is_normalized_and_named(spec, name, seed):
-    loaded, expected = load_object(ObjectSettings(spec, "thing", albedo_scale=2.0)), normalize(solid(name, seed))
-    assert (loaded.label, loaded.albedo_scale) == ("thing", 2.0)
-    assert np.array_equal(loaded.mesh.vertices, expected.vertices) and np.array_equal(loaded.mesh.faces, expected.faces)
-
-
-def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
+def test_a_file_is_turned_upright_and_its_albedo_scale_multiplies(tmp_path):
     """A wall in the file's xy plane, 2 wide and 1 high: seen from π/3, it is upright only when y is up."""
     path = tmp_path / "wall.obj"
     path.write_text("v -1 0 0\nv 1 0 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n")
@@ -248,30 +220,21 @@ def test_a_file_is_turned_upright_and_its_gain_multiplies(tmp_path):
     ("spec", "message"),
     [
         ("solid:orangutan", "solid:orangutan: No solid is called 'orangutan': use 'orange'"),
-        ("solid", "No solid is called ''"),
         ("solid:orange:" + 30 * "9", rf"solid:orange:{30 * '9'}: seed="),
         ("solid:orange:red", "solid:orange:red: the seed must be a whole number"),
-        ("solid:orange:-1", "must be a whole number"),
-        ("solid:orange:1:2", "must be a whole number"),
         ("no/such.glb", "no/such.glb does not exist"),
     ],
 )
-def test_a_mesh_that_is_not_there_is_refused(spec, message):
+def test_an_unknown_mesh_is_refused(spec, message):
     with pytest.raises(InputError, match=message):
         load_object(ObjectSettings(spec, "orange"))
-
-
-@pytest.mark.parametrize("albedo_scale", [0.0, -1.0, float("nan")])
-def test_a_gain_that_leaves_nothing_is_refused(albedo_scale):
-    with pytest.raises(InputError, match="albedo_scale="):
-        ObjectSettings("solid:orange", "orange", albedo_scale=albedo_scale)
 
 
 TWO = [ObjectSettings(f"solid:{name}", name) for name in ("plate", "cup")]
 
 
 def test_a_lighting_attack_rasterizes_nothing(rasterized):
-    """Each mesh is rasterized once, in all views; 30 steps on 24 examples that are never fooled add nothing."""
+    """Each mesh is rasterized once, in all views; 30 steps on 24 examples without success add nothing."""
     scene = built(TWO, orbit_cameras(4, 2), SETTINGS)
     assert rasterized == [] and scene.stacks and rasterized == [4, 4]
     network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 3))
@@ -304,15 +267,6 @@ def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterized
     assert torch.equal(*images)
 
 
-def test_under_grace_a_plate_is_brighter_from_above_than_from_below():
-    """The whole way from a spec to an image."""
-    scene = built([ObjectSettings("solid:plate", "plate")], orbit_cameras(1, 2.0), SETTINGS)
-    light = probe("grace").expand(3, -1, -1)
-    upside_down = light.clone()
-    upside_down[:, 2] *= -1
-    assert render(scene, light)[0].mean() > 1.2 * render(scene, upside_down)[0].mean()
-
-
 # ---------------------------------------------------------------------------------------- rows of every kind
 
 
@@ -335,7 +289,7 @@ def mixed(request) -> Iterator[Scene]:
 
 @pytest.mark.parametrize("by", ["light", "vertices"])
 @pytest.mark.parametrize("examples", [[0, 1, 2, 3], [3, 0], [2, 2, 1]])
-def test_rows_of_several_meshes_are_what_each_is_by_itself(mixed, examples, by):
+def test_rows_of_several_meshes_are_rendered_as_each_is_by_itself(mixed, examples, by):
     """By stacked operators and by rasterizing anew, beside `renderer.render`, which shares no code with the stacks."""
     chosen, conditions = torch.tensor(examples), mixed.conditions(torch.tensor(examples))
     if by == "vertices":
@@ -368,7 +322,7 @@ def test_each_row_has_the_gradient_that_it_has_by_itself(mixed):
         torch.testing.assert_close(gradient([example])[0], together[example], rtol=0, atol=1e-12)
 
 
-def test_a_step_of_vertices_makes_and_checks_no_mesh_where_no_light_stands_in_the_scene(mixed, monkeypatch):
+def test_a_step_of_vertices_checks_no_mesh_without_local_lights(mixed, monkeypatch):
     examples = torch.arange(len(mixed))
     conditions = replace(mixed.conditions(examples), vertices=mixed.vertices[mixed.object_of])
     expected = mixed.render(conditions, examples)
@@ -378,7 +332,7 @@ def test_a_step_of_vertices_makes_and_checks_no_mesh_where_no_light_stands_in_th
 
 @pytest.mark.parametrize("kind", [Geometry, Albedo])
 def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_its_own_values_only(mixed, kind):
-    """What is left over has no gradient and is never drawn; the L2 ball is that of the values in use."""
+    """Unused values have no gradient and are never drawn; the L2 ball is that of the used values."""
     own = kind(mixed, StepSettings("l2", 0.2))
     sizes = [len(item.mesh.vertices if kind is Geometry else item.mesh.faces) for item in mixed.objects]
     everything, used = torch.arange(4), torch.tensor([3 * sizes[row.object] for row in mixed.examples])
@@ -411,7 +365,7 @@ class Lamps(EnvironmentBasis):
         return nearest_in_box(coefficients, 0, 1, within)
 
 
-def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its_own():
+def test_a_new_basis_is_one_class_with_its_own_operators_gradients_and_norm_balls():
     """A white box before the camera from above: its top has the power of the lamp above, which falls to 0 at most."""
     box = SceneObject("box", Mesh.plain(trimesh.creation.box().vertices, trimesh.creation.box().faces))
     start = torch.tensor([[0.2] * 3, [0.3] * 3, [0.4, 0.5, 0.6]], dtype=torch.float64)
@@ -435,7 +389,7 @@ def test_a_new_basis_is_one_class_with_operators_gradients_and_norm_balls_of_its
 
 
 def test_a_light_of_another_basis_is_refused():
-    with pytest.raises(InputError, match=r"lights of shape \(9, 3\) is not of harmonics of degree 6: give 49 rows"):
+    with pytest.raises(InputError, match=r"lights has shape \(9, 3\): give 49 rows"):
         plate = SceneObject("plate", solid("plate"))
         Scene.grid([plate], orbit_cameras(1, 2.0), load_backgrounds([0.5], 8), torch.zeros(9, 3), SETTINGS, RASTERIZER)
 
@@ -457,7 +411,7 @@ def test_a_scene_of_shadowed_and_open_meshes_shows_each_as_its_operator_does():
 
 
 @pytest.mark.parametrize("bounces", [0, 2])
-def test_where_no_vertex_or_color_has_moved_yet_shadows_are_those_of_the_operators(bounces):
+def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(bounces):
     scene = built(
         [ObjectSettings("solid:cup", "cup")], orbit_cameras(2, 2), replace(SETTINGS, shadows=True, bounces=bounces)
     )
@@ -491,7 +445,7 @@ def test_a_table_is_shadowed_by_the_object_on_it_and_returns_light_of_its_own_co
     assert green > 3 * red > 0 and green > 3 * blue > 0
 
 
-def test_shadows_are_found_anew_for_a_shape_that_is_not_near_and_held_for_one_that_is():
+def test_shadows_are_computed_again_for_a_shape_that_is_not_near_and_frozen_for_one_that_is():
     """Each example has its own shape; back where it began, it has the mesh's own shadows."""
     settings, cameras = replace(SETTINGS, shadows=True), orbit_cameras(2, 2)
     scene = built([ObjectSettings("solid:cup", "cup")], cameras, settings)
@@ -516,7 +470,7 @@ def test_shadows_are_found_anew_for_a_shape_that_is_not_near_and_held_for_one_th
     assert off(0.0) < 1000 * EPS32
 
 
-def test_a_shadow_goes_with_the_color_of_its_pixel():
+def test_a_shadow_is_scaled_with_the_albedo_of_its_pixel():
     """Half the albedo leaves half of all light, shadows included."""
     gray = replace(load_object(ObjectSettings("solid:cup", "cup")).mesh, textures=())
     gray = replace(gray, corner_colors=np.full_like(gray.corner_colors, 0.5))
@@ -537,7 +491,7 @@ def test_a_shadow_goes_with_the_color_of_its_pixel():
 
 @pytest.mark.parametrize("nothing", [{"meshes": []}, {"views": 0}, {"backgrounds": ()}])
 def test_a_scene_of_nothing_is_refused(nothing):
-    with pytest.raises(InputError, match=r"nothing is to be rendered|backgrounds is empty|views=0 must be"):
+    with pytest.raises(InputError, match=r"examples is empty|backgrounds is empty|views=0 must be"):
         build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "rasterizer": "numpy"} | nothing)
 
 
@@ -550,11 +504,7 @@ def with_apple(*at: float, **more: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("along", [-10.0, 10.0])
-def test_parallel_rays_show_company_alike_however_near_or_far_it_is(along):
+def test_parallel_rays_show_props_alike_near_and_far(along):
     there = with_apple(0.0, 1.6)
     assert not torch.equal(there, with_apple())
     torch.testing.assert_close(with_apple(along, 1.6), there, rtol=0, atol=64 * EPS32)
-
-
-def test_in_perspective_company_far_behind_is_seen():
-    assert not torch.equal(with_apple(-10.0, 4.0, fov=40.0), with_apple(fov=40.0))
