@@ -62,13 +62,13 @@ def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
 
 
 def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, albedo_scale: float, added: Tensor) -> Tensor:
-    """(S, 3) at the samples: the albedo times the gain plus what is `added` to each face (F, 3), within [0, 1] or up to
-    what it was beyond; differentiable in what is added. InputError: NaN.
+    """(S, 3) at the samples: the scaled albedo plus `added`, (F, 3) per face, clamped to [0, 1], or to the scaled
+    albedo where that is larger; differentiable in `added`. InputError: NaN.
 
-    It is kept within where it is stored, at corners and texels, and then interpolated, so that colors and textures can
-    hold it: see `renderer.io.texture_bake`.
+    Corners and texels are clamped before they are interpolated, so that files can hold them: see
+    `renderer.io.texture_bake`.
     """
-    there, faces = face_albedo(added, fragments), fragments.faces.cpu().numpy()
+    offset, faces = face_albedo(added, fragments), fragments.faces.cpu().numpy()
     corners = decode(torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(added), encoding) * albedo_scale
     albedo = fragments.interpolate(_within(corners + added.index_select(0, fragments.faces)[:, None], corners))
     if not mesh.textures:
@@ -81,7 +81,7 @@ def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, albedo_scale
         texels = [
             (weight.to(added), colors[here] * texture.texels(at).T) for weight, at in _taps(texture, uvs[:, here])
         ]
-        value = reduce(torch.add, (weight[:, None] * _within(texel + there[here], texel) for weight, texel in texels))
+        value = reduce(torch.add, (weight[:, None] * _within(texel + offset[here], texel) for weight, texel in texels))
         albedo = albedo.index_copy(0, here, value)
     return albedo
 
@@ -138,15 +138,15 @@ def bilinear(texture: Texture, uvs: Tensor) -> Tensor:
 
 
 def _taps(texture: Texture, uvs: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """(weight, row-major index) of the four texels around places (2, S)."""
+    """(weight, row-major index) of the four texels around texture coordinates (2, S)."""
     columns, rows = _neighbors(uvs[0], texture.width), _neighbors(1 - uvs[1], texture.height)
     return [(down * across, (row * texture.width + column).long()) for row, down in rows for column, across in columns]
 
 
 def _neighbors(along: Tensor, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """(index, weight) of the texels before and after places (S,), in a texture that repeats from 0 to 1."""
-    place = along * count - 0.5
-    first = place.floor()
-    share = place - first
+    """(index, weight) of the texels before and after coordinates (S,), in a texture that repeats from 0 to 1."""
+    position = along * count - 0.5
+    first = position.floor()
+    fraction = position - first
     first, second = (index - count * (index / count).floor() for index in (first, first + 1))  # the remainder
-    return (first, 1 - share), (second, share)
+    return (first, 1 - fraction), (second, fraction)

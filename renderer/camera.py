@@ -1,4 +1,4 @@
-"""Orthographic and perspective cameras that look at the origin, and rings of them.
+"""Orthographic and perspective cameras that look at the origin, and orbits of them.
 
 World axes are right-handed with z up.
 """
@@ -14,7 +14,7 @@ from renderer.errors import LARGEST, InputError, require_range
 
 REACH = 2.0  # enough for a normalized mesh, whose radius is at most √3
 MOST_VIEWS = 10**5
-NEAREST = 0.01  # of its distance: what comes nearer to a camera than that is no view of a mesh
+NEAREST = 0.01  # of its distance: a mesh that comes nearer to the camera is refused
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,9 @@ class Camera(ABC):
     """A square image from polar angle θ off +z and azimuth φ off +x towards +y, both in radians.
 
     width: width of the image in world units, at the origin; a normalized mesh spans at most [-1, 1] per axis.
-    right, up: where the origin lies in the image, in world units from its middle: by so much the camera stands aside.
-    reach: world units from the origin along the view within which surface is seen. distance: of its plane from the
-    origin. InputError where a width or distance is not positive, an angle is not
-    finite, or any is too large.
+    right, up: the origin's position in the image, in world units from the middle. reach: the depth along the view, in
+    world units to either side of the origin, within which surfaces are visible. distance: of the camera from the
+    origin. InputError: a width or distance that is not positive, values that are not finite or too large.
     """
 
     polar: float
@@ -45,7 +44,7 @@ class Camera(ABC):
 
     @property
     def near(self) -> float:
-        """Distance from which on it sees surface, up to `far`."""
+        """Distance from the camera at which visible surface begins; it ends at `far`."""
         return max(self.distance - self.reach, NEAREST * self.distance)
 
     @property
@@ -53,7 +52,7 @@ class Camera(ABC):
         return self.distance + self.reach
 
     def seeing(self, radius: float) -> Self:
-        """The same, with a reach that holds what lies within a radius around the origin."""
+        """The same camera, with a reach that contains a ball around the origin."""
         return self if radius <= self.reach else replace(self, reach=math.floor(radius) + 1.0)
 
     def axes(self) -> np.ndarray:
@@ -65,9 +64,9 @@ class Camera(ABC):
         return np.array([right, np.cross(back, right), back])
 
     def pose(self) -> np.ndarray:
-        """(4, 4) its axes and, last, where it stands, as columns in world coordinates."""
-        axes, place = self.axes(), np.array([-self.right, -self.up, self.distance])
-        return np.vstack([np.column_stack([axes.T, place @ axes]), [0, 0, 0, 1]])
+        """(4, 4) the axes and, last, the position of the camera, as columns in world coordinates."""
+        axes, position = self.axes(), np.array([-self.right, -self.up, self.distance])
+        return np.vstack([np.column_stack([axes.T, position @ axes]), [0, 0, 0, 1]])
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -94,7 +93,7 @@ class OrthographicCamera(Camera):
 
     @property
     def distance(self) -> float:  # type: ignore[override]
-        """In files: in an image it shows nowhere."""
+        """In files; images do not depend on it."""
         return 2 * self.reach
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -149,8 +148,8 @@ def orbit_cameras(
 ) -> list[Camera]:
     """Cameras at one polar angle and equally spaced azimuths from a first (the paper's appendix C: π/3 and 10).
 
-    fov: the angle between opposite sides of the image, in radians, which says how far off perspective cameras
-    are; None of orthographic ones.
+    width: of the image at the origin, in world units. fov: the angle between opposite sides of the image, in radians,
+    which sets the distance of perspective cameras; None for orthographic ones. InputError: values out of range.
 
     >>> [round(math.degrees(camera.azimuth)) for camera in orbit_cameras(views=4, width=2.0)]
     [0, 90, 180, 270]
@@ -160,7 +159,7 @@ def orbit_cameras(
     require_range("views", views, 1, MOST_VIEWS)
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
     if fov is None:
-        return [OrthographicCamera(polar, each, width) for each in azimuths]
+        return [OrthographicCamera(polar, angle, width) for angle in azimuths]
     require_range("a camera's fov", fov, 1e-3, 3)
     distance = width / 2 / math.tan(fov / 2)
-    return [PerspectiveCamera(polar, each, width, distance=distance) for each in azimuths]
+    return [PerspectiveCamera(polar, angle, width, distance=distance) for angle in azimuths]

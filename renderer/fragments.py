@@ -1,6 +1,6 @@
 """What a view sees of a mesh: the covered samples of an image, each with its pixel and its face.
 
-Rasterized once and then held fixed, while light, albedo or the positions of the vertices are differentiated.
+Rasterized once and then fixed, while light, albedo or the positions of the vertices are differentiated.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,12 +26,12 @@ class Fragments:
     """S covered samples of an image of size² pixels and samples² samples each; they see G faces in P pixels.
 
     pixels: (P,) int64, row-major indices of the covered pixels, ascending; row 0 is the top of the image.
-    coverage: (P,) float64 in (0, 1], the share of a pixel's samples that the mesh covers.
+    coverage: (P,) float64 in (0, 1], the fraction of a pixel's samples that the mesh covers.
     faces: (G,) int64, the mesh's faces that any sample sees, ascending; the others are neither shaded nor moved.
     corners: (G, 3) int64, their vertices. facing: (G, 1) float64, -1 where the camera sees a face from behind.
     outlines: (G, 3, 2) float64, their corners as projected, x right and y up in [-1, 1].
     pixel, face: (S,) int64, indices into `pixels` and `faces`; samples of a pixel lie together.
-    sample: (S,) int64, their place in the image: pixel by pixel, and row by row within a pixel.
+    sample: (S,) int64, their position in the image: pixel by pixel, and row by row within a pixel.
     depths: (G, 3) float64 of the corners, by which perspective divides (`Camera.depths`); None without perspective.
     """
 
@@ -52,8 +52,8 @@ class Fragments:
     def barycentric(self) -> Tensor:
         """(S, 3) float64 weights of the faces' corners at the samples, clipped into the face: corners were snapped.
 
-        What is linear on a face is, under perspective, a quotient of linear functions in the image: both of it are
-        interpolated there (Heckbert and Moreton 1991).
+        Under perspective, a function that is linear on a face is a quotient of two linear functions in the image, which
+        are interpolated there (Heckbert and Moreton 1991).
         """
         outlines = self.outlines.permute(2, 1, 0)
         edges = outlines[:, 1:] - outlines[:, :1]
@@ -75,7 +75,7 @@ class Fragments:
         return weights.T
 
     def positions(self) -> Tensor:
-        """(S, 2) float64 places of the samples, in the same coordinates as `outlines`."""
+        """(S, 2) float64 positions of the samples, in the same coordinates as `outlines`."""
         pixel, within = _divide(self.sample.double(), self.samples**2)  # as floats: integers divide ten times as slowly
         (row, column), (down, across) = _divide(pixel, self.size), _divide(within, self.samples)
         resolution = self.size * self.samples
@@ -103,8 +103,8 @@ class Fragments:
         starts[1:] = (self.pixel[1:] != self.pixel[:-1]) | (self.face[1:] != self.face[:-1])
         run = starts.cumsum(0) - 1
         count = int(run[-1]) + 1
-        # What the samples of a run agree on is written once for each: a fifth of nonzero's time.
-        pixel, face = (each.new_empty(count).scatter_(0, run, each) for each in (self.pixel, self.face))
+        # Writing each run's common value several times takes a fifth of the time of nonzero.
+        pixel, face = (index.new_empty(count).scatter_(0, run, index) for index in (self.pixel, self.face))
         return pixel, face, run
 
     def to(self, device: torch.device | str) -> "Fragments":
@@ -166,7 +166,7 @@ def _fragments(
     within = ids.view(f"V{samples * ids.itemsize}").reshape(size, samples, size)  # a pixel's row of samples as one item
     by_pixel = within.swapaxes(1, 2).reshape(-1).view(ids.dtype)
     hits = np.flatnonzero(by_pixel >= 0)
-    seen, face = _compact(by_pixel[hits], len(faces))
+    visible, face = _compact(by_pixel[hits], len(faces))
     if samples == 1:  # a sample is a pixel
         pixels, pixel, counts = hits, np.arange(len(hits)), np.ones(len(hits), dtype=np.int64)
     else:
@@ -174,7 +174,7 @@ def _fragments(
         pixels = np.flatnonzero(counts > 0)
         counts = counts[pixels]
         pixel = np.repeat(np.arange(len(pixels)), counts)
-    corners = np.ascontiguousarray(faces.take(seen, axis=0).T)
+    corners = np.ascontiguousarray(faces.take(visible, axis=0).T)
     outlines = projected[:, :2].T.take(corners, axis=1)
     (ax, bx, cx), (ay, by, cy) = outlines
     behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
@@ -183,7 +183,7 @@ def _fragments(
         samples=samples,
         pixels=torch.from_numpy(pixels),
         coverage=torch.from_numpy(counts / samples**2),
-        faces=torch.from_numpy(seen),
+        faces=torch.from_numpy(visible),
         corners=torch.from_numpy(corners).T,  # with all first corners side by side in memory, as they are read
         facing=torch.from_numpy(np.where(behind, -1.0, 1.0))[:, None],
         outlines=torch.from_numpy(outlines.T),
@@ -202,7 +202,7 @@ def _compact(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blocks(*tensors: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Views of so many samples, the last axis of each tensor, at a time."""
+    """Blocks of samples, along the last axis of each tensor."""
     return zip(*(tensor.split(BLOCK, dim=-1) for tensor in tensors), strict=True)
 
 

@@ -45,7 +45,7 @@ def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
 
 
 def negative_fraction(radiance: Tensor) -> float:
-    """The negative part of a map's radiance (H, W, 3), integrated over the sphere, as a share of its magnitude."""
+    """The negative part of a map's radiance (H, W, 3), integrated over the sphere, as a fraction of its magnitude."""
     _, solid_angles = equirectangular(*radiance.shape[:2])
     power = radiance * solid_angles[..., None]
     return float((-power).clamp(min=0).sum() / power.abs().sum().clamp(min=torch.finfo(power.dtype).tiny))
@@ -82,7 +82,7 @@ def read_panorama(path: Path) -> Tensor:
 def check_map_name(path: Path) -> None:
     """InputError where the suffix is not one of `SUFFIXES`."""
     if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path} is no name for an environment map: give one that ends in {', '.join(SUFFIXES)}")
+        raise InputError(f"{path} must end in one of {', '.join(SUFFIXES)} for an environment map")
 
 
 def write_map(path: Path, radiance: Tensor) -> None:
@@ -153,13 +153,13 @@ def _to_rgbe_precision(radiance: Tensor) -> Tensor:
 
 
 def _color_channels(path: Path, names: tuple[str, ...]) -> list[int]:
-    """Where red, green and blue lie; three times the same where all but alpha is one gray channel."""
+    """Indices of red, green and blue, equal for a gray channel."""
     split = [name.casefold().rpartition(".")[::2] for name in names]  # (layer, channel)
     for layer, _ in split:  # the library puts the unnamed layer first
         for colors in (("r", "g", "b"), ("red", "green", "blue")):
-            wanted = [(layer, color) for color in colors]
-            if set(wanted) <= set(split):
-                return [split.index(channel) for channel in wanted]
+            channels = [(layer, color) for color in colors]
+            if set(channels) <= set(split):
+                return [split.index(channel) for channel in channels]
     gray = [index for index, (_, channel) in enumerate(split) if channel not in ("a", "alpha")]
     if len(gray) == 1:
         return gray * 3

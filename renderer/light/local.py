@@ -13,18 +13,18 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.light.basis import Basis, LightPaths, LocalBasis, SumBasis, parts_of
 from renderer.normals import tangent_axes
 
-SHARES, RAYS = 4, 8  # neighboring samples look at other points of a disc, in turns of so many, at so many each
+SHARES, RAYS = 4, 8  # neighboring samples cast rays to different points of a disc: SHARES sets of RAYS points
 LARGEST = 256  # pixels per side of a projector
 
 
 @dataclass(frozen=True)
 class Lamps(LocalBasis):
-    """A coefficient for each of the places (x, y, z): the irradiance head on at distance 1, from which it falls with
-    the square. power: the largest; the least is 0.
+    """Lamps at positions (x, y, z); the coefficient of each is its irradiance at normal incidence at distance 1, which
+    falls with the squared distance. power: the largest coefficient; the least is 0.
 
-    radius: of discs that face the origin and shine to the front as diffuse surfaces do, so that off their axis it is
-    less by the cosine; the coefficient is that of a point as bright from afar. 0: points, which shine all around.
-    InputError: no place, or one on the origin.
+    radius: of discs that face the origin and emit to the front as diffuse surfaces do, with the cosine of the angle off
+    their axis; their coefficient is that of a point that is as bright from afar. 0: points, which shine all around.
+    InputError: no position, or one at the origin.
     """
 
     positions: tuple[tuple[float, float, float], ...]
@@ -51,7 +51,7 @@ class Lamps(LocalBasis):
         return len(self.positions)
 
     def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
-        """positions: (L, 3) of the lamps, in place of their own; the irradiance is differentiable in them, too."""
+        """positions: (L, 3), instead of the basis'; the irradiance is differentiable in them, too."""
         positions = points.new_tensor(self.positions) if positions is None else positions
         sources = self._discs(positions) if self.radius else positions[None, :, None]
         share = torch.arange(len(points), device=points.device) % len(sources)
@@ -64,8 +64,7 @@ class Lamps(LocalBasis):
         return LightPaths(point, lamp, source, received / sources.shape[2])
 
     def _discs(self, positions: Tensor) -> Tensor:
-        """(SHARES, L, RAYS, 3) points, each of which stands for as much of its disc: Vogel's spiral (1979), in each
-        share turned and a little farther out."""
+        """(SHARES, L, RAYS, 3) points that divide each disc equally: Vogel's spiral (1979), turned in each share."""
         share, ray = torch.meshgrid(torch.arange(SHARES), torch.arange(RAYS), indexing="ij")
         distance = self.radius * ((ray + (share + 0.5) / SHARES) / RAYS).sqrt()
         angle = ray * math.pi * (3 - math.sqrt(5)) + share * 2 * math.pi / SHARES
@@ -73,8 +72,8 @@ class Lamps(LocalBasis):
         return positions[:, None] + torch.einsum("sra,laj->slrj", across, _disc_axes(F.normalize(positions, dim=1)))
 
     def _irradiance(self, toward: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
-        """(...) at surfaces of unit normals (..., 3) from power 1 that is `toward` (..., 3) from there, of lamps at
-        places (..., 3); not above 0 behind a surface or a disc."""
+        """(...) irradiance at power 1 of surfaces with unit normals (..., 3) from lamps at positions (..., 3); toward:
+        from surface to lamp. Not above 0 behind a surface or a disc."""
         squared = toward.square().sum(-1)
         received = (toward * normals).sum(-1) / squared**1.5
         if not self.radius:
@@ -90,7 +89,7 @@ def _disc_axes(normals: Tensor) -> Tensor:
 
 
 def moved(basis: Basis, positions: Tensor) -> Basis:
-    """The basis with its lamps at places (L, 3)."""
+    """The basis with its lamps at positions (L, 3)."""
     points = tuple(map(tuple, positions.tolist()))
     parts = [replace(part, positions=points) if isinstance(part, Lamps) else part for _, part in parts_of(basis)]
     return SumBasis(tuple(parts)) if isinstance(basis, SumBasis) else parts[0]
@@ -100,10 +99,10 @@ def moved(basis: Basis, positions: Tensor) -> Basis:
 class Projector(LocalBasis):
     """Patterns of pixels² coefficients, row by row from the top left, as a screen shows them.
 
-    It stands at polar angle θ off +z and azimuth φ off +x, in radians, `distance` from the origin, which it aims at;
-    fov: the angle between opposite sides, in radians. A coefficient of 1 makes a white surface at the origin
-    that faces it as bright as radiance 1; it falls with the square of the distance, and on a flat screen it is even, as
-    projectors are made. power: the largest coefficient; the least is 0. InputError: settings out of range.
+    polar, azimuth: of its position off +z and +x, in radians; it aims at the origin from `distance`. fov: the angle
+    between opposite sides, in radians. A coefficient of 1 gives a white surface at the origin that faces the projector
+    the radiance 1; the light falls with the squared distance and is even on a flat screen. power: the largest
+    coefficient; the least is 0. InputError: settings out of range.
     """
 
     pixels: int = 16
@@ -129,16 +128,16 @@ class Projector(LocalBasis):
         return self.pixels**2
 
     def connect(self, points: Tensor, normals: Tensor) -> LightPaths:
-        """One pixel reaches a point."""
+        """One path for each point within the pattern."""
         axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
-        place = self.distance * axes[2]
-        right, up, back = ((points - place) @ axes.T).unbind(1)
+        source = self.distance * axes[2]
+        right, up, back = ((points - source) @ axes.T).unbind(1)
         depth, edge = -back, math.tan(self.fov / 2)
         column = ((1 + right / (depth * edge)) / 2 * self.pixels).floor()
         row = ((1 - up / (depth * edge)) / 2 * self.pixels).floor()
-        cosine = ((place - points) * normals).sum(1) / depth  # over that of the angle from the axis
+        cosine = ((source - points) * normals).sum(1) / depth  # over that of the angle from the axis
         within = (row >= 0) & (row < self.pixels) & (column >= 0) & (column < self.pixels)
         (point,) = torch.nonzero(within & (depth > 0) & (cosine > 0), as_tuple=True)
         function = (row * self.pixels + column)[point].long()
         irradiance = (cosine * (self.distance / depth) ** 2)[point]
-        return LightPaths(point, function, place.expand(len(point), 3), irradiance)
+        return LightPaths(point, function, source.expand(len(point), 3), irradiance)

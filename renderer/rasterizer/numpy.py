@@ -1,7 +1,16 @@
 """The NumPy rasterizer: fixed-point corners and exact integer arithmetic, as GPUs have them.
 
-A triangle is cut into rows, and what it covers of a row into samples, so that only covered samples are ever looked at.
-The longest axis is the last one of every array.
+Corners (x, y) are integers in 1/256 of a sample. In the row y = 256 r, an edge from (x₀, y₀) to (x₁, y₁) begins at the
+column ⌈(x₀ + (y − y₀) (x₁ − x₀) / (y₁ − y₀)) / 256⌉, an exact quotient of integers, which both faces of the edge share:
+so each sample belongs to one of them (the top-left rule). Between its two columns in a row, a face covers a run of
+samples. Depth is the plane z = z_a + (x − x_a) ∂z/∂x + (y − y_a) ∂z/∂y, rounded to 24 bits, and the image is the least
+key of each sample,
+
+    key = depth · 2³² + face,
+
+whose lower half is the id: the nearest face, and of equal depths the one with the lower index. Only covered samples are
+computed: faces are cut into rows, and rows into samples, in blocks that stay in the cache. The longest axis is the last
+of every array.
 """
 
 from collections.abc import Iterator
