@@ -17,12 +17,10 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from renderer.errors import InputError
-from renderer.io.images import read_square
 from train.attack_examples import SUFFIX, Side, read_attack_examples
 from train.errors import one_sentence
 from train.photographs.metrics import OVERALL, Roc, find_metric, metric_title
-from train.photographs.predictions import PREDICTIONS, Prediction, outcomes, read_predictions
-from train.photographs.sheet import COLORS, caption, evenly
+from train.photographs.sheet import evenly
 from train.report import plots
 from train.report.command import attack_command, training_command
 from train.report.compare import (
@@ -55,7 +53,7 @@ from train.tables import Table, as_text
 PAGE, HEADLINE = "report.html", "report.png"
 MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons
 MOST_ROWS, MOST_UNFINISHED, MOST_ATTACKS = 30, 3, 12  # rows of a table, unfinished runs in plots, attacks in sections
-EXAMPLES, ATTACK_EXAMPLES, TILES = 3, 4, 8  # in the headline, with images of an attack, photographs of each outcome
+EXAMPLES, ATTACK_EXAMPLES = 3, 4  # in the headline, with images of an attack
 GRID, SHEET = 720, 1100  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
 SHOWN = ("recall", "false_positive_rate", "auc", "recall_at/0.10")  # of METRICS, by source
 
@@ -349,10 +347,13 @@ def _images_name(run: RunSummary, name: str) -> str:
 
 
 def _photographs(arms: Arms, name: str) -> Iterator[Section]:
-    """Metrics by source, and photographs with the predictions of each arm's first run."""
+    """Metrics by source, and the contact sheet of each arm's first run."""
     runs = _scored(arms, name)
     yield Section(f"{name}: by source", [*_by_source(runs, name)])
-    blocks = [block for arm, group in runs.items() for block in _photograph_galleries(arm, group[0], name)]
+    sheets = {arm: group[0].folder / name / "contact_sheet.png" for arm, group in runs.items()}
+    blocks = [
+        Gallery(arm, plots.from_file(path, f"{name}, predictions of {arm}", SHEET)) for arm, path in sheets.items()
+    ]
     yield Section(f"{name}: predictions", blocks)
 
 
@@ -396,34 +397,6 @@ def _scores(evaluations: Mapping[str, Sequence[Evaluation]], metric: str) -> dic
 
 def _cell(scores: Mapping[str, Mapping[str, Score | None]], source: str, arm: str) -> str:
     return str(scores.get(source, {}).get(arm) or "-")
-
-
-def _photograph_galleries(arm: str, run: RunSummary, name: str) -> Iterator[Block]:
-    folder = _photographs_folder(run, name)
-    if folder is None or not folder.is_dir():
-        alt = f"Photographs of {name} with the predictions of {arm}"
-        yield Gallery(arm, plots.from_file(run.folder / name / "contact_sheet.png", alt, SHEET))
-        return
-    try:
-        predictions = read_predictions(run.folder / name / PREDICTIONS, run.label)
-    except InputError as error:
-        yield str(error)
-        return
-    for kind, group in zip(COLORS, outcomes(predictions, run.label), strict=True):
-        tiles = [tile for prediction in evenly(group, TILES) for tile in _photograph(prediction, folder)]
-        yield Gallery(f"{arm}: {kind}, {len(tiles)} of {len(group)}", tiles)
-
-
-def _photograph(prediction: Prediction, folder: Path) -> list[Picture]:
-    path = prediction.photograph.path
-    if path.is_absolute() or ".." in path.parts or not (folder / path).is_file():
-        return []
-    try:
-        pixels = read_square(folder / path, plots.SMALL)
-    except Exception:  # Pillow's decoders raise almost anything at a broken file
-        return []
-    text = " / ".join(caption(prediction))
-    return [plots.encoded(Image.fromarray(pixels), f"{prediction.photograph.label}, predicted {text}", text)]
 
 
 # ------------------------------------------------------------------------------------- attacks
