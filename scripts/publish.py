@@ -24,7 +24,7 @@ class Settings:
 
 
 def main(settings: Settings) -> None:
-    run, out = summarize(Path(settings.run)), writable_folder(settings.out, "out")
+    out, run = writable_folder(settings.out, "out"), summarize(Path(settings.run))
     state = checkpoint.load(run.folder / checkpoint.BEST)
     if not str(state["architecture"].get("name")).startswith(PYTHON):  # only its user runs that code
         load_run(run.folder / checkpoint.BEST)  # or InputError, since nobody could use it

@@ -41,10 +41,10 @@ def test_a_network_is_scored_at_its_size_on_photographs_whose_names_are_numbers_
     assert call(*EVALUATE, "out=1e3") == 0
     assert "1 images of orange, 1 of other things" in capsys.readouterr().out
     assert {path.name for path in (here / "1e3").iterdir()} == {
-        *("photographs.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK)
+        *("predictions.csv", "summary.json", "contact_sheet.png", "roc.csv", "roc.png", LOCK)
     }
     assert json.loads((here / "1e3" / "summary.json").read_text())["size"] == 64
-    header, *rows = (here / "1e3" / "photographs.csv").read_text(encoding="utf-8").splitlines()
+    header, *rows = (here / "1e3" / "predictions.csv").read_text(encoding="utf-8").splitlines()
     assert any(row.startswith(r"other_\udcff/a.png,") for row in rows)
     (first,) = (row.split(",") for row in rows if row.startswith("orange/a.png,"))
     image = np.asarray(Image.open(here / "2024" / "orange" / "a.png")).transpose(2, 0, 1).copy()
@@ -74,7 +74,7 @@ def test_a_network_that_a_python_function_makes_is_scored_at_its_size_and_on_its
         Image.new("RGB", (40, 30), color).save(tmp_path / "lit" / name / "one.png")
     assert call("evaluate_photos", "classifier=python:own:build", "photos=lit", "device=cpu", "out=out") == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (summary["size"], summary["recall"]["value"], summary["false_alarms"]["value"]) == (16, 1, 0)
+    assert (summary["size"], summary["recall"]["value"], summary["false_positive_rate"]["value"]) == (16, 1, 0)
 
 
 WRONG = [

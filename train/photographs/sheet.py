@@ -107,8 +107,8 @@ def draw_roc(axes: "Axes", rocs: Mapping[str, Sequence[Roc]], label: str, styles
     styles: matplotlib's keywords of a name's lines.
     """
     axes.axline((0, 0), slope=1, color="0.6", linewidth=1)  # chance
-    for rate in map(float, RATES):
-        axes.axvline(rate, color="0.6", linewidth=1, linestyle=":")
+    for marked in map(float, RATES):
+        axes.axvline(marked, color="0.6", linewidth=1, linestyle=":")
     for name, group in rocs.items():
         title = f"{name}: AUC {np.mean([roc.values()['auc'] for roc in group]):.3f}" if group else None
         for roc in group:

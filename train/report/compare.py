@@ -88,7 +88,7 @@ def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], sou
         return {}
     values = [np.mean([find_metric(run.metrics[source], name)["value"] for run in runs]) for runs in groups]
     replicates = [np.stack([run.replicates[source][name] for run in runs]) for runs in groups]
-    differences = replicate_difference(*replicates, paired=_have_same_seeds(group, reference))
+    differences = replicate_difference(replicates[0], replicates[1], paired=_have_same_seeds(group, reference))
     return {"value": float(values[0] - values[1]), **interval(differences)}
 
 

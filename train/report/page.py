@@ -175,9 +175,9 @@ def _difference_in_words(runs: Arms, name: str) -> Iterator[str]:
     (reference, base), *_, (arm, group) = runs.items()
     metric = "recall_at/0.10"
     with suppress(InputError):
-        both = [[read_evaluation(run, name, base[0].label) for run in group] for group in (group, base)]
-        require_comparable([*both[1], *both[0]], name)
-        if result := difference(*both, OVERALL, metric):
+        first, last = ([read_evaluation(run, name, base[0].label) for run in runs] for runs in (base, group))
+        require_comparable([*first, *last], name)
+        if result := difference(last, first, OVERALL, metric):
             unsure = "" if result["low"] > 0 or result["high"] < 0 else ", so that no difference is shown"
             images = _images_name(base[0], name)
             yield f"{arm} minus {reference}, {metric_title(metric)} on {images}: {format_difference(result)}{unsure}."

@@ -159,6 +159,7 @@ def from_file(path: Path, alt: str, widest: int, caption: str = "") -> list[Pict
 
 DPI, FONT = 200, 14  # a phone shows its 7.2 inches at half their size
 WIDE = 7.2  # inches
+HEADLINE = {**NO_SPINES, "font.size": FONT}
 LONGEST_LINE, LONGEST_CLASS, LONGEST_TITLE = 14, 9, 25  # characters; longer ones are wrapped, or set smaller
 
 
@@ -174,7 +175,7 @@ def headline(
 
     lines = sum(len(textwrap.wrap(arm, LONGEST_LINE)) for by_arm in scores.values() for arm in by_arm)
     width, file = WIDE if scores else WIDE / 2, io.BytesIO()
-    with mpl.rc_context({**NO_SPINES, "font.size": FONT}):  # type: ignore[arg-type]
+    with mpl.rc_context(HEADLINE):  # type: ignore[arg-type]
         figure = Figure(figsize=(width, max(4.0, 1.4 + 0.22 * lines)), layout="constrained", dpi=DPI)
         panels = figure.subfigures(1, 2 if scores else 1, squeeze=False)[0]
         _draw_pairs(panels[0], pairs, f"One {label}, another light")
