@@ -8,7 +8,7 @@ faces       (F, 3) integer; drawn from both sides unless closed
 resolution  samples per side R; sample (i, j) sits at x = (2j + 1)/R - 1, y = 1 - (2i + 1)/R
 closed      promises a watertight mesh within the range of depths, its faces counter-clockwise seen from outside, and
             leaves out the faces that wind clockwise in the image: the same samples are covered, with the same ids
-            but where a face turned away is as near as the nearest within rounding, as along outlines
+            except where a face turned away is as near as the nearest within rounding, as along outlines
 ids         (N, R, R) int32, row 0 at the top: the nearest face's index, the lower one where depths tie, or -1
 
 All snap vertices to 1/256 of a sample, so faces that share an edge cover each sample once. NumPy and numba agree to the
@@ -41,22 +41,22 @@ class Rasterizer:
         """Ids (N, R, R) int32 by the module's contract. ValueError: points that are not finite."""
         if not np.isfinite(points).all():
             raise ValueError("points hold NaN or infinity")
-        reach = SPAN / resolution
+        limit = SPAN / resolution
         module = import_module(f"renderer.rasterizer.{self.name}")
-        return module.rasterize(np.clip(points, -reach, reach), faces, resolution, closed)
+        return module.rasterize(np.clip(points, -limit, limit), faces, resolution, closed)
 
 
 def choose(rasterizer: str = "auto") -> Rasterizer:
     """Settle on a rasterizer, once at the start.
 
     "auto" takes OpenGL where a GPU drives it, else numba where it is installed, else numpy. InputError:
-    unknown name, "opengl" on a machine that cannot, or "numba" without numba.
+    an unknown name, "opengl" on a machine that cannot, or "numba" without numba.
     """
     require_choice("renderer.rasterizer", rasterizer, NAMES)
     if rasterizer == "numpy":
         return Rasterizer("numpy", "numpy")
     if rasterizer == "numba":
-        return _compiled()
+        return _numba()
     try:
         device = opengl.device()
     except InputError as error:
@@ -70,12 +70,12 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
 
 def _on_cpu(reason: str) -> Rasterizer:
     try:
-        return _compiled()
+        return _numba()
     except InputError:
         return Rasterizer("numpy", f"numpy ({reason})")
 
 
-def _compiled() -> Rasterizer:
-    from renderer.rasterizer import numba as compiled  # numba takes half a second to import
+def _numba() -> Rasterizer:
+    from renderer.rasterizer import numba  # takes half a second to import
 
-    return Rasterizer("numba", f"numba ({compiled.VERSION})")
+    return Rasterizer("numba", f"numba ({numba.VERSION})")

@@ -25,7 +25,7 @@ TYPES = "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, :
 
 
 def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
-    """Ids by the contract in `renderer.rasterizer`, for finite points. IndexError: a face of no such vertex."""
+    """Ids by the contract in `renderer.rasterizer`, for finite points. IndexError: a face of a missing vertex."""
     corners = np.ascontiguousarray(faces, dtype=np.int64).view(np.uint64)  # numba looks for no negative ones then
     if corners.max(initial=0) >= points.shape[1]:
         raise IndexError(f"faces name vertices that are not among the {points.shape[1]}")
@@ -37,7 +37,7 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
     return ids
 
 
-_njit: Callable[..., Any] = partial(numba.njit, nogil=True, error_model="numpy")  # no divisor is 0: none is looked at
+_njit: Callable[..., Any] = partial(numba.njit, nogil=True, error_model="numpy")  # no divisor is 0, so none is checked
 
 
 def _inlined(function: Function) -> Function:
@@ -47,7 +47,7 @@ def _inlined(function: Function) -> Function:
 def _compiled(function: Function) -> Function:
     try:
         return _njit(TYPES, cache=True)(function)
-    except Exception:  # nowhere to keep it, or what was kept is damaged: numba has no narrower class
+    except Exception:  # its cache cannot be written or is damaged: numba has no narrower class
         return _njit(TYPES)(function)
 
 
@@ -57,7 +57,7 @@ def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
 
 
 @_inlined
-def _reach(along: Any, a: int, b: int, c: int, bits: int, resolution: int) -> tuple[int, int]:
+def _covered_range(along: Any, a: int, b: int, c: int, bits: int, resolution: int) -> tuple[int, int]:
     """The first row or column at or after a triangle's least coordinate, and at or after its greatest."""
     least, greatest = min(along[a], along[b], along[c]), max(along[a], along[b], along[c])
     return max(-(-least >> bits), 0), min(-(-greatest >> bits), resolution)
@@ -78,8 +78,8 @@ def _draw(positions: Any, depths: Any, faces: Any, closed: bool, bits: int, ids:
         area = _doubled_area(x, y, a, b, c)
         if area == 0 or (closed and area > 0):
             continue
-        top, bottom = _reach(y, a, b, c, bits, resolution)
-        left, right = _reach(x, a, b, c, bits, resolution)
+        top, bottom = _covered_range(y, a, b, c, bits, resolution)
+        left, right = _covered_range(x, a, b, c, bits, resolution)
         if top >= bottom or left >= right:
             continue
         a, b, c = min(a, b, c), a + b + c - min(a, b, c) - max(a, b, c), max(a, b, c)  # duplicates have one depth
@@ -95,11 +95,11 @@ def _draw(positions: Any, depths: Any, faces: Any, closed: bool, bits: int, ids:
         if ay > by:
             ax, ay, bx, by = bx, by, ax, ay
         for row in range(top, bottom):
-            place, depth = row << bits, first_depth + (row - first_row) * by_row
-            one = _crossing(ax, ay, cx, cy, place, bits)
-            other = _crossing(ax, ay, bx, by, place, bits) if place < by else _crossing(bx, by, cx, cy, place, bits)
+            y_row, depth = row << bits, first_depth + (row - first_row) * by_row
+            one = _crossing(ax, ay, cx, cy, y_row, bits)
+            other = _crossing(ax, ay, bx, by, y_row, bits) if y_row < by else _crossing(bx, by, cx, cy, y_row, bits)
             for column in range(max(min(one, other), 0), min(max(one, other), resolution)):
                 sample = np.uint64(row), np.uint64(column)
-                here = np.rint(depth + by_column * (column - first_column))
-                if 0 <= here < nearest[sample]:
-                    nearest[sample], ids[sample] = here, index
+                z = np.rint(depth + by_column * (column - first_column))
+                if 0 <= z < nearest[sample]:
+                    nearest[sample], ids[sample] = z, index

@@ -41,8 +41,8 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
         block = np.ascontiguousarray(faces[begin : begin + FACES].T)
         drawn, first, rows = _cull(positions.take(block, axis=1), resolution, closed)
         corners = _sort(block.take(drawn, axis=1))  # so that duplicate faces have one depth and tie
-        places = positions.take(corners, axis=1)
-        edges, planes, ids = _edges(places), _planes(places, depths.take(corners)), drawn + begin
+        triangles = positions.take(corners, axis=1)
+        edges, planes, ids = _edges(triangles), _planes(triangles, depths.take(corners)), drawn + begin
         for triangle, row in _parts(rows):
             row += first.take(triangle)
             left, right = _crossings(edges, triangle, row, resolution)
@@ -87,7 +87,7 @@ def _doubled_areas(corners: np.ndarray) -> np.ndarray:
 
 
 def _next_sample(positions: np.ndarray) -> np.ndarray:
-    """The first row or column at or after each."""
+    """The first row or column at or after each position."""
     return (positions + (SUBSAMPLES - 1)) >> SUBSAMPLE_BITS
 
 
@@ -143,7 +143,7 @@ def _key(depth: np.ndarray, face: np.ndarray) -> np.ndarray:
 
 
 def _parts(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(whole, part): each whole as often as it has parts, numbered from 0; about PARTS at a time, wholes uncut."""
+    """(whole, part): each whole repeated by its count, with parts from 0; about PARTS at a time, wholes uncut."""
     ends = np.cumsum(counts)
     starts, begin, done = ends - counts, 0, 0
     while begin < len(counts):

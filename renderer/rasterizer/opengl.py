@@ -45,11 +45,11 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
     InputError: no EGL device, or a driver that renders wrong ids or fails.
     """
     with _context() as context:
-        return _draw(context, points, _in_one_order(faces, closed), resolution, closed)
+        return _draw(context, points, _normalized_corners(faces, closed), resolution, closed)
 
 
 def device() -> str:
-    """The name of what drives OpenGL. InputError: no EGL device, or a driver that renders wrong ids."""
+    """The name of the OpenGL driver's device. InputError: no EGL device, or a driver that renders wrong ids."""
     with _context() as context:
         return context.info["GL_RENDERER"]
 
@@ -74,7 +74,7 @@ def _context() -> Iterator[moderngl.Context]:
 
 
 def _check(context: moderngl.Context) -> None:
-    """InputError unless a large triangle, first turned away and then not, and a small one before it come out right."""
+    """InputError unless a test image is right: a large triangle, first turned away and then not, behind a small one."""
     points = np.array([[[-1, -1, 0], [3, -1, 0], [-1, 3, 0], [-1, -0.2, -0.5], [0.2, 1, -0.5], [-1, 1, -0.5]]])
     ids = _draw(context, points, np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]]), 4, closed=True)
     if ids[0].tolist() != [[2, 2, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]]:
@@ -82,7 +82,7 @@ def _check(context: moderngl.Context) -> None:
         raise InputError(f"the OpenGL driver {name} renders wrong face ids: set renderer.rasterizer=numpy")
 
 
-def _in_one_order(faces: np.ndarray, closed: bool) -> np.ndarray:
+def _normalized_corners(faces: np.ndarray, closed: bool) -> np.ndarray:
     """Sorted corners or, where the winding counts, the least first: duplicate faces have one depth, and tie."""
     if not closed:
         return np.sort(faces, axis=1)
