@@ -37,10 +37,10 @@ class Camera(ABC):
     distance: ClassVar[float]
 
     def __post_init__(self) -> None:
-        require_range("scene.width", self.width, 1 / LARGEST, LARGEST)
-        require_range("a camera's reach", self.reach, 1 / LARGEST, LARGEST)
+        require_range("width", self.width, 1 / LARGEST, LARGEST)
+        require_range("reach", self.reach, 1 / LARGEST, LARGEST)
         for name in ("polar", "azimuth", "right", "up"):
-            require_range(f"a camera's {name}", getattr(self, name), -LARGEST, LARGEST)
+            require_range(name, getattr(self, name), -LARGEST, LARGEST)
 
     @property
     def near(self) -> float:
@@ -117,7 +117,7 @@ class PerspectiveCamera(Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("a camera's distance", self.distance, 1 / LARGEST, LARGEST)
+        require_range("distance", self.distance, 1 / LARGEST, LARGEST)
 
     @property
     def angle(self) -> float:
@@ -138,7 +138,7 @@ class PerspectiveCamera(Camera):
         if not (depths >= NEAREST * self.distance).all():
             raise InputError(
                 f"the mesh reaches to a camera at distance {self.distance:g}, or beyond: give a larger distance "
-                "(a smaller scene.fov or a larger scene.width), or normalize the mesh"
+                "(a smaller fov or a larger width), or normalize the mesh"
             )
         return depths
 
@@ -160,6 +160,6 @@ def orbit_cameras(
     azimuths = [azimuth + 2 * math.pi * view / views for view in range(views)]
     if fov is None:
         return [OrthographicCamera(polar, angle, width) for angle in azimuths]
-    require_range("a camera's fov", fov, 1e-3, 3)
+    require_range("fov", fov, 1e-3, 3)
     distance = width / 2 / math.tan(fov / 2)
     return [PerspectiveCamera(polar, angle, width, distance=distance) for angle in azimuths]

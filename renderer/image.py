@@ -42,15 +42,15 @@ class ImageSettings:
 
     def __post_init__(self) -> None:
         require_range("size", self.size, 1, MOST_SAMPLES)
-        require_range("renderer.samples", self.samples, 1, FINEST)
+        require_range("samples", self.samples, 1, FINEST)
         if self.size * self.samples > MOST_SAMPLES:
             raise InputError(
-                f"renderer.samples={self.samples} for each of {self.size} pixels in a row are more than "
+                f"samples={self.samples} for each of {self.size} pixels in a row are more than "
                 f"{MOST_SAMPLES}: choose fewer"
             )
-        require_choice("renderer.encoding", self.encoding, ENCODINGS)
-        require_choice("renderer.normals", self.normals, NORMALS)
-        require_range("renderer.bounces", self.bounces, 0, MOST_BOUNCES)
+        require_choice("encoding", self.encoding, ENCODINGS)
+        require_choice("normals", self.normals, NORMALS)
+        require_range("bounces", self.bounces, 0, MOST_BOUNCES)
 
     @property
     def global_illumination(self) -> bool:
@@ -150,7 +150,7 @@ class _Clamp(torch.autograd.Function):
 
 def encode(linear: Tensor, encoding: str) -> Tensor:
     """Linear values in [0, 1] to image values: unchanged, or the sRGB transfer function (IEC 61966-2-1)."""
-    require_choice("renderer.encoding", encoding, ENCODINGS)
+    require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return linear
     # The power's derivative is infinite at 0, in the branch that is not taken; the floor keeps it finite.
@@ -160,7 +160,7 @@ def encode(linear: Tensor, encoding: str) -> Tensor:
 
 def decode(image: Tensor, encoding: str) -> Tensor:
     """Inverse of `encode`. Under "linear" a texture's values are taken as the albedo as they stand."""
-    require_choice("renderer.encoding", encoding, ENCODINGS)
+    require_choice("encoding", encoding, ENCODINGS)
     if encoding == "linear":
         return image
     curve = ((image.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4

@@ -52,7 +52,7 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
     "auto" takes OpenGL where a GPU drives it, else numba where it is installed, else numpy. InputError:
     an unknown name, "opengl" on a machine that cannot, or "numba" without numba.
     """
-    require_choice("renderer.rasterizer", rasterizer, NAMES)
+    require_choice("rasterizer", rasterizer, NAMES)
     if rasterizer == "numpy":
         return Rasterizer("numpy", "numpy")
     if rasterizer == "numba":

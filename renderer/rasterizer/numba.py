@@ -17,7 +17,7 @@ from renderer.rasterizer.numpy import FAR, SUBSAMPLE_BITS, to_fixed_point
 try:
     import numba
 except ImportError as error:  # also where it does not know this version of NumPy
-    raise InputError(f"numba does not start ({error}): pip install numba, or renderer.rasterizer=numpy") from error
+    raise InputError(f"numba does not start ({error}): pip install numba, or set rasterizer=numpy") from error
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 VERSION = numba.__version__

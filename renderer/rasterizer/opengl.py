@@ -63,12 +63,12 @@ def _context() -> Iterator[moderngl.Context]:
     try:
         context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]  # annotated as though a dict
     except Exception as error:  # moderngl raises no narrower class
-        raise InputError("no EGL device: apt install libegl1 libgl1, or renderer.rasterizer=numpy") from error
+        raise InputError("no EGL device: apt install libegl1 libgl1, or set rasterizer=numpy") from error
     try:
         _check(context)
         yield context
     except moderngl.Error as error:
-        raise InputError(f"the OpenGL driver failed ({error}): set renderer.rasterizer=numpy") from error
+        raise InputError(f"the OpenGL driver failed ({error}): set rasterizer=numpy") from error
     finally:
         context.release()
 
@@ -79,7 +79,7 @@ def _check(context: moderngl.Context) -> None:
     ids = _draw(context, points, np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]]), 4, closed=True)
     if ids[0].tolist() != [[2, 2, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]]:
         name = context.info["GL_RENDERER"]
-        raise InputError(f"the OpenGL driver {name} renders wrong face ids: set renderer.rasterizer=numpy")
+        raise InputError(f"the OpenGL driver {name} renders wrong face ids: set rasterizer=numpy")
 
 
 def _normalized_corners(faces: np.ndarray, closed: bool) -> np.ndarray:

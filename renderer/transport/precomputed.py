@@ -67,7 +67,7 @@ def build_transport(mesh: Mesh, settings: ImageSettings, albedo_scale: float, ba
     parts = [part for _, part in parts_of(basis)]
     environment = [part for part in parts if not isinstance(part, LocalBasis)]
     if len(environment) < len(parts) and settings.bounces:
-        raise InputError(f"renderer.bounces={settings.bounces}: light of {basis} does not bounce; set renderer.shadows")
+        raise InputError(f"bounces={settings.bounces}: light of {basis} does not bounce; set shadows")
     return (
         Transport(mesh, settings, albedo_scale, environment[0])
         if environment and settings.global_illumination

@@ -139,7 +139,7 @@ def _embree_scene(mesh: Mesh) -> Any:
         from embreex.rtcore_scene import EmbreeScene
     except ImportError as error:
         raise InputError(
-            "shadows are found by rays that Embree casts: pip install embreex, or set renderer.shadows=false and "
+            "shadows are found by rays that Embree casts: pip install embreex, or set shadows=false and "
             "no lights that stand in the scene"
         ) from error
     scene = EmbreeScene(robust=True)

@@ -137,11 +137,11 @@ def test_black_and_white_themselves_are_not_clamped(encoding):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (dict(samples=0), r"renderer\.samples=0"),
+        (dict(samples=0), r"samples=0"),
         (dict(size=0), r"size=0 must be at least 1"),
         (dict(size=-3), r"size=-3 must be at least 1"),
-        (dict(samples=65), r"renderer\.samples=65 must be at least 1 and at most 64"),
-        (dict(encoding="gamma"), r"renderer\.encoding=gamma: choose one of linear, srgb"),
+        (dict(samples=65), r"samples=65 must be at least 1 and at most 64"),
+        (dict(encoding="gamma"), r"encoding=gamma: choose one of linear, srgb"),
     ],
 )
 def test_settings_that_make_no_image_are_refused(settings, message):

@@ -176,7 +176,7 @@ DAMAGES = {
     "images of 10 TB": (announced, "after.npy cannot be read"),
     "images of text": (lambda folder: np.save(folder / "after.npy", np.array(["a"])), "after.npy cannot be read"),
     "images of 1e300": (lambda folder: np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300)), "cannot be read"),
-    "a size of NaN": (described(image={"size": float("nan")}), "size is nan: give int"),
+    "a size of NaN": (described(image={"size": float("nan")}), "size=nan must be"),
     "no such lamps": (described(placed_lights=["lamps.json"]), "lamps.json does not exist"),
 }
 

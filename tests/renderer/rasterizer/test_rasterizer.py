@@ -512,7 +512,7 @@ def test_numba_is_chosen_where_no_gpu_drives_opengl_and_numba_is_installed(monke
 
 
 def test_without_numba_it_is_refused(no_numba):
-    with pytest.raises(InputError, match=r"numba does not start .*: pip install numba, or renderer\.rasterizer=numpy"):
+    with pytest.raises(InputError, match=r"numba does not start .*: pip install numba, or set rasterizer=numpy"):
         choose("numba")
 
 
@@ -531,7 +531,7 @@ def test_without_egl_and_numba_auto_takes_numpy_and_gives_the_reason(no_egl, no_
 
 
 def test_without_egl_opengl_is_refused(no_egl):
-    with pytest.raises(InputError, match=r"apt install libegl1 libgl1, or renderer\.rasterizer=numpy"):
+    with pytest.raises(InputError, match=r"apt install libegl1 libgl1, or set rasterizer=numpy"):
         choose("opengl")
 
 
@@ -548,7 +548,7 @@ def test_the_context_of_a_failing_driver_is_released(monkeypatch):
     monkeypatch.setattr(moderngl, "create_context", lambda **_: Context())
     monkeypatch.setattr(opengl, "_check", lambda context: None)
     monkeypatch.setattr(opengl, "_draw", fail)
-    with pytest.raises(InputError, match=r"driver failed \(cannot create buffer\): set renderer.rasterizer=numpy"):
+    with pytest.raises(InputError, match=r"driver failed \(cannot create buffer\): set rasterizer=numpy"):
         opengl.rasterize(np.zeros((1, 3, 3)), np.array([[0, 1, 2]]), 4, closed=False)
     assert len(released) == 1
 
@@ -556,5 +556,5 @@ def test_the_context_of_a_failing_driver_is_released(monkeypatch):
 @needs_egl
 def test_a_driver_that_renders_wrong_ids_is_refused(monkeypatch):
     monkeypatch.setattr(opengl, "VERTEX_SHADER", opengl.VERTEX_SHADER.replace("gl_VertexID / 3", "0"))
-    with pytest.raises(InputError, match=r"wrong face ids: set renderer\.rasterizer=numpy"):
+    with pytest.raises(InputError, match=r"wrong face ids: set rasterizer=numpy"):
         choose("opengl")

@@ -220,7 +220,7 @@ REFUSED = [
     (["target=[lime,sky]", "scene.views=2"], r"names 2 classes for 1 views"),
     (["target=[lime]", "scene.views=2", "attack.shared=true"], r"names 1 classes for 2 views"),
     (["target=[lime,mango]", "scene.views=2", "attack.shared=true"], r"'mango' is not a class of the model"),
-    (["renderer.normals=round"], r"renderer.normals=round: choose one of flat, smooth"),
+    (["renderer.normals=round"], r"normals=round: choose one of flat, smooth"),
     (["scene.meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"scene.meshes\[0\]"),
     (["scene.meshes=[absent.glb]"], r"absent.glb"),
     (["scene.light=moon"], r"light 'moon' is not known"),
