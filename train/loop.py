@@ -197,7 +197,7 @@ class Trainer:
         return renders
 
     def _reset_to_initial(self) -> None:
-        """Of a soup: begin the epoch with the weights that the run began with."""
+        """Begin a soup's epoch with the weights that the run began with."""
         if self._initial:
             self.model.load_state_dict(self._initial)
             self.optimizer.state.clear()

@@ -145,7 +145,8 @@ def soup(model: nn.Module) -> AveragedModel:
 
 
 def augmentation(name: str, model: nn.Module, seed: int) -> Augment:
-    """One of `AUGMENTATIONS`, the usual ways to robustness; model: that an adversarial one attacks.
+    """One of `AUGMENTATIONS`, the usual ways to robustness: PGD against the model, or a transform of torchvision's, the
+    jitter at half the strengths of Chen et al. 2020, as is usual for small images.
 
     Every image is changed by draws of its own, which depend on the seed, the step and its index in the global batch
     alone.
@@ -154,20 +155,14 @@ def augmentation(name: str, model: nn.Module, seed: int) -> Augment:
         return lambda images, labels, step: images
     if name == "pgd":
         return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", utils.rank()))
-    transform = torchvision_transform(name)
-    return lambda images, labels, step: _transform_each(transform, images, seed, step)
-
-
-def torchvision_transform(name: str) -> nn.Module:
-    """One of `TRANSFORMS`, as torchvision has it; the jitter at half the strengths of Chen et al. 2020, as is usual
-    for small images."""
     from torchvision.transforms import v2  # takes a second, as wherever torchvision is imported where it is used
 
-    return {
+    transform = {
         "color_jitter": v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1),
         "trivial_augment": v2.TrivialAugmentWide(),
         "augmix": v2.AugMix(),
     }[name]
+    return lambda images, labels, step: _transform_each(transform, images, seed, step)
 
 
 @torch.enable_grad()

@@ -61,13 +61,8 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path) -> Callab
     @_one_error_without_room(folder)
     def train_and_score() -> dict[str, float]:
         console.info(
-            "%s images, %s classes; %s, %s, %d threads, %d processes",
-            len(train),
-            len(data.classes),
-            device,
-            trainer.model.precision,
-            torch.get_num_threads(),
-            utils.world_size(),
+            f"{len(train)} images, {len(data.classes)} classes; {device}, {trainer.model.precision}, "
+            f"{torch.get_num_threads()} threads, {utils.world_size()} processes"
         )
         log = NoLog() if utils.rank() else RunLog(folder, trainer.history)
         trainer.fit(train.to(device), validation.to(device), log)
@@ -160,19 +155,13 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
     cache: OperatorCache = choices["operators"]
     covered = sum(len(stack.pixels) for stack in scene.stacks) / len(scene.stacks)
     console.info(
-        "operators: %d views for %d examples, %d from the cache, %d built (%.2f s)%s",
-        cache.views,
-        len(scene),
-        cache.views - cache.built,
-        cache.built,
-        time.perf_counter() - start,
-        f"; not kept: {cache.problem}" if cache.problem else "",
+        f"operators: {cache.views} views for {len(scene)} examples, {cache.views - cache.built} from the cache, "
+        f"{cache.built} built ({time.perf_counter() - start:.2f} s)"
+        f"{f'; not cached: {cache.problem}' if cache.problem else ''}"
     )
     console.info(
-        "skipped: rasterization in every epoch, %d of %d light coefficients, %.0f %% of the pixels (background)",
-        COEFFICIENTS - len(nonzero_coefficients(DEGREE)),
-        COEFFICIENTS,
-        100 * (1 - covered / scene.settings.size**2),
+        f"skipped: rasterization in every epoch, {COEFFICIENTS - len(nonzero_coefficients(DEGREE))} of {COEFFICIENTS} "
+        f"light coefficients, {100 * (1 - covered / scene.settings.size**2):.0f} % of the pixels (background)"
     )
     return scene
 

@@ -125,7 +125,7 @@ def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode
     assert scores["accuracy"] == (logits.argmax(1) == split.labels).double().mean().item()
 
 
-def test_a_ranking_without_look_alikes_is_refused(tmp_path):
+def test_a_ranking_without_hard_negatives_is_refused(tmp_path):
     with pytest.raises(
         InputError, match=r"train\.ranking=1\.0 ranks hard negatives: name some in scene\.hard_negatives"
     ):
