@@ -1,4 +1,4 @@
-"""The one exception for what a user can mend, and the checks that keep NaN and the absurd out."""
+"""The exception for errors that a user can fix, and the checks that keep NaN and values out of range out."""
 
 import os
 from collections.abc import Collection, Sequence
@@ -23,7 +23,7 @@ class InputError(ValueError):
 
 
 def in_one_line(error: Exception) -> str:
-    """What an error says, or its kind where it says nothing."""
+    """The message of an error in one line, or its type where it has none."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
@@ -41,25 +41,25 @@ def as_device(device: torch.device | str) -> torch.device:
 
 
 def require_file(path: Path, advice: str) -> None:
-    """InputError naming what is no regular file: a pipe would be waited for."""
-    if not os.path.isfile(path):  # False, too, where the name is none or its folder closed
-        raise InputError(f"{path} {'is no file' if os.path.exists(path) else 'does not exist'}: {advice}")
+    """InputError naming a path that is not a regular file: a pipe would block."""
+    if not os.path.isfile(path):  # False, too, for an invalid name or a folder without permission
+        raise InputError(f"{path} {'is not a regular file' if os.path.exists(path) else 'does not exist'}: {advice}")
 
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:
-    """InputError naming a setting that lies outside of what can be meant, NaN included; None is not set."""
+    """InputError naming a value outside of its range, or NaN; None means not set."""
     if value is not None and not least <= value <= most:
         raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}")
 
 
 def require_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """InputError naming a setting that is none of its choices."""
+    """InputError naming a value that is not one of its choices."""
     if value not in choices:
         raise InputError(f"{name}={value}: choose one of {', '.join(choices)}")
 
 
 def require_limits(name: str, limits: Sequence[float], least: float, most: float) -> None:
-    """InputError naming a setting that is not [low, high] with both inside of what can be meant."""
+    """InputError naming limits that are not [low, high] with both in range."""
     if len(limits) != 2 or not least <= limits[0] <= limits[1] <= most:
         raise InputError(f"{name}={list(limits)}: give [least, most], both from {least:g} to {most:g}")
 
@@ -72,7 +72,7 @@ def require_finite(**tensors: Tensor) -> None:
 
 
 def require_bounded(**tensors: Tensor) -> None:
-    """InputError naming the first tensor that is of no real floating-point type, or holds NaN, infinity or magnitudes
+    """InputError naming the first tensor that is not a dense floating-point one, or holds NaN, infinity or magnitudes
     beyond 1e12."""
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():

@@ -1,7 +1,7 @@
 """Triangle meshes with colors: the data class, loading, checking and normalizing.
 
-World axes are right-handed with z up. Colors stay as authored for display (sRGB-encoded); whoever
-needs linear light decodes them.
+World axes are right-handed with z up. Colors stay as authored for display (sRGB-encoded); linear
+light needs them decoded.
 """
 
 from __future__ import annotations
@@ -61,8 +61,6 @@ class Mesh:
             vertex_colors = np.broadcast_to(np.asarray(color, dtype=np.float32), vertices.shape)
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)") from error
-        _require_shape("vertices", vertices, (*vertices.shape[:1], 3))
-        _require_shape("faces", faces, (*faces.shape[:1], 3))
         _require_indices(faces, len(vertices))
         return Mesh(
             vertices=vertices,
@@ -94,15 +92,14 @@ class Mesh:
 
     @cached_property
     def packed_textures(self) -> tuple[np.ndarray, ...]:
-        """(H, W) int32 each: red, green and blue in the bits from 0, 8 and 16, since one number is looked up faster."""
+        """Textures (H, W) int32, red, green and blue in the bits from 0, 8 and 16: one number is looked up faster."""
         return tuple(texture.astype(np.int32) @ np.array([1, 2**8, 2**16], dtype=np.int32) for texture in self.textures)
 
     @cached_property
     def closed(self) -> bool:
         """Whether no face is ever seen from behind: every part is watertight, and its faces counter-clockwise outside.
 
-        That is, each edge is run through once in either direction, and the volume within the faces that edges connect
-        is positive.
+        That is, each edge occurs once in either direction, and the faces that edges connect enclose a positive volume.
         """
         from trimesh.graph import connected_component_labels  # trimesh takes half a second
 
@@ -126,7 +123,7 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def _require_shape(name: str, values: np.ndarray, shape: tuple[int, ...], kinds: str = "fiu") -> None:
     """kinds: NumPy's letters of the types that will do."""
     if values.shape != shape or values.dtype.kind not in kinds:
-        raise InputError(f"{name} of {values.dtype} {values.shape} make no mesh: give numbers {shape}")
+        raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
 
 
 def _require_indices(faces: np.ndarray, vertices: int) -> None:
@@ -154,7 +151,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
-    """Read a mesh with its colors and textures from .glb, .gltf, .obj, .ply, .stl or what else trimesh reads.
+    """Read a mesh with its colors and textures from .glb, .gltf, .obj, .ply, .stl or another format of trimesh.
 
     All parts of a scene, placed by their nodes, become one mesh; vertices at one position become one vertex, so
     that moving it opens no seam, and unused vertices are dropped. A color is the product of the material's
@@ -188,7 +185,7 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
 
 def normalize(mesh: Mesh) -> Mesh:
     """Move the area-weighted centroid of the faces to the origin and scale the largest |coordinate| to 1, rounded to
-    float32: so files hold the vertices exactly, and what is read back covers the same pixels.
+    float32: so files hold the vertices exactly, and a mesh that is read back covers the same pixels.
 
     The same point is the average of the vertices weighted with the areas around them (the paper's appendix).
     InputError where there is no positive area, which `load_mesh` ensures.
@@ -205,7 +202,7 @@ def normalize(mesh: Mesh) -> Mesh:
 
 
 def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
-    """The mesh under an affine matrix (4, 4). A mirroring one turns the faces round, so that outside stays out."""
+    """The mesh under an affine matrix (4, 4). A mirroring one reverses the faces, so that normals stay outward."""
     order = [0, 1, 2] if np.linalg.det(matrix[:3, :3]) >= 0 else [0, 2, 1]
     return replace(
         mesh,

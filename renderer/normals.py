@@ -141,7 +141,7 @@ def _power_of_two(edges: Tensor) -> Tensor:
 
 
 def _cross(u: Tensor, v: Tensor) -> Tensor:
-    """Of (3, N) each. torch's own fuses multiplications and additions, so that parallel vectors do not give zero."""
+    """Cross products (3, N). torch's own fuses multiply and add, so that parallel vectors do not give zero."""
     (x, y, z), (r, s, t) = u, v
     return torch.stack([y * t - z * s, z * r - x * t, x * s - y * r])
 
@@ -155,14 +155,14 @@ def _exact_cross(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """(a - b rounded, what that rounding took off)."""
+    """(a - b rounded, its rounding error)."""
     rounded = a - b
     back = rounded - a
     return rounded, (a - (rounded - back)) - (b + back)
 
 
 def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """(a b rounded, what that rounding took off)."""
+    """(a b rounded, its rounding error)."""
     rounded = a * b
     (a, a_low), (b, b_low) = _halves(a), _halves(b)
     return rounded, ((a * b - rounded) + a * b_low + a_low * b) + a_low * b_low

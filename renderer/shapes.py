@@ -1,7 +1,7 @@
 """Procedural solids: the embedded orange, the other things of the demo data set and hard negatives, from formulas
 alone.
 
-Names are CIFAR-100 class names, so that a classifier's labels agree; hard negatives are what CIFAR-100 lacks. Every
+Names are CIFAR-100 class names, so that a classifier's labels agree; hard negatives are not in CIFAR-100. Every
 solid is closed, stands upright along z, has counter-clockwise faces outward and lies within about [−1, 1]³. Colors are
 RGB in [0, 1], sRGB-encoded.
 """
@@ -24,14 +24,14 @@ STEP = 0.1  # longest edge along a profile, in world units
 
 
 def solid(name: str, seed: int = 0) -> Mesh:
-    """The instance that `seed` picks of the solid `name`; InputError for a name that is in neither registry.
+    """The instance of the solid `name` that `seed` draws; InputError for a name that is in neither registry.
 
     >>> orange = solid("orange", seed=3)
     >>> orange.faces.shape, orange.closed
     ((5120, 3), True)
     """
     require_range("seed", seed, 0, 2**63 - 1)
-    known = SOLIDS | LOOK_ALIKES
+    known = SOLIDS | HARD_NEGATIVES
     if name not in known:
         nearest = get_close_matches(name, known, n=1, cutoff=0)[0]
         raise InputError(f"No solid is called '{name}': use '{nearest}', or another of {', '.join(known)}.")
@@ -268,9 +268,9 @@ def fruit(rng: np.random.Generator) -> Mesh:
 SOLIDS: dict[str, Callable[[np.random.Generator], Mesh]] = {
     make.__name__: make for make in (orange, apple, pear, sweet_pepper, mushroom, bottle, cup, plate, lamp, table)
 }
-# What an orange is told apart from, beside the fruit above: not in CIFAR-100. All but `fruit`, which is for training,
-# are kept for measuring.
-LOOK_ALIKES: dict[str, Callable[[np.random.Generator], Mesh]] = {
+# Hard negatives of an orange, beside the fruit above: not in CIFAR-100. `fruit` is for training, the others are for
+# evaluation.
+HARD_NEGATIVES: dict[str, Callable[[np.random.Generator], Mesh]] = {
     make.__name__: make for make in (lemon, peach, ball, fruit)
 }
 
@@ -301,7 +301,7 @@ def revolve(*strokes: np.ndarray | Sequence[tuple[float, float]]) -> tuple[np.nd
 
 
 def _subdivide(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The polyline (n, 2) with edges cut to at most STEP, and which edge each piece is of.
+    """The polyline (n, 2) with edges cut to at most STEP, and the edge of each piece.
 
     A repeated corner leaves no piece.
     """

@@ -1,4 +1,4 @@
-"""Finer meshes of the same shape, so that an attack on the vertices has more of them to move."""
+"""Finer meshes of the same shape, so that an attack can move more vertices."""
 
 from dataclasses import replace
 from typing import Any
@@ -15,7 +15,7 @@ _QUARTERS = ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))  # corners 0 to 2 and t
 
 
 def subdivide(mesh: Mesh, vertices: int) -> Mesh:
-    """The same surface with more than so many vertices: each face becomes four, as often as it takes.
+    """The same surface with more vertices than `vertices`: every face is divided into four until there are enough.
 
     New vertices are the middles of edges, shared by the faces that share the edge, so that a closed mesh stays closed;
     colors (as they are stored, sRGB-encoded) and texture coordinates are interpolated. The old vertices keep their
@@ -33,7 +33,7 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
 
 
 def refine(mesh: Mesh, area: float) -> Mesh:
-    """The same surface with faces no larger than that: each that is becomes four, as often as it takes.
+    """The same surface with faces of at most an area: larger ones are divided into four until none is left.
 
     The faces come in another order; the old vertices keep their indices, and new ones may lie on a neighbor's edge.
     """

@@ -1,4 +1,4 @@
-"""Meshes as files: .glb with colors, textures, normals and cameras, .ply with colors and normals."""
+"""Meshes as files: .glb with colors, textures, normals and cameras; .ply with colors and normals."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -44,7 +44,7 @@ def export_mesh(
     glb = partial(_glb, cameras=cameras, first=first)
     writers: dict[str, Callable[[Mesh, np.ndarray], bytes]] = {".glb": glb, ".ply": _ply}
     if path.suffix.lower() not in writers:
-        raise InputError(f"{path} is no name for a mesh to write: give one that ends in {', '.join(writers)}")
+        raise InputError(f"{path} cannot be written as a mesh: give a name that ends in {', '.join(writers)}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(writers[path.suffix.lower()](mesh, corner_normals(mesh, normals)))
@@ -62,14 +62,14 @@ def _glb(mesh: Mesh, normals: np.ndarray, cameras: Sequence[Camera], first: int 
     return trimesh.Scene(parts).export(file_type="glb", include_normals=False, tree_postprocessor=finish)
 
 
-def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int, here: np.ndarray) -> "trimesh.Trimesh":
-    """The faces (F,) bool that are `here`, of one texture or of none, y up."""
+def _textured_part(mesh: Mesh, normals: np.ndarray, texture_id: int, selected: np.ndarray) -> "trimesh.Trimesh":
+    """The selected faces (F,) bool, of one texture or of none, y up."""
     import trimesh
     from trimesh.visual.material import PBRMaterial
     from trimesh.visual.texture import TextureVisuals
 
-    corners = np.concatenate([mesh.corner_colors[here], mesh.corner_uvs[here], normals[here]], axis=-1)
-    ids, values, faces = _split(mesh.faces[here], corners)
+    corners = np.concatenate([mesh.corner_colors[selected], mesh.corner_uvs[selected], normals[selected]], axis=-1)
+    ids, values, faces = _split(mesh.faces[selected], corners)
     colors, uvs, normals = values[:, :3], values[:, 3:5], values[:, 5:]
     material = PBRMaterial(
         name=f"texture {texture_id}",  # trimesh would take images of the same bytes and other sizes for one
@@ -113,7 +113,7 @@ def _gltf_camera(camera: Camera) -> dict[str, Any]:
 
 
 def _camera_node(camera: Camera, index: int) -> dict[str, Any]:
-    """Where a camera stands, y up; it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
+    """A camera's pose, y up: it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
     matrix = Y_UP_TO_Z_UP.T @ camera.pose()
     return {"camera": index, "name": f"view {index}", "matrix": matrix.T.ravel().tolist()}
 

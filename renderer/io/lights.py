@@ -40,7 +40,7 @@ def save_light(path: Path, coefficients: Tensor, basis: EnvironmentBasis | Local
 
 def read_light(path: Path, *kinds: type[Any]) -> tuple[Any, Tensor]:
     """(the basis, of one of these kinds, and coefficients (size, 3) float32) of a .json file; rows alone are of
-    harmonics. InputError: there is no such file, or it holds no such light."""
+    harmonics. InputError: a file that is missing or describes another light."""
     require_file(path, "give the path of a .json file of coefficients")
     try:
         description = json.loads(path.read_text(encoding="utf-8-sig"))

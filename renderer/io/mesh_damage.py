@@ -1,4 +1,4 @@
-"""What moving the vertices of a mesh did to its faces."""
+"""Faces that a deformation of a mesh flipped or collapsed."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 from renderer.mesh import doubled_area_vectors
 
 # Storing both ends of a face's height as float32 moves each by up to √3 · 2⁻²⁴ of the coordinate, which is 2^-22.2
-# together: a height below 2⁻²² of it cannot be told from none.
+# together: a height below 2⁻²² of it cannot be distinguished from zero.
 _SMALLEST_HEIGHT = 2.0**-22
 
 

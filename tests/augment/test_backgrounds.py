@@ -42,7 +42,7 @@ def test_grays_outside_0_to_1_and_what_is_no_background_are_refused(choice):
 def test_an_unreadable_background_is_named(tmp_path):
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no image")
-    faults = {broken: "cannot be read .*", tmp_path / "absent.png": "does not exist", tmp_path: "is no file"}
+    faults = {broken: "cannot be read .*", tmp_path / "absent.png": "does not exist", tmp_path: "is not a regular file"}
     for path, fault in faults.items():
         with pytest.raises(InputError, match=f"backgrounds: {path} {fault}: give an image file or a gray value"):
             load_background(str(path), 4)

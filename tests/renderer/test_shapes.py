@@ -7,9 +7,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from renderer.errors import InputError
-from renderer.shapes import LOOK_ALIKES, SOLIDS, solid
+from renderer.shapes import HARD_NEGATIVES, SOLIDS, solid
 
-ALL = SOLIDS | LOOK_ALIKES
+ALL = SOLIDS | HARD_NEGATIVES
 SHELLS = dict.fromkeys(ALL, 1) | {"cup": 2}  # a cup's handle is a shell of its own
 SEEDS = range(4)
 

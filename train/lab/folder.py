@@ -19,7 +19,7 @@ from renderer.errors import FACTOR, InputError, require_choice, require_limits, 
 from renderer.image import LARGEST_SIZE, encode
 from renderer.io.mitsuba import Part
 from renderer.light.environment import read_panorama
-from renderer.shapes import LOOK_ALIKES
+from renderer.shapes import HARD_NEGATIVES
 from train.errors import writable_folder
 from train.lab.patterns import FAMILIES
 from train.lab.shots import Shot, draw_shots
@@ -161,4 +161,4 @@ def _label_of_solid(mesh: str) -> str:
     name = name.partition(":")[0]
     if kind != "solid":
         return ""
-    return FOREIGN + name if name in LOOK_ALIKES else name
+    return FOREIGN + name if name in HARD_NEGATIVES else name

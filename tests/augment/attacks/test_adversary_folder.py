@@ -165,7 +165,7 @@ DAMAGES = {
     "too bright a background": (described(background=3), "give gray values"),
     "images cut short": (lambda folder: (folder / "after.npy").write_bytes(b"\\x93NUMPY"), "after.npy cannot be read"),
     "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy does not exist"),
-    "a pipe for images": (piped("after.npy"), "after.npy is no file"),
+    "a pipe for images": (piped("after.npy"), "after.npy is not a regular file"),
     "a gain of 10⁴⁰⁰": (described(albedo_scale=10**400), "does not describe an adversary"),
     "infinitely many faces": (described(own_faces=float("inf")), "does not describe an adversary"),
     "a list for a background": (described(background=[1]), r"adversary\.json: background=\[1\]: give gray values"),

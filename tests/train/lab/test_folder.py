@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from renderer.errors import InputError
-from renderer.shapes import LOOK_ALIKES, SOLIDS
+from renderer.shapes import HARD_NEGATIVES, SOLIDS
 from train.lab.folder import LabSettings, read_subject, write_laboratory
 from train.photographs.folder import find_photographs, load_photographs
 
@@ -86,7 +86,7 @@ def test_exposure_brightens(laboratory, tmp_path):
         assert exposed > plain
 
 
-@pytest.mark.parametrize("name", [*SOLIDS, *LOOK_ALIKES])
+@pytest.mark.parametrize("name", [*SOLIDS, *HARD_NEGATIVES])
 def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_else(name):
     expected = name if name in SOLIDS else f"other_{name}"
     assert read_subject(f"solid:{name}:1", 0).label == expected
