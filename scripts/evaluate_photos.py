@@ -25,7 +25,7 @@ class Settings:
     classifier: str | None = None  # instead of run, any other network, by a name that conf/attack.yaml explains
     weights: str | None = None  # the classifier's local weights file, if it brings none
     photos: str = MISSING  # a folder of class folders, or of images of `label`
-    label: str = "orange"  # the class whose recall and false alarms count, and that of a flat folder's images
+    label: str = "orange"  # the class whose recall and false positives count, and that of a flat folder's images
     out: str = "runs/photographs/${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # the folder of the scores
     skip_unreadable: bool = False  # skip broken photographs
     precision: str = "auto"  # auto (bfloat16 where the hardware has it) | bfloat16 | float32

@@ -39,15 +39,15 @@ def load_others(settings: AttackExperimentSettings, attacked: Classifier, device
 
 
 def write_transfers(found: Sequence[Transfer], folder: Path) -> None:
-    """transfer.jsonl: a line for each place, with the fraction of successes and every adversary's answers by view."""
+    """transfer.jsonl: a line for each place, with the success rate and every adversary's predictions by view."""
     lines = [
         {
             each.kind: each.name,
             **_fraction(each),
             "clean_correct": each.clean_correct.tolist(),
             "success": each.success.tolist(),
-            **{f"{name}_before": answer for name, answer in _answers(each.before, each.classes).items()},
-            **_answers(each.after, each.classes),
+            **{f"{name}_before": values for name, values in _predictions(each.before, each.classes).items()},
+            **_predictions(each.after, each.classes),
         }
         for each in found
     ]
@@ -62,14 +62,14 @@ def format_transfers(found: Sequence[Transfer]) -> str:
         rows.append(
             [f"{each.kind} {each.name}", f"{result['n']} of {len(each.clean_correct)}", format_fraction(result)]
         )
-    return aligned(["what fools, shown to", "correct before", "success"], rows)
+    return aligned(["adversaries shown to", "correct before", "success"], rows)
 
 
 def _fraction(found: Transfer) -> dict[str, Any]:
     return fraction(int(found.success[found.clean_correct].sum()), int(found.clean_correct.sum()))
 
 
-def _answers(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
+def _predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
     best = logits.softmax(2).max(2)
     return {
         "predicted": [[classes[index] for index in views] for views in best.indices.tolist()],
