@@ -38,7 +38,7 @@ SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then b
 VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
 DIFFERENTIABLE = "llvm_ad_rgb"
 TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # its maps: y up, +z in the middle
-XML_TAGS: dict[str, str] = {
+XML_TAGS: dict[Any, str] = {
     **dict.fromkeys(("path", "direct"), "integrator"),
     **dict.fromkeys(("envmap", "projector", "point", "area"), "emitter"),
     **dict.fromkeys(("perspective", "orthographic"), "sensor"),
