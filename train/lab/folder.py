@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from omegaconf import MISSING
 from PIL import Image
 
 from augment.objects import load_object
@@ -30,29 +31,29 @@ from train.settings import LARGEST_SEED, read_object
 
 PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel
 COLUMNS = ("path", "source_tag", "setup", "mesh", "brightness")
+SOLIDS = (
+    *("orange:101", "orange:102", "orange:103", "orange:104", "orange:105", "orange:106", "apple:101", "apple:102"),
+    *("pear:101", "sweet_pepper:101", "lemon:101", "lemon:102", "peach:101", "peach:102", "ball:101", "ball:103"),
+)
 LARGEST = {"setups": 10**6, "size": LARGEST_SIZE, "spp": 10**5, "bounces": 1000}
 
 
 @dataclass
 class LabSettings:
-    """conf/lab.yaml. meshes: each a file, a `solid:NAME`, or a mapping with ObjectSettings' keys.
+    """The settings of scripts/lab.py. A mesh is a file, `solid:NAME:SEED` or a mapping with the keys of ObjectSettings,
+    whose label is a class, or other_NAME if the network lacks it."""
 
-    setups: draws of light, camera and pose, each shown with one object of `label` and one other. environments: files of
-    maps, beside or in place of the projector's patterns. brightness: of either, from dim to bright; see `Shot`. spp:
-    paths per pixel and light.
-    """
-
-    out: str
-    meshes: list[Any]
-    label: str = "orange"
-    setups: int = 180
-    patterns: list[str] = field(default_factory=lambda: list(FAMILIES))
-    environments: list[str] = field(default_factory=list)
-    brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])
-    exposure: float = 1.0
-    size: int = 64
-    spp: int = 32
-    bounces: int = 4
+    out: str = MISSING  # a new folder, for photos= of scripts/evaluate_photos.py
+    label: str = "orange"  # the class under study: one of its objects and one other stand in each setup
+    meshes: list[Any] = field(default_factory=lambda: [f"solid:{solid}" for solid in SOLIDS])
+    setups: int = 180  # draws of light, camera and pose; two photographs each
+    patterns: list[str] = field(default_factory=lambda: list(FAMILIES))  # of the projector, for as many setups each
+    environments: list[str] = field(default_factory=list)  # maps (.npy, .hdr, .exr) instead, for as many setups each
+    brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])  # of white surfaces that face the light
+    exposure: float = 1.0  # multiplies radiance; at 1, a radiance of 1 is white
+    size: int = 64  # pixels per side
+    spp: int = 32  # paths per pixel and light
+    bounces: int = 4  # of light, at most
     seed: int = 0
 
     def __post_init__(self) -> None:
