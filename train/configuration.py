@@ -3,7 +3,7 @@
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import hydra
 from hydra import initialize_config_module
@@ -66,18 +66,18 @@ def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Se
     InputError names the key that is unknown, unset, of the wrong type or, by the dataclass's own check, out of range.
     """
     try:
-        merged = OmegaConf.merge(OmegaConf.structured(kind), config)
+        merged: Any = OmegaConf.merge(OmegaConf.structured(kind), config)
         if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
             raise InputError(f"{_join(key, min(unset))} is not set: give {_join(key, min(unset))}=...")
         _check(merged, key)
-        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+        return cast(Settings, OmegaConf.to_object(merged))
     except (OmegaConfBaseException, OverflowError) as error:  # the latter for a whole number that no float holds
         raise InputError(_fault(kind, config, key) or _join(key, one_sentence(error) or in_one_line(error))) from error
 
 
 def _check(node: DictConfig, key: str) -> None:
     """InputError with the key of the innermost dataclass that refuses its values, or of a list of other things."""
-    types = get_type_hints(OmegaConf.get_type(node))
+    types: dict[Any, Any] = get_type_hints(OmegaConf.get_type(node))
     for name, child in node.items():
         inner = _join(key, str(name))
         if isinstance(child, DictConfig) and OmegaConf.get_type(child) is not dict:
@@ -92,7 +92,8 @@ def _check(node: DictConfig, key: str) -> None:
 
 def _fault(kind: type, config: DictConfig, key: str) -> str | None:
     """The key of the first value that is wrong by itself, with the reason; OmegaConf may name only its group."""
-    for name, value in dotted(OmegaConf.to_container(config)):
+    plain: Any = OmegaConf.to_container(config)
+    for name, value in dotted(plain):
         alone = OmegaConf.create()
         OmegaConf.update(alone, name, value, force_add=True)
         try:
