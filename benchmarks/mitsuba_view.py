@@ -32,7 +32,7 @@ class MitsubaView:
         scene = {
             "type": "scene",
             "integrator": integrator(bounces=0),
-            "light": environment(numbered),
+            "light": environment({"bitmap": numbered}),
             "sensor": sensor_of(CAMERA, view.size, "rgb"),
         }
         surface = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ALBEDO)}}

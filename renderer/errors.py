@@ -72,14 +72,12 @@ def require_finite(**tensors: Tensor) -> None:
 
 
 def require_bounded(**tensors: Tensor) -> None:
-    """InputError naming the first tensor that is not a dense floating-point one, or holds NaN, infinity or magnitudes
+    """InputError naming the first tensor that is not of floating-point numbers, or holds NaN, infinity or magnitudes
     beyond 1e12."""
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
             kind = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
             raise InputError(f"{name} is {kind}: give a tensor of floating-point numbers")
-        if tensor.is_meta or tensor.layout != torch.strided:
-            raise InputError(f"{name} is sparse or has no values: give a dense tensor on a device")
         if not _largest(tensor) <= LARGEST:
             raise InputError(f"{name} holds NaN, infinity or magnitudes beyond {LARGEST:g}: give finite values")
 

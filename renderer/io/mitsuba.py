@@ -6,7 +6,7 @@ is an array (H, W, 3) under "bitmap" or a file's name under "filename". `load` g
 
 Mitsuba's diffuse surfaces reflect albedo / π of the irradiance, ours all of it: the scale of a light makes up for that,
 and for the albedo's scale, which a bounce would otherwise have more than once. Shadows are always on: without shadows
-here, what a concave mesh throws on itself is dark there. Its radiance is premultiplied with alpha, as ours with the
+here, a concave mesh has dark places there. Its radiance is premultiplied with alpha, as ours with the
 coverage.
 """
 
@@ -116,19 +116,14 @@ def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
     return {"type": "direct", "emitter_samples": emitter_samples, "bsdf_samples": 1, "hide_emitters": True}
 
 
-def image_of(source: str | np.ndarray) -> Scene:
-    """The entry for an image, a file's name or an array (H, W, 3)."""
-    return {"filename": source} if isinstance(source, str) else {"bitmap": source}
-
-
-def environment(radiance: str | np.ndarray, scale: float = 1.0) -> Scene:
-    """An environment map, laid out as in `renderer.light.environment`."""
-    return {"type": "envmap", **image_of(radiance), "scale": scale, "to_world": TO_Z_UP}
+def environment(radiance: Scene, scale: float = 1.0) -> Scene:
+    """An environment map, laid out as in `renderer.light.environment`. radiance: its entry "bitmap" or "filename"."""
+    return {"type": "envmap", **radiance, "scale": scale, "to_world": TO_Z_UP}
 
 
 def projector(pose: np.ndarray, fov: float, pattern: Scene, scale: float) -> Scene:
-    """A projector of a pattern (entries of a bitmap), `fov` in degrees. A white surface that faces it at distance 1
-    gets the pattern's radiance times the scale."""
+    """A projector of a pattern (its entry "bitmap" or "filename"), `fov` in degrees. A white surface that faces it at
+    distance 1 has the radiance pattern · scale."""
     irradiance = {"type": "bitmap", **pattern, "raw": True}
     return {"type": "projector", "irradiance": irradiance, "fov": fov, "scale": scale, "to_world": pose}
 
@@ -237,7 +232,7 @@ def write_mitsuba_scene(
     folder.mkdir(parents=True, exist_ok=True)
     emitters = [emitter for lit in placed for emitter in _emitters(folder, *lit, albedo_scale)]
     # Surfaces find the sky by themselves, with less noise.
-    sky = environment(light, math.pi * albedo_scale) | {"sampling_weight": 0.0 if emitters else 1.0}
+    sky = environment({"filename": light}, math.pi * albedo_scale) | {"sampling_weight": 0.0 if emitters else 1.0}
     sampler = {"type": "multijitter", "sample_count": SAMPLES}
     sensors = [sensor_of(camera, settings.size) | {"sampler": sampler} for camera in cameras]
     scene = xml.Element("scene", version="3.0.0")

@@ -64,7 +64,7 @@ def _rgb(color: np.ndarray) -> dict[str, Any]:
 
 def _lights(shot: Shot) -> list[dict[str, Any]]:
     if shot.environment is not None:
-        return [environment(shot.environment)]
+        return [environment({"bitmap": shot.environment})]
     distance = float(np.linalg.norm(shot.projector - shot.center))
     fov, scale = 2 * float(np.degrees(np.arctan(THROW / distance))), shot.brightness * distance**2
     pattern = projector(look_at(shot.projector, shot.center), fov, {"bitmap": shot.pattern}, scale)

@@ -45,7 +45,7 @@ def ball() -> Mesh:
     )
 
 
-def test_a_map_for_mitsuba_is_the_light_in_every_direction(tmp_path):
+def test_a_mitsuba_map_equals_the_light_in_every_direction(tmp_path):
     """But for the interpolation between texels."""
     light, settings = load_light("grace").double(), ImageSettings(8)
     write_mitsuba_scene(tmp_path, normalize(ball()), 1.0, CAMERAS, settings, "light.exr")
@@ -62,7 +62,7 @@ def test_a_map_for_mitsuba_is_the_light_in_every_direction(tmp_path):
 
 
 @pytest.mark.parametrize(("encoding", "normals"), [("linear", "smooth"), ("srgb", "flat")])
-def test_the_files_look_in_mitsuba_as_the_scene_does_here(tmp_path, encoding, normals):
+def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, encoding, normals):
     """Inside the outline, on average to half of a 255th and in root mean square to a 200th, which is Mitsuba's noise at
     the texels' edges. The probe is positive all round."""
     mesh, light, settings = normalize(ball()), load_light("st_peters"), ImageSettings(24, 8, encoding, normals)
@@ -81,7 +81,7 @@ def test_the_files_look_in_mitsuba_as_the_scene_does_here(tmp_path, encoding, no
 
 
 @pytest.mark.parametrize("bounces", [0, 2])
-def test_a_bowl_is_as_dark_or_bright_within_as_its_transport_says(tmp_path, bounces):
+def test_a_bowl_has_the_shadows_and_bounces_of_its_settings(tmp_path, bounces):
     """To the quadrature of a pixel's rays, and far from what direct light makes of it."""
     shell = trimesh.creation.icosphere(subdivisions=3)
     lower = shell.vertices[shell.faces].mean(axis=1)[:, 2] < 0
@@ -90,8 +90,8 @@ def test_a_bowl_is_as_dark_or_bright_within_as_its_transport_says(tmp_path, boun
     write_mitsuba_scene(tmp_path, bowl, 1.0, [camera], replace(settings, shadows=True, bounces=bounces), "light.exr")
     write_map(tmp_path / "light.exr", mitsuba_map(light, 128))
     theirs = render_mitsuba_scene(tmp_path / SCENE, 1)[0].flatten(1)
-    for chosen, close in (({"shadows": True, "bounces": bounces}, True), ({}, False)):
-        [operator] = build_operators(bowl, [camera], replace(settings, **chosen), choose("numpy"))
+    for options, close in (({"shadows": True, "bounces": bounces}, True), ({}, False)):
+        [operator] = build_operators(bowl, [camera], replace(settings, **options), choose("numpy"))
         inside = (operator.coverage == 1) & (theirs[3, operator.pixels] == 1)
         off = (operator.radiance(light) - theirs[:3, operator.pixels])[:, inside]
         assert (off.square().mean().sqrt() < 0.02 * theirs[:3].max()) == close

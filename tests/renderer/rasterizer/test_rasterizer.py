@@ -393,14 +393,6 @@ def test_culling_a_closed_mesh_changes_ids_only_within_rounding_of_an_outline(ra
     assert (distances_of_changed_ids(rasterizer, mesh, points, resolution) <= SNAP).all()
 
 
-def test_culling_a_closed_mesh_changes_ids_where_front_and_back_meet_on_a_sample(rasterizer):
-    """A convex solid whose vertices, and some points of its outline, are sample centers of an image of 17×17."""
-    mesh = trimesh.convex.convex_hull(np.random.default_rng(6).integers(-3, 4, (40, 3)) * 4 / 17)
-    distances = distances_of_changed_ids(rasterizer, mesh, mesh.vertices[None] * [1, 1, -1], 17)
-    assert len(distances) > 0
-    np.testing.assert_allclose(distances, 0, atol=17 * np.finfo(float).eps)
-
-
 @needs_egl
 @pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
 @pytest.mark.parametrize("resolution", [32, 224, 333])
