@@ -2,26 +2,23 @@
 
     python -m benchmarks.lights --mitsuba
 
-writes lights.jsonl, a line per measurement, in some minutes on one CPU thread. It needs the extra `shadows`, and for
---mitsuba the extra `lab` and LLVM (apt install libllvm19). Its tables:
+writes lights.csv in some minutes on one CPU thread. It needs the extra `shadows`, and for --mitsuba the extra `lab` and
+LLVM (apt install libllvm19). Its tables:
 
-cost          building operators and a light step (image, clamp, gradient), by light paths, mesh and size
-rays          time and error of an operator with shadows or bounces, by its rays and samples per pixel
-local lights  the same for lamps and projectors; "dense" stores zeros, too; errors are against 64² samples in float64
-lamp step     a step by the positions of three lamps, which casts its rays in every step
-stale         error of the image and of its gradient by the vertices when shadows stay as the mesh moves away
+cost          building an operator, and a light step (image, clamp, gradient), by light paths and size; errors are
+              against many rays and samples
+local lights  the same for lamps and projectors; errors are against 64² samples in float64
 mitsuba       difference to a path tracer; "noise" is its standard error, "direct" our error without light paths
 
 Errors are root mean squares of the difference over the reference's.
 """
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,15 +28,11 @@ import torch
 import trimesh
 from torch import Tensor
 
-from augment.reshading import FrozenTransport
-from benchmarks.common import append_json, machine, medians, relative_error, seconds
-from renderer import shading
-from renderer.albedo import surface_albedo
+from benchmarks.common import machine, medians, relative_error, seconds, write_csv
 from renderer.camera import OrthographicCamera, orbit_cameras
-from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.io.mitsuba import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mitsuba_map, write_mitsuba_scene
-from renderer.light.basis import HARMONICS, Basis, SumBasis
+from renderer.light.basis import HARMONICS, SumBasis
 from renderer.light.environment import write_map
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light
@@ -48,18 +41,15 @@ from renderer.rasterizer import choose
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
 from renderer.transfer import TransferOperator, build_operators
-from renderer.transport import local as sparse
 from renderer.transport import radiosity, rays
-from renderer.transport.local import local_radiance, unoccluded
-from renderer.transport.surface import Surface
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
 LIGHT_PATHS = {"direct": {}, "shadows": {"shadows": True}, "bounces:3": {"bounces": 3}}
 VIEWS, SEEDS = 20, 8  # SEEDS: Mitsuba's images, whose spread tells its noise
 CONVERGED, FINEST = (2**14, 2**13, 2**8), 16  # rays per pixel, patches and their rays; samples per side of a pixel
-RAYS, SAMPLES, REFERENCE = (64, 128, 256, 512, 1024, 2048), (2, 4, 8, 16), 64
+REFERENCE = 64  # samples per side of a pixel for local lights
 LAMPS = Lamps(((2.0, 2.0, 2.0), (-2.0, 2.0, 2.0), (2.0, -2.0, 2.0)))
-BASES: dict[str, Basis] = {
+BASES = {
     "harmonics": HARMONICS,
     "3 lamps": LAMPS,
     "3 discs": replace(LAMPS, radius=0.5),
@@ -67,7 +57,6 @@ BASES: dict[str, Basis] = {
     "projector of 32²": Projector(32),
     "harmonics and projector of 16²": SumBasis((HARMONICS, Projector(16))),
 }
-STEP, STEPS_AWAY = 0.0005, (0, 1, 2, 5, 10, 20)  # of an attack on a shape, which moves every coordinate
 
 Row = dict[str, Any]
 
@@ -114,144 +103,40 @@ def quadrature(
         rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS = before
 
 
-@contextmanager
-def dense() -> Iterator[None]:
-    """Operators store their zeros."""
-    before, sparse.SPARSE = sparse.SPARSE, 0.0
-    try:
-        yield
-    finally:
-        sparse.SPARSE = before
-
-
 # ---------------------------------------------------------------------------- tables
 
 
 def cost(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
-    """A mesh of one color needs one channel where several need three, unless colored light bounces."""
     light = load_light("grace").requires_grad_()
-    colors = {"several colors": None, "one gray": (0.5, 0.5, 0.5), "one color": (0.9, 0.5, 0.2)}
-    for name, color in colors.items():
-        mesh = cup
-        if color:
-            corner_colors = np.ones_like(cup.corner_colors) * np.array(color, np.float32)
-            mesh = replace(cup, corner_colors=corner_colors, texture_ids=np.full(len(cup.faces), -1))
-        built = {(paths, size): operator(mesh, size, paths) for paths in LIGHT_PATHS for size in sizes}
-        times = medians({key: partial(light_step, each, light) for key, each in built.items()}, rounds)
-        for paths, size in built:
-            settings = ImageSettings(size, **LIGHT_PATHS[paths])
-            build = partial(build_operators, mesh, orbit_cameras(VIEWS, 2.2), settings, choose("numpy"))
-            channels, coefficients = built[paths, size].transfer.shape[:2]
-            yield {
-                "table": "cost", "mesh": name, "light_paths": paths, "size": size, "step_ms": times[paths, size],
-                "of_direct": times[paths, size] / times["direct", size], "channels": channels,
-                "coefficients": coefficients, "megabytes": megabytes(built[paths, size]),
-                "build_s": min(seconds(build) for _ in range(2)) / VIEWS,
-            }  # fmt: skip
-
-
-def rays_and_samples(cup: Mesh, size: int, rounds: int) -> Iterator[Row]:
-    light = load_light("grace")
-    for paths in [*LIGHT_PATHS][1:]:
-        with quadrature(*CONVERGED):
-            exact = image_and_gradient(operator(cup, size, paths, FINEST), light)
-        rows, calls = {}, {}
-        for count, samples in product(RAYS, SAMPLES):
-
-            def build(count: int = count, samples: int = samples, paths: str = paths) -> TransferOperator:
-                with quadrature(count):
-                    return operator(cup, size, paths, samples)
-
-            calls[count, samples] = build
-            rows[count, samples] = errors(image_and_gradient(build(), light), exact)
-        for key, milliseconds in medians(calls, max(1, rounds // 5)).items():
-            setting = {"table": "rays", "light_paths": paths, "size": size, "rays": key[0], "samples": key[1] ** 2}
-            yield setting | {"build_ms": milliseconds} | rows[key]
-
-
-def local_lights(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
-    built = {
-        (name, size, False): operator(cup, size, samples=2, basis=each)
-        for name, each in BASES.items()
-        for size in sizes
-    }
-    with dense():
-        for name, basis in BASES.items():
-            if built[name, sizes[-1], False].sparse is not None:
-                built |= {(name, size, True): operator(cup, size, samples=2, basis=basis) for size in sizes}
-    lights = {key: torch.rand(each.basis.size, 3).requires_grad_() for key, each in built.items()}
-    times = medians({key: partial(light_step, each, lights[key]) for key, each in built.items()}, rounds)
-    for (name, size, is_dense), each in built.items():
-        row: Row = {
-            "table": "local lights",
-            "light": name,
-            "dense": is_dense,
-            "size": size,
-            "functions": each.basis.size,
-        }
-        row |= {"step_ms": times[name, size, is_dense], "megabytes": megabytes(each)}
-        if not is_dense:
-            row["build_s"] = seconds(partial(operator, cup, size, samples=2, basis=each.basis))
-        if size == sizes[0] and not is_dense:
-            generator = torch.Generator().manual_seed(0)
-            light = torch.rand(each.basis.size, 3, generator=generator, dtype=torch.float64)
-            fine = operator(cup, size, samples=REFERENCE, basis=each.basis, dtype=torch.float64)
-            exact = image_and_gradient(fine, light)
-            for samples in (2, 8):
-                coarse = operator(cup, size, samples=samples, basis=each.basis)
-                found = errors(image_and_gradient(coarse, light.float()), exact)
-                row |= {f"{key}_{samples}x{samples}": value for key, value in found.items()}
+    built = {(paths, size): operator(cup, size, paths) for paths in LIGHT_PATHS for size in sizes}
+    times = medians({key: partial(light_step, each, light) for key, each in built.items()}, rounds)
+    for (paths, size), each in built.items():
+        settings = ImageSettings(size, **LIGHT_PATHS[paths])
+        build = partial(build_operators, cup, orbit_cameras(VIEWS, 2.2), settings, choose("numpy"))
+        row: Row = {"table": "cost", "light": paths, "size": size, "step_ms": times[paths, size]}
+        row |= {"of_direct": times[paths, size] / times["direct", size], "megabytes": megabytes(each)}
+        row["build_s"] = min(seconds(build) for _ in range(2)) / VIEWS
+        if size == sizes[0]:
+            with quadrature(*CONVERGED):
+                exact = image_and_gradient(operator(cup, size, paths, FINEST), light.detach())
+            row |= errors(image_and_gradient(each, light.detach()), exact)
         yield row
 
 
-def lamp_steps(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
-    positions, powers, caster = (
-        torch.tensor(LAMPS.positions).requires_grad_(),
-        torch.ones(3, 3).double(),
-        rays.Rays(cup),
-    )
-
-    def step(surface: Surface, albedo: Tensor) -> None:
-        connections = unoccluded(caster, surface, LAMPS.connect(surface.points, surface.normals, positions.double()))
-        radiance = local_radiance(surface.fragments, albedo, connections, powers)
-        torch.autograd.grad(radiance.square().sum(), positions)
-
-    calls = {}
-    for size in sizes:
-        settings = ImageSettings(size, 2)
-        [view] = build_fragments(cup.vertices, cup.faces, [CAMERA], settings, choose("numpy"))
-        calls[size] = partial(step, Surface.of(cup, view, settings), surface_albedo(cup, view, settings.encoding))
-    for size, milliseconds in medians(calls, rounds).items():
-        yield {"table": "lamp step", "size": size, "step_ms": milliseconds}
-
-
-def stale_shadows(size: int) -> Iterator[Row]:
-    """The vertices move by signed steps in one random direction, from the shape whose shadows are used."""
-    cup, light, settings = normalize(solid("cup", 0)), load_light("grace"), ImageSettings(size, 2, shadows=True)
-    generator = torch.Generator().manual_seed(0)
-    direction = torch.randn(cup.vertices.shape, generator=generator).sign().double().numpy()
-    weights = torch.randn(3, size**2, generator=generator)
-
-    def render(shadows: FrozenTransport, vertices: np.ndarray) -> tuple[Tensor, Tensor]:
-        variable = torch.from_numpy(vertices).float().requires_grad_()
-        [fragments] = build_fragments(vertices, cup.faces, [CAMERA], settings, choose("numpy"))
-        albedo = surface_albedo(cup, fragments, settings.encoding)
-        if not shadows.knows(CAMERA):
-            shadows.add(CAMERA, fragments, albedo)
-        radiance = shading.radiance(fragments, variable, light, albedo) + shadows.radiance(
-            CAMERA, fragments, albedo, light
-        )
-        loss = (radiance.square() * weights[:, fragments.pixels]).sum()  # not linear, as a classifier is not
-        [gradient] = torch.autograd.grad(loss, variable)
-        return radiance.new_zeros(3, size**2).index_copy(1, fragments.pixels, radiance.detach()), gradient
-
-    first = FrozenTransport(cup, settings, 1.0, HARMONICS)
-    render(first, cup.vertices)
-    for steps in STEPS_AWAY:
-        vertices = cup.vertices + steps * STEP * direction
-        anew = FrozenTransport(replace(cup, vertices=vertices), settings, 1.0, HARMONICS)
-        found = errors(render(first, vertices), render(anew, vertices))
-        yield {"table": "stale", "size": size, "steps": steps, "distance": steps * STEP} | found
+def local_lights(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
+    keys = list(product(BASES, sizes))
+    built = {(name, size): operator(cup, size, samples=2, basis=BASES[name]) for name, size in keys}
+    lights = {name: torch.rand(basis.size, 3).requires_grad_() for name, basis in BASES.items()}
+    times = medians({key: partial(light_step, built[key], lights[key[0]]) for key in keys}, rounds)
+    for name, size in keys:
+        row: Row = {"table": "local lights", "light": name, "size": size, "step_ms": times[name, size]}
+        row |= {"of_direct": times[name, size] / times["harmonics", size], "megabytes": megabytes(built[name, size])}
+        row["build_s"] = seconds(partial(operator, cup, size, samples=2, basis=BASES[name]))
+        if size == sizes[0]:
+            light = lights[name].detach()
+            fine = operator(cup, size, samples=REFERENCE, basis=BASES[name], dtype=torch.float64)
+            row |= errors(image_and_gradient(built[name, size], light), image_and_gradient(fine, light.double()))
+        yield row
 
 
 # ---------------------------------------------------------------------------- Mitsuba
@@ -279,12 +164,9 @@ def hard_meshes() -> dict[str, Mesh]:
     }
 
 
-def beside_mitsuba(size: int, meshes: Sequence[str] | None = None) -> Iterator[Row]:
-    for (name, mesh), paths in product(hard_meshes().items(), [*LIGHT_PATHS][1:]):
-        if meshes is None or name in meshes:
-            yield {"table": "mitsuba", "mesh": name, "light_paths": paths, "size": size} | differences(
-                mesh, size, paths
-            )
+def beside_mitsuba(size: int) -> Iterator[Row]:
+    for (name, mesh), paths in product(hard_meshes().items(), ["shadows", "bounces:3"]):
+        yield {"table": "mitsuba", "mesh": name, "light": paths, "size": size} | differences(mesh, size, paths)
 
 
 def differences(mesh: Mesh, size: int, paths: str) -> Row:
@@ -362,9 +244,8 @@ def mean_and_noise(draws: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, and write a line of JSON for each measurement, in place of the file before."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("docs/lights.jsonl"))
+    parser.add_argument("--csv", type=Path, default=Path("lights.csv"))
     parser.add_argument("--mitsuba", action="store_true", help="compare with Mitsuba 3, too")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 224], help="of images, in pixels")
     parser.add_argument("--vertices", type=int, default=4000, help="of the cup, at least")
@@ -372,21 +253,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     print(machine())
-    cup, sizes, rounds = subdivide(normalize(solid("cup", 0)), options.vertices), options.sizes, options.rounds
-    tables = [
-        cost(cup, sizes, rounds),
-        local_lights(cup, sizes, rounds),
-        lamp_steps(cup, sizes, rounds),
-        stale_shadows(sizes[0]),
-        rays_and_samples(cup, sizes[0], rounds),
-        *([beside_mitsuba(sizes[0])] if options.mitsuba else []),
-    ]
-    options.out.unlink(missing_ok=True)
-    for table in tables:
-        for row in table:
-            row = {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in row.items()}
-            append_json(options.out, row)
-            print(json.dumps(row, ensure_ascii=False), flush=True)
+    cup, sizes = subdivide(normalize(solid("cup", 0)), options.vertices), options.sizes
+    tables = [cost(cup, sizes, options.rounds), local_lights(cup, sizes, options.rounds)]
+    tables += [beside_mitsuba(sizes[0])] if options.mitsuba else []
+    rows = []
+    for row in chain.from_iterable(tables):
+        print(row, flush=True)
+        rows.append(row)
+        write_csv(options.csv, rows)
 
 
 if __name__ == "__main__":

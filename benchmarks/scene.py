@@ -35,22 +35,10 @@ Row = dict[str, Any]
 Shading = Callable[[Fragments, Tensor, Tensor, Tensor], Tensor]
 
 
-def ellipsoid(vertices: int) -> Mesh:
-    """A closed mesh of about so many vertices: an icosahedron whose edges are cut into n, V = 10n² + 2, blown up."""
-    pieces = max(1, round(((vertices - 2) / 10) ** 0.5))
-    icosahedron = trimesh.creation.icosahedron()
-    steps = np.array([(i, j, pieces - i - j) for i in range(pieces + 1) for j in range(pieces + 1 - i)])
-    number = np.full((pieces + 1, pieces + 1), -1)
-    number[steps[:, 0], steps[:, 1]] = np.arange(len(steps))
-    i, j = steps[steps[:, 2] > 0, :2].T
-    upright = np.stack([number[i + 1, j], number[i, j + 1], number[i, j]], axis=1)
-    i, j = steps[steps[:, 2] > 1, :2].T
-    inverted = np.stack([number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]], axis=1)
-    points = np.einsum("sc,fcd->fsd", steps / pieces, icosahedron.vertices[icosahedron.faces]).reshape(-1, 3)
-    _, first, index = np.unique(points.round(9) + 0.0, axis=0, return_index=True, return_inverse=True)
-    faces = index.reshape(-1, len(steps))[:, np.concatenate([upright, inverted])].reshape(-1, 3)
-    directions = points[first] / np.linalg.norm(points[first], axis=1, keepdims=True)
-    return Mesh.plain(directions * (1.0, 0.9, 0.8), faces, ALBEDO)
+def ellipsoid(subdivisions: int) -> Mesh:
+    """A closed mesh of 10·4^subdivisions + 2 vertices."""
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    return Mesh.plain(ball.vertices * (1.0, 0.9, 0.8), ball.faces, ALBEDO)
 
 
 def coefficients(degree: int, dtype: torch.dtype = torch.float64, device: str = "cpu") -> Tensor:
@@ -94,10 +82,6 @@ class View:
         fragments = found.to(self.device)
         albedo = surface_albedo(self.mesh, fragments, "linear").to(vertices.dtype)
         return fragments, albedo, fragments.coverage.to(vertices.dtype)[None]
-
-    @property
-    def name(self) -> str:
-        return f"{self.size}², {len(self.mesh.vertices):,} vertices"
 
     def vertices(self, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.from_numpy(self.mesh.vertices).to(self.device, dtype)

@@ -2,7 +2,7 @@
 
 python -m benchmarks.paper.rendering_quality --out rendering_quality.jsonl --renders 10000 \\
     --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
-python -m benchmarks.paper.table rendering_quality.jsonl --figure rendering_quality.png
+python -m benchmarks.paper.table rendering_quality.jsonl
 
 Cameras are random, and each sees the mesh on five grays. Intervals resample cameras, whose renders resemble each other.
 """

@@ -1,13 +1,13 @@
-"""Markdown tables, and figures, of what the paper's benchmarks measured: the last run in a file of JSON lines.
+"""Markdown tables of what the paper's benchmarks measured: the last run in a file of JSON lines.
 
 python -m benchmarks.paper.table docs/paper/norm_balls.jsonl --figure norm_balls.png
 
-Brackets hold 95 % Wilson intervals, or the quartiles of times.
+Brackets hold 95 % Wilson intervals, or the quartiles of times. A figure is drawn of norm_balls alone.
 """
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import chain, pairwise
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -141,48 +141,6 @@ def survival(rows: Sequence[Row]) -> Table:
         yield [attack, len(group) - len(made), fraction(row["success"] for row in made), *map(fraction, kept)]
 
 
-# ---------------------------------------------------------------------------------------- figures
-
-
-def draw_norm_balls(panel: Any, rows: Sequence[Row]) -> None:
-    rows = [row for row in rows if row["radius"] is not None]
-    for method in ("adversarial", "random", "search"):
-        balls = {radius: hits(group, method) for (radius,), group in groups(rows, "radius").items()}
-        errorbars(panel, balls, method)
-    panel.set(xscale="log", xlabel="L∞ radius", ylabel="fraction fooled", ylim=(-0.03, 1.03))
-
-
-def draw_views(panel: Any, rows: Sequence[Row]) -> None:
-    for (count,), group in groups(rows, "attacked").items():
-        bins = {(low + high) / 2: within(group, low, high) for low, high in pairwise((0, 15, 30, 60, 90, 180))}
-        errorbars(panel, {middle: outcomes for middle, outcomes in bins.items() if outcomes}, f"{count} attacked")
-    panel.set(xlabel="degrees to the nearest attacked view", ylabel="fraction fooled", ylim=(-0.03, 1.03))
-
-
-def draw_run_time(panel: Any, rows: Sequence[Row]) -> None:
-    """One image at a time: the classifier's time below the renderer's, against pixels."""
-    first = next(iter(groups(rows, "setup")))[0]
-    rows = sorted((row for row in rows if row["setup"] == first), key=lambda row: row["pixels"])
-    inside, whole = ([np.median(row[name]) for row in rows] for name in ("inside", "whole"))
-    labels = ["classifier", "renderer"]
-    panel.stackplot([row["pixels"] for row in rows], inside, np.subtract(whole, inside), labels=labels)
-    panel.set(xlabel="covered pixels", ylabel="ms per iteration")
-
-
-def draw_rendering_quality(panel: Any, rows: Sequence[Row]) -> None:
-    counts = rows[0]["histogram"]
-    panel.stairs(counts, np.linspace(0, 1, len(counts) + 1), fill=True, label="recognized")
-    panel.set(xlabel="confidence in the correct label", ylabel="renders")
-
-
-def errorbars(panel: Any, outcomes: Mapping[float, Sequence[bool]], label: str) -> None:
-    """Fractions with their intervals, by where they are drawn."""
-    values = np.array([np.mean(each) for each in outcomes.values()])
-    low, high = np.array([interval(each) for each in outcomes.values()]).T
-    error = np.maximum([values - low, high - values], 0)  # below 0 by rounding alone
-    panel.errorbar(list(outcomes), values, error, label=label, marker="o", capsize=3)
-
-
 TABLES: dict[str, Callable[[Sequence[Row]], Table]] = {
     "norm_balls": norm_balls,
     "networks": networks,
@@ -191,27 +149,26 @@ TABLES: dict[str, Callable[[Sequence[Row]], Table]] = {
     "rendering_quality": rendering_quality,
     "survival": survival,
 }
-FIGURES: dict[str, tuple[str, Callable[[Any, Sequence[Row]], None]]] = {  # a panel per value of a name
-    "norm_balls": ("space", draw_norm_balls),
-    "views": ("kind", draw_views),
-    "run_time": ("kind", draw_run_time),
-    "rendering_quality": ("mesh", draw_rendering_quality),
-}
 
 
-def draw(study: str, rows: Sequence[Row], path: Path) -> None:
+def draw_norm_balls(rows: Sequence[Row], path: Path) -> None:
+    """Success against the radius with intervals, a set of axes per space."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    name, draw_panel = FIGURES[study]
-    parts = groups((row for row in rows if name in row), name)
-    figure, panels = plt.subplots(1, len(parts), figsize=(3.7 * len(parts), 3.4), squeeze=False, layout="tight")
-    for panel, ((title,), group) in zip(panels[0], parts.items(), strict=True):
-        panel.set_title(title)
-        draw_panel(panel, group)
-    panels[0, 0].legend(fontsize=8)
+    spaces = groups((row for row in rows if row["radius"] is not None), "space")
+    figure, axes = plt.subplots(1, len(spaces), figsize=(3.7 * len(spaces), 3.4), squeeze=False, layout="tight")
+    for ax, ((space,), group) in zip(axes[0], spaces.items(), strict=True):
+        for method in ("adversarial", "random", "search"):
+            balls = {radius: hits(ball, method) for (radius,), ball in groups(group, "radius").items()}
+            values = np.array([np.mean(outcomes) for outcomes in balls.values()])
+            low, high = np.array([interval(outcomes) for outcomes in balls.values()]).T
+            error = np.maximum([values - low, high - values], 0)  # below 0 by rounding alone
+            ax.errorbar(list(balls), values, error, label=method, marker="o", capsize=3)
+        ax.set(title=space, xscale="log", xlabel="L∞ radius", ylabel="success", ylim=(-0.03, 1.03))
+    axes[0, 0].legend(fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -219,14 +176,16 @@ def draw(study: str, rows: Sequence[Row], path: Path) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("records", type=Path, help="file of JSON lines")
-    options.add_argument("--figure", type=Path, help="also draw the numbers here")
+    options.add_argument("--figure", type=Path, help="also draw norm_balls here")
     args = options.parse_args(argv)
     settings, rows = last_run(args.records)
+    if args.figure is not None and settings["study"] != "norm_balls":
+        options.error(f"--figure draws norm_balls, and {args.records} holds {settings['study']}")
     header, *cells = TABLES[settings["study"]](rows)
     for line in (header, ["---"] * len(header), *cells):
         print(f"| {' | '.join(map(str, line))} |")
     if args.figure is not None:
-        draw(settings["study"], rows, args.figure)
+        draw_norm_balls(rows, args.figure)
 
 
 if __name__ == "__main__":
