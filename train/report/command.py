@@ -1,10 +1,10 @@
-"""The command that trains a run, or makes an attack, again: what its configuration has otherwise than the defaults."""
+"""The command that repeats a run or an attack: the settings in its configuration that are not the defaults."""
 
 import json
 import re
 import shlex
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -17,26 +17,31 @@ PLAIN = re.compile(r"(?!(null|true|false|nan|inf)$)[A-Za-z_/][\w./:-]*", re.ASCI
 
 
 def training_command(config: DictConfig) -> str:
+    """The command of a run's configuration."""
     return _command("python -m train", "train", config, "attack@augment.attack", config.augment.attack)
 
 
 def attack_command(config: DictConfig) -> str:
+    """The command of an attack's configuration."""
     return _command("python scripts/attack.py", "attack", config, "attack", config.attack)
 
 
 def _command(start: str, name: str, config: DictConfig, group: str, attack: Mapping[str, Any]) -> str:
-    """Also of a run from another version, whose keys this one may lack; they are left out."""
-    kinds = [kind for kind in PARAMETERS if attack.get(kind) is not None]
-    chosen = [f"{group}=[{','.join(kinds)}]"] if kinds else []
+    """Keys of another version that this one lacks are left out."""
+    parameters = [parameter for parameter in PARAMETERS if attack.get(parameter) is not None]
+    groups = [f"{group}=[{','.join(parameters)}]"] if parameters else []
     if config.get("data", {}).get("name") in DATA:
-        chosen.append(f"data={config.data.name}")
-    defaults = dict(dotted(OmegaConf.to_container(compose(name, chosen))))
-    own = dict(dotted(OmegaConf.to_container(config)))
-    if own.get("evaluate.photos") and own.get("evaluate.photos") == own.get("data.images"):
-        del own["evaluate.photos"]  # the run's own renders, which it makes again
-    changed = {key: value for key, value in own.items() if key in defaults and value != defaults[key]}
+        groups.append(f"data={config.data.name}")
+    defaults, values = _by_key(compose(name, groups)), _by_key(config)
+    if values.get("evaluate.photos") and values.get("evaluate.photos") == values.get("data.images"):
+        del values["evaluate.photos"]  # the run's own renders, which it makes again
+    changed = {key: value for key, value in values.items() if key in defaults and value != defaults[key]}
     overrides = [f"{key}={_value(value)}" for key, value in changed.items() if not is_within(key, CIRCUMSTANCES)]
-    return shlex.join([*start.split(), *chosen, *overrides])
+    return shlex.join([*start.split(), *groups, *overrides])
+
+
+def _by_key(config: DictConfig) -> dict[str, Any]:
+    return dict(dotted(cast(dict[str, Any], OmegaConf.to_container(config))))
 
 
 def _value(value: object) -> str:
@@ -46,5 +51,5 @@ def _value(value: object) -> str:
     if isinstance(value, list):
         return f"[{','.join(map(_value, value))}]"
     if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{_value(each)}" for key, each in value.items()) + "}"
+        return "{" + ",".join(f"{key}:{_value(item)}" for key, item in value.items()) + "}"
     return json.dumps(value)
