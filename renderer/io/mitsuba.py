@@ -45,7 +45,9 @@ XML_TAGS: dict[Any, str] = {
     **dict.fromkeys(("ply", "disk"), "shape"),
     **dict.fromkeys(("twosided", "diffuse"), "bsdf"),
     **dict.fromkeys(("bitmap", "mesh_attribute"), "texture"),
-    **{"hdrfilm": "film", "box": "rfilter", "multijitter": "sampler"},
+    "hdrfilm": "film",
+    "box": "rfilter",
+    "multijitter": "sampler",
     **{bool: "boolean", int: "integer", float: "float", str: "string", list: "point"},
 }
 Scene = dict[str, Any]

@@ -161,30 +161,6 @@ def test_row_0_is_the_top_and_x_runs_right(rasterizer):
     np.testing.assert_array_equal(np.where(ids[0] < 0, -1, ids[0] // 2), expected)
 
 
-def test_ids_equal_a_brute_force_oracle_away_from_edges_and_depth_ties(rasterizer):
-    resolution = 40
-    points, faces = random_triangles(seed=1, count=30, reach=1.3)
-    centers = sample_centers(resolution)
-    corners = points[0][faces]
-
-    a, b = corners[:, :, :2], np.roll(corners, -1, axis=1)[:, :, :2]  # (F, 3 edges, 2)
-    to_sample = centers[:, :, None, None] - a  # (R, R, F, 3, 2)
-    along = ((to_sample * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1)).clip(0, 1)
-    edge_distance = np.linalg.norm(to_sample - along[..., None] * (b - a), axis=-1).min(axis=-1)
-    sides = (b - a)[..., 0] * to_sample[..., 1] - (b - a)[..., 1] * to_sample[..., 0]
-    covered = (sides > 0).all(axis=-1) | (sides < 0).all(axis=-1)
-
-    plane = planes(points[0], faces)
-    depth = np.where(covered, centers @ plane[:, :2].T + plane[:, 2], np.inf)
-    expected = np.where(covered.any(axis=-1), depth.argmin(axis=-1), -1)
-
-    margin = depth_tolerance(plane[:, :2], resolution)
-    rivals = depth - margin < (depth + margin).min(axis=-1, keepdims=True)
-    clear = (edge_distance > 2 * SNAP * 2 / resolution).all(axis=-1) & (rivals.sum(axis=-1) <= 1)
-    assert clear.mean() > 0.7
-    np.testing.assert_array_equal(rasterizer.rasterize(points, faces, resolution)[0][clear], expected[clear])
-
-
 def test_shared_edges_are_covered_exactly_once(rasterizer):
     """A triangulated square, with vertices and edges on sample centers and between; a view for each triangle."""
     rng = np.random.default_rng(0)
@@ -355,42 +331,6 @@ def test_numba_draws_in_many_threads_at_once():
 def test_numba_refuses_faces_of_missing_vertices(corner):
     with pytest.raises(IndexError, match="not among the 3"):
         choose("numba").rasterize(np.zeros((1, 3, 3)), np.array([[0, 1, corner]]), 4)
-
-
-def outline_distance(mesh: trimesh.Trimesh, corners: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """(S,) from samples (S, 2) to the nearest edge between a face towards the camera and one that is not."""
-    (ax, ay), (bx, by), (cx, cy) = np.moveaxis(corners[mesh.faces, :2], 0, -1)
-    towards = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) > 0
-    outline = mesh.face_adjacency_edges[np.diff(towards[mesh.face_adjacency], axis=1)[:, 0]]
-    start, end = np.moveaxis(corners[outline, :2], 1, 0)
-    to_sample, along = samples[:, None] - start, end - start
-    share = ((to_sample * along).sum(-1) / (along**2).sum(-1)).clip(0, 1)
-    return np.linalg.norm(to_sample - share[..., None] * along, axis=-1).min(axis=1)
-
-
-def distances_of_changed_ids(
-    rasterizer: Rasterizer, mesh: trimesh.Trimesh, points: np.ndarray, resolution: int
-) -> np.ndarray:
-    """(S,) in samples, from the outline to where `closed` changes the id; that it changes no coverage is checked."""
-    both = rasterizer.rasterize(points, mesh.faces, resolution)
-    front = rasterizer.rasterize(points, mesh.faces, resolution, closed=True)
-    np.testing.assert_array_equal(front >= 0, both >= 0)
-    row, column = np.nonzero(front[0] != both[0])
-    return outline_distance(mesh, points[0], sample_centers(resolution)[row, column]) * resolution / 2
-
-
-@pytest.mark.parametrize("resolution", [17, 224])
-@pytest.mark.parametrize(
-    "mesh",
-    [
-        trimesh.creation.icosphere(subdivisions=4, radius=0.9),
-        trimesh.creation.torus(0.6, 0.3, major_sections=60, minor_sections=30),
-    ],
-    ids=["sphere", "torus"],
-)
-def test_culling_a_closed_mesh_changes_ids_only_within_rounding_of_an_outline(rasterizer, mesh, resolution):
-    points, _ = turned(mesh, views=1)
-    assert (distances_of_changed_ids(rasterizer, mesh, points, resolution) <= SNAP).all()
 
 
 @needs_egl
