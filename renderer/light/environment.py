@@ -59,7 +59,10 @@ def read_map(path: Path) -> Tensor:
     InputError where the file is missing, unreadable, no such map, or holds NaN or infinity.
     """
     require_file(path, "give the path of an .npy, .hdr or .exr file")
-    texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
+    try:
+        texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
+    except UnicodeDecodeError as error:  # OpenImageIO's own, of a name in the header or of its message about it
+        raise InputError(f"environment map {path} is damaged: its header is not text") from error
     radiance = texels[..., _color_channels(path, names)]
     if not np.isfinite(radiance).all():
         raise InputError(f"environment map {path} holds NaN or infinity: give a map of finite radiance")

@@ -284,6 +284,10 @@ def zip_bomb(path: Path) -> None:
             archive.writestr(f"{name}.npy", header.getvalue() + bytes(10**6))
 
 
+def name_not_text(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"\0string\0", b"\0string\x80"))
+
+
 def huge_png() -> bytes:
     """A small file whose header says 10¹⁰ pixels."""
 
@@ -320,6 +324,7 @@ FORGED: list[tuple[str, str, str | bytes | Callable[[Path], object]]] = [  # fil
     ("light.npy", "code for a shape", npy_header("__import__('os').getcwd()")),
     ("light.npy", "objects", lambda path: np.save(path, np.array([[{}]], dtype=object), allow_pickle=True)),
     ("light.hdr", "10⁹ wide", "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1000000000 +X 1000000000\n"),
+    ("light.exr", "a name that is not UTF-8", name_not_text),
     ("light.json", "NaN", json.dumps([[float("nan")] * 3] * 49)),
     ("background.png", "10¹⁰ pixels", huge_png()),
     ("photographs/orange/0.png", "10¹⁰ pixels", huge_png()),
