@@ -15,8 +15,9 @@ from torch.utils.data import Dataset
 from augment import utils
 from augment.attacks.attack import AttackSettings, logits_of
 from augment.attacks.criteria import NO_CLASS, Goal
-from augment.attacks.descent import DescentResult, Part, descend_in_parts
-from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting, StepSettings
+from augment.attacks.descent import DescentResult, Part, descend
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting
 from augment.build import Shown, build_scene
 from augment.labels import is_right, label_loss, require_known
 from augment.scene import Conditions, Scene
@@ -52,7 +53,7 @@ class RandomLightSettings:
 @dataclass
 class TrainingAttackSettings(AttackSettings):
     """Unless parameters are named, the attack of the paper's appendix C on all coefficients of the light: 30 steps of
-    0.05 along the gradient's direction, negative light allowed.
+    0.05 along the gradient's direction, negative light allowed, until the classifier errs on unrounded images.
 
     step, step_size: of that attack on the light, as in `StepSettings`.
     """
@@ -60,6 +61,8 @@ class TrainingAttackSettings(AttackSettings):
     step: str = "unit"
     step_size: float = 0.05
     allow_negative: bool = True
+    margin: float = 0.0
+    rounded: bool = False
     batch_size: int = 128
 
     def __post_init__(self) -> None:
@@ -250,7 +253,8 @@ class AugmentationService:
         values = self._random_values(problem, number)
         images = problem.images(values)
         with as_found(model), self.phases("attack_classifier"):
-            logits = logits_of(model, images, self.settings.attack.batch_size)[:, 0]
+            preprocessed_model = self.settings.attack.preprocessed_model(model)
+            logits = logits_of(preprocessed_model, images, self.settings.attack.batch_size)[:, 0]
         require_known(self.labels, logits)
         success = ~is_right(logits.argmax(1), self.labels)
         diagnostics = {"attack_success": _mean(success), "loss": _mean(label_loss(logits, self.labels))}
@@ -263,9 +267,16 @@ class AugmentationService:
         part = Part(problem, shard, self._start(problem, number)[shard])
         draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
-        eot_model = attack.eot_model(model, stream_seed(self.seed, number))
-        goal = self._goal().of(shard)
-        result = descend_in_parts(eot_model, part, goal, attack, self.phases, restarts, problem.scene.at_once)
+        result = descend(
+            attack.preprocessed_model(model),
+            part,
+            self._goal().of(shard),
+            attack,
+            self.phases,
+            starts=restarts,
+            at_once=problem.scene.at_once,
+            seed=stream_seed(self.seed, number),
+        )
         gathered = {item.name: getattr(result, item.name) for item in fields(result)}
         result = DescentResult(
             **{name: utils.merged(rows, shard, total, self.world_size) for name, rows in gathered.items()}

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
-from augment.attacks.adversary import read_adversary
+import augment
 from augment.attacks.attack import logits_of
-from augment.attacks.evaluate import Sweep
+from augment.attacks.evaluate import RadiusSweep
 from augment.attacks.files import LINES
 from renderer.errors import InputError
 from renderer.rasterizer import choose
@@ -25,7 +25,7 @@ from train.runtime import choose_device
 
 
 def main(settings: AttackExperimentSettings) -> None:
-    adversary = read_adversary(Path(settings.reload)) if settings.reload else None
+    adversary = augment.reload(settings.reload) if settings.reload else None
     if adversary is None:
         settings.attack.require_parameters()
     device = choose_device(settings.device)
@@ -40,22 +40,22 @@ def main(settings: AttackExperimentSettings) -> None:
     out = writable_folder(settings.out, "out")
     if any(out.glob(f"*/{LINES}")):  # whose examples would lie among the new ones
         raise InputError(f"out={out} holds the adversaries of an earlier call: choose another folder, or remove it")
-    sweeps: dict[str, Sweep] = {}
+    sweeps: dict[str, RadiusSweep] = {}
     with sole_writer("out", out):
         for index, (name, scene, attacked) in enumerate(attacks(settings, classifier, device, adversary)):
             if scene != settings.scene:
                 print(f"{name} is not recognized in the scene as it is, but is with {overrides(scene, settings.scene)}")
-            checks = attacked.check() if settings.attack.checks else None
+            checks = augment.check(attacked) if settings.attack.checks else None
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
-            rerender_checks = attacked.save(folder, checks, settings.attack.renderers)
+            rerender_checks = augment.save(attacked, folder, checks, settings.attack.renderers)
             print(format_attack(name, attacked, checks, rerender_checks))
             print(f"images, adversaries and numbers: {folder}\n")
             if others:
-                found = [*attacked.transfer(**others)]
+                found = augment.transfer(attacked, **others)
                 write_transfers(found, folder)
                 print(f"{format_transfers(found)}\n")
-            if settings.attack.sweep:
-                sweeps[folder.name] = attacked.sweep(settings.attack.sweep)
+            if settings.attack.radius_scales:
+                sweeps[folder.name] = augment.success_by_radius(attacked, settings.attack.radius_scales)
                 print(f"{format_curve(sweeps[folder.name])}\n")
         if sweeps:
             write_curve(curve(sweeps), {kind: each.norm for kind, each in settings.attack.parameters.items()}, out)

@@ -87,7 +87,7 @@ SCENES = {
 CLASSES = ["orange", "apple", "pear", "bottle"]
 ORANGES = [("solid:orange:0", "orange"), ("solid:orange:1", "orange")]
 SCENE = {"samples": 2, "encoding": "linear", "normals": "flat", **SOFTWARE}
-SETTINGS = {"max_steps": 4, "margin": 0.5, "allow_negative": False}
+SETTINGS = {"max_steps": 4, "margin": 0.5, "rounded": False, "allow_negative": False}
 Step, Sky = augment.StepSettings, augment.SkylightSettings
 BOTH = {"lighting": Step(step_size=0.2), "geometry": Step(radius=0.01, step="sign", step_size=0.005)}
 SHAPE, COLOR = {"geometry": Step("linf", 0.02, "sign", 0.01)}, {"albedo": Step("linf", 0.2, "sign", 0.03)}

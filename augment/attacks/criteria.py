@@ -1,4 +1,4 @@
-"""What an attack is to reach, and the cost that it decreases on the way."""
+"""Criteria of success, and the cost that an attack decreases on the way."""
 
 from __future__ import annotations
 
@@ -18,31 +18,30 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
-NO_CLASS = -1  # in place of a class that does not count
+NO_CLASS = -1  # in place of a class, where there is none
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Per example and view, the class whose confidence falls and, where there is a target, the one whose rises.
+    """Source and target class of each view: an attack is to lower the confidence in one and to raise it in the other.
 
-    source: NO_CLASS where the target alone counts. target: the same, or None for an attack that takes
-    any error, as it does where it is NO_CLASS. An example is fooled where every view is given its target, or without
-    one, anything but `source`.
+    source: NO_CLASS where only the target counts. target: NO_CLASS, or None for all views, where any error will do. A
+    goal is reached where every view is classified as its target or, without a target, as anything but its source.
     """
 
     source: Int[Tensor, "E V"]
     target: Int[Tensor, "E V"] | None = None
 
     def of(self, examples: Tensor) -> Goal:
-        """The same for some of the examples."""
+        """The goal of some of the examples."""
         return Goal(self.source[examples], None if self.target is None else self.target[examples])
 
     def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
-        """Whether all views of an example are, for predicted classes."""
+        """Whether the predicted classes reach the goal in all views of an example."""
         return self.reached_in_views(predicted).all(1)
 
     def reached_in_views(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, "E V"]:
-        """Whether each view is, for predicted classes."""
+        """Whether the predicted classes reach the goal, view by view."""
         erred = predicted != self.source
         if self.target is None:
             return erred
@@ -52,10 +51,10 @@ class Goal:
 def adversarial_cost(
     logits: Float[Tensor, "E classes"], source: Int[Tensor, " E"], target: Int[Tensor, " E"] | None = None
 ) -> Float[Tensor, " E"]:
-    """-CE(f, L_d) + CE(f, L_i) per example, the paper's equation 1, which an attack decreases.
+    """−CE(logits, source) + CE(logits, target) per image, the paper's equation 1, which an attack decreases.
 
-    source: the classes whose confidence falls. target: those whose confidence rises; None attacks without a target.
-    NO_CLASS in either leaves its term out. InputError for a class that there are no logits of.
+    target: None leaves the second term out. NO_CLASS in either leaves its term out. InputError for a class beyond the
+    logits.
     """
     require_known(source, logits)
     cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
@@ -65,11 +64,8 @@ def adversarial_cost(
 
 
 def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
-    """By how much the goal is exceeded, negative where it is not reached: that of the wanted class over all others, or
-    without one, that of the best other class over `source`. (E,)
-
-    Shapes as in `adversarial_cost`.
-    """
+    """The lead (E,) of the target's logit over all others or, without a target, of the best other class over the
+    source; negative where the goal is not reached. Shapes as in `adversarial_cost`."""
     wanted = torch.full_like(source, NO_CLASS) if target is None else target
     chosen = torch.where(wanted == NO_CLASS, source, wanted)[:, None]
     gap = logits.gather(1, chosen)[:, 0] - logits.scatter(1, chosen, -torch.inf).amax(1)
@@ -78,10 +74,10 @@ def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> T
 
 @runtime_checkable
 class Criterion(Protocol):
-    """Anything with this method."""
+    """Chooses the target classes of an attack."""
 
     def targets(self, logits: Tensor, classifier: Classifier) -> Tensor | None:
-        """(E, V) the classes to reach, given the logits (E, V, C) before; None where any error will do."""
+        """The target classes (E, V), given the logits (E, V, C) before; None where any error will do."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +90,7 @@ class Misclassification:
 
 @dataclass(frozen=True)
 class Targeted:
-    """A class by name for all images, or a list of them, one for each of the views that share what is attacked."""
+    """A class by name for all images, or a list of classes, one for each of the views that share what is attacked."""
 
     classes: str | Sequence[str]
 
@@ -103,8 +99,8 @@ class Targeted:
         names = [self.classes] * views if isinstance(self.classes, str) else [str(name) for name in self.classes]
         if len(names) != views:
             raise InputError(
-                f"target={names} names {len(names)} classes for {views} views that share what is attacked: give as "
-                "many, and attack.shared=true"
+                f"target={names} names {len(names)} classes for {views} views that share what is attacked: give one "
+                "class per view, and shared=true"
             )
         wanted = torch.tensor([classifier.label(name) for name in names], device=logits.device)
         return wanted.expand(len(logits), views)
@@ -112,7 +108,7 @@ class Targeted:
 
 @dataclass(frozen=True)
 class LeastLikely:
-    """Of each image, the class that it had the least confidence in."""
+    """The class of each image's lowest confidence."""
 
     def targets(self, logits: Tensor, classifier: Classifier) -> Tensor:
         return logits.argmin(2)

@@ -1,96 +1,56 @@
-"""Descent on the adversarial cost over anything that renders differentiably, until the classifier is fooled."""
+"""Projected gradient descent on the adversarial cost, over anything that renders differentiably.
+
+An example's values x (light, shape, ...) render to V views I_v(x). With a source class s (what the views show) and,
+in a targeted attack, a target class t for each view, descent lowers the paper's equation 1,
+
+    cost(x) = Σ_v  −CE(f(I_v(x)), s_v) + CE(f(I_v(x)), t_v),        x ← project(x − length · step(∂cost/∂x)),
+
+where step() scales the gradient (`augment.attacks.norm_ball.StepSettings`) and project() returns into the norm-ball and
+the physically possible. The length is 1; with `shorten`, a step that did not lower the cost is undone and tried at half
+its length. One forward pass gives the cost, the gradient and the predictions. An example is a success once the
+criterion is met in every view by the image as the preprocessed classifier gets it; it leaves the batch once its
+logits also lead by `margin` there. Until then, the success of lowest cost is kept.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from augment.attacks.criteria import Goal, adversarial_cost, logit_gap
-from augment.utils import BatchSize, Phases, as_found, progress
-from renderer.errors import FACTOR, require_range
+from augment.attacks.eot import ExpectationOverTransformations
+from augment.utils import BatchSize, Phases, as_found, generator, progress
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-
-@dataclass
-class DescentSettings:
-    """How long a descent lasts.
-
-    max_steps: renders after the first; the paper's appendix C has 30. shorten: a step after which the cost has not
-    fallen is taken back and tried at half its length, since the gradient of geometry holds visibility fixed.
-    batch_size: images per pass through the classifier, fewer where memory runs out. margin: by how much the logits of
-    what fools are to exceed all others, in every view, before an example leaves.
-    """
-
-    max_steps: int = 30
-    shorten: bool = False
-    batch_size: int = 128
-    margin: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_range("attack: max_steps", self.max_steps, 0, 10**6)
-        require_range("attack: batch_size", self.batch_size, 1, 10**6)
-        require_range("attack: margin", self.margin, 0, FACTOR)
+    from augment.attacks.attack import AttackSettings
 
 
 class Problem(Protocol):
-    """What is attacked: E examples of V views each, whose images follow from values (E, D)."""
+    """What is attacked: E examples of V views each, rendered from values (E, D)."""
 
     @property
     def start(self) -> Float[Tensor, "E D"]:
-        """The values where they begin."""
+        """The values where descent begins."""
 
     def render(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 H W"]:
-        """Images in [0, 1] of some examples under values of theirs."""
+        """Images in [0, 1] of some examples under these values."""
 
     def step(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
-        """How far to go down a gradient."""
+        """The step for a gradient, to be subtracted."""
 
     def project(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
-        """Values moved to where they may be."""
-
-
-@dataclass(frozen=True)
-class DescentResult:
-    """What an attack did, per example; all tensors lie on the values' device.
-
-    values, images: where the descent ended, or of those that fool the one of the lowest cost. steps: taken. fooled_at:
-    the step that first fooled, of no meaning where none did; with a margin, a descent goes on from there.
-    cost_before, cost: the paper's cost, summed over views. predicted: the classes there. zero_gradient: the first
-    gradient was exactly zero.
-    """
-
-    values: Float[Tensor, "E D"]
-    images: Float[Tensor, "E V 3 H W"]
-    steps: Int[Tensor, " E"]
-    success_before: Bool[Tensor, " E"]
-    success: Bool[Tensor, " E"]
-    success_at: Int[Tensor, " E"]
-    cost_before: Float[Tensor, " E"]
-    cost: Float[Tensor, " E"]
-    predicted: Int[Tensor, "E V"]
-    zero_gradient: Bool[Tensor, " E"]
-
-
-@dataclass(frozen=True)
-class _Pass:
-    """What a classifier makes of A examples: the cost's gradient is by their images (A, V, 3, H, W). gap: (A,), the
-    least over views of `logit_gap`."""
-
-    cost: Tensor
-    predicted: Tensor
-    gap: Tensor
-    gradient: Tensor
+        """The nearest permitted values."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Some examples (A,) of a problem, from starts (A, D) of their own."""
+    """Some examples (A,) of a problem, with other starts (A, D)."""
 
     problem: Problem
     examples: Tensor
@@ -106,58 +66,81 @@ class Part:
         return self.problem.project(values, self.examples[examples])
 
 
-def descend_in_parts(
+@dataclass(frozen=True)
+class DescentResult:
+    """The end of a descent, per example; all tensors lie on the values' device.
+
+    values, images: of the success of lowest cost or, without a success, of the last step that was kept. steps: number
+    of steps. success_at: the first step that was a success (meaningless without one); with a margin, descent goes on
+    from there. cost_before, cost: equation 1. predicted: classes. zero_gradient: the first gradient was exactly zero.
+    """
+
+    values: Float[Tensor, "E D"]
+    images: Float[Tensor, "E V 3 H W"]
+    steps: Int[Tensor, " E"]
+    success_before: Bool[Tensor, " E"]
+    success: Bool[Tensor, " E"]
+    success_at: Int[Tensor, " E"]
+    cost_before: Float[Tensor, " E"]
+    cost: Float[Tensor, " E"]
+    predicted: Int[Tensor, "E V"]
+    zero_gradient: Bool[Tensor, " E"]
+
+
+def descend(
     model: nn.Module,
     problem: Problem,
     goal: Goal,
-    settings: DescentSettings,
-    phases: Phases,
-    starts: Iterable[Tensor],
-    at_once: int,
+    settings: AttackSettings,
+    phases: Phases | None = None,
+    *,
+    starts: Iterable[Tensor] = (),
+    at_once: int | None = None,
+    seed: int = 0,
 ) -> DescentResult:
-    """`descend_repeatedly`, of so many examples at a time, so that memory holds no more than these and the result."""
-    parts = torch.arange(len(problem.start), device=problem.start.device).split(at_once)
-    if len(parts) <= 1:
-        return descend_repeatedly(model, problem, goal, settings, phases, starts)
-    starts = list(starts)
+    """Descend from the problem's start and, for examples without success, from further starts (E, D).
+
+    model: (N, 3, H, W) in [0, 1] → logits, with its preprocessing; used in eval mode and left as it was found. A later
+    start replaces an example's result only if it succeeds; steps add up. at_once: examples per round, so that memory
+    holds no more than theirs; None: all. seed: of the transformations that `settings.eot` asks for.
+    """
+    phases, begin = phases or Phases(), problem.start
+    expectation = ExpectationOverTransformations(settings.eot, generator(seed, "expectation"))
+    rounds = torch.arange(len(begin), device=begin.device).split(at_once or max(len(begin), 1))
+    starts = starts if len(rounds) <= 1 else list(starts)
     whole: dict[str, Tensor] = {}
-    for rows in progress(parts, "attack"):
-        part, begin = Part(problem, rows, problem.start[rows]), (start[rows] for start in starts)
-        result = descend_repeatedly(model, part, goal.of(rows), settings, phases, begin)
-        for item in fields(result):
-            found = getattr(result, item.name)
-            whole.setdefault(item.name, found.new_empty(len(problem.start), *found.shape[1:]))[rows] = found
+    for rows in progress(rounds, "attack") if len(rounds) > 1 else rounds:
+        part = problem if len(rounds) == 1 else Part(problem, rows, begin[rows])
+        best = _descend_once(model, part, goal.of(rows), settings, expectation, phases)
+        for start in starts:
+            left = torch.nonzero(~best.success).squeeze(1)
+            if not len(left):
+                break
+            rest = Part(problem, rows[left], start[rows[left]])
+            again = _descend_once(model, rest, goal.of(rows[left]), settings, expectation, phases)
+            better = left[again.success]
+            best.success_at[better] = (best.steps[left] + again.success_at)[again.success]
+            best.steps[left] += again.steps
+            for name in ("values", "images", "success", "cost", "predicted"):
+                getattr(best, name)[better] = getattr(again, name)[again.success]
+        if len(rounds) == 1:
+            return best
+        for item in fields(best):
+            result = getattr(best, item.name)
+            whole.setdefault(item.name, result.new_empty(len(begin), *result.shape[1:]))[rows] = result
     return DescentResult(**whole)
 
 
-def descend_repeatedly(
-    model: nn.Module, problem: Problem, goal: Goal, settings: DescentSettings, phases: Phases, starts: Iterable[Tensor]
-) -> DescentResult:
-    """`descend`, and again from other starts (E, D) for the examples that no descent has fooled yet.
-
-    What a later descent reaches counts where it fools; steps add up.
-    """
-    best = descend(model, problem, goal, settings, phases)
-    for start in starts:
-        left = torch.nonzero(~best.success).squeeze(1)
-        if not len(left):
-            break
-        again = descend(model, Part(problem, left, start[left]), goal.of(left), settings, phases)
-        better = left[again.success]
-        best.success_at[better] = (best.steps[left] + again.success_at)[again.success]
-        best.steps[left] += again.steps
-        for name in ("values", "images", "success", "cost", "predicted"):
-            getattr(best, name)[better] = getattr(again, name)[again.success]
-    return best
-
-
 @torch.enable_grad()
-def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSettings, phases: Phases) -> DescentResult:
-    """Step each example's values down the cost, summed over its views, until the goal is reached.
-
-    model: (N, 3, H, W) in [0, 1] → logits; used in eval mode and left as it was found. The forward pass that yields the
-    gradient also tells who is fooled, and only examples that go on are rendered.
-    """
+def _descend_once(
+    model: nn.Module,
+    problem: Problem,
+    goal: Goal,
+    settings: AttackSettings,
+    expectation: ExpectationOverTransformations,
+    phases: Phases,
+) -> DescentResult:
+    """Only examples that go on are rendered."""
     values = problem.start.detach().clone()
     active = torch.arange(len(values), device=values.device)
     steps, success_at, success = torch.zeros_like(active), torch.zeros_like(active), torch.zeros_like(active).bool()
@@ -170,21 +153,21 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
             rendered = problem.render(chosen, active)
             aim = goal.of(active)
             with phases("attack_classifier"):
-                seen = _classifier_pass(model, rendered.detach(), aim, batch_size)
-            (gradient,) = torch.autograd.grad(rendered, chosen, seen.gradient)
-            reached = aim.reached(seen.predicted)
+                now = _classifier_pass(model, rendered.detach(), aim, batch_size, expectation)
+            (gradient,) = torch.autograd.grad(rendered, chosen, now.gradient)
+            reached = aim.reached(now.predicted)
             if step == 0:
-                images, cost_before, success_before = rendered.detach().clone(), seen.cost, reached
+                images, cost_before, success_before = rendered.detach().clone(), now.cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
-            done = reached & (seen.gap >= settings.margin)
+            done = reached & (now.gap >= settings.margin)
             success_at[active[reached & ~success[active]]] = step
-            fell = seen.cost < cost[active]
+            fell = now.cost < cost[active]
             taken = done | fell if settings.shorten else torch.ones_like(done)
             best = done | torch.where(success[active], reached & fell, reached | taken)
             rows = torch.nonzero(best).squeeze(1)
             kept = active[rows]
             values[kept], images[kept] = candidate[kept], rendered.detach()[rows]
-            cost[kept], predicted[kept], success[kept] = seen.cost[rows], seen.predicted[rows], reached[rows]
+            cost[kept], predicted[kept], success[kept] = now.cost[rows], now.predicted[rows], reached[rows]
             place[active[taken]], slope[active[taken]] = candidate[active[taken]], gradient[taken]
             length[active[~taken]] /= 2
             active = active[~done]
@@ -198,24 +181,33 @@ def descend(model: nn.Module, problem: Problem, goal: Goal, settings: DescentSet
     )
 
 
-def _classifier_pass(model: nn.Module, images: Tensor, goal: Goal, batch_size: BatchSize) -> _Pass:
+class _Pass(NamedTuple):
+    """A classifier's pass over A examples. cost, gap: (A,), the sum and the least over views. predicted: (A, V), of the
+    images as they are. gradient: of the cost by the images (A, V, 3, H, W)."""
+
+    cost: Tensor
+    gap: Tensor
+    predicted: Tensor
+    gradient: Tensor
+
+
+def _classifier_pass(
+    model: nn.Module, images: Tensor, goal: Goal, batch_size: BatchSize, expectation: ExpectationOverTransformations
+) -> _Pass:
     views, flat = images.shape[1], images.flatten(0, 1)
     source, target = goal.source.flatten(), None if goal.target is None else goal.target.flatten()
     gradient = torch.empty_like(flat)
 
-    def preprocessed_model(part: slice) -> tuple[Tensor, Tensor, Tensor]:
+    def compute(part: slice) -> tuple[Tensor, Tensor, Tensor]:
         batch = flat[part].detach().requires_grad_(True)
         logits = model(batch)
+        expected = expectation(model, batch, logits)
         aim = source[part], None if target is None else target[part]
-        cost = adversarial_cost(logits, *aim)
+        cost = adversarial_cost(expected, *aim)
         (by_image,) = torch.autograd.grad(cost.sum(), batch)
         gradient[part] = by_image  # laid out as the images are, not as the network's channels
-        return cost.detach(), logits.detach().argmax(1), logit_gap(logits.detach(), *aim)
+        return cost.detach(), logit_gap(expected.detach(), *aim), logits.detach().argmax(1)
 
-    costs, predicted, gaps = zip(*batch_size.map(preprocessed_model, len(flat)), strict=True)
-    return _Pass(
-        torch.cat(costs).unflatten(0, (-1, views)).sum(1),
-        torch.cat(predicted).unflatten(0, (-1, views)),
-        torch.cat(gaps).unflatten(0, (-1, views)).amin(1),
-        gradient.unflatten(0, (-1, views)),
-    )
+    parts = zip(*batch_size.map(compute, len(flat)), strict=True)
+    costs, gaps, predicted = (torch.cat(part).unflatten(0, (-1, views)) for part in parts)
+    return _Pass(costs.sum(1), gaps.amin(1), predicted, gradient.unflatten(0, (-1, views)))

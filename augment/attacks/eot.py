@@ -1,4 +1,4 @@
-"""What a classifier is given of a rendered image: as it is, rounded to 8 bits, or as unsteady cameras might take it."""
+"""The image as a classifier gets it: rounded to 8 bits, or under random transformations, as of an unsteady camera."""
 
 import io
 from collections.abc import Callable
@@ -16,11 +16,11 @@ from renderer.image import clamp, to_bytes, to_unit
 
 @dataclass
 class EOTSettings:
-    """Random changes of an image over which an attack takes the expectation (Athalye et al. 2018, EOT).
+    """Random transformations of an image over which an attack takes the expectation (Athalye et al. 2018, EOT).
 
-    draws: of each image at each step, beside the image as it is; none by default. jitter: of the camera, up to this
-    share of the image's width, radians and share of the distance. exposure: stops, up or down. noise: standard
-    deviation of values. jpeg: the least quality, of which the greatest is 100.
+    draws: transformations of each image at each step, beside the image as it is; 0 for none. jitter: of the camera, at
+    most this fraction of the image's width, radians and fraction of the distance. exposure: stops, up or down. noise:
+    standard deviation of pixel values. jpeg: the least quality, of at most 100.
     """
 
     draws: int = 0
@@ -30,44 +30,46 @@ class EOTSettings:
     jpeg: int = 75
 
     def __post_init__(self) -> None:
-        require_range("attack.eot.draws", self.draws, 0, 1000)
+        require_range("draws", self.draws, 0, 1000)
         for name, most in (("jitter", 0.5), ("exposure", 5), ("noise", 1)):
-            require_range(f"attack.eot.{name}", getattr(self, name), 0, most)
-        require_range("attack.eot.jpeg", self.jpeg, 1, 100)
+            require_range(name, getattr(self, name), 0, most)
+        require_range("jpeg", self.jpeg, 1, 100)
 
 
 class Rounded(nn.Module):
-    """A model that is given 8 bits a channel; the derivative passes straight through."""
+    """A model whose images are rounded to 8 bits per channel; the derivative passes straight through."""
 
     def __init__(self, model: nn.Module):
         super().__init__()
         self.model = model
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.model(straight_through(images, lambda each: to_unit(to_bytes(each)).to(each)))
+        return self.model(straight_through(images, lambda exact: to_unit(to_bytes(exact)).to(exact)))
 
 
-class ExpectationOverTransformations(nn.Module):
-    """A model's mean log-probabilities over images and random changes of them, drawn anew each time; the derivative
-    passes straight through their compression."""
+class ExpectationOverTransformations:
+    """The mean of a model's log-probabilities over images and random transformations of them, drawn anew in each call;
+    the derivative passes straight through their compression."""
 
-    def __init__(self, model: nn.Module, settings: EOTSettings, draws: torch.Generator):
-        super().__init__()
-        self.model, self.settings, self._draws = model, settings, draws
+    def __init__(self, settings: EOTSettings, draws: torch.Generator):
+        self.settings, self._draws = settings, draws
 
-    def forward(self, images: Tensor) -> Tensor:
-        seen = [images, *(self._changed(images) for _ in range(self.settings.draws))]
-        return torch.stack([self.model(each).log_softmax(1) for each in seen]).mean(0)
+    def __call__(self, model: nn.Module, images: Tensor, logits: Tensor) -> Tensor:
+        """(N, C) of images (N, 3, H, W) with logits (N, C); the logits themselves, where nothing is to be drawn."""
+        if not self.settings.draws:
+            return logits
+        others = (model(self._transformed(images)) for _ in range(self.settings.draws))
+        return torch.stack([each.log_softmax(1) for each in (logits, *others)]).mean(0)
 
-    def _changed(self, images: Tensor) -> Tensor:
-        """Images (N, 3, H, W), each under changes of its own."""
+    def _transformed(self, images: Tensor) -> Tensor:
+        """Images (N, 3, H, W), each with its own transformation."""
         settings, count = self.settings, len(images)
         moved = _moved(images, settings.jitter * self._uniform(count, 4).to(images))
         brighter = clamp(moved * (2 ** (settings.exposure * self._uniform(count, 1, 1, 1))).to(images))
         noise = settings.noise * torch.randn(images.shape, generator=self._draws)
         noisy = clamp(brighter + noise.to(images))
         quality = int(torch.randint(settings.jpeg, 101, (), generator=self._draws))
-        return straight_through(noisy, lambda each: as_jpeg(each.cpu(), quality).to(each))
+        return straight_through(noisy, lambda exact: as_jpeg(exact.cpu(), quality).to(exact))
 
     def _uniform(self, *shape: int) -> Tensor:
         return 2 * torch.rand(*shape, generator=self._draws) - 1
@@ -90,8 +92,8 @@ def as_jpeg(images: Tensor, quality: int) -> Tensor:
 
 
 def _moved(images: Tensor, amounts: Tensor) -> Tensor:
-    """Images (N, 3, H, W) shifted, turned and enlarged by amounts (N, 4): shares of the width, across and down,
-    radians, share of the size; what comes in from outside is the border."""
+    """Images (N, 3, H, W) shifted, rotated and scaled by amounts (N, 4): fractions of the width across and down,
+    radians, fraction of the size; pixels from outside repeat the border."""
     across, down, angle, scale = amounts.unbind(1)
     cos, sin = (1 + scale) * angle.cos(), (1 + scale) * angle.sin()
     rows = torch.stack([cos, -sin, 2 * across, sin, cos, 2 * down], dim=1)

@@ -1,23 +1,25 @@
-"""Norm-balls in a space of parameters: the exact projection into them and uniform draws from them."""
+"""Norm-balls in a space of parameters: the exact projection into them, uniform draws from them, steps within them."""
 
 import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from renderer.errors import FACTOR, InputError, require_choice, require_range
+from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
 from renderer.light.convex import Ball, nearest_in_box
 
 NORMS = ("linf", "l2")
+STEPS = ("unit", "raw", "sign")
 
 
 class Domain(Protocol):
     """A convex set of values (D,)."""
 
     def __call__(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Its nearest points to values (A, D), within a ball whose centers are of it."""
+        """Its nearest points to values (A, D), within a ball whose centers it contains."""
 
 
 def anywhere(values: Tensor, within: Ball | None = None) -> Tensor:
@@ -26,34 +28,38 @@ def anywhere(values: Tensor, within: Ball | None = None) -> Tensor:
 
 
 @dataclass
-class NormBall:
-    """All values (D,) within a radius of a center; radius None is the whole space.
+class StepSettings:
+    """A norm-ball of values (D,) around where an attack begins, and the steps of gradient descent within it.
 
-    The paper's radii (Section 4.1): linf 0.1 per lighting coefficient and 0.002 per vertex axis.
-    InputError: unknown norm, radius below zero.
+    norm: "linf" or "l2". radius: of the ball; None is the whole space. The paper's radii (Section 4.1) are linf 0.1
+    per lighting coefficient and 0.002 per vertex axis. step: the gradient at unit L2 norm ("unit"), as it is ("raw"),
+    or its sign ("sign"). step_size: the step's factor.
+    InputError: an unknown norm or step, a radius below zero.
     """
 
     norm: str = "linf"
     radius: float | None = None
+    step: str = "unit"
+    step_size: float = 0.05
 
     def __post_init__(self) -> None:
-        require_choice("attack: norm", self.norm, NORMS)
-        require_range("attack: radius", self.radius, 0, FACTOR)  # no limit: null
+        require_choice("norm", self.norm, NORMS)
+        require_range("radius", self.radius, 0, FACTOR)
+        require_choice("step", self.step, STEPS)
+        require_range("step_size", self.step_size, 1 / LARGEST, FACTOR)
 
     def project(self, values: Tensor, center: Tensor, domain: Domain = anywhere) -> Tensor:
-        """The nearest points of what ball and domain share, in the Euclidean sense; values and center (A, D).
-
-        The domain holds the center.
-        """
+        """The nearest points, in the Euclidean sense, of the ball's intersection with a domain that contains its
+        center; values and center (A, D)."""
         return domain(values, within=None if self.radius is None else Ball(center, self.radius, self.norm))
 
     def sample(self, center: Tensor, generator: torch.Generator, used: Tensor | None = None) -> Tensor:
-        """A uniform draw around each center (A, D), on the generator's device. InputError where there is no radius.
+        """A uniform draw around each center (A, D), on the generator's device. InputError without a radius.
 
         used: (A, D) bool, the axes along which each is drawn; None for all.
         """
         if self.radius is None:
-            raise InputError("attack: radius=null has no uniform draw: set a radius to compare with random ones")
+            raise InputError("radius=None has no uniform draw: set a radius")
         if self.norm == "linf":
             offset = 2 * torch.rand(center.shape, generator=generator) - 1
         else:
@@ -61,8 +67,23 @@ class NormBall:
             axes: int | Tensor = center.shape[1]
             if used is not None:
                 direction, axes = direction * used.cpu(), used.cpu().sum(1, keepdim=True)
-            share = torch.rand(len(center), 1, generator=generator) ** (1 / axes)
-            offset = direction / direction.norm(dim=1, keepdim=True) * share
+            fraction = torch.rand(len(center), 1, generator=generator) ** (1 / axes)
+            offset = direction / direction.norm(dim=1, keepdim=True) * fraction
         if used is not None:
             offset = offset * used.cpu()
         return center + self.radius * offset.to(center)
+
+    def along(self, gradient: Tensor) -> Tensor:
+        """The step (A, D) for a gradient (A, D), to be subtracted; a gradient of zero gives a step of zero."""
+        return self.step_size * direction(gradient, self.step)
+
+
+def direction(gradient: Tensor, step: str) -> Tensor:
+    """The gradient (A, D) at unit L2 norm per example (a zero gradient stays zero), raw, or its sign."""
+    if step == "raw":
+        return gradient
+    if step == "sign":
+        return gradient.sign()
+    # Scaling by the largest entry first keeps tiny gradients from underflowing when squared.
+    tiny = torch.finfo(gradient.dtype).tiny
+    return F.normalize(gradient / gradient.abs().amax(1, keepdim=True).clamp(min=tiny), eps=tiny)

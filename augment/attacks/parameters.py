@@ -8,47 +8,17 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from augment.attacks.norm_ball import NormBall, anywhere
+from augment.attacks.norm_ball import StepSettings, anywhere
 from augment.scene import Conditions, Scene
-from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
+from renderer.errors import InputError
 from renderer.light.basis import EnvironmentBasis, LocalBasis, parts_of
 from renderer.light.convex import Ball, nearest_in_box
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
-
-STEPS = ("unit", "raw", "sign")
-
-
-@dataclass
-class StepSettings(NormBall):
-    """A norm-ball, and how far values go in it at once.
-
-    step: the gradient at unit L2 norm, as it is, or its sign. step_size: times that.
-    """
-
-    step: str = "unit"
-    step_size: float = 0.05
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("attack: step", self.step, STEPS)
-        require_range("attack: step_size", self.step_size, 1 / LARGEST, FACTOR)
-
-
-def direction(gradient: Tensor, step: str) -> Tensor:
-    """The gradient (A, D) as a step: unit L2 norm per example (a zero gradient stays zero), raw, or its sign."""
-    if step == "raw":
-        return gradient
-    if step == "sign":
-        return gradient.sign()
-    # Scaling by the largest entry first keeps tiny gradients from underflowing when squared.
-    tiny = torch.finfo(gradient.dtype).tiny
-    return F.normalize(gradient / gradient.abs().amax(1, keepdim=True).clamp(min=tiny), eps=tiny)
 
 
 class Parameter(ABC):
@@ -90,10 +60,6 @@ class Parameter(ABC):
     def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
         """See `augment.attacks.norm_ball.Domain`; by default there is no bound."""
         return anywhere(values, within)
-
-    def step(self, gradient: Tensor) -> Tensor:
-        """How far to go down a gradient (A, D)."""
-        return self.settings.step_size * direction(gradient, self.settings.step)
 
 
 TURBIDITY_UNIT = 4.0  # its domain spans 2 of them, as the zenith's and the azimuth's span about 1.6 and 6
@@ -312,7 +278,7 @@ class AttackProblem:
 
     def step(self, gradient: Tensor) -> Tensor:
         parts = zip(self.parameters, self.split(gradient), strict=True)
-        return torch.cat([parameter.step(part) for parameter, part in parts], dim=1)
+        return torch.cat([parameter.settings.along(part) for parameter, part in parts], dim=1)
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
         parts = zip(self.parameters, self.split(values), strict=True)

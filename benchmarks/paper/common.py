@@ -104,7 +104,8 @@ def attack_settings(kind: str, max_steps: int = 30, **more: Any) -> AttackSettin
         "geometry": StepSettings("linf", 0.002, "sign", 0.0005),
     }
     shorten = kind == "geometry"  # its gradient holds visibility fixed, so that whole steps may raise the cost
-    return AttackSettings(**{kind: steps[kind]}, allow_negative=True, shorten=shorten, max_steps=max_steps, **more)
+    paper = {"allow_negative": True, "margin": 0.0, "rounded": False}
+    return AttackSettings(**{kind: steps[kind]}, **paper | more, shorten=shorten, max_steps=max_steps)
 
 
 def scene_of(subject: SceneObject, size: int, light: str, views: Sequence[View]) -> Scene:

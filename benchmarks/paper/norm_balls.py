@@ -39,6 +39,8 @@ def settings_of(space: str, radius: float | None, steps: int) -> AttackSettings:
         **{"lighting" if space == "physical" else space: step},
         allow_negative=space != "physical",
         max_steps=steps,
+        margin=0.0,
+        rounded=False,
         shorten=space == "geometry",
         batch_size=common.BATCH,
     )

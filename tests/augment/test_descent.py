@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from augment.attacks.attack import AttackSettings
 from augment.attacks.criteria import Goal
-from augment.attacks.descent import DescentResult, DescentSettings, descend, descend_repeatedly
-from augment.attacks.norm_ball import NormBall
-from augment.attacks.parameters import STEPS, direction
+from augment.attacks.descent import DescentResult, descend
+from augment.attacks.norm_ball import STEPS, StepSettings, direction
 from augment.utils import Phases
 from renderer.errors import InputError
 
@@ -46,7 +46,7 @@ class LinearScene:
     start: Tensor
     rule: str = "unit"
     size: float = 0.05
-    ball: NormBall = field(default_factory=NormBall)
+    ball: StepSettings = field(default_factory=StepSettings)
     views: int = 1
     center: Tensor | None = None  # of the balls, where it is not the start
 
@@ -66,10 +66,15 @@ class LinearScene:
         return self.ball.project(values, self.center[examples])
 
 
+def settings_of(max_steps: int = 30, **others) -> AttackSettings:
+    """Until the classifier errs, unless a margin is given."""
+    return AttackSettings(max_steps=max_steps, **{"margin": 0.0, **others})
+
+
 def attack(model: nn.Module, problem, classes: Tensor, steps: int = 30, **settings) -> DescentResult:
     """Without a target."""
     goal = Goal(classes if classes.ndim == 2 else classes[:, None])
-    return descend(model, problem, goal, DescentSettings(steps, **settings), Phases())
+    return descend(model, problem, goal, settings_of(steps, **settings))
 
 
 def closed_form(step: str, size: float, max_steps: int, slope: Tensor, margin: float) -> tuple[Tensor, int, float]:
@@ -119,10 +124,10 @@ def test_on_a_linear_classifier_every_step_is_as_in_closed_form(step, size):
 @pytest.mark.parametrize("views", [1, 2])
 def test_the_lowest_point_of_a_sphere_is_reached_from_anywhere_in_it(views, step):
     """Also from starts off its center, where the steps first lead elsewhere: the way along the surface converges."""
-    ball, center = NormBall("l2", 0.4), random(8, DIMENSIONS, seed=2)
+    ball, center = StepSettings("l2", 0.4), random(8, DIMENSIONS, seed=2)
     problem = LinearScene(ball.sample(center, torch.Generator().manual_seed(0)), step, 0.3, ball, views, center)
     goal = Goal(torch.zeros(8, views, dtype=torch.int64), torch.ones(8, views, dtype=torch.int64))
-    result = descend(Linear(WEIGHT, bias=50.0), problem, goal, DescentSettings(120), Phases())
+    result = descend(Linear(WEIGHT, bias=50.0), problem, goal, settings_of(120))
     slope = (CAMERAS[:views] @ (WEIGHT[0] - WEIGHT[1])).sum(0)
     expected = center - 0.4 * slope / slope.norm()
     # Each step turns the values towards the end by a factor of at least 0.4 / 0.7, and 120 of them by 1e-29.
@@ -205,7 +210,7 @@ class Axis:
 def on_the_axis(steps: int, shorten: bool) -> DescentResult:
     start = torch.tensor([[1.0], [0.125], [0.75]], dtype=torch.float64)
     goal = Goal(torch.zeros(3, 1, dtype=torch.int64), torch.ones(3, 1, dtype=torch.int64))
-    return descend(Bowl(), Axis(start), goal, DescentSettings(steps, shorten), Phases())
+    return descend(Bowl(), Axis(start), goal, settings_of(steps, shorten=shorten))
 
 
 def test_a_step_that_does_not_lower_the_cost_is_taken_back_and_tried_at_half_its_length():
@@ -251,10 +256,7 @@ def test_with_shortened_steps_towards_the_least_likely_class_the_cost_never_rise
     network, start = small_network().eval(), 3 * random(9, DIMENSIONS, seed=3)
     logits = network(Waves(start).render(start, torch.arange(9))[:, 0])
     goal = Goal(logits.argmax(1, keepdim=True), logits.argmin(1, keepdim=True))
-    runs = [
-        descend(network, Waves(start, size=4.0), goal, DescentSettings(steps, shorten=True), Phases())
-        for steps in range(12)
-    ]
+    runs = [descend(network, Waves(start, size=4.0), goal, settings_of(steps, shorten=True)) for steps in range(12)]
     rejected = 0
     for before, after in itertools.pairwise(runs):
         assert (after.cost[~after.success] <= before.cost[~after.success]).all()
@@ -297,8 +299,8 @@ def small_attack(
     """Nine examples, of which some are fooled at once, on the way and never."""
     problem = LinearScene(3 * random(9, DIMENSIONS, seed=3), size=0.3, views=views)
     classes = (torch.arange(9) % 4)[:, None].expand(9, views)
-    settings = DescentSettings(8, shorten, batch_size, margin)
-    return problem, descend(small_network(), problem, Goal(classes), settings, Phases())
+    settings = settings_of(8, shorten=shorten, batch_size=batch_size, margin=margin)
+    return problem, descend(small_network(), problem, Goal(classes), settings)
 
 
 @pytest.mark.parametrize("views", [1, 2])
@@ -325,7 +327,7 @@ def test_every_example_is_attacked_as_if_alone(views, shorten):
         alone = Alone(problem.start[[row]], size=0.3, views=views)
         alone.row = row
         classes = torch.full((1, views), row % 4)
-        result = descend(small_network(), alone, Goal(classes), DescentSettings(8, shorten), Phases())
+        result = descend(small_network(), alone, Goal(classes), settings_of(8, shorten=shorten))
         for name in FIELDS:
             torch.testing.assert_close(getattr(result, name)[0], getattr(together, name)[row], rtol=0, atol=1e-12)
 
@@ -337,14 +339,14 @@ def test_the_same_attack_gives_the_same_to_the_bit():
 
 def test_restarts_go_on_with_those_that_are_left_and_keep_what_fools():
     """Against as many descents one by one: an example's result is that of the first that fools it, or of the first."""
-    center, ball, network = random(40, DIMENSIONS, seed=3), NormBall("linf", 0.5), Linear(WEIGHT)
-    goal, settings = Goal(torch.arange(40)[:, None] % 2), DescentSettings(2)
+    center, ball, network = random(40, DIMENSIONS, seed=3), StepSettings("linf", 0.5), Linear(WEIGHT)
+    goal, settings = Goal(torch.arange(40)[:, None] % 2), settings_of(2)
     starts = [ball.sample(center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
     problem = LinearScene(center, "sign", 0.1, ball)
-    result = descend_repeatedly(network, problem, goal, settings, Phases(), starts)
+    result = descend(network, problem, goal, settings, starts=starts)
     counted = problem.rendered.clone()
     problems = [LinearScene(start, "sign", 0.1, ball, center=center) for start in (center, *starts)]
-    single = [descend(network, each, goal, settings, Phases()) for each in problems]
+    single = [descend(network, each, goal, settings) for each in problems]
     assert torch.isclose((single[1].values - center).abs(), torch.tensor(0.5).double()).any()  # the ball holds some
     rounds = torch.stack([each.success for each in single]).long().argmax(0)
     assert set(rounds.tolist()) == {0, 1, 2} and not result.success.all()
@@ -442,7 +444,7 @@ def test_the_start_is_not_written_to():
 
 def test_the_classifiers_share_of_the_time_is_told():
     phases, goal = Phases(), Goal(torch.arange(2)[:, None])
-    descend(Linear(WEIGHT), LinearScene(random(2, DIMENSIONS, seed=2)), goal, DescentSettings(), phases)
+    descend(Linear(WEIGHT), LinearScene(random(2, DIMENSIONS, seed=2)), goal, settings_of(), phases)
     assert phases.take()["attack_classifier"] > 0
 
 
@@ -451,4 +453,4 @@ def test_the_classifiers_share_of_the_time_is_told():
 )
 def test_settings_that_make_no_attack_are_refused(change, message):
     with pytest.raises(InputError, match=message):
-        DescentSettings(**change)
+        settings_of(**change)

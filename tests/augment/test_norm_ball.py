@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
 from torch import Tensor
 
-from augment.attacks.norm_ball import NORMS, NormBall
+from augment.attacks.norm_ball import NORMS, StepSettings
 from renderer.errors import InputError
 from renderer.light.convex import nearest_in_box
 
@@ -36,7 +36,7 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
     """p is nearest to v exactly when it lies in the ball and (v - p)·(q - p) ≤ 0 for all of its points q; the largest
     of these products is (v - p)·(c - p) + radius × the dual norm of v - p."""
     values, center = torch.from_numpy(pair).to(dtype)
-    nearest = NormBall(name, radius).project(values, center)
+    nearest = StepSettings(name, radius).project(values, center)
     assert nearest.dtype == dtype
     moved, inward = (values - nearest).double(), (center - nearest).double()
     rounding = 16 * torch.finfo(dtype).eps * 200  # of differences of numbers up to 200
@@ -51,11 +51,11 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
 @settings(max_examples=60, deadline=None)
 def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
     values, center = torch.from_numpy(pair).to(dtype)
-    nearest = NormBall(name, radius).project(values, center)
+    nearest = StepSettings(name, radius).project(values, center)
     inside = norm((values - center).double(), name) <= radius * (1 - 1e-6)  # clear of the rounding at the surface
     assert torch.equal(nearest[inside], values[inside])
-    assert torch.equal(NormBall(name, 0.0).project(values, center), center)
-    assert torch.equal(NormBall(name, None).project(values, center), values)
+    assert torch.equal(StepSettings(name, 0.0).project(values, center), center)
+    assert torch.equal(StepSettings(name, None).project(values, center), values)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -72,7 +72,9 @@ def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with
     """The ends are distances from the center, downwards and upwards. No descent by scipy gets nearer."""
     (values, center), (down, up) = torch.from_numpy(pair).to(dtype), torch.from_numpy(ends).to(dtype)
     low, high = center - down, center + up
-    nearest = NormBall(name, radius).project(values[None], center[None], partial(nearest_in_box, low=low, high=high))[0]
+    nearest = StepSettings(name, radius).project(
+        values[None], center[None], partial(nearest_in_box, low=low, high=high)
+    )[0]
     rounding = 64 * torch.finfo(dtype).eps
     assert nearest.dtype == dtype and (low <= nearest).all() and (nearest <= high).all()
     offset = (nearest - center).double()[None]
@@ -97,7 +99,7 @@ def test_a_corner_is_reached_exactly():
     """Also where center plus offset rounds."""
     draws = torch.Generator().manual_seed(0)
     center, signs = torch.randn(50, 7, generator=draws), torch.randn(50, 7, generator=draws).sign()
-    corner = NormBall("linf", 0.1).project(center + 3 * signs, center)
+    corner = StepSettings("linf", 0.1).project(center + 3 * signs, center)
     assert torch.equal(corner, torch.where(signs > 0, center + 0.1, center - 0.1))
 
 
@@ -107,7 +109,7 @@ def test_draws_are_uniform_in_the_ball(name, dimensions):
     """(norm / radius)^D is uniform in [0, 1], and no direction is preferred: the means vanish and the covariances are
     those of the ball, r²/3 along each axis of a cube and r²/(D + 2) of a sphere, to five standard errors."""
     radius, center = 0.3, torch.linspace(-1, 1, dimensions, dtype=torch.float64).expand(DRAWS, -1)
-    offset = (NormBall(name, radius).sample(center, torch.Generator().manual_seed(1)) - center) / radius
+    offset = (StepSettings(name, radius).sample(center, torch.Generator().manual_seed(1)) - center) / radius
     assert norm(offset, name).max() <= 1 + 1e-6  # draws have float32's digits
     assert stats.kstest(norm(offset, name).numpy() ** dimensions, "uniform").pvalue > 0.01
     variance = 1 / 3 if name == "linf" else 1 / (dimensions + 2)
@@ -120,19 +122,19 @@ def test_draws_are_uniform_in_the_ball(name, dimensions):
 @pytest.mark.parametrize("name", NORMS)
 def test_draws_repeat_with_the_generator_and_leave_the_global_one(name):
     center, state = torch.zeros(5, 9), torch.random.get_rng_state()
-    first, again = (NormBall(name, 1.0).sample(center, torch.Generator().manual_seed(3)) for _ in range(2))
+    first, again = (StepSettings(name, 1.0).sample(center, torch.Generator().manual_seed(3)) for _ in range(2))
     assert torch.equal(first, again) and len(first.unique(dim=0)) == 5
     assert torch.equal(torch.random.get_rng_state(), state)
-    assert torch.equal(NormBall(name, 0.0).sample(center, torch.Generator()), center)
+    assert torch.equal(StepSettings(name, 0.0).sample(center, torch.Generator()), center)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: NormBall("l1", 1.0), "norm=l1: choose one of linf, l2"),
-        (lambda: NormBall("l2", -0.1), "radius=-0.1 must be at least 0"),
-        (lambda: NormBall("linf", math.nan), "radius=nan"),
-        (lambda: NormBall().sample(torch.zeros(1, 2), torch.Generator()), "radius=null has no uniform draw"),
+        (lambda: StepSettings("l1", 1.0), "norm=l1: choose one of linf, l2"),
+        (lambda: StepSettings("l2", -0.1), "radius=-0.1 must be at least 0"),
+        (lambda: StepSettings("linf", math.nan), "radius=nan"),
+        (lambda: StepSettings().sample(torch.zeros(1, 2), torch.Generator()), "radius=None has no uniform draw"),
     ],
 )
 def test_balls_and_draws_that_make_no_sense_are_refused(make, message):

@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from augment import reshading
+from augment.attacks.attack import AttackSettings
 from augment.attacks.criteria import Goal
-from augment.attacks.descent import DescentSettings, descend
+from augment.attacks.descent import descend
+from augment.attacks.norm_ball import STEPS, StepSettings, direction
 from augment.attacks.parameters import (
     PARAMETERS,
-    STEPS,
     Albedo,
     AttackProblem,
     Geometry,
@@ -24,11 +25,8 @@ from augment.attacks.parameters import (
     Pixels,
     Skylight,
     SkylightSettings,
-    StepSettings,
-    direction,
 )
 from augment.scene import Conditions, Scene
-from augment.utils import Phases
 from renderer.errors import InputError
 from renderer.light.environment import read_map, to_map, write_map
 from renderer.light.harmonics import project
@@ -154,7 +152,7 @@ def test_vertices_that_move_along_the_view_have_the_gradient_of_the_image_render
 
 def attack(model: torch.nn.Module, problem: AttackProblem, goal: Goal, steps: int) -> tuple[Tensor, Tensor]:
     """(values, images) that a descent of so many steps ends with."""
-    result = descend(model, problem, goal, DescentSettings(steps, batch_size=4), Phases())
+    result = descend(model, problem, goal, AttackSettings(max_steps=steps, margin=0.0, batch_size=4))
     return result.values, result.images
 
 

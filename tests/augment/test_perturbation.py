@@ -5,8 +5,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from augment.attacks.attack import AttackSettings
 from augment.attacks.criteria import Goal
-from augment.attacks.descent import DescentResult, DescentSettings, descend
+from augment.attacks.descent import DescentResult, descend
+from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import (
     Albedo,
     AttackProblem,
@@ -15,10 +17,8 @@ from augment.attacks.parameters import (
     Pixels,
     Skylight,
     SkylightSettings,
-    StepSettings,
 )
 from augment.scene import Scene
-from augment.utils import Phases
 from renderer.camera import orbit_cameras
 from renderer.light.harmonics import nonzero_coefficients
 from renderer.transfer import build_operators
@@ -30,7 +30,7 @@ FRONT, SIDE, BACK = orbit_cameras(3, 2.2)
 
 
 def attack(model: nn.Module, problem: AttackProblem, goal: Goal, steps: int, **settings) -> DescentResult:
-    return descend(model, problem, goal, DescentSettings(steps, **settings), Phases())
+    return descend(model, problem, goal, AttackSettings(max_steps=steps, margin=0.0, **settings))
 
 
 def towards(problem: AttackProblem, target: int | None = 1) -> Goal:

@@ -6,8 +6,9 @@ import torch
 from PIL import Image
 
 import augment
-from augment.attacks.adversary import Adversary, read_adversary, write_adversary
-from augment.attacks.parameters import AttackProblem, LampPlaces, LampPowers, Lighting, ProjectorPattern, StepSettings
+from augment.attacks.adversary import Adversary, reload, write_adversary
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters import AttackProblem, LampPlaces, LampPowers, Lighting, ProjectorPattern
 from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from augment.service import TrainingAttackSettings
@@ -80,7 +81,7 @@ def test_an_adversary_with_lights_in_the_scene_is_read_back_and_seen_by_mitsuba(
     assert (done.images - done.images_before).abs().max() > 0.05
     written = Adversary.of(done.problem.scene, 0, done.conditions, done.images_before[0], done.images[0])
     write_adversary(written, tmp_path)
-    found = read_adversary(tmp_path)
+    found = reload(tmp_path)
     assert torch.equal(found.light, written.light) and found.basis == written.basis
     torch.testing.assert_close(found.render(choose("numpy")), done.images[0], rtol=0, atol=1e-6)
     thrown, pattern = ProjectorSettings(6, power=2.0, pattern=str(tmp_path / "projector.png")).build()
@@ -162,7 +163,7 @@ def test_lamps_are_moved_within_their_ball_and_stand_where_they_ended_when_read_
     assert (reach > 0.1).all() and (reach <= 0.6 * (1 + 1e-5)).all()
     after = Adversary.of(done.problem.scene, 1, done.conditions, done.images_before[1], done.images[1])
     write_adversary(after, tmp_path)
-    found = read_adversary(tmp_path)
+    found = reload(tmp_path)
     (lamps,) = [part for _, part in parts_of(found.basis) if part.name == "lamps"]
     assert torch.equal(torch.tensor(lamps.positions), done.conditions.positions[1])
     torch.testing.assert_close(found.render(choose("numpy")), done.images[1], rtol=0, atol=1e-6)

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 import augment
-from augment.attacks.adversary import Adversary, read_adversary, write_adversary
-from augment.attacks.parameters import AttackProblem, Skylight, StepSettings
+from augment.attacks.adversary import Adversary, reload, write_adversary
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters import AttackProblem, Skylight
 from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from renderer.rasterizer import choose
@@ -83,7 +84,7 @@ def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_the_same_image(kinds
     for example in range(2):
         images = done.images_before[example], done.images[example]
         write_adversary(Adversary.of(done.problem.scene, example, done.conditions, *images), tmp_path)
-        seen = read_adversary(tmp_path).render(choose("numpy"))
+        seen = reload(tmp_path).render(choose("numpy"))
         torch.testing.assert_close(seen, done.images[example], rtol=0, atol=1 / 255)
 
 

@@ -8,9 +8,11 @@ import trimesh
 
 import renderer
 from augment import relighting
+from augment.attacks.attack import AttackSettings
 from augment.attacks.criteria import Goal
-from augment.attacks.descent import DescentSettings, descend
-from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting, StepSettings
+from augment.attacks.descent import descend
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting
 from augment.backgrounds import load_backgrounds
 from augment.build import build_scene, count_views
 from augment.objects import ObjectSettings, PropSettings, SceneObject, load_object
@@ -382,7 +384,7 @@ def test_a_new_basis_is_one_class_with_its_own_operators_gradients_and_norm_ball
     torch.nn.init.constant_(dark[1].weight, 0)
     with torch.no_grad():
         dark[1].weight[1], dark[1].bias[:] = -0.01, torch.tensor([5.0, 0.0])  # no darkness is enough
-    result = descend(dark, problem, goal, DescentSettings(5), Phases())
+    result = descend(dark, problem, goal, AttackSettings(max_steps=5, margin=0.0))
     lamps = result.values.view(3, 3)
     torch.testing.assert_close(lamps[:2], start[:2], rtol=0, atol=0)
     torch.testing.assert_close(lamps[2], torch.tensor([0.0, 0.05, 0.15], dtype=torch.float64), rtol=0, atol=1e-12)

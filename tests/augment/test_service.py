@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
-from augment.attacks.parameters import StepSettings
+from augment.attacks.norm_ball import StepSettings
 from augment.backgrounds import load_backgrounds
 from augment.labels import complementary_label
 from augment.objects import ObjectSettings, load_object

@@ -90,7 +90,7 @@ def test_an_adversary_is_rendered_again_and_gone_on_from(run, tmp_path, capsys):
 
 def test_success_against_radius_is_a_table_and_a_figure(run, tmp_path, capsys):
     two = "scene.meshes=[solid:orange:0,solid:orange:0]"
-    assert run("attack=lighting", "attack.checks=false", "scene.views=2", two, "attack.sweep=[1,0.01,0.2]") == 0
+    assert run("attack=lighting", "attack.checks=false", "scene.views=2", two, "attack.radius_scales=[1,0.01,0.2]") == 0
     assert capsys.readouterr().out.count("| lighting 0.2 ") == 2
     with open(tmp_path / "out" / "sweep.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -131,20 +131,20 @@ REFUSED = [
         "'paer' is not a class of the model: choose one, such as pear",
     ),
     (["transfer.classifiers=[squeezenet]"], "classifier=squeezenet is not known"),
-    (["attack=geometry", "transfer.meshes=[a.glb]"], "transfer.meshes: attack=geometry belongs to what was attacked"),
-    (["attack=pixels", "transfer.azimuths=[3]"], "transfer.azimuths: attack=pixels belongs to what was attacked"),
-    (["attack.sweep=[0.1,-1]"], "attack.sweep=-1.0 must be at least 1e-05"),
+    (["attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry cannot be transferred"),
+    (["attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels cannot be transferred"),
+    (["attack.radius_scales=[0.1,-1]"], "radius_scales=-1.0 must be at least 1e-05"),
     (["attack=lihgting"], "In 'attack': Could not load 'attack/lihgting'"),
     (["attack=[]"], "attack: name what to change"),
-    (["attack=lighting+skylight"], "attack: lighting and skylight both set the light: choose one of them"),
+    (["attack=lighting+skylight"], "lighting and skylight both set the light: choose one of them"),
     (["attack.lighting.radius=-1"], "radius=-1.0 must be at least 0"),
-    (["attack.restarts=1"], "attack.restarts draws from the norm-balls"),
+    (["attack.restarts=1"], "restarts draws from the norm-balls"),
     (["scene.views=0"], "scene.views: views=0 must be at least 1"),
     (["scene.backgrounds=[absent.png]"], "scene.backgrounds: absent.png does not exist"),
     (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
     (["target=[apple,pear]", "attack.shared=true"], "target=['apple', 'pear'] names 2 classes for 1 views"),
     (["classifier=alexnet"], "classifier=alexnet is not known: choose one of "),
-    (["attack.verify=blender"], "attack.verify=blender: choose one of reload, mitsuba"),
+    (["attack.verify=blender"], "verify=blender: choose one of reload, mitsuba"),
     (["reload=absent"], "absent/adversary.json does not exist: give a folder that an attack wrote"),
     (
         ["label=apple", "attack.force=false", "scene.search=0"],

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from augment.attacks.evaluate import Sweep
+from augment.attacks.evaluate import RadiusSweep
 from train.report.plots import COLORS, LINES, MARKERS
 from train.tables import aligned, format_fraction, fraction
 
@@ -16,13 +16,13 @@ TABLE, FIGURE = "sweep.csv", "sweep.png"
 ALL = "all"
 
 
-def curve(found: Mapping[str, Sweep]) -> list[dict[str, Any]]:
+def curve(found: Mapping[str, RadiusSweep]) -> list[dict[str, Any]]:
     """A record for each mesh (and all of several), method and radius: the success rate on examples that were correct
     before, with its 95 % Wilson interval; radii by the name of the attacked parameter."""
     together = {}
     if len(found) > 1:
         pooled = (torch.cat([getattr(each, method) for each in found.values()], dim=1) for method in METHODS)
-        together[ALL] = Sweep(next(iter(found.values())).radii, *pooled)
+        together[ALL] = RadiusSweep(next(iter(found.values())).radii, *pooled)
     return [
         {"mesh": mesh, "method": method, **radii, **fraction(int(success.sum()), len(success))}
         for mesh, sweep in {**found, **together}.items()
@@ -31,7 +31,7 @@ def curve(found: Mapping[str, Sweep]) -> list[dict[str, Any]]:
     ]
 
 
-def format_curve(sweep: Sweep) -> str:
+def format_curve(sweep: RadiusSweep) -> str:
     """One mesh's, a line per radius."""
     if not sweep.adversarial.numel():
         return "no example was correct before, so that there is no success against radius"

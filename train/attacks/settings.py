@@ -18,24 +18,22 @@ LIT = 2.0  # power of the default lamps whose places alone are attacked
 class AttackCommandSettings(AttackSettings):
     """shared: the views share what is attacked. force: go on where nothing is recognized. checks: see `Checks`.
 
-    sweep: radii to draw success against; see `augment.attacks.evaluate`.
+    radius_scales: of the radii to draw success against; see `augment.success_by_radius`.
     verify: what renders the adversaries anew from their files, "reload" or "mitsuba" or both joined by +; or None.
     """
 
     shared: bool = False
     force: bool = False
     checks: bool = True
-    sweep: list[float] = field(default_factory=list)
-    margin: float = 2.0
-    rounded: bool = True
+    radius_scales: list[float] = field(default_factory=list)
     verify: str | None = "reload"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_renderers(self.renderers)
-        require_range("attack.sweep: radii", len(self.sweep), 0, MOST_RADII)
-        for scale in self.sweep:
-            require_range("attack.sweep", scale, 1 / FACTOR, FACTOR)
+        require_range("radius_scales: their number", len(self.radius_scales), 0, MOST_RADII)
+        for scale in self.radius_scales:
+            require_range("radius_scales", scale, 1 / FACTOR, FACTOR)
 
     @property
     def renderers(self) -> list[str]:

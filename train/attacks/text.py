@@ -14,9 +14,8 @@ def format_attack(
     mesh: str, attacked: AttackResult, checks: Checks | None, rerender_checks: Sequence[RerenderCheck] = ()
 ) -> str:
     """A paragraph on one mesh's attack, without a newline at the end."""
-    result = attacked.descent
     kinds = "+".join(kind.name for kind in attacked.problem.parameters)
-    steps = result.steps[result.success & ~result.success_before].double()
+    steps = attacked.steps[attacked.success & ~attacked.success_before].double()
     lines = [
         f"{mesh}: {kinds} against {attacked.classifier.name}: {_success(attacked)}"
         + (f"; median of {steps.median():.0f} steps" if len(steps) else "")

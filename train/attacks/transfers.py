@@ -21,7 +21,7 @@ FILE = "transfer.jsonl"
 
 
 def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:
-    """The arguments of `AttackResult.transfer`; none where nothing is asked for. InputError: as the loaders, and where
+    """The arguments of `augment.transfer`; none where nothing is asked for. InputError: as the loaders, and where
     a classifier lacks a class."""
     asked, scene = settings.transfer, settings.scene
     named = [item if isinstance(item, dict) else {"classifier": item} for item in asked.classifiers]

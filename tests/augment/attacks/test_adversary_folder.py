@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import augment
-from augment.attacks.adversary import DESCRIPTION, Adversary, read_adversary, write_adversary
+from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
 from augment.attacks.parameters import PARAMETERS
 from augment.objects import SceneObject, on_ground, with_props
 from augment.scene import Example, Scene
@@ -63,7 +63,7 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
     )
     done = attacked(kinds, scene)
     write_adversary(adversary_of(done), tmp_path)
-    found = read_adversary(tmp_path)
+    found = reload(tmp_path)
     assert torch.equal(found.images, done.images[0]) and torch.equal(found.images_before, done.images_before[0])
     assert (done.images - done.images_before).abs().max() > 0.02
     limit = 1 / 255 if "albedo" in kinds else 1e-5
@@ -84,7 +84,7 @@ def test_company_and_table_are_never_attacked_not_after_they_are_read_back_eithe
         moved = (done.conditions.vertices - scene.vertices)[0]
         assert moved[shown.own_vertices].any() and not moved[~shown.own_vertices].any()
         write_adversary(adversary_of(done), folder)
-        found = read_adversary(folder)
+        found = reload(folder)
         torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=1e-5)
         assert points(found.shown, own=False) == points(item, own=False)
         scene = found.scene(SOFTWARE)
@@ -107,7 +107,7 @@ def test_exposure_gain_background_and_place_are_kept(tmp_path, perspective):
     objects = [replace(each, albedo_scale=0.6) for each in scene.objects]
     done = attacked({"albedo", "lighting"}, replace(scene, examples=[row], objects=objects, backgrounds=backgrounds))
     write_adversary(adversary_of(done), tmp_path)
-    found = read_adversary(tmp_path)
+    found = reload(tmp_path)
     assert torch.equal(found.background, backgrounds[1]) and found.cameras == row.cameras
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=1e-5)
 
@@ -149,7 +149,7 @@ DAMAGES = {
     "a key less": (described(image={"size": 8, "color": 1}), "does not describe an adversary"),
     "no size": (described(image={"size": 0}), "must be at least 1"),
     "another size": (described(image={"size": 9}), "has shape"),
-    "no cameras": (described(cameras=[]), "has no cameras"),
+    "no cameras": (described(cameras=[]), "cameras: there are none"),
     "a flat camera": (described(cameras=[{"polar": 0, "azimuth": 0, "width": 0}]), "width=0"),
     "no faces of its own": (described(own_faces=0), "own_faces=0 must be at least 1"),
     "more than all faces": (described(own_faces=10**6), "own_faces=1000000 must be at least 1 and at most"),
@@ -159,9 +159,8 @@ DAMAGES = {
         "distance=0 must be at least",
     ),
     "no gain": (described(albedo_scale=0), "albedo_scale=0.0 must be at least"),
-    "no mesh": (described(mesh="absent.glb"), "absent.glb does not exist"),
-    "no light": (described(light="absent.json"), "absent.json does not exist"),
-    "a number for a name": (described(mesh=3), "3 does not exist"),
+    "no mesh": (lambda folder: (folder / "mesh.glb").unlink(), "mesh.glb does not exist"),
+    "no light": (lambda folder: (folder / "light.json").unlink(), "light.json does not exist"),
     "too bright a background": (described(background=3), "give gray values"),
     "images cut short": (lambda folder: (folder / "after.npy").write_bytes(b"\\x93NUMPY"), "after.npy cannot be read"),
     "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy does not exist"),
@@ -177,7 +176,7 @@ DAMAGES = {
     "images of text": (lambda folder: np.save(folder / "after.npy", np.array(["a"])), "after.npy cannot be read"),
     "images of 1e300": (lambda folder: np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300)), "cannot be read"),
     "a size of NaN": (described(image={"size": float("nan")}), "size=nan must be"),
-    "no such lamps": (described(placed_lights=["lamps.json"]), "lamps.json does not exist"),
+    "no such lamps": (described(local_lights=["lamps"]), "lamps.json does not exist"),
 }
 
 
@@ -185,5 +184,5 @@ DAMAGES = {
 def test_a_damaged_folder_is_refused_in_one_sentence(folder, damage, message):
     damage(folder)
     with pytest.raises(InputError, match=message) as refused:
-        read_adversary(folder)
+        reload(folder)
     assert "\n" not in str(refused.value)

@@ -1,6 +1,7 @@
-"""What an attack sees of a classifier: 8 bits, and the mean over random changes."""
+"""Images as classifiers get them: of 8 bits, and under random transformations; success is by the former alone."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,10 +34,12 @@ def noise(*shape: int) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(0))
 
 
-def expected(**settings) -> tuple[ExpectationOverTransformations, Means]:
+def transformed(images: Tensor, seed: int = 0, **settings) -> tuple[Tensor, list[Tensor]]:
+    """The expectation, and the images that the model was given for it."""
     nothing = {"draws": 1, "jitter": 0.0, "exposure": 0.0, "noise": 0.0, "jpeg": 100}
+    expectation = ExpectationOverTransformations(EOTSettings(**nothing | settings), generator(seed))
     means = Means()
-    return ExpectationOverTransformations(means, EOTSettings(**nothing | settings), generator(0)), means
+    return expectation(means, images, means(images)), means.seen
 
 
 def test_a_model_is_given_bytes_and_its_derivative_passes_them_by():
@@ -48,39 +51,32 @@ def test_a_model_is_given_bytes_and_its_derivative_passes_them_by():
 
 
 def test_the_mean_is_of_log_probabilities_over_the_image_and_its_changes():
-    model, means = expected(draws=3, noise=0.3, exposure=1.0, jitter=0.2, jpeg=50)
     images = noise(4, 3, 16, 16)
-    found = model(images)
-    assert torch.equal(means.seen[0], images) and len(means.seen) == 4
-    assert all((means.seen[0] - each).abs().amax((1, 2, 3)).min() > 0.1 for each in means.seen[1:])
-    assert all(each.min() >= 0 and each.max() <= 1 for each in means.seen)
-    torch.testing.assert_close(
-        found, torch.stack([(30 * each.mean((2, 3))).log_softmax(1) for each in means.seen]).mean(0)
-    )
+    mean, seen = transformed(images, draws=3, noise=0.3, exposure=1.0, jitter=0.2, jpeg=50)
+    assert torch.equal(seen[0], images) and len(seen) == 4
+    assert all((images - other).abs().amax((1, 2, 3)).min() > 0.1 for other in seen[1:])
+    assert all(other.min() >= 0 and other.max() <= 1 for other in seen)
+    torch.testing.assert_close(mean, torch.stack([(30 * x.mean((2, 3))).log_softmax(1) for x in seen]).mean(0))
 
 
 def test_each_change_does_what_it_says(monkeypatch):
     monkeypatch.setattr(eot, "as_jpeg", lambda images, quality: images)
     images = 0.25 + 0.5 * noise(8, 3, 32, 32)
-    model, means = expected(exposure=0.5)
-    model(images)
-    stops = (means.seen[1].mean((1, 2, 3)) / images.mean((1, 2, 3))).log2()
+    _, (_, brighter) = transformed(images, exposure=0.5)
+    stops = (brighter.mean((1, 2, 3)) / images.mean((1, 2, 3))).log2()
     assert stops.abs().max() < 0.52 and stops.min() < -0.1 and stops.max() > 0.1
-    model, means = expected(noise=0.05)
-    model(images)
-    assert (means.seen[1] - images).std().item() == pytest.approx(0.05, rel=0.1)
+    _, (_, noisy) = transformed(images, noise=0.05)
+    assert (noisy - images).std().item() == pytest.approx(0.05, rel=0.1)
     ramp = torch.linspace(0, 1, 32).expand(64, 3, 32, 32)
-    model, means = expected(jitter=0.1)
-    model(ramp)
-    inner = (means.seen[1] - ramp)[..., 12:20, 12:20].mean((1, 2, 3))
+    _, (_, moved) = transformed(ramp, jitter=0.1)
+    inner = (moved - ramp)[..., 12:20, 12:20].mean((1, 2, 3))
     assert 0.05 < inner.abs().max() < 0.115  # a shift of a tenth of a ramp from 0 to 1, and a corner's turn
 
 
 def test_nothing_drawn_is_the_image_but_for_compression():
-    model, means = expected()
     images = noise(1, 3, 16, 16)
-    model(images)
-    torch.testing.assert_close(means.seen[1], as_jpeg(images, 100), rtol=0, atol=1e-6)
+    _, (_, compressed) = transformed(images)
+    torch.testing.assert_close(compressed, as_jpeg(images, 100), rtol=0, atol=1e-6)
 
 
 def test_jpeg_is_pillows():
@@ -96,7 +92,7 @@ def test_jpeg_is_pillows():
     ("key", "value"), [("draws", -1), ("jitter", 2.0), ("noise", float("nan")), ("exposure", 99.0), ("jpeg", 0)]
 )
 def test_settings_out_of_range_are_refused(key, value):
-    with pytest.raises(InputError, match=f"attack.eot.{key}={value} must be at least"):
+    with pytest.raises(InputError, match=f"^{key}={value} must be at least"):
         EOTSettings(**{key: value})
 
 
@@ -126,13 +122,28 @@ def test_what_fools_is_kept_where_the_margin_is_out_of_reach():
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES)
     scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")
     light = augment.StepSettings(step_size=0.05)
-    first = augment.attack(
-        classifier, scene, settings=augment.AttackSettings(lighting=light, allow_negative=True, max_steps=60)
-    )
-    further = augment.AttackSettings(lighting=light, allow_negative=True, max_steps=60, margin=1e4)
-    done = augment.attack(classifier, scene, settings=further)
+    settings = augment.AttackSettings(lighting=light, allow_negative=True, max_steps=60, margin=0.0)
+    first = augment.attack(classifier, scene, settings=settings)
+    done = augment.attack(classifier, scene, settings=replace(settings, margin=1e4))
     assert done.success.all() and done.steps.item() == 60
     assert done.descent.cost < first.descent.cost
+
+
+def test_success_is_by_the_image_itself_and_not_by_the_mean_over_transformations():
+    """Of a classifier that errs on noisy images alone."""
+
+    def smooth_or_rough(images: Tensor) -> Tensor:
+        roughness = (images[..., 1:] - images[..., :-1]).abs().mean((1, 2, 3))
+        return torch.stack([60 * (0.2 - roughness), 0 * roughness], dim=1)
+
+    scene = augment.build_scene([("solid:orange", "smooth")], 8, rasterizer="numpy")
+    classifier = augment.Classifier(smooth_or_rough, 8, ("smooth", "rough"))
+    settings = augment.AttackSettings(
+        lighting=augment.StepSettings(), max_steps=0, eot=EOTSettings(draws=4, jitter=0.0, exposure=0.0, noise=0.5)
+    )
+    result = augment.attack(classifier, scene, settings=settings)
+    assert result.descent.cost < -1  # the mean log-probability of the right class
+    assert not result.descent.success.any() and not result.success.any() and result.descent.predicted.item() == 0
 
 
 def test_expected_adversaries_survive_changes_that_others_do_not():
@@ -143,10 +154,11 @@ def test_expected_adversaries_survive_changes_that_others_do_not():
     for draws in (0, 8):
         changes = EOTSettings(draws=draws, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)
         light = augment.StepSettings(step_size=0.02)
-        settings = augment.AttackSettings(lighting=light, allow_negative=True, max_steps=100, eot=changes)
+        settings = augment.AttackSettings(
+            lighting=light, allow_negative=True, max_steps=100, margin=0.0, rounded=False, eot=changes
+        )
         done = augment.attack(classifier, scene, settings=settings)
-        others, means = ExpectationOverTransformations(Means(), EOTSettings(200, 0.2, 0.5, 0.1, 60), generator(1)), []
-        others(done.images[:, 0])
-        means = torch.cat([each.mean((2, 3)) for each in others.model.seen[1:]])
+        _, (_, *others) = transformed(done.images[:, 0], 1, draws=200, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)
+        means = torch.cat([image.mean((2, 3)) for image in others])
         survived.append((means.argmax(1) != 0).double().mean().item())
     assert survived[1] > survived[0] + 0.1

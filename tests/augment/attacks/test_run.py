@@ -55,7 +55,7 @@ def test_what_is_judged_has_the_shadows_of_the_shape_and_the_colors_that_leave(c
     settings = augment.AttackSettings(**moved, max_steps=2)
     attacked = augment.attack(classifier, scene, settings=settings, force=True)
     held = attacked.problem.images(attacked.descent.values)
-    rerender_checks = {each.version: each for each in attacked.save(tmp_path)}
+    rerender_checks = {each.version: each for each in augment.save(attacked, tmp_path)}
     assert (held - attacked.images).abs().max() > 0.5 / 255
     assert rerender_checks["reload"].largest.max() < 0.1 / 255
 
@@ -68,9 +68,9 @@ def test_all_kinds_keep_to_their_norm_balls_beside_a_baseline_at_random(classifi
     )
     moved = (attacked.descent.values - attacked.problem.start).abs()
     assert 0.009 < moved.max() <= 0.01 + 1e-6
-    checks = attacked.check()
+    checks = augment.check(attacked)
     assert isinstance(checks, Checks) and checks.cost < checks.cost_before
-    attacked.save(tmp_path / "new", checks)
+    augment.save(attacked, tmp_path / "new", checks)
     *lines, last = [json.loads(line) for line in (tmp_path / "new" / "attack.jsonl").read_text().splitlines()]
     assert lines[0]["largest_change"].keys() == kinds.keys() and last["checks"]["random_search"] == checks.random_search
     shape = load_mesh(tmp_path / "new" / "example_000" / "mesh.glb")
@@ -91,7 +91,7 @@ def test_whatever_is_attacked_the_light_is_one_that_something_can_emit_unless_an
     assert torch.equal(lights, scene.lights) != physical
     images = [attacked.problem.images(values) for values in (attacked.problem.start, attacked.descent.values)]
     assert torch.equal(images[0], attacked.images_before) and torch.equal(images[1], attacked.images)
-    attacked.save(tmp_path)
+    augment.save(attacked, tmp_path)
     assert (tmp_path / "example_000" / "light.exr").is_file() == physical
 
 

@@ -6,7 +6,7 @@ import torch
 
 import augment
 from augment.attacks.attack import AttackResult
-from augment.attacks.parameters import StepSettings
+from augment.attacks.norm_ball import StepSettings
 from renderer.errors import InputError
 
 CLASSES, SIZE = ("orange", "lime", "sky"), 12
@@ -24,7 +24,7 @@ def attacked(criterion=None, **kinds: StepSettings) -> AttackResult:
     scene = augment.build_scene(
         [("solid:orange", "orange")], SIZE, 2, backgrounds=[0.4], light="st_peters", exposure=0.5
     )
-    settings = augment.AttackSettings(**kinds, allow_negative=True, max_steps=20)
+    settings = augment.AttackSettings(**kinds, allow_negative=True, margin=0.0, rounded=False, max_steps=20)
     found = augment.attack(network(), scene, criterion, settings)
     assert found.success.all()
     return found
@@ -41,7 +41,7 @@ KINDS = {
 @pytest.mark.parametrize("kinds", [["lighting"], ["geometry", "albedo", "lighting"], ["pixels"]])
 def test_where_nothing_is_another_the_answers_are_the_same(kinds):
     done = attacked(**{kind: KINDS[kind] for kind in kinds})
-    (found,) = done.transfer([network()])
+    (found,) = augment.transfer(done, [network()])
     torch.testing.assert_close(found.before, done.logits_before, rtol=0, atol=1e-4)
     torch.testing.assert_close(found.after, done.logits, rtol=0, atol=1e-4)
     assert found.clean_correct.all() and found.success.all() and found.kind == "network"
@@ -49,19 +49,19 @@ def test_where_nothing_is_another_the_answers_are_the_same(kinds):
 
 def test_another_network_sees_a_render_at_its_size_and_has_its_own_order_of_classes():
     done = attacked(criterion=augment.Targeted("sky"), lighting=LIGHT)
-    (found,) = done.transfer([network(("sky", "orange", "lime"), size=3 * SIZE)])
+    (found,) = augment.transfer(done, [network(("sky", "orange", "lime"), size=3 * SIZE)])
     assert (found.after.argmax(2) == 0).all() and found.clean_correct.all() and found.success.all()
     finer = augment.build_scene([("solid:orange", "orange")], 3 * SIZE, 2, backgrounds=[0.4])
     images = finer.render(done.conditions, torch.arange(2))
     torch.testing.assert_close(found.after, network(found.classes, 3 * SIZE)(images[:, 0])[:, None], rtol=0, atol=1e-4)
     with pytest.raises(InputError, match="'sky' is not a class of the model"):
-        next(done.transfer([network(("orange", "lime"))]))
+        augment.transfer(done, [network(("orange", "lime"))])
 
 
 def test_other_sides_and_other_meshes_are_those_of_a_scene_with_them():
     done = attacked(lighting=LIGHT)
     apple = augment.build_scene([("solid:apple", "lime")], SIZE, 2, backgrounds=[0.4])
-    turned, other = done.transfer(azimuths=[-30.0], objects=apple.objects)
+    turned, other = augment.transfer(done, azimuths=[-30.0], objects=apple.objects)
     assert (turned.kind, turned.name, other.kind) == ("azimuth", "-30°", "mesh")
     scene = done.problem.scene
     cameras = [replace(row.cameras[0], azimuth=row.cameras[0].azimuth - math.pi / 6) for row in scene.examples]
@@ -76,7 +76,7 @@ def test_only_what_was_recognized_and_then_fooled_is_shown():
     done = attacked(lighting=LIGHT)
     before = done.logits_before.clone()
     before[0] = -before[0]  # as if the first had been taken for something else
-    (found,) = replace(done, logits_before=before).transfer([network()])
+    (found,) = augment.transfer(replace(done, logits_before=before), [network()])
     torch.testing.assert_close(found.after, done.logits[1:], rtol=0, atol=1e-4)
-    (none,) = replace(done, logits_before=-done.logits_before).transfer([network()])
+    (none,) = augment.transfer(replace(done, logits_before=-done.logits_before), [network()])
     assert none.after.shape == (0, 1, 3) and not len(none.success)

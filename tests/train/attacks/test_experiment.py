@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
+import augment
 from augment.attacks import attack
 from augment.attacks.attack import AttackResult
 from augment.attacks.criteria import adversarial_cost
-from augment.attacks.descent import descend_in_parts
+from augment.attacks.descent import descend
 from augment.attacks.evaluate import Checks
 from augment.attacks.parameters import PARAMETERS
 from augment.classifiers import Classifier
@@ -145,12 +146,11 @@ def test_restarts_are_within_the_ball_and_follow_from_the_seed(monkeypatch):
     def starts(seed: int) -> Tensor:
         drawn = []
 
-        def recorded(*arguments):
-            *rest, each, at_once = arguments
-            drawn.extend(each)
-            return descend_in_parts(*rest, drawn, at_once)
+        def recorded(*arguments, starts, **others):
+            drawn.extend(starts)
+            return descend(*arguments, starts=drawn, **others)
 
-        monkeypatch.setattr(attack, "descend_in_parts", recorded)
+        monkeypatch.setattr(attack, "descend", recorded)
         done = attacked(f"seed={seed}", "attack.restarts=2", "attack.lighting.radius=0.02", "attack.max_steps=0")
         return torch.stack(drawn) - done.problem.start
 
@@ -194,15 +194,15 @@ def test_a_class_whose_name_is_a_number_is_a_target():
 
 
 REFUSED = [
-    (["attack=[lighting,skylight]"], r"attack: lighting and skylight both set the light: choose one of them"),
-    (["attack.lighting.radius=-1"], r"attack: radius=-1.0 must be at least 0"),
-    (["attack.lighting.norm=l3"], r"attack: norm=l3: choose one of linf, l2"),
+    (["attack=[lighting,skylight]"], r"lighting and skylight both set the light: choose one of them"),
+    (["attack.lighting.radius=-1"], r"radius=-1.0 must be at least 0"),
+    (["attack.lighting.norm=l3"], r"norm=l3: choose one of linf, l2"),
     (["attack.lighting.step=long"], r"step=long: choose one of unit, raw, sign"),
     (["attack.lighting.step_size=0"], r"step_size=0.0 must be at least"),
-    (["attack.restarts=2"], r"attack.restarts draws from the norm-balls: set the radius of every kind, or restarts=0"),
-    (["attack.restarts=-1"], r"attack.restarts=-1 must be at least 0"),
-    (["attack.max_steps=-1"], r"attack: max_steps=-1 must be at least 0"),
-    (["attack.batch_size=0"], r"attack: batch_size=0 must be at least 1"),
+    (["attack.restarts=2"], r"restarts draws from the norm-balls: set the radius of every parameter, or restarts=0"),
+    (["attack.restarts=-1"], r"restarts=-1 must be at least 0"),
+    (["attack.max_steps=-1"], r"max_steps=-1 must be at least 0"),
+    (["attack.batch_size=0"], r"batch_size=0 must be at least 1"),
     (["scene.views=0"], r"scene.views=0 must be at least 1"),
     (["scene.polar=1e30"], r"scene.polar=1e\+30 must be at least 0 and at most 180"),
     (["scene.azimuth=inf"], r"scene.azimuth=inf must be at least -360 and at most 360"),
@@ -216,7 +216,7 @@ REFUSED = [
     (["attack.max_steps=many"], r"attack.max_steps: Value 'many' of type 'str' could not be converted to Integer"),
     (["label=mango"], r"classifier=by_color: 'mango' is not a class of the model: choose one, such as "),
     (["target=mango"], r"classifier=by_color: 'mango' is not a class of the model: choose one, such as "),
-    (["target=[lime,sky]"], r"target=\['lime', 'sky'\] names 2 classes for 1 views .*: give as many, and"),
+    (["target=[lime,sky]"], r"target=\['lime', 'sky'\] names 2 classes for 1 views .*: give one class per view, and"),
     (["target=[lime,sky]", "scene.views=2"], r"names 2 classes for 1 views"),
     (["target=[lime]", "scene.views=2", "attack.shared=true"], r"names 1 classes for 2 views"),
     (["target=[lime,mango]", "scene.views=2", "attack.shared=true"], r"'mango' is not a class of the model"),
@@ -282,13 +282,13 @@ def test_a_mesh_that_is_not_recognized_is_refused_with_the_best_answers_unless_f
         attacked("scene.views=2", classifier=deaf)
     assert str(refused.value) == (
         f"2 of 2 images of solid:orange:0 are not recognized as 'orange' before any attack (the first: {best}): "
-        "change the scene, or set attack.force=true"
+        "change the scene, or set force=true"
     )
     done = attacked("scene.views=2", "attack.force=true", "attack.max_steps=1", classifier=deaf)
     assert done.descent.success_before.all() and not done.descent.steps.any()
     assert done.descent.zero_gradient.all()
     assert format_attack("mesh", done, None).startswith("mesh: lighting against callable: none of 2 examples was")
-    found = done.check()
+    found = augment.check(done)
     assert (found.success, found.random_search, set(found.success_by_steps.values())) == (0, 0, {0})
 
 
@@ -328,7 +328,7 @@ def test_what_is_attacked_stands_in_the_scene_without_being_named(kind):
 
 def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
     done = attacked("attack.max_steps=3", "scene.backgrounds=[0.3,0.5,0.7]", "attack.lighting.step_size=0.1")
-    found = done.check()
+    found = augment.check(done)
     assert found.cost_before == pytest.approx(float(done.descent.cost_before.mean()))
     assert found.cost == pytest.approx(float(done.descent.cost.mean())) and found.cost < found.cost_before
     assert found.cost_fell == 1 and found.zero_gradient == 0 and 0 <= found.random_search <= 1
@@ -336,14 +336,14 @@ def test_checks_see_that_the_cost_falls_and_that_more_steps_fool_more():
     assert list(found.success_by_steps) == [3, 9, 30]
     # A longer descent repeats the shorter one: nothing here is drawn.
     assert shares == sorted(shares) and shares[0] == found.success < shares[-1] == 1
-    assert found == done.check()
+    assert found == augment.check(done)
 
 
 def test_checks_count_what_fools_within_the_steps_also_where_a_margin_sends_it_on():
     done = attacked(
         "attack.max_steps=3", "attack.margin=100", "attack.allow_negative=true", "attack.lighting.step_size=0.2"
     )
-    found = done.check()
+    found = augment.check(done)
     assert found.success == 1 and found.success_by_steps == {3: 1, 9: 1, 30: 1}
 
 
@@ -357,7 +357,7 @@ def test_random_search_that_does_as_well_is_a_warning():
 
     network = Classifier(narrow, SIZE, CLASSES[:2])
     done = attacked("attack.lighting.radius=0.1", "attack.max_steps=8", classifier=network)
-    found = done.check()
+    found = augment.check(done)
     assert not done.descent.success_before.any() and found.success == found.random_search == 1
     assert found.warnings == ["random search does as well or better"]
 

@@ -7,9 +7,10 @@ import pytest
 import torch
 import trimesh
 
+import augment
 from augment.attacks.adversary import MAP_HEIGHT
 from augment.attacks.attack import AttackResult
-from augment.attacks.files import LINES, write_files
+from augment.attacks.files import LINES
 from augment.classifiers import Classifier
 from renderer.io.mesh_damage import mesh_damage
 from renderer.io.mitsuba import mitsuba_map
@@ -39,14 +40,14 @@ def attacked(*overrides: str) -> AttackResult:
 
 def written(done: AttackResult, folder: Path) -> list[dict]:
     """The lines."""
-    write_files(done, None, folder)
+    augment.save(done, folder)
     return [json.loads(line) for line in (folder / LINES).read_text().splitlines()]
 
 
 def test_each_example_has_a_line_and_a_last_one_holds_the_checks(tmp_path):
     done = attacked("scene.backgrounds=[0.4,0.6]", "target=lime")
-    checks = done.check()
-    write_files(done, checks, tmp_path)
+    checks = augment.check(done)
+    augment.save(done, tmp_path, checks)
     *lines, last = [json.loads(line) for line in (tmp_path / LINES).read_text().splitlines()]
     by_steps = {str(steps): share for steps, share in checks.success_by_steps.items()}
     assert last == {"checks": asdict(checks) | {"success_by_steps": by_steps}, "warnings": checks.warnings}
@@ -71,7 +72,7 @@ def test_the_image_shows_the_light_that_the_attack_has_changed(tmp_path, monkeyp
     """All of it, a pattern included."""
     panels = []
     monkeypatch.setattr("augment.attacks.files.save_figure", lambda *sides: panels.extend(sides[:2]))
-    write_files(attacked(f"attack={kind}"), None, tmp_path)
+    augment.save(attacked(f"attack={kind}"), tmp_path)
     spheres = [panel.spheres for panel in panels if panel.spheres is not None]
     assert len(spheres) == lights and (not lights or (spheres[0] != spheres[1]).any())
 
