@@ -28,7 +28,8 @@ def result() -> augment.AttackResult:
     """As in the example of `augment.attack`."""
     classifier = augment.Classifier(logits, size=8, classes=["orange", "other"])
     scene = augment.build_scene([("solid:orange", "orange")], classifier.size)
-    settings = augment.AttackSettings(lighting=augment.StepSettings(step_size=0.5), max_steps=20)
+    light = augment.StepSettings(step_size=0.5)
+    settings = augment.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
     return augment.attack(classifier, scene, settings=settings)
 
 

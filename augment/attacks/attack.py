@@ -172,7 +172,8 @@ def attack(
     ...     return torch.stack([mean, 0.3 + 0 * mean], dim=1)
     >>> classifier = augment.Classifier(logits, size=8, classes=["orange", "other"])
     >>> scene = augment.build_scene([("solid:orange", "orange")], classifier.size)
-    >>> settings = augment.AttackSettings(lighting=augment.StepSettings(step_size=0.5), max_steps=20)
+    >>> light = augment.StepSettings(step_size=0.5)
+    >>> settings = augment.AttackSettings(lighting=light, max_steps=20, allow_negative=True)
     >>> result = augment.attack(classifier, scene, settings=settings)
     >>> result.success, result.images.shape
     (tensor([True]), torch.Size([1, 1, 3, 8, 8]))
