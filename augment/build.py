@@ -129,6 +129,13 @@ class RendererSettings:
     bounces: int = 0
     cache: str | None = "auto"
 
+    def __post_init__(self) -> None:
+        self.image(size=1)  # which checks them
+
+    def image(self, size: int) -> ImageSettings:
+        """The settings of an image of `size` pixels per side."""
+        return ImageSettings(size, self.samples, self.encoding, self.normals, self.shadows, self.bounces)
+
 
 Shown = str | Path | Mesh
 Member = ObjectSettings | tuple[Shown, str]
@@ -167,7 +174,6 @@ def build_scene(
         operators = OperatorCache(cache_folder(renderer.cache)) if renderer else OperatorCache()
     shown = replace(scene or SceneSettings(), views=views, **_among(options, SCENE))
     drawn = replace(renderer or RendererSettings(), **_among(options, RENDERER))
-    settings = ImageSettings(size, drawn.samples, drawn.encoding, drawn.normals, drawn.shadows, drawn.bounces)
     environment: Any = load_light(shown.light) if isinstance(shown.light, str) else shown.light
     local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
     basis, lights = with_local_lights(environment * shown.exposure, local)
@@ -177,7 +183,7 @@ def build_scene(
         orbit_cameras(views, shown.width, math.radians(shown.polar), math.radians(shown.azimuth), fov),
         load_backgrounds(shown.backgrounds, size),
         lights.to(as_device(device)),
-        settings,
+        drawn.image(size),
         choose(drawn.rasterizer) if isinstance(drawn.rasterizer, str) else drawn.rasterizer,
         operators,
         shared=shared,

@@ -14,7 +14,7 @@ from augment.labels import complementary_label
 from augment.scene import Scene
 from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed
-from renderer.cache import OperatorCache, TensorCache, cache_folder
+from renderer.cache import TensorCache, cache_folder
 from renderer.errors import InputError, require_choice
 from renderer.image import LARGEST_SIZE
 from renderer.light.harmonics import nonzero_coefficients
@@ -145,14 +145,14 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
     for key, item in settings.objects.items():
         if item.label != OTHER:
             class_index(data.classes, item.label, f"label of {key}")
-    choices, start = settings.renderer.choices, time.perf_counter()
-    console.info("rasterizer: %s", choices["rasterizer"].description)
-    objects = list(settings.objects.values())
-    scene = build_scene(objects, data.size, settings.views, **settings.scene.choices, **choices, device=device)
+    start, objects = time.perf_counter(), list(settings.objects.values())
+    chosen = {"scene": settings.scene, "renderer": settings.renderer}
+    scene = build_scene(objects, data.size, settings.views, **chosen, device=device)
+    console.info("rasterizer: %s", scene.rasterizer.description)
     if not settings.augment.relights:
         console.info("operators: none are kept, since views are rasterized in every epoch")
         return scene
-    cache: OperatorCache = choices["operators"]
+    cache = scene.operators
     covered = sum(len(stack.pixels) for stack in scene.stacks) / len(scene.stacks)
     console.info(
         f"operators: {cache.views} views for {len(scene)} examples, {cache.views - cache.built} from the cache, "

@@ -1,21 +1,17 @@
 """The schema of conf/train.yaml: the types, ranges, keys and defaults of a run."""
 
 import re
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from augment.build import LampsSettings, ProjectorSettings, count_views
+from augment.build import RendererSettings, SceneSettings, count_views
 from augment.objects import ObjectSettings, PropSettings
 from augment.service import AugmentationSettings
-from renderer.cache import OperatorCache, cache_folder
-from renderer.camera import MOST_VIEWS
-from renderer.errors import FACTOR, InputError, require_range
+from renderer.errors import InputError, require_range
 from renderer.image import LARGEST_SIZE
-from renderer.rasterizer import choose
-from renderer.subdivision import MOST_VERTICES
 from train.configuration import read_settings
 from train.networks import WIDERESNET
 from train.recipe import TrainSettings
@@ -25,7 +21,6 @@ PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a fold
 RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
 SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, LARGEST_SEED = 10**6, 2**63 - 1
-COUNTED = ("meshes", "views")  # what a scene shows and how often; the rest says how
 
 
 @dataclass
@@ -50,40 +45,6 @@ class DataSettings:
 
 
 @dataclass
-class SceneSettings:
-    """What is rendered, as `augment.build_scene` takes it. meshes: each a file, a `solid:NAME`, or a mapping with
-    ObjectSettings' keys.
-    """
-
-    meshes: list[Any] = field(default_factory=lambda: ["solid:orange:0"])
-    backgrounds: list[Any] = field(default_factory=lambda: [0.5])
-    views: int | None = 1
-    polar: float = 60.0
-    azimuth: float = 0.0
-    width: float = 2.0
-    fov: float | None = None
-    vertices: int = 0
-    light: str = "grace"
-    exposure: float = 1.0
-    projector: ProjectorSettings | None = None
-    lamps: LampsSettings | None = None
-    ground: list[float] | None = None
-
-    def __post_init__(self) -> None:
-        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
-        require_range("views", self.views, 1, MOST_VIEWS)
-        require_range("vertices", self.vertices, 0, MOST_VERTICES)
-        require_range("polar", self.polar, 0, 180)
-        require_range("azimuth", self.azimuth, -360, 360)
-        require_range("fov", self.fov, 0.1, 150)
-
-    @property
-    def choices(self) -> dict[str, Any]:
-        """Arguments of `augment.build_scene`: all but the meshes and the number of views."""
-        return {each.name: getattr(self, each.name) for each in fields(SceneSettings) if each.name not in COUNTED}
-
-
-@dataclass
 class TrainingSceneSettings(SceneSettings):
     """hard_negatives: like meshes, of other classes than `label`; of no class, unless a mapping names one."""
 
@@ -96,30 +57,6 @@ class TrainingSceneSettings(SceneSettings):
     def objects(self) -> int:
         """The number of meshes and hard negatives; 0 without a mesh."""
         return len(self.meshes) + len(self.hard_negatives) if self.meshes else 0
-
-
-@dataclass
-class RendererSettings:
-    """rasterizer: auto, opengl, numba or numpy. samples per pixel side. encoding: linear or srgb. normals: flat
-    or smooth.
-
-    shadows, bounces: see `renderer.render`. cache: the folder of what is rendered once, auto or
-    None; see `renderer.cache.cache_folder`.
-    """
-
-    rasterizer: str = "auto"
-    samples: int = 2
-    encoding: str = "linear"
-    normals: str = "smooth"
-    shadows: bool = False
-    bounces: int = 0
-    cache: str | None = "auto"
-
-    @property
-    def choices(self) -> dict[str, Any]:
-        """Arguments of `augment.build_scene`."""
-        drawn = {name: getattr(self, name) for name in ("samples", "encoding", "normals", "shadows", "bounces")}
-        return {**drawn, "rasterizer": choose(self.rasterizer), "operators": OperatorCache(cache_folder(self.cache))}
 
 
 @dataclass

@@ -34,8 +34,8 @@ def scene_of(item: ObjectSettings, settings: AttackExperimentSettings, size: int
         size,
         settings.scene.views,
         shared=settings.attack.shared,
-        **settings.scene.choices,
-        **settings.renderer.choices,
+        scene=settings.scene,
+        renderer=settings.renderer,
         device=device,
     )
 

@@ -5,10 +5,10 @@ from typing import Any
 
 from augment.attacks.attack import AttackSettings
 from augment.attacks.evaluate import require_renderers, require_transferable
-from augment.build import LampsSettings, ProjectorSettings
+from augment.build import LampsSettings, ProjectorSettings, RendererSettings, SceneSettings
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
-from train.settings import LARGEST_SEED, RendererSettings, SceneSettings
+from train.settings import LARGEST_SEED
 
 MOST_RADII = 100
 LIT = 2.0  # power of the default lamps whose places alone are attacked
