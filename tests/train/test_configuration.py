@@ -13,7 +13,6 @@ from augment.variation import VariationSettings
 from renderer.errors import InputError, require_range
 from train.attacks.settings import AttackExperimentSettings
 from train.configuration import as_override, compose, dotted, quoted, read_settings
-from train.lab.folder import LabSettings
 from train.run import load_data, prepare
 from train.settings import ExperimentSettings
 
@@ -23,7 +22,6 @@ from train.settings import ExperimentSettings
     [
         ("train", ExperimentSettings, ["experiment=paper", "data=shapes"], {"run", "data.images"}),
         ("attack", AttackExperimentSettings, ["attack=[]"], {"out"}),
-        ("lab", LabSettings, [], {"meshes"}),
     ],
 )
 def test_the_dataclasses_have_the_defaults_of_the_configuration(command, kind, overrides, by_the_clock_or_required):
