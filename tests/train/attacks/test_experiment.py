@@ -206,7 +206,7 @@ REFUSED = [
     (["scene.views=0"], r"views=0 must be at least 1"),
     (["scene.polar=1e30"], r"polar=1e\+30 must be at least 0 and at most 180"),
     (["scene.azimuth=inf"], r"azimuth=inf must be at least -360 and at most 360"),
-    (["scene.exposure=0"], r"exposure=0.0 must be at least 1e-05 and at most 100000"),
+    (["scene.exposure=-1"], r"exposure=-1.0 must be at least 0 and at most 100000"),
     (["scene.exposure=inf"], r"exposure=inf must be at least"),
     (["scene.exposure=1e30"], r"exposure=1e[+]30 must be at least"),
     (["scene.vertices=1000000000000"], r"vertices=1000000000000 must be at least 0 and at most"),
