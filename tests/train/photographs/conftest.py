@@ -6,8 +6,8 @@ import torch
 from PIL import Image
 
 
-class Oracle(torch.nn.Module):
-    """Answers row i of a table of logits for an image whose red is i."""
+class TableModel(torch.nn.Module):
+    """Predicts row i of a table of logits for an image whose red is i."""
 
     def __init__(self, table):
         super().__init__()
@@ -19,26 +19,26 @@ class Oracle(torch.nn.Module):
 
 
 @pytest.fixture
-def known_model(tmp_path) -> Callable[..., tuple[Oracle, list[str], Path]]:
+def known_model(tmp_path) -> Callable[..., tuple[TableModel, list[str], Path]]:
     """Makes a folder of the named images and a model that gives the i-th of them the i-th row of logits.
 
     Returns the model, its classes and the folder, in the order in which `evaluate_photographs` takes them.
     """
 
-    def make(names: Sequence[str], logits: Sequence, classes: list[str]) -> tuple[Oracle, list[str], Path]:
+    def make(names: Sequence[str], logits: Sequence, classes: list[str]) -> tuple[TableModel, list[str], Path]:
         folder = tmp_path / "photos"
         for red, name in enumerate(names):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             Image.new("RGB", (32, 32), (red, 0, 0)).save(folder / name)
-        return Oracle(logits), classes, folder
+        return TableModel(logits), classes, folder
 
     return make
 
 
-STORY_CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
+FRUIT_CLASSES = ["apple", "fig", "lime", "orange", "pear", "plum"]
 
 # Photograph, source, and the model's classes from best to worst.
-STORY = [
+FRUIT = [
     ("orange/a.png", "lab", "orange pear plum fig lime apple"),
     ("orange/b.png", "lab", "pear orange plum fig lime apple"),
     ("orange/c.png", "street", "apple pear plum fig lime orange"),
@@ -53,10 +53,10 @@ STORY = [
 
 
 @pytest.fixture
-def story(known_model):
-    """A model whose every answer is known, its classes and a folder of photographs with sources."""
-    logits = [[-order.split().index(name) for name in STORY_CLASSES] for _, _, order in STORY]
-    model, classes, folder = known_model([name for name, _, _ in STORY], logits, STORY_CLASSES)
-    lines = [f"{name},{source}" for name, source, _ in STORY]
+def fruit(known_model):
+    """A model whose every prediction is known, its classes and a folder of photographs with sources."""
+    logits = [[-order.split().index(name) for name in FRUIT_CLASSES] for _, _, order in FRUIT]
+    model, classes, folder = known_model([name for name, _, _ in FRUIT], logits, FRUIT_CLASSES)
+    lines = [f"{name},{source}" for name, source, _ in FRUIT]
     (folder / "photos.csv").write_text("\n".join(["path,source_tag", *lines]))
     return model, classes, folder

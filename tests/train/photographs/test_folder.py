@@ -1,4 +1,3 @@
-import errno
 import logging
 import os
 from pathlib import Path, PurePosixPath
@@ -85,20 +84,6 @@ def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):
     assert [path for path, _ in find(photos)] == ["orange/b.jpg", "orange/deep/a.jpg", "pear/c.jpg", "pear/d.jpg"]
 
 
-def test_a_folder_that_cannot_be_read_is_refused_by_name(tmp_path, monkeypatch):
-    touch(tmp_path, "orange/a.jpg", "pear/b.jpg")
-    scandir = os.scandir
-
-    def denied(path):
-        if Path(path).name == "pear":
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))
-        return scandir(path)
-
-    monkeypatch.setattr(os, "scandir", denied)
-    with pytest.raises(InputError, match=rf"{tmp_path / 'pear'} cannot be read: Permission denied"):
-        find(tmp_path)
-
-
 def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
     touch(tmp_path, "orange/a.jpg", "orange/b.HEIC", "orange/c.avif", "orange/.d.heic", "notes.txt", "lab.json")
     (tmp_path / "orange" / "folder.jpg").mkdir()
@@ -108,30 +93,21 @@ def test_files_of_other_kinds_are_left_out_and_listed(tmp_path):
     assert [*map(str, left_out(tmp_path))] == ["notes.txt", "orange/b.HEIC", "orange/c.avif", "orange/pipe.jpg"]
 
 
-def test_a_broken_link_is_an_image_that_cannot_be_read(tmp_path):
-    save(tmp_path / "good.png", plain())
-    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
-    _, _, unreadable = load_photographs(tmp_path, find_photographs(tmp_path, CLASSES, "orange"), skip_unreadable=True)
-    assert unreadable == ["gone.jpg"]
-
-
 @pytest.mark.parametrize(
     ("files", "folder", "label", "message"),
     [
         ((), "gone", "orange", "gone does not exist"),
         (("a.jpg",), "a.jpg", "orange", r"a\.jpg is not a folder"),
-        ((), ".", "orange", "holds no photographs"),
         (("orange/notes.txt",), ".", "orange", "holds no photographs among its 1 files"),
         (("Oranges/a.jpg",), ".", "orange", "Oranges is not .*such as orange, .* other_Oranges"),
         (("orange/a.jpg", "b.jpg"), ".", "orange", r"b\.jpg lies beside class folders"),
         (("other_lemon/a.jpg",), ".", "other_lemon", "'other_lemon' is not a class"),
     ],
 )
-def test_a_folder_of_another_layout_is_refused_in_one_sentence(tmp_path, files, folder, label, message):
+def test_a_folder_of_another_layout_is_refused(tmp_path, files, folder, label, message):
     touch(tmp_path, *files)
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message):
         find_photographs(tmp_path / folder, CLASSES, label)
-    assert "\n" not in str(caught.value)
 
 
 # ---------------------------------------------------------------------------------------- photos.csv
@@ -151,29 +127,17 @@ def test_sources_and_hard_negatives_come_from_photos_csv_in_any_order_of_columns
     assert "photos.csv has 1 of 5 rows for no file of the folder, such as fig/gone.jpg" in caplog.text
 
 
-COLUMNS = "make it UTF-8 with the columns path and source_tag, separated by commas$"
-
-
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        (b"", COLUMNS),
-        (b"path,source\na.jpg,web\n", COLUMNS),
-        (b"path,source_tag\n\xff.jpg,web\n", COLUMNS),
-        (b'path,source_tag\na.jpg,"web\n', COLUMNS),
-        (b"path;source_tag\na.jpg;web\n", COLUMNS),
-        (None, "does not exist: make it UTF-8"),
+        (b"path;source_tag\na.jpg;web\n", "make it UTF-8 with the columns path and source_tag, separated by commas$"),
         (b"path,source_tag\nb/a.jpg,web\n", "1 of 1 rows for no file of the folder, .*; give paths such as a.jpg$"),
         (b"path,source_tag\na.jpg,web\na.jpg,web\n./a.jpg,lab\n", "has two different rows for a.jpg: keep one$"),
         (b"path,source_tag,hard_negatives\na.jpg,web,lib\n", "a.jpg hard_negatives of source 'lib', .* one of web$"),
     ],
 )
 def test_a_photos_csv_that_cannot_be_used_is_refused_by_name(tmp_path, table, message):
-    touch(tmp_path, "a.jpg")
-    if table is None:
-        (tmp_path / "photos.csv").symlink_to("nowhere.csv")
-    else:
-        (tmp_path / "photos.csv").write_bytes(table)
+    (touch(tmp_path, "a.jpg") / "photos.csv").write_bytes(table)
     with pytest.raises(InputError, match=rf"photos\.csv .*{message}"):
         find(tmp_path)
 
@@ -210,14 +174,11 @@ def test_every_exif_orientation_is_undone(tmp_path, orientation, sides, suffix):
     assert np.abs(load_one(path) - upright).max() <= tolerance
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_only_the_central_square_is_kept(tmp_path, axis):
+def test_only_the_central_square_is_used_whichever_way_the_image_is_turned(tmp_path):
     thirds = [np.broadcast_to(np.uint8(color), (32, 32, 3)) for color in ((255, 0, 0), (0, 200, 0), (0, 0, 255))]
-    path = save(tmp_path / "a.png", np.concatenate(thirds, axis=axis))
-    np.testing.assert_array_equal(load_one(path), thirds[1])
-
-
-def test_the_square_is_exactly_central_so_that_a_turned_image_loads_turned(tmp_path):
+    for axis in (0, 1):
+        path = save(tmp_path / "thirds.png", np.concatenate(thirds, axis=axis))
+        np.testing.assert_array_equal(load_one(path), thirds[1])
     pixels = np.random.default_rng(0).integers(64, 192, (67, 90, 3), dtype=np.uint8)  # no clipping
     loaded = load_one(save(tmp_path / "a.png", pixels))
     turned = load_one(save(tmp_path / "b.png", np.ascontiguousarray(np.rot90(pixels))))
@@ -244,10 +205,6 @@ def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
     assert difference.max() <= 8 and difference.mean() <= 1
 
 
-def with_alpha(mode: str, color: tuple[int, ...]) -> Image.Image:
-    return Image.new(mode, (40, 40), color)
-
-
 def palette() -> Image.Image:
     image = Image.new("P", (40, 40), 1)
     image.putpalette([0, 0, 0, 10, 200, 30])
@@ -258,21 +215,14 @@ def palette() -> Image.Image:
     ("name", "image", "options", "expected"),
     [
         ("gray.png", Image.new("L", (40, 40), 100), {}, (100, 100, 100)),
-        ("black-and-white.png", Image.new("1", (40, 40), 1), {}, (255, 255, 255)),
-        ("palette.png", palette(), {}, (10, 200, 30)),
         ("palette.gif", palette(), {}, (10, 200, 30)),
-        ("clear-palette.png", palette(), {"transparency": 1}, (255, 255, 255)),
         ("half-clear-palette.png", palette(), {"transparency": bytes([255, 51])}, (206, 244, 210)),
         ("color-key.png", plain((10, 20, 30)), {"transparency": (10, 20, 30)}, (255, 255, 255)),
         ("alpha.png", Image.new("RGBA", (40, 40), (255, 0, 0, 51)), {}, (255, 204, 204)),
         ("gray-alpha.png", Image.new("LA", (40, 40), (0, 51)), {}, (204, 204, 204)),
-        ("alpha.webp", Image.new("RGBA", (40, 40), (255, 0, 0, 0)), {"lossless": True}, (255, 255, 255)),
-        ("cmyk.tif", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {}, (255, 0, 0)),
         ("cmyk.jpg", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {"quality": 100}, (255, 0, 0)),
         ("sixteen.png", Image.fromarray(np.full((40, 40), 0x80C0, np.uint16)), {}, (128, 128, 128)),
-        ("sixteen.tif", Image.fromarray(np.full((40, 40), 0xFFFF, np.uint16)), {}, (255, 255, 255)),
         ("thirty-two.tif", Image.fromarray(np.full((40, 40), 0x40FF, np.int32)), {}, (64, 64, 64)),
-        ("plain.bmp", plain((1, 2, 3)), {}, (1, 2, 3)),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -286,54 +236,35 @@ def test_images_come_as_bytes_in_the_order_asked_for(tmp_path):
     for name, color in colors.items():
         save(tmp_path / name, plain(color, (50, 40)))
     photographs = [Photograph(PurePosixPath(name), "orange", None) for name in colors]
-    kept, images, unreadable = load_photographs(tmp_path, photographs, size=8)
-    assert (kept, unreadable) == (photographs, [])
+    loaded, images, unreadable = load_photographs(tmp_path, photographs, size=8)
+    assert (loaded, unreadable) == (photographs, [])
     assert images.dtype == torch.uint8 and images.shape == (3, 3, 8, 8) and images.is_contiguous()
     assert [tuple(image[:, 4, 4].tolist()) for image in images] == list(colors.values())
 
 
-def truncated(path: Path) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
-    save(path, noise)
-    path.write_bytes(path.read_bytes()[:2000])
-
-
-BROKEN = {
-    "truncated.jpg": truncated,
-    "truncated.png": truncated,
-    "empty.jpg": Path.touch,
-    "text.png": lambda path: path.write_text("not an image"),
-    "huge.png": lambda path: save(path, plain(size=(100, 100))),
-    "float.tif": lambda path: save(path, np.ones((40, 40), np.float32)),
-}
-
-
-@pytest.fixture
-def small_bomb_limit(monkeypatch):
+def test_unreadable_images_are_named_or_skipped(tmp_path, monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4096)  # Pillow refuses what has over twice as many
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    for name in ("cut.jpg", "cut.png"):
+        cut = save(tmp_path / name, noise)
+        cut.write_bytes(cut.read_bytes()[:2000])
+    save(tmp_path / "float.tif", np.ones((40, 40), np.float32))
+    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
+    save(tmp_path / "huge.png", plain(size=(100, 100)))
+    (tmp_path / "text.png").write_text("not an image")
+    broken = sorted(path.name for path in tmp_path.iterdir())
+    found = find_photographs(tmp_path, CLASSES, "orange")
+    for skip_unreadable in (False, True):  # nothing is left when all of them are skipped
+        with pytest.raises(InputError, match=r"6 of 6 .*cut\.jpg .*replace them$"):
+            load_photographs(tmp_path, found, skip_unreadable=skip_unreadable)
 
-
-@pytest.mark.parametrize(("name", "break_image"), BROKEN.items())
-def test_an_unreadable_image_is_named_or_skipped(tmp_path, small_bomb_limit, name, break_image):
-    break_image(tmp_path / name)
     save(tmp_path / "good.png", plain())
     found = find_photographs(tmp_path, CLASSES, "orange")
-    with pytest.raises(
-        InputError, match=rf"1 of 2 .*{name} .* set skip_unreadable=true \(evaluate\.skip_unreadable=true in training\)"
-    ):
+    with pytest.raises(InputError, match=r"6 of 7 .*cut\.jpg .* set skip_unreadable=true"):
         load_photographs(tmp_path, found)
-    kept, images, unreadable = load_photographs(tmp_path, found, skip_unreadable=True)
-    assert [str(photograph.path) for photograph in kept] == ["good.png"]
-    assert images.shape == (1, 3, 32, 32) and unreadable == [name]
-
-
-def test_many_unreadable_images_are_counted_and_the_first_is_named(tmp_path, small_bomb_limit):
-    for name, break_image in BROKEN.items():
-        break_image(tmp_path / name)
-    found = find_photographs(tmp_path, CLASSES, "orange")
-    for skip_unreadable in (False, True):  # there is nothing to go on with
-        with pytest.raises(InputError, match=r"6 of 6 .*empty\.jpg .*replace them$"):
-            load_photographs(tmp_path, found, skip_unreadable=skip_unreadable)
+    loaded, images, unreadable = load_photographs(tmp_path, found, skip_unreadable=True)
+    assert [str(photograph.path) for photograph in loaded] == ["good.png"]
+    assert images.shape == (1, 3, 32, 32) and unreadable == broken
 
 
 # -------------------------------------------------------------------------------------- real data
@@ -349,8 +280,8 @@ def test_the_shared_photographs_are_found_labeled_and_loaded():
     assert (len(oranges), len(found) - len(oranges)) == (527, 920)
     sources = {photograph.source for photograph in oranges}
     assert sources == {"tiny", "web1", "web2", "web3", "turntable"}
-    kept, images, unreadable = load_photographs(DATA / "photos", found[::10])
-    assert (kept, unreadable) == (found[::10], [])
+    loaded, images, unreadable = load_photographs(DATA / "photos", found[::10])
+    assert (loaded, unreadable) == (found[::10], [])
     assert images.shape == (145, 3, 32, 32)
-    of_oranges = images[[photograph.label == "orange" for photograph in kept]].float().mean(dim=(0, 2, 3))
+    of_oranges = images[[photograph.label == "orange" for photograph in loaded]].float().mean(dim=(0, 2, 3))
     assert of_oranges[0] > of_oranges[1] > of_oranges[2]  # red above green above blue
