@@ -134,7 +134,7 @@ def _joined(
         if sparse is not None:
             columns = torch.searchsorted(pixels, operator.pixels)
             parts.append(sparse._replace(pixel=columns[sparse.pixel]))
-    entries = joined(*parts)
+    entries = joined(parts)
     return entries and entries.to(device), torch.tensor(counts, device=device).cumsum(0)
 
 

@@ -20,12 +20,11 @@ import torch
 from torch import Tensor
 
 from renderer.camera import Camera
-from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.light.basis import HARMONICS, Basis
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.transfer import TENSORS, OperatorBuilder, TransferOperator
+from renderer.transfer import TENSORS, TransferOperator, build_operators
 from renderer.transport.local import SparseTransfer
 
 
@@ -147,10 +146,9 @@ class OperatorCache(TensorCache):
                 operators[camera] = TransferOperator(**tensors, settings=settings, basis=basis, sparse=sparse)
         missing = [camera for camera in keys if camera not in operators]
         if missing:
-            fragments = build_fragments(mesh.vertices, mesh.faces, missing, settings, rasterizer, closed=mesh.closed)
-            builder = OperatorBuilder(mesh, settings, albedo_scale, basis, dtype)
-            for camera, view in zip(missing, fragments, strict=True):
-                operators[camera] = operator = builder.operator(view)
+            new = build_operators(mesh, missing, settings, rasterizer, albedo_scale, basis, dtype)
+            for camera, operator in zip(missing, new, strict=True):
+                operators[camera] = operator
                 sparse_tensors = operator.sparse._asdict() if operator.sparse else {}
                 self.write(keys[camera], {name: getattr(operator, name) for name in TENSORS} | sparse_tensors)
         self.views += len(keys)

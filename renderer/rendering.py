@@ -22,7 +22,7 @@ from renderer.rasterizer import choose
 from renderer.shading import radiance
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport.local import LocalLightView
-from renderer.transport.precomputed import Transport, build_transport
+from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 
@@ -97,7 +97,7 @@ def render(
         fragments = view.to(like.device)
         colors = _albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale
         surface = Surface.of(moved, view, settings)
-        indirect = partial(_indirect, transport, surface) if transport else None
+        indirect = partial(transport.radiance, surface) if transport else None
         in_local_light = cache(partial(LocalLightView, rays, mesh, view, settings, vertices))
         shade = view_radiance(fragments, vertices, colors, emitters, smooth_faces, in_local_light, indirect)
         images.append(composite(shade, fragments.coverage.to(like), fragments.pixels, behind, encoding))
@@ -128,10 +128,6 @@ def view_radiance(
         if indirect is not None:
             radiances.append(indirect(albedo, light))
     return reduce(torch.add, radiances)
-
-
-def _indirect(transport: Transport, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
-    return transport.radiance(surface, albedo.detach().cpu().double(), light)
 
 
 def _with_coefficients(light: LocalLight) -> tuple[LocalBasis, Tensor]:

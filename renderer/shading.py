@@ -16,7 +16,7 @@ how normals turn and not how outlines move. For the light alone, `renderer.trans
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -102,8 +102,8 @@ class _Irradiance(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, normals: Tensor, light: Tensor) -> Tensor:
         unit, length = unit_vectors(normals)
-        unit, polynomial = unit.to(light.dtype), _Polynomial.of(light)
-        blocks = zip(*map(polynomial, unit.split(BLOCK, dim=1)), strict=True)
+        unit = unit.to(light.dtype)
+        blocks = zip(*map(_polynomial(light), unit.split(BLOCK, dim=1)), strict=True)
         value, slope = (torch.cat(parts, dim=-1) for parts in blocks)
         absent = torch.nonzero(length == 0).squeeze(1)
         if len(absent):  # the homogeneous polynomials are not those of `basis` at 0
@@ -131,39 +131,31 @@ class _Irradiance(torch.autograd.Function):
         return by_normal, by_light
 
 
-@dataclass(frozen=True)
-class _Polynomial:
-    """One light's irradiance as a polynomial in the unit normal: its even bands from 2 on as a homogeneous one of
-    `degree`, by its slopes (9, J), per axis and channel, in monomials; bands 1 (9, 1) and 0 (3, 1)."""
+def _polynomial(light: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """One light's irradiance as a polynomial: unit vectors (3, N) → value (3, N) and slope (3 axes, 3, N), of which the
+    tangential part counts.
 
-    degree: int
-    even: Tensor
-    linear: Tensor
-    constant: Tensor
+    Even bands from 2 on are a homogeneous polynomial, by its slopes in monomials: its value is its slope times its
+    argument, over its degree (Euler).
+    """
+    degree = _even(math.isqrt(len(light)) - 1)
+    per_light = _slopes_per_light(math.isqrt(len(light)) - 1, light.dtype, light.device)
+    slopes = (per_light @ light[: per_light.shape[2]]).mT.flatten(0, 1)  # (3 axes × 3 channels, J + 1)
+    even, linear, constant = slopes[:, :-1], slopes[:, -1:], light[:1].T * math.sqrt(math.pi / 4)
 
-    @staticmethod
-    def of(light: Tensor) -> _Polynomial:
-        """light: ((degree + 1)², 3)."""
-        degree = math.isqrt(len(light)) - 1
-        per_light = _slopes_per_light(degree, light.dtype, light.device)
-        slopes = (per_light @ light[: per_light.shape[2]]).mT.flatten(0, 1)
-        return _Polynomial(_even(degree), slopes[:, :-1], slopes[:, -1:], light[:1].T * math.sqrt(math.pi / 4))
-
-    def __call__(self, unit: Tensor) -> tuple[Tensor, Tensor]:
-        """Value (3, N) and slope (3 axes, 3, N) at unit vectors (3, N); of the slope, the tangential part counts.
-
-        A homogeneous polynomial is its slope times its argument, over its degree (Euler).
-        """
-        slope = torch.addmm(self.linear, self.even, monomials(unit, self.degree - 1)).unflatten(0, (3, 3))
-        value = torch.addmm(self.constant, self.linear.view(3, 3).T, unit, alpha=1 - 1 / self.degree)
+    def evaluate(unit: Tensor) -> tuple[Tensor, Tensor]:
+        slope = torch.addmm(linear, even, monomials(unit, degree - 1)).unflatten(0, (3, 3))
+        value = torch.addmm(constant, linear.view(3, 3).T, unit, alpha=1 - 1 / degree)
         for along, component in zip(slope, unit, strict=True):
-            value.addcmul_(along, component, value=1 / self.degree)
+            value.addcmul_(along, component, value=1 / degree)
         return value, slope
+
+    return evaluate
 
 
 @per_degree
 def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(3, J + 1, K): what one of each of a light's first K coefficients adds to the slopes of a `_Polynomial`: by each
+    """(3, J + 1, K): what one of each of a light's first K coefficients adds to the slopes in `_polynomial`: by each
     axis, those of its even bands in monomials, and that of band 1."""
     even = _even(degree)
     slopes = torch.cat([_slopes(even), F.pad(_slopes(1), (0, (even + 1) ** 2 - 4))], dim=1) * _factors(even).T

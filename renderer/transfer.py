@@ -26,7 +26,7 @@ from renderer.light.basis import HARMONICS, Basis, EnvironmentBasis, LocalBasis,
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
 from renderer.transport.local import SparseTransfer, joined, local_transfer
-from renderer.transport.precomputed import build_transport
+from renderer.transport.precomputed import Transport, build_transport
 from renderer.transport.rays import Rays
 from renderer.transport.surface import Surface
 
@@ -94,9 +94,7 @@ class TransferOperator:
                 f"lights of shape {tuple(lights.shape)} are not of the operator's {self.basis}: "
                 f"give {self.basis.size} rows"
             )
-        if torch.is_grad_enabled() and lights.requires_grad:
-            return _Radiance.apply(lights, self)
-        return _radiance(self, lights)
+        return _Radiance.apply(lights, self)
 
     def light_gradient(
         self, radiance_gradient: Float[Tensor, "*lights 3 P"]
@@ -146,25 +144,21 @@ class _Radiance(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, lights: Tensor, operator: TransferOperator) -> Tensor:
         ctx.operator = operator
-        return _radiance(operator, lights)
+        nonzero = lights.index_select(-2, operator.nonzero).to(operator.transfer.dtype)
+        if operator._shared is not None:
+            product = (nonzero.mT @ operator._shared).mul_(operator.albedo)
+        else:
+            product = torch.einsum("...kc,ckp->...cp", nonzero, operator.transfer)
+        if operator.sparse is not None:
+            batch = lights.to(product.dtype).reshape(-1, *lights.shape[-2:])
+            entries, image = _repeated(operator.sparse, len(batch))
+            product = product + entries.radiance(batch, image, product.shape[-1]).reshape(product.shape)
+        return product.to(lights.dtype)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         return ctx.operator.light_gradient(upstream), None
-
-
-def _radiance(operator: TransferOperator, lights: Tensor) -> Tensor:
-    nonzero = lights.index_select(-2, operator.nonzero).to(operator.transfer.dtype)
-    if operator._shared is not None:
-        product = (nonzero.mT @ operator._shared).mul_(operator.albedo)
-    else:
-        product = torch.einsum("...kc,ckp->...cp", nonzero, operator.transfer)
-    if operator.sparse is not None:
-        batch = lights.to(product.dtype).reshape(-1, *lights.shape[-2:])
-        entries, image = _repeated(operator.sparse, len(batch))
-        product = product + entries.radiance(batch, image, product.shape[-1]).reshape(product.shape)
-    return product.to(lights.dtype)
 
 
 def _repeated(entries: SparseTransfer, images: int) -> tuple[SparseTransfer, Tensor]:
@@ -197,63 +191,60 @@ def build_operators(
     albedo_scale multiplies the albedo, for meshes whose texture is darker than the thing. Surfaces shade on the side
     that the camera sees, with normals as the settings say. InputError: bounces of local lights.
     """
+    require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
-    builder = OperatorBuilder(mesh, settings, albedo_scale, basis, dtype)
-    return [builder.operator(view) for view in views]
+    transport = build_transport(mesh, settings, albedo_scale, basis)
+    rays = transport.rays if transport else Rays(mesh)
+    operators = []
+    for view in views:
+        surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding) * albedo_scale
+        operators.append(_operator(surface, albedo, rays, transport, settings, basis, dtype))
+    return operators
 
 
-class OperatorBuilder:
-    """Builds the operators of one mesh for one basis; see `build_operators`. Views share rays and radiosity."""
-
-    def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis, dtype: torch.dtype):
-        require_bounded(albedo_scale=torch.tensor(float(albedo_scale)))
-        self._mesh, self._settings, self._albedo_scale = mesh, settings, albedo_scale
-        self._basis, self._dtype = basis, dtype
-        self._transport = build_transport(mesh, settings, albedo_scale, basis)
-        self._rays = self._transport.rays if self._transport else Rays(mesh)
-
-    def operator(self, fragments: Fragments) -> TransferOperator:
-        """The operator of one rasterized view."""
-        albedo = surface_albedo(self._mesh, fragments, self._settings.encoding) * self._albedo_scale
-        colors = self._transport and self._transport.colors
-        factor = None if colors else _pixel_albedo(fragments, albedo, self._dtype)
-        if factor is None:
-            factor = torch.ones(len(fragments.pixels), 3)
+def _operator(
+    surface: Surface,
+    albedo: Tensor,
+    rays: Rays,
+    transport: Transport | None,
+    settings: ImageSettings,
+    basis: Basis,
+    dtype: torch.dtype,
+) -> TransferOperator:
+    """The operator of one view, with albedo (S, 3) at its samples."""
+    fragments, pixels = surface.fragments, len(surface.fragments.pixels)
+    factor = None if transport and transport.colors else _pixel_albedo(fragments, albedo, dtype)
+    if factor is None:
+        factor = torch.ones(pixels, 3)
+    else:
+        albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
+    transfers, nonzero = [torch.empty(albedo.shape[1], 0, pixels, dtype=dtype)], [torch.arange(0)]
+    sparse = []
+    for rows, part in parts_of(basis):
+        if isinstance(part, LocalBasis):
+            entries = local_transfer(rays, surface, albedo, part)
+            if entries.few(pixels):
+                weight = (entries.weight * factor[entries.pixel]).to(dtype)
+                sparse.append(SparseTransfer(rows.start + entries.function, entries.pixel, weight))
+                continue
+            transfer, indices = entries.dense(pixels)
         else:
-            albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
-        surface, pixels = Surface.of(self._mesh, fragments, self._settings), len(fragments.pixels)
-        transfers, nonzero = [torch.empty(albedo.shape[1], 0, pixels, dtype=self._dtype)], [torch.arange(0)]
-        sparse = None
-        for where, part in parts_of(self._basis):
-            if isinstance(part, LocalBasis):
-                entries = local_transfer(self._rays, surface, albedo, part)
-                if entries.few(pixels):
-                    weight = (entries.weight * factor[entries.pixel]).to(self._dtype)
-                    sparse = joined(sparse, SparseTransfer(where.start + entries.function, entries.pixel, weight))
-                    continue
-                transfer, reaching = entries.dense(pixels)
-            else:
-                transfer, reaching = self._environment_transfer(surface, albedo, part)
-            transfers.append(transfer.to(self._dtype))
-            nonzero.append(where.start + reaching)
-        return TransferOperator(
-            transfer=torch.cat(transfers, dim=1),
-            albedo=factor.T.to(self._dtype).contiguous(),
-            coverage=fragments.coverage.to(self._dtype),
-            pixels=fragments.pixels,
-            nonzero=torch.cat(nonzero),
-            settings=self._settings,
-            basis=self._basis,
-            sparse=sparse,
-        )
-
-    def _environment_transfer(self, surface: Surface, albedo: Tensor, basis: EnvironmentBasis) -> tuple[Tensor, Tensor]:
-        """((C, K, P), the K coefficients that reach a pixel (K,)); albedo: (S, C), at the samples."""
-        transfer = _box_filter(surface, albedo, basis, self._dtype)
-        change = self._transport.change(surface, albedo) if self._transport else None
-        if change is None:
-            return transfer, basis.nonzero
-        return change.index_add_(1, basis.nonzero, transfer.double()), torch.arange(basis.size)
+            transfer, indices = _box_filter(surface, albedo, part, dtype), part.nonzero
+            change = transport.change(surface, albedo) if transport else None
+            if change is not None:
+                transfer, indices = change.index_add_(1, indices, transfer.double()), torch.arange(part.size)
+        transfers.append(transfer.to(dtype))
+        nonzero.append(rows.start + indices)
+    return TransferOperator(
+        transfer=torch.cat(transfers, dim=1),
+        albedo=factor.T.to(dtype).contiguous(),
+        coverage=fragments.coverage.to(dtype),
+        pixels=fragments.pixels,
+        nonzero=torch.cat(nonzero),
+        settings=settings,
+        basis=basis,
+        sparse=joined(sparse),
+    )
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from renderer.errors import InputError, require_finite
+from renderer.errors import InputError, require_finite, require_range
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64, Int
@@ -51,7 +51,7 @@ def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "
     Source: the Legendre recurrences of the paper's appendix B.1 with sin^m θ taken out of P_l^m and put into
     Re and Im of (x + iy)^m.
     """
-    _check_degree(degree)
+    require_range("degree", degree, 0, MAX_DEGREE)
     require_finite(directions=directions)
     return _Basis.apply(directions, degree)
 
@@ -63,7 +63,7 @@ def basis_gradient(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[
     Source: r^l Y_lm is a polynomial whose derivatives lie in band l - 1 (`gradient_matrices`); the radial part,
     l Y_lm n, is taken off.
     """
-    _check_degree(degree)
+    require_range("degree", degree, 0, MAX_DEGREE)
     require_finite(directions=directions)
     tangential, length = _tangential_gradient(directions, degree)
     return _over(tangential, length[..., None, None], directions.dtype)
@@ -103,18 +103,18 @@ class _Basis(torch.autograd.Function):
 def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
     """The harmonics with these indices, (...) each, of unit vectors (3, ...): `basis` for inner loops, unchecked."""
     x, y, z = unit
-    wanted, rows = dict.fromkeys(indices), {}
-    degree = math.isqrt(max(wanted, default=0))
+    indices, rows = dict.fromkeys(indices), {}
+    degree = math.isqrt(max(indices, default=0))
     cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # Re and Im of (x + iy)^m, times √2 where m > 0
     for m in range(degree + 1):
         for l, legendre in zip(range(m, degree + 1), _legendre(z, m, degree), strict=True):
             for index, circular in ((l * l + l - m, sine), (l * l + l + m, cosine)):
-                if index in wanted:
+                if index in indices:
                     rows[index] = circular * legendre
         if m == 0:
             cosine = cosine * math.sqrt(2)
         cosine, sine = (torch.addcmul(x * cosine, y, sine, value=-1), torch.addcmul(x * sine, y, cosine))
-    return [rows[index] for index in wanted]
+    return [rows[index] for index in indices]
 
 
 def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:
@@ -219,7 +219,7 @@ def lambertian_factors(degree: int) -> Float64[Tensor, " bands"]:
 
     A_l = π, 2π/3, π/4, 0, -π/24, 0, π/64, ...: the clamped cosine (Ramamoorthi and Hanrahan 2001, equation 8).
     """
-    _check_degree(degree)
+    require_range("degree", degree, 0, MAX_DEGREE)
     factors = torch.zeros(degree + 1, dtype=torch.float64)
     factors[:2] = torch.tensor([math.pi, 2 * math.pi / 3], dtype=torch.float64)[: degree + 1]
     for l in range(2, degree + 1, 2):
@@ -235,7 +235,7 @@ def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
 
 
 def irradiance_basis(normals: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch K"]:
-    """A_l Y_lm(n) of the K live coefficients: irradiance at unit normals per unit coefficient."""
+    """A_l Y_lm(n) of the K nonzero coefficients: irradiance at unit normals per unit coefficient."""
     nonzero = nonzero_coefficients(degree)
     factors = lambertian_factors(degree)[bands(degree)[nonzero]].to(normals)
     return basis(normals, degree)[..., nonzero.to(normals.device)] * factors
@@ -310,8 +310,3 @@ def rotate(
         quadrature_degree=2 * degree,
     )
     return turned.to(coefficients)
-
-
-def _check_degree(degree: int) -> None:
-    if not 0 <= degree <= MAX_DEGREE:
-        raise InputError(f"harmonics of degree {degree}: give a degree of 0 to {MAX_DEGREE}")

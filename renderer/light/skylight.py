@@ -176,15 +176,14 @@ def _checked(zenith: Tensor | float, azimuth: Tensor | float, turbidity: Tensor 
     like = next(floating, torch.zeros((), dtype=torch.float64))
     zenith, azimuth, turbidity = (torch.as_tensor(value, dtype=like.dtype, device=like.device) for value in values)
     require_finite(azimuth=azimuth)
-    _require_between("zenith", zenith, ZENITH, "0 to π/2, with the sun above the horizon")
-    _require_between("turbidity", turbidity, TURBIDITY, "2 to 10")
+    for name, value, (least, most), domain in (
+        ("zenith", zenith, ZENITH, "0 to π/2, with the sun above the horizon"),
+        ("turbidity", turbidity, TURBIDITY, "2 to 10"),
+    ):
+        outside = ~((value >= least) & (value <= most))  # NaN is outside too
+        if outside.any():
+            raise InputError(f"{name}={value[outside][0].item():.9g} is outside the sky model's domain: give {domain}")
     return [zenith, azimuth, turbidity]
-
-
-def _require_between(name: str, value: Tensor, limits: tuple[float, float], domain: str) -> None:
-    outside = ~((value >= limits[0]) & (value <= limits[1]))  # NaN is outside too
-    if outside.any():
-        raise InputError(f"{name}={value[outside][0].item():.9g} is outside the sky model's domain: give {domain}")
 
 
 def _radiance(directions: Tensor, zenith: Tensor, azimuth: Tensor, turbidity: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -62,10 +63,9 @@ class SparseTransfer(NamedTuple):
         return gradient.unflatten(0, (images, size))
 
 
-def joined(*parts: SparseTransfer | None) -> SparseTransfer | None:
-    """The entries of all; None where there are none."""
-    there = [part for part in parts if part is not None]
-    return SparseTransfer(*map(torch.cat, zip(*there, strict=True))) if there else None
+def joined(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
+    """The entries of all; None of no parts."""
+    return SparseTransfer(*map(torch.cat, zip(*parts, strict=True))) if parts else None
 
 
 def local_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBasis) -> SparseTransfer:

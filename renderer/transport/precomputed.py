@@ -27,9 +27,7 @@ class Transport:
         """albedo_scale: of the surfaces that light bounces off."""
         patches = Patches.of(mesh) if settings.bounces else None
         self.rays = Rays(patches.pieces if patches else mesh)
-        self._radiosity = (
-            Radiosity(patches, self.rays, settings.encoding, albedo_scale, basis, settings.bounces) if patches else None
-        )
+        self._radiosity = Radiosity(patches, self.rays, settings, albedo_scale, basis) if patches else None
         self._directions = sphere(rays.DIRECTIONS)
         self._sky = basis.radiance(self._directions)
         self.colors = self._radiosity is not None and self._radiosity.colors
@@ -41,21 +39,20 @@ class Transport:
         change, fragments = None, surface.fragments
         weights = albedo.T / fragments.samples**2
         for hits in self.rays.hits(surface, self._directions):
-            blocked = hits.blocked()
-            if not blocked.any():
+            if not hits.weight.any():
                 continue
             if change is None:
                 change = self._sky.new_zeros(len(weights), self._sky.shape[1], len(fragments.pixels))
             for channel, (added, weight) in enumerate(zip(change, weights, strict=True)):
-                lost = blocked * weight[hits.sample]
-                added[:, hits.pixels] = -(lost @ self._sky).T
+                blocked = hits.weight * weight[hits.sample]
+                added[:, hits.pixels] = -(blocked @ self._sky).T
                 if self._radiosity is not None:
-                    added[:, hits.pixels] += self._radiosity.gather(hits, lost, channel).T
+                    added[:, hits.pixels] += self._radiosity.gather(hits, blocked, channel).T
         return change
 
     def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
-        """(3, P) in the light's dtype: `change` in a light (size, 3); differentiable in it."""
-        change = self.change(surface, albedo)
+        """(3, P) in the light's dtype: `change` in a light (size, 3); differentiable in it, not in the albedo."""
+        change = self.change(surface, albedo.detach().cpu().double())
         if change is None:
             return light.new_zeros(3, len(surface.fragments.pixels))
         return torch.einsum("ckp,kc->cp", change.to(light), light)
@@ -68,8 +65,6 @@ def build_transport(mesh: Mesh, settings: ImageSettings, albedo_scale: float, ba
     environment = [part for part in parts if not isinstance(part, LocalBasis)]
     if len(environment) < len(parts) and settings.bounces:
         raise InputError(f"bounces={settings.bounces}: light of {basis} does not bounce; set shadows")
-    return (
-        Transport(mesh, settings, albedo_scale, environment[0])
-        if environment and settings.global_illumination
-        else None
-    )
+    if not environment or not settings.global_illumination:
+        return None
+    return Transport(mesh, settings, albedo_scale, environment[0])

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from renderer.albedo import surface_albedo
 from renderer.fragments import Fragments
+from renderer.image import ImageSettings
 from renderer.light.basis import EnvironmentBasis
 from renderer.mesh import Mesh
 from renderer.subdivision import refine
@@ -101,16 +102,16 @@ class Radiosity:
     """
 
     def __init__(
-        self, patches: Patches, rays: Rays, encoding: str, albedo_scale: float, basis: EnvironmentBasis, bounces: int
+        self, patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: EnvironmentBasis
     ):
         """rays: among the patches' pieces. albedo_scale multiplies the mesh's albedo."""
         self.patches = patches
-        albedo = patches.mean(surface_albedo(patches.pieces, patches.view, encoding)) * albedo_scale
+        albedo = patches.mean(surface_albedo(patches.pieces, patches.view, settings.encoding)) * albedo_scale
         self.colors = bool((albedo != albedo[:, :1]).any())
         reflected = albedo[:, None, : 3 if self.colors else 1] / math.pi
         from_sky, receiving, links = _first_bounce(patches, rays, basis)
         self._sent = from_sky * reflected
-        for _ in range(bounces - 1):
+        for _ in range(settings.bounces - 1):
             arriving = torch.from_numpy(links @ self._sent.flatten(1).numpy()).view(-1, *self._sent.shape[1:])
             self._sent = from_sky.expand_as(self._sent).index_add(0, receiving, arriving) * reflected
 
@@ -128,7 +129,7 @@ def _first_bounce(patches: Patches, rays: Rays, basis: EnvironmentBasis) -> tupl
     directions = sphere(DIRECTIONS)
     receiving, links, radiance = [], [], basis.radiance(directions)
     for hits in rays.hits(surface, directions):
-        weights = hits.blocked() * patches.fractions[hits.sample, 0]
+        weights = hits.weight * patches.fractions[hits.sample, 0]
         from_sky[hits.pixels] -= weights @ radiance
         receiving.append(hits.pixels)
         links.append(patches.weights_by_patch(hits, weights))

@@ -7,6 +7,7 @@ surface, such as all of a convex mesh, cast no rays.
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -31,8 +32,8 @@ class RayHits:
     """The faces of the mesh that B of a view's pixels see in D directions; sample, weight, face: (B, D).
 
     pixels: (B,), indices among the view's. directions: (D, 3). sample: from which the ray starts. weight: of the
-    radiance from there in the pixel's irradiance, solid angle × cosine × the number of the pixel's samples. face: the
-    first that the ray hits, -1 for none.
+    radiance from there in the pixel's irradiance, solid angle × cosine × the number of the pixel's samples, and zero
+    where the ray hits no face. face: the first that the ray hits, -1 for none.
     """
 
     pixels: Tensor
@@ -40,10 +41,6 @@ class RayHits:
     sample: Tensor
     weight: Tensor
     face: Tensor
-
-    def blocked(self) -> Tensor:
-        """The weight of the rays that hit a face, zero for the others."""
-        return self.weight.masked_fill(self.face < 0, 0)
 
 
 class Rays:
@@ -79,15 +76,32 @@ class Rays:
                 surface.points[sample[cast]] + self.offset * planes[sample[cast]], directions[cast[1]]
             )
             face = torch.full_like(sample, -1).index_put_(cast, face)
-            yield RayHits(some, directions, sample, cosine * of_pixel * solid_angle, face)
+            weight = (cosine * of_pixel * solid_angle).masked_fill(face < 0, 0)
+            yield RayHits(some, directions, sample, weight, face)
 
     @cached_property
     def _scene(self) -> Any:
-        return _embree_scene(self._mesh)
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError as error:
+            raise InputError(
+                "shadows are found by rays that Embree casts: pip install embreex, or set shadows=false and "
+                "no lights that stand in the scene"
+            ) from error
+        scene = EmbreeScene(robust=True)
+        TriangleMesh(scene, self._mesh.vertices.astype(np.float32), self._mesh.faces.astype(np.int32))
+        return scene
 
     @cached_property
     def _outermost(self) -> Tensor:
-        return torch.from_numpy(_outermost(self._mesh.vertices[np.unique(self._mesh.faces)])).double()
+        """The vertices on the convex hull, or all where they lie in a plane."""
+        from scipy.spatial import ConvexHull, QhullError  # takes long to import
+
+        vertices = self._mesh.vertices[np.unique(self._mesh.faces)]
+        with suppress(QhullError):
+            vertices = vertices[ConvexHull(vertices).vertices]
+        return torch.from_numpy(vertices).double()
 
     def _pixels_to_cast(self, surface: Surface) -> Tensor:
         """The pixels with a sample on a face above whose plane other vertices lie; all pixels, where that test would
@@ -121,27 +135,3 @@ def sphere(count: int) -> Tensor:
 def _shuffled(count: int) -> Tensor:
     """A fixed permutation of 0 to count - 1, so that each sample gets directions from all over the sphere."""
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))
-
-
-def _outermost(vertices: np.ndarray) -> np.ndarray:
-    """Vertices (N, 3) with the same convex hull: those on the hull, or all where they lie in a plane."""
-    from scipy.spatial import ConvexHull, QhullError  # takes long to import
-
-    try:
-        return vertices[ConvexHull(vertices).vertices]
-    except QhullError:
-        return vertices
-
-
-def _embree_scene(mesh: Mesh) -> Any:
-    try:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-    except ImportError as error:
-        raise InputError(
-            "shadows are found by rays that Embree casts: pip install embreex, or set shadows=false and "
-            "no lights that stand in the scene"
-        ) from error
-    scene = EmbreeScene(robust=True)
-    TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
-    return scene
