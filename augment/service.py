@@ -14,12 +14,12 @@ from torch.utils.data import Dataset
 
 from augment import utils
 from augment.attacks.attack import AttackSettings, logits_of
-from augment.attacks.criteria import NO_CLASS, Goal
+from augment.attacks.criteria import Goal
 from augment.attacks.descent import DescentResult, Part, descend
 from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting
 from augment.build import Shown, build_scene
-from augment.labels import is_right, label_loss, require_known
+from augment.losses import NO_CLASS, is_right, label_loss, require_known
 from augment.scene import Conditions, Scene
 from augment.utils import Phases, as_found, generator, stream_seed
 from augment.variation import VariationSettings, vary
@@ -164,7 +164,7 @@ class Renders(Dataset[tuple[Tensor, int]]):
 class AugmentationService:
     """The scene and, with `warm_start`, the attack's values from one regeneration to the next.
 
-    scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.labels`. label:
+    scene: with one view per example; None where nothing is rendered. labels: (E,) int64, see `augment.losses`. label:
     the class that hard negatives are attacked towards, where a scene has any: these are the examples of all other
     labels. None: every attack leads away from the example's own class. rank, world_size: of this process among those
     that train together; each attacks its shard of the examples, and all get all renders.

@@ -1,4 +1,8 @@
-"""Checkpoints: written atomically with a hash of their content, read without pickle."""
+"""Checkpoints: written atomically with a hash of their content, read without pickle.
+
+A file holds a dictionary of plain values and tensors: `model` (the network's state) and `architecture` (what rebuilds
+it, with its VERSION), in best.pt; and in last.pt what `train.loop.Trainer.state_dict` adds to go on with a run.
+"""
 
 import hashlib
 import io

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
 
 from augment import utils
-from augment.labels import divergence, is_right, label_loss, ranking_loss
+from augment.losses import divergence, is_right, label_loss, ranking_loss
 from augment.utils import as_found, generator, stream_seed
 from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.image import to_bytes, to_unit

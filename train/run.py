@@ -10,7 +10,7 @@ import torch
 from augment import utils
 from augment.build import build_scene
 from augment.classifiers.adapter import class_index
-from augment.labels import complementary_label
+from augment.losses import complementary_label
 from augment.scene import Scene
 from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed

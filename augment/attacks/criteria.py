@@ -1,4 +1,4 @@
-"""Criteria of success, and the cost that an attack decreases on the way."""
+"""Criteria of success: which classes an attack leads to, and whether it has reached them."""
 
 from __future__ import annotations
 
@@ -7,18 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from augment.classifiers.adapter import Classifier
-from augment.labels import require_known
+from augment.losses import NO_CLASS
 from renderer.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-
-
-NO_CLASS = -1  # in place of a class, where there is none
+    from jaxtyping import Bool, Int
 
 
 @dataclass(frozen=True)
@@ -46,30 +42,6 @@ class Goal:
         if self.target is None:
             return erred
         return torch.where(self.target == NO_CLASS, erred, predicted == self.target)
-
-
-def adversarial_cost(
-    logits: Float[Tensor, "E classes"], source: Int[Tensor, " E"], target: Int[Tensor, " E"] | None = None
-) -> Float[Tensor, " E"]:
-    """−CE(logits, source) + CE(logits, target) per image, the paper's equation 1, which an attack decreases.
-
-    target: None leaves the second term out. NO_CLASS in either leaves its term out. InputError for a class beyond the
-    logits.
-    """
-    require_known(source, logits)
-    cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
-    if target is not None:
-        cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)
-    return cost
-
-
-def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
-    """The lead (E,) of the target's logit over all others or, without a target, of the best other class over the
-    source; negative where the goal is not reached. Shapes as in `adversarial_cost`."""
-    wanted = torch.full_like(source, NO_CLASS) if target is None else target
-    chosen = torch.where(wanted == NO_CLASS, source, wanted)[:, None]
-    gap = logits.gather(1, chosen)[:, 0] - logits.scatter(1, chosen, -torch.inf).amax(1)
-    return torch.where(wanted == NO_CLASS, -gap, gap)
 
 
 @runtime_checkable

@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.criteria import Goal, adversarial_cost, logit_gap
+from augment.attacks.criteria import Goal
 from augment.attacks.eot import ExpectationOverTransformations
+from augment.losses import adversarial_cost, logit_gap
 from augment.utils import BatchSize, Phases, as_found, generator, progress
 
 if TYPE_CHECKING:

@@ -1,4 +1,8 @@
-"""Bases of light. An image is linear in the coefficients of a light of fixed position, so each basis has operators."""
+"""Bases of light. An image is linear in the coefficients of a light of fixed position, so each basis has operators.
+
+A new basis is a frozen dataclass of `EnvironmentBasis` (as `Harmonics` below) or of `LocalBasis` (as
+`light.local.Lamps`); it needs no registration: whatever takes a light's basis takes it.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

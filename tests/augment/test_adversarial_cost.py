@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from scipy.special import log_softmax
 
-from augment.attacks.criteria import adversarial_cost
+from augment.losses import adversarial_cost
 
 EPS = torch.finfo(torch.float64).eps
 LOGITS = torch.from_numpy(np.random.default_rng(0).normal(0, 5, (20, 7)))

@@ -7,7 +7,7 @@ from torch.utils.data import ConcatDataset, DataLoader
 
 from augment.attacks.norm_ball import StepSettings
 from augment.backgrounds import load_backgrounds
-from augment.labels import complementary_label
+from augment.losses import complementary_label
 from augment.objects import ObjectSettings, load_object
 from augment.scene import Conditions, Scene
 from augment.service import AugmentationService, AugmentationSettings, RandomLightSettings, TrainingAttackSettings

@@ -13,7 +13,7 @@ import torch
 import trimesh
 from omegaconf import OmegaConf
 
-from augment.labels import complementary_label
+from augment.losses import complementary_label
 from renderer.errors import InputError
 from train import checkpoint, loop
 from train.data import DataSet

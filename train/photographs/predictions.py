@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
-from augment.labels import log_odds
+from augment.losses import log_odds
 from augment.utils import eval_mode, progress
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_unit

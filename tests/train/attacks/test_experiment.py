@@ -9,11 +9,11 @@ from torch import Tensor
 import augment
 from augment.attacks import attack
 from augment.attacks.attack import AttackResult
-from augment.attacks.criteria import adversarial_cost
 from augment.attacks.descent import descend
 from augment.attacks.evaluate import Checks
 from augment.attacks.parameters import PARAMETERS
 from augment.classifiers import Classifier
+from augment.losses import adversarial_cost
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.presets import probe

@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.special import log_softmax, logit, rel_entr, softmax
 
-from augment.labels import complementary_label, divergence, is_right, label_loss, log_odds, ranking_loss
+from augment.losses import complementary_label, divergence, is_right, label_loss, log_odds, ranking_loss
 
 EPS = torch.finfo(torch.float64).eps
 LOGITS = 3 * torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -1,10 +1,46 @@
-"""Labels of examples, and losses by them: a class, or any class but one (a complementary label), written −1 − class."""
+"""Losses: the cost that an attack decreases, and those of training.
+
+A label is a class, or any class but one (a complementary label), written −1 − class.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.errors import require_range
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+NO_CLASS = -1  # in place of a source or target class, where there is none
+
+
+def adversarial_cost(
+    logits: Float[Tensor, "E classes"], source: Int[Tensor, " E"], target: Int[Tensor, " E"] | None = None
+) -> Float[Tensor, " E"]:
+    """−CE(logits, source) + CE(logits, target) per image, the paper's equation 1, which an attack decreases.
+
+    target: None leaves the second term out. NO_CLASS in either leaves its term out. InputError for a class beyond the
+    logits.
+    """
+    require_known(source, logits)
+    cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
+    if target is not None:
+        cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)
+    return cost
+
+
+def logit_gap(logits: Tensor, source: Tensor, target: Tensor | None = None) -> Tensor:
+    """The lead (E,) of the target's logit over all others or, without a target, of the best other class over the
+    source; negative where the goal is not reached. Shapes as in `adversarial_cost`."""
+    wanted = torch.full_like(source, NO_CLASS) if target is None else target
+    chosen = torch.where(wanted == NO_CLASS, source, wanted)[:, None]
+    gap = logits.gather(1, chosen)[:, 0] - logits.scatter(1, chosen, -torch.inf).amax(1)
+    return torch.where(wanted == NO_CLASS, -gap, gap)
 
 
 def complementary_label(label: int) -> int:
