@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -20,38 +18,22 @@ def linear_of(srgb: float) -> float:
 
 
 def pixel(*rgb: float) -> torch.Tensor:
-    return torch.tensor(rgb, dtype=torch.float64).view(3, 1)
+    return torch.tensor(rgb, dtype=torch.float64)[:, None]
 
 
-def share(coverage: float) -> torch.Tensor:
-    return torch.full((1, 1), coverage, dtype=torch.float64)
-
-
-def gray(value: float) -> torch.Tensor:
+def one(value: float) -> torch.Tensor:
     return torch.full((1, 1), value, dtype=torch.float64)
 
 
-def composite(radiance: torch.Tensor, coverage: torch.Tensor, background: torch.Tensor, encoding: str) -> torch.Tensor:
-    return radiance + background_term(coverage, background, encoding)
-
-
-def test_the_surface_lies_over_the_background_by_its_coverage():
-    image = tonemap(pixel(0.1, 0.2, 0.3), share(0.25), gray(0.4))
+def test_the_surface_covers_the_background_in_linear_light_and_the_clamp_comes_last():
+    image = tonemap(pixel(0.1, 0.2, 0.3), one(0.25), one(0.4))
     torch.testing.assert_close(image, pixel(0.4, 0.5, 0.6), rtol=4 * EPS, atol=0)
-
-
-def test_under_srgb_the_compositing_is_linear():
-    image = tonemap(pixel(0.1, 0.2, 0.3), share(0.25), gray(0.5), "srgb")
+    image = tonemap(pixel(0.1, 0.2, 0.3), one(0.25), one(0.5), "srgb")
     expected = pixel(*(srgb_of(surface + 0.75 * linear_of(0.5)) for surface in (0.1, 0.2, 0.3)))
     torch.testing.assert_close(image, expected, rtol=8 * EPS, atol=0)
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS)
-def test_the_clamp_comes_last(encoding):
-    """Half a pixel at radiance 1.5, -0.4 and 2.5: clamped before compositing, the first two would be 0.5 and 0.5."""
-    image = tonemap(pixel(0.75, -0.2, 1.25), share(0.5), pixel(0, 1, 1), encoding)
-    composite = pixel(0.75, 0.3, 1.0)
-    torch.testing.assert_close(image, encode(composite, encoding), rtol=4 * EPS, atol=0)
+    # Half a pixel at radiance 1.5, -0.4 and 2.5: clamped before compositing, the first two would be 0.5 and 0.5.
+    image = tonemap(pixel(0.75, -0.2, 1.25), one(0.5), pixel(0, 1, 1), "srgb")
+    torch.testing.assert_close(image, pixel(*map(srgb_of, (0.75, 0.3, 1.0))), rtol=8 * EPS, atol=0)
 
 
 def test_color_backgrounds_and_batches_broadcast():
@@ -82,20 +64,24 @@ def test_encoding_and_decoding_are_the_srgb_standards():
     assert encoded[500] == pytest.approx(0.735356983052449) and decoded[500] == pytest.approx(0.214041140482232)
 
 
-def test_the_gradient_through_srgb_is_its_derivative_and_finite_from_black_to_white():
-    values = [0.0, 1e-30, 0.001, 0.0031308, 0.0032, 0.2, 1.0]
-    linear = torch.tensor(values, dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(encode(linear, "srgb").sum(), linear)
-    slopes = [12.92 if value <= 0.0031308 else 1.055 / 2.4 * value ** (1 / 2.4 - 1) for value in values]
-    np.testing.assert_allclose(gradient, slopes, rtol=8 * EPS)
-
-
-def test_the_gradient_of_decoding_is_its_derivative_and_finite_outside_of_black_and_white_too():
-    values = [-1.0, -0.055, -0.01, 0.0, 0.04, 0.05, 0.5, 1.0, 1.5]
-    image = torch.tensor(values, dtype=torch.float64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(decode(image, "srgb").sum(), image)
-    slopes = [1 / 12.92 if value <= 0.04045 else 2.4 / 1.055 * ((value + 0.055) / 1.055) ** 1.4 for value in values]
-    np.testing.assert_allclose(gradient, slopes, rtol=8 * EPS)
+@pytest.mark.parametrize(
+    ("function", "threshold", "slopes", "values"),
+    [
+        (encode, 0.0031308, (12.92, lambda x: 1.055 / 2.4 * x ** (1 / 2.4 - 1)), [0, 1e-30, 0.0031308, 0.0032, 0.2, 1]),
+        (
+            decode,
+            0.04045,
+            (1 / 12.92, lambda x: 2.4 / 1.055 * ((x + 0.055) / 1.055) ** 1.4),
+            [-1, 0.04, 0.5, 2],
+        ),
+    ],
+)
+def test_the_gradient_of_an_srgb_curve_is_its_derivative_and_finite(function, threshold, slopes, values):
+    """From black to white, and for decoding outside of them, too."""
+    inputs = torch.tensor(values, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(function(inputs, "srgb").sum(), inputs)
+    expected = [slopes[0] if value <= threshold else slopes[1](value) for value in values]
+    np.testing.assert_allclose(gradient, expected, rtol=8 * EPS)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -113,37 +99,28 @@ def test_gradients_by_radiance_coverage_and_background_are_central_differences(e
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_clamped_values_are_those_without_a_gradient(encoding):
-    radiance = pixel(-0.3, 0.2, 1.4).requires_grad_(True)
-    for background in (0.0, 0.5, 1.0):
-        scene = (radiance, share(0.5), gray(background))
+def test_only_clamped_values_have_no_gradient(encoding):
+    """Black and white themselves have one, so that a light of zero can grow."""
+    radiance = pixel(-0.3, 0, 0.2, 1, 1.4).T.contiguous().requires_grad_(True)
+    for coverage, background in ((1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.5, 1.0)):
+        scene = radiance, one(coverage), one(background)
+        beyond = clamped(radiance + background_term(*scene[1:], encoding))
         (gradient,) = torch.autograd.grad(tonemap(*scene, encoding).sum(), radiance)
-        assert gradient.isfinite().all()
-        torch.testing.assert_close(clamped(composite(*scene, encoding)), gradient == 0)
-    assert clamped(composite(radiance, share(0.5), gray(0.0), encoding)).flatten().tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS)
-def test_black_and_white_themselves_are_not_clamped(encoding):
-    """So that a light of zero can grow."""
-    radiance = pixel(0, 0.5, 1).requires_grad_(True)
-    scene = (radiance, share(1.0), gray(math.pi / 4))
-    assert not clamped(composite(*scene, encoding)).any()
-    (gradient,) = torch.autograd.grad(tonemap(*scene, encoding).sum(), radiance)
-    slopes = [12.92, 1.055 / 2.4 * 0.5 ** (1 / 2.4 - 1), 1.055 / 2.4] if encoding == "srgb" else [1, 1, 1]
-    np.testing.assert_allclose(gradient[:, 0], slopes, rtol=8 * EPS)
+        assert gradient.isfinite().all() and torch.equal(beyond, gradient == 0)
+        if background == 0:
+            assert beyond.flatten().tolist() == [True, False, False, False, True]
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (dict(samples=0), r"samples=0"),
-        (dict(size=0), r"size=0 must be at least 1"),
         (dict(size=-3), r"size=-3 must be at least 1"),
         (dict(samples=65), r"samples=65 must be at least 1 and at most 64"),
         (dict(encoding="gamma"), r"encoding=gamma: choose one of linear, srgb"),
+        (dict(bounces=-1), r"bounces=-1"),
+        (dict(bounces=101), r"bounces=101"),
     ],
 )
-def test_settings_that_make_no_image_are_refused(settings, message):
+def test_settings_out_of_range_are_refused(settings, message):
     with pytest.raises(InputError, match=message):
         ImageSettings(**settings)

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.special import sph_harm_y_all
+from oracles import draw, patchwork, scipy_irradiance
 
 from renderer.albedo import face_albedo, surface_albedo, textured_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, background_term, clamped, tonemap
-from renderer.light.harmonics import MAX_DEGREE, lambertian_factors, nonzero_coefficients
+from renderer.light.harmonics import MAX_DEGREE, nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.shading import irradiance, radiance
@@ -31,44 +31,16 @@ DEGREES = [0, 1, 2, 3, 6, 13, MAX_DEGREE]
 SPECIAL = [[0.0, 0.0, 1.0], [-0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-1.0, -0.0, 0.0], [0.0, -1.0, -0.0], [1e-9, 0.0, 1.0]]
 
 
-def draw(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
 def some_normals(count: int) -> torch.Tensor:
     """Of unit length or not; poles and the equator, too."""
     return torch.cat([3 * draw(count, 3), torch.tensor(SPECIAL, dtype=torch.float64)])
 
 
-def scipy_irradiance(normals: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """(3, N) Σ A_l U_lm Y_lm(n), with scipy's complex harmonics; A_l is proven in test_harmonics."""
-    degree = math.isqrt(len(light)) - 1
-    x, y, z = normals.T
-    values = sph_harm_y_all(degree, degree, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x))
-    total = np.zeros((3, len(normals)))
-    for l, factor in enumerate(lambertian_factors(degree).tolist()):
-        for m in range(-l, l + 1):
-            part = values[l, abs(m)].real if m >= 0 else values[l, abs(m)].imag
-            real = part if m == 0 else math.sqrt(2) * (-1) ** m * part
-            total += factor * np.outer(light[l * l + l + m], real)
-    return total
-
-
-def brightest(light: torch.Tensor) -> float:
-    """What no irradiance exceeds: Σ A_l √((2l + 1) / 4π) |U_l|, since the squares of a band add up to (2l + 1) / 4π."""
-    l = torch.arange(math.isqrt(len(light)), dtype=torch.float64)
-    norms = torch.stack([band.norm(dim=0).max() for band in light.detach().double().split((2 * l + 1).long().tolist())])
-    return float((lambertian_factors(len(l) - 1).abs() * ((2 * l + 1) / (4 * math.pi)).sqrt() * norms).sum())
-
-
-# ---------------------------------------------------------------------------- irradiance
-
-
 @pytest.mark.parametrize("degree", DEGREES)
 def test_irradiance_is_scipys(degree):
     normals, light = some_normals(100), draw((degree + 1) ** 2, 3)
-    expected = scipy_irradiance(normals.numpy(), light.numpy())
-    np.testing.assert_allclose(irradiance(normals, light), expected, rtol=0, atol=1e-13 * brightest(light))
+    expected = scipy_irradiance(normals, light).T
+    np.testing.assert_allclose(irradiance(normals, light), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 6, MAX_DEGREE])
@@ -111,44 +83,24 @@ def test_second_derivatives_are_refused_rather_than_wrong():
         gradient.sum().backward()
 
 
-# ---------------------------------------------------------------------------- scenes
-
-
-def solid(seed: int = 0, closed: bool = True) -> Mesh:
-    """A dented icosahedron with two textures and bare faces, vertex colors on all; or two thirds of it."""
-    draws = np.random.default_rng(seed)
+def solid(closed: bool = True) -> Mesh:
+    """A dented icosahedron, or two thirds of it."""
     shape = trimesh.creation.icosahedron()
-    faces = shape.faces[: 20 if closed else 13]
-    mesh = Mesh.plain(shape.vertices * draws.uniform(0.7, 1, (12, 1)), faces)
-    return replace(
-        mesh,
-        corner_colors=draws.uniform(0.1, 1, (len(faces), 3, 3)).astype(np.float32),
-        corner_uvs=draws.uniform(-1, 2, (len(faces), 3, 2)).astype(np.float32),
-        texture_ids=(np.arange(len(faces), dtype=np.int32) % 3) - 1,
-        textures=tuple(
-            draws.integers(0, 256, (height, width, 3), dtype=np.uint8) for height, width in [(3, 4), (2, 3)]
-        ),
-    )
+    return patchwork(shape.vertices, shape.faces[: 20 if closed else 13])
 
 
-def with_faces(mesh: Mesh, rows) -> Mesh:
-    """The faces of these indices, which may come up again."""
-    per_face = {name: getattr(mesh, name)[rows] for name in ("faces", "corner_colors", "corner_uvs", "texture_ids")}
-    return replace(mesh, **per_face)
-
-
-def turned_round(mesh: Mesh) -> Mesh:
-    """Clockwise faces."""
+def with_inverted_winding(mesh: Mesh) -> Mesh:
     per_corner = {name: getattr(mesh, name)[:, ::-1].copy() for name in ("faces", "corner_colors", "corner_uvs")}
     return replace(mesh, **per_corner)
 
 
-def spoiled(mesh: Mesh) -> Mesh:
-    """With three more faces that have no area, each in its own way, and every face a second time."""
+def degenerate(mesh: Mesh) -> Mesh:
+    """With three more faces of different kinds without area, and every face twice."""
     count = len(mesh.faces)
-    mesh = with_faces(mesh, [*range(count), 0, 1, 2, *range(count)])
-    mesh.faces[count : count + 3] = [[0, 0, 0], [1, 1, 2], [3, 4, 4]]
-    return mesh
+    rows = [*range(count), 0, 1, 2, *range(count)]
+    per_face = {name: getattr(mesh, name)[rows] for name in ("faces", "corner_colors", "corner_uvs", "texture_ids")}
+    per_face["faces"][count : count + 3] = [[0, 0, 0], [1, 1, 2], [3, 4, 4]]
+    return replace(mesh, **per_face)
 
 
 IN_FRONT, BEHIND = OrthographicCamera(1.0, 0.4, 2.2), OrthographicCamera(math.pi - 1.0, 0.4 + math.pi, 2.2)
@@ -178,16 +130,13 @@ SCENES = {
     "solid": Scene(solid()),
     "open, from in front": Scene(solid(closed=False)),
     "open, from behind": Scene(solid(closed=False), BEHIND),
-    "wound the other way": Scene(turned_round(solid())),
-    "spoiled": Scene(spoiled(solid())),
+    "inverted winding": Scene(with_inverted_winding(solid())),
+    "degenerate faces": Scene(degenerate(solid())),
     "one sample per pixel": Scene(solid(), size=9, samples=1),
     "from close by": Scene(solid(), PerspectiveCamera(1.0, 0.4, 2.2, distance=1.8)),
 }
-each_scene = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+all_scenes = pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 flat_and_smooth = pytest.mark.parametrize("smooth", [False, True], ids=["flat", "smooth"])
-
-
-# ---------------------------------------------------------------------------- images
 
 
 @dataclass(frozen=True)
@@ -233,7 +182,7 @@ def slope(function, inputs, steps, length: float = 1e-5) -> torch.Tensor:
         return (8 * (at(length) - at(-length)) - (at(2 * length) - at(-2 * length))) / (12 * length)
 
 
-@each_scene
+@all_scenes
 @flat_and_smooth
 @pytest.mark.parametrize("encoding", ["linear", "srgb"])
 def test_derivatives_of_images_are_central_differences(scene, smooth, encoding):
@@ -254,6 +203,31 @@ def test_derivatives_of_images_are_central_differences(scene, smooth, encoding):
         assert found.item() == pytest.approx(expected.item(), rel=1e-8, abs=1e-8)
 
 
+@all_scenes
+@flat_and_smooth
+def test_gradients_are_exactly_zero_where_nothing_is_visible_or_clamped(scene, smooth):
+    """By the light: bands 3 and 5. By the vertices: those of no visible face (nor of a neighbor, where normals are
+    smooth). By everything: pixels of the background, and clamped ones."""
+    image, fragments = Image(scene, "srgb", smooth), scene.fragments
+    inputs = image.inputs()
+    values = image(*inputs)
+    by_vertex, by_light, *_ = torch.autograd.grad(values, inputs, draw(3, scene.size**2), retain_graph=True)
+    unlit = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero_coefficients(6), False)
+    assert not by_light[unlit].any() and by_light[~unlit].all()
+    moving = np.unique(fragments.corners)
+    if smooth:
+        moving = np.unique(scene.mesh.faces[np.isin(scene.mesh.faces, moving).any(axis=1)])
+    still = np.setdiff1d(np.arange(len(by_vertex)), moving)
+    assert not by_vertex[still].any() and by_vertex[moving].any(dim=1).all()
+
+    background = torch.ones(3, scene.size**2).index_fill(1, fragments.pixels, 0)
+    at_an_end = torch.zeros_like(background).index_copy(1, fragments.pixels, image.clamped(*inputs).float())
+    assert at_an_end.any()
+    for upstream in (background, at_an_end):
+        gradients = torch.autograd.grad(values, inputs, upstream.double(), retain_graph=True)
+        assert not any(gradient.any() for gradient in gradients)
+
+
 @flat_and_smooth
 def test_albedo_per_face_has_the_derivative_of_central_differences(smooth):
     scene = SCENES["solid"]
@@ -265,70 +239,22 @@ def test_albedo_per_face_has_the_derivative_of_central_differences(smooth):
     albedo = draw(len(scene.mesh.faces), 3).requires_grad_(True)
     assert torch.autograd.gradcheck(lit, albedo)
     (gradient,) = torch.autograd.grad(lit(albedo).sum(), albedo)
-    unseen = np.setdiff1d(np.arange(len(albedo)), fragments.faces)
-    assert len(unseen) and not gradient[unseen].any()
+    hidden = np.setdiff1d(np.arange(len(albedo)), fragments.faces)
+    assert len(hidden) and not gradient[hidden].any()
 
 
-# ---------------------------------------------------------------------------- zeros
-
-
-@each_scene
+@all_scenes
 @flat_and_smooth
-def test_what_no_sample_sees_has_a_gradient_of_exactly_zero(scene, smooth):
-    """Coefficients of the dead bands, vertices of no seen face (nor of a neighbor's, where normals are smooth)."""
-    image = Image(scene, "linear", smooth)
-    inputs = image.inputs()
-    fragments = scene.fragments
-    by_vertex, by_light, *_ = torch.autograd.grad(image(*inputs), inputs, draw(3, scene.size**2))
-    dead = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero_coefficients(6), False)
-    assert not by_light[dead].any() and by_light[~dead].all()
-    moving = np.unique(fragments.corners)
-    if smooth:
-        moving = np.unique(scene.mesh.faces[np.isin(scene.mesh.faces, moving).any(axis=1)])
-    still = np.setdiff1d(np.arange(len(by_vertex)), moving)
-    assert not by_vertex[still].any() and by_vertex[moving].any(dim=1).all()
-
-
-@each_scene
-@flat_and_smooth
-def test_background_and_clamped_pixels_have_a_gradient_of_exactly_zero(scene, smooth):
-    image = Image(scene, "srgb", smooth)
-    inputs = image.inputs()
-    values = image(*inputs)
-    fragments = scene.fragments
-    around = torch.ones(3, scene.size**2).index_fill(1, fragments.pixels, 0)
-    at_an_end = torch.zeros_like(around).index_copy(1, fragments.pixels, image.clamped(*inputs).float())
-    assert at_an_end.any()
-    for upstream in (around, at_an_end):
-        gradients = torch.autograd.grad(values, inputs, upstream.double(), retain_graph=True)
-        assert not any(gradient.any() for gradient in gradients)
-
-
-# ---------------------------------------------------------------------------- radiance
-
-
-def lit_and_gradients(scene: Scene, smooth: bool, dtype=torch.float64) -> tuple[torch.Tensor, ...]:
-    """Radiance and its gradients by vertices, light and albedo."""
-    albedo = surface_albedo(scene.mesh, scene.fragments, "linear")
-    inputs = [tensor.to(dtype).requires_grad_(True) for tensor in (scene.vertices(), draw(49, 3), albedo)]
-    lit = radiance(scene.fragments, *inputs, scene.all_faces(smooth))
-    upstream = draw(*lit.shape, seed=1).to(dtype)
-    return lit.detach(), *torch.autograd.grad(lit, inputs, upstream)
-
-
-@each_scene
-@pytest.mark.parametrize("color", [None, (0.9, 0.5, 0.2)], ids=["its own colors", "one color"])
-def test_flat_radiance_is_the_operators(scene, color):
-    mesh = scene.mesh if color is None else Mesh.plain(scene.mesh.vertices, scene.mesh.faces, color)
-    scene = replace(scene, mesh=mesh)
-    settings = ImageSettings(scene.size, scene.samples)
-    [operator] = build_operators(mesh, [scene.camera], settings, RASTERIZER, dtype=torch.float64)
-    assert len(operator.transfer) == (3 if color is None and scene.samples > 1 else 1)
-    lit, _, by_light, _ = lit_and_gradients(scene, smooth=False)
-    light = draw(49, 3)
-    torch.testing.assert_close(lit, operator.radiance(light), rtol=0, atol=16 * EPS * brightest(light))
-    by_operator = operator.light_gradient(draw(*lit.shape, seed=1))
-    torch.testing.assert_close(by_light, by_operator, rtol=0, atol=64 * EPS * float(by_operator.abs().max()))
+def test_radiance_and_its_light_gradient_are_those_of_an_operator(scene, smooth):
+    settings = ImageSettings(scene.size, scene.samples, normals="smooth" if smooth else "flat")
+    [operator] = build_operators(scene.mesh, [scene.camera], settings, RASTERIZER, dtype=torch.float64)
+    light, albedo = draw(49, 3).requires_grad_(), surface_albedo(scene.mesh, scene.fragments, "linear").double()
+    lit = radiance(scene.fragments, scene.vertices(), light, albedo, scene.all_faces(smooth))
+    torch.testing.assert_close(lit, operator.radiance(light), rtol=0, atol=100 * EPS)
+    upstream = draw(*lit.shape, seed=1)
+    (by_light,) = torch.autograd.grad(lit, light, upstream)
+    expected = operator.light_gradient(upstream)
+    torch.testing.assert_close(by_light, expected, rtol=0, atol=64 * EPS * float(expected.abs().max()))
 
 
 def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surface():
@@ -336,17 +262,15 @@ def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surfac
     hull = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))
     scene = Scene(Mesh.plain(hull.vertices, hull.faces), size=24, samples=1)
     fragments, light = scene.fragments, draw(49, 3)
-    lit, *_ = lit_and_gradients(scene, smooth=True)
+    albedo = surface_albedo(scene.mesh, fragments, "linear").double()
+    lit = radiance(fragments, scene.vertices(), light, albedo, scene.all_faces(smooth=True))
     right, up, back = scene.camera.axes()
     across = fragments.positions().numpy() * scene.camera.width / 2
     # The faces' planes are n · p = 1.
     normals = np.sign(scene.mesh.vertices[fragments.corners[fragments.face]].sum(axis=1))
     foot = across @ np.stack([right, up])
     points = foot + ((1 - (normals * foot).sum(axis=1)) / (normals @ back))[:, None] * back
-    expected = scipy_irradiance(points, light.numpy())
     inside = (np.sign(points) == normals).all(axis=1)  # corners are snapped to 1/256 of a sample
     assert inside.mean() > 0.95 and len(inside) > 100
-    np.testing.assert_allclose(lit[:, inside], expected[:, inside], rtol=0, atol=64 * EPS * brightest(light))
-
-
-# ---------------------------------------------------------------------------- generated meshes and lights
+    expected = scipy_irradiance(points[inside], light).T
+    np.testing.assert_allclose(lit[:, inside], expected, rtol=0, atol=400 * EPS)

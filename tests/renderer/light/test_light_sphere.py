@@ -2,20 +2,18 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 import trimesh
 
 from renderer.camera import OrthographicCamera, orbit_cameras
-from renderer.fragments import build_fragments
-from renderer.image import ImageSettings, encode
+from renderer.image import encode
 from renderer.light.basis import HARMONICS, SumBasis
 from renderer.light.light_sphere import light_sphere
 from renderer.light.local import Lamps
 from renderer.light.presets import ambient, probe
-from renderer.rasterizer import choose
-from renderer.shading import radiance
+from renderer.mesh import Mesh
+from renderer.rendering import render
 
 EPS32 = torch.finfo(torch.float32).eps
 FRONT, TOP = OrthographicCamera(math.pi / 2, 0.0, 2.0), OrthographicCamera(0.0, 0.0, 2.0)  # from +x, from +z
@@ -68,35 +66,28 @@ def test_light_that_grows_linearly_with_direction_shades_the_ball_linearly(camer
 
 
 @pytest.mark.parametrize("name", ["grace", "eucalyptus"])
-def test_it_is_what_the_renderer_makes_of_a_white_ball(name):
+def test_the_image_is_that_of_a_rendered_white_ball(name):
     """At the same samples. Edges of 0.018 leave the faces 0.018² / 8 inside the ball, seen at cosines above 0.28: the
     normals are off by 1.5e-4. Irradiance / π grows by less than 1 in a radian, and sRGB's slope is 2.5 at 0.02."""
     ball = trimesh.creation.icosphere(subdivisions=6)
-    camera, light, size = orbit_cameras(3, 2.0)[1], probe(name), 48
-    settings = ImageSettings(size, 2)
-    vertices, faces = np.array(ball.vertices), np.array(ball.faces)
-    [fragments] = build_fragments(vertices, faces, [camera], settings, choose("numpy"))
-    albedo = torch.full((len(fragments.pixel), 3), 1 / math.pi, dtype=torch.float64)
-    linear = torch.zeros(3, size * size, dtype=torch.float64)
-    linear[:, fragments.pixels] = radiance(
-        fragments, torch.from_numpy(vertices), light.double(), albedo, torch.from_numpy(faces)
-    )
-    inside = disc(size)
-    expected = encode(linear, "srgb").unflatten(1, (size, size))[:, inside].float()
+    camera, light, inside = orbit_cameras(3, 2.0)[1], probe(name).double(), disc(48)
+    mesh = Mesh.plain(ball.vertices, ball.faces)
+    [image] = render(mesh, camera, light, 48, albedo_scale=1 / math.pi, encoding="srgb", rasterizer="numpy")
+    expected = image[:, inside].float()
     assert expected.min() > encode(torch.tensor(0.02), "srgb")
-    torch.testing.assert_close(light_sphere(light, size, camera)[:, inside], expected, rtol=0, atol=2.5 * 1.5e-4)
+    torch.testing.assert_close(light_sphere(light, 48, camera)[:, inside], expected, rtol=0, atol=2.5 * 1.5e-4)
 
 
-def test_lamps_add_their_inverse_squares_to_the_light_from_afar():
+def test_lamps_add_their_inverse_squares_to_the_environment_light():
     """c · cos / d² at each of a pixel's four samples, which are averaged before the encoding."""
-    place, power, size = torch.tensor([0.3, -0.4, 2.5]).double(), torch.tensor([0.5, 1.0, 2.0]).double(), 32
+    position, power, size = torch.tensor([0.3, -0.4, 2.5]).double(), torch.tensor([0.5, 1.0, 2.0]).double(), 32
     light = torch.cat([ambient(torch.full((3,), 0.1)), power[None].float()])
-    image = light_sphere(light, size, TOP, SumBasis((HARMONICS, Lamps((tuple(place.tolist()),)))))
+    image = light_sphere(light, size, TOP, SumBasis((HARMONICS, Lamps((tuple(position.tolist()),)))))
     at = (torch.arange(2 * size).double() + 0.5) / size - 1
     right, up = at.expand(2 * size, -1), -at[:, None].expand(-1, 2 * size)
     back = (1 - right**2 - up**2).clamp(min=0).sqrt()
     normal = torch.stack([-up, right, back])  # from above, +y is to the right and -x is up
-    toward = place[:, None, None] - normal
+    toward = position[:, None, None] - normal
     arriving = ((toward * normal).sum(0) / toward.norm(dim=0) ** 3).clamp(min=0)
     expected = 0.1 + power[:, None, None] * torch.nn.functional.avg_pool2d(arriving[None, None], 2)[0]
     inside = disc(size)

@@ -20,14 +20,7 @@ def random_lights(count: int, amplitude: float) -> Tensor:
     return load_light("grace").double() + amplitude * offsets
 
 
-def lowest(lights: Tensor) -> float:
-    """The least radiance in any direction over the largest of the same channel."""
-    degree = round(lights.shape[-2] ** 0.5) - 1
-    radiance = torch.einsum("dk,...kc->...dc", basis(DENSE, degree), lights.double())
-    return float((radiance.amin(-2) / radiance.abs().amax(-2).clamp(min=1e-300)).min())
-
-
-def test_in_degree_1_it_is_the_projection_into_a_second_order_cone():
+def test_degree_1_is_projected_into_a_second_order_cone():
     """a + b·ω is nowhere negative where |b| ≤ a, whose projection has a closed form (Boyd and Vandenberghe, 8.1.1);
     Y₁ is √3 times as steep as Y₀ is high."""
     draws = torch.Generator().manual_seed(0)
@@ -44,35 +37,35 @@ def test_in_degree_1_it_is_the_projection_into_a_second_order_cone():
 
 
 @pytest.mark.parametrize(("norm", "radius"), [("linf", None), ("linf", 0.1), ("l2", 0.3)])
-def test_no_light_that_is_nowhere_negative_on_a_grid_is_nearer_as_scipy_finds_it(norm, radius):
+def test_scipy_finds_no_nearer_light_that_is_nowhere_negative_on_a_grid(norm, radius):
     """A grid's program lacks the directions between, so that its light is nearer, by the grid's width squared."""
-    wanted = random_lights(1, 0.1)[0, :, 0]
+    target = random_lights(1, 0.1)[0, :, 0]
     center = project_nonnegative(load_light("grace").double())[:, 0]
-    nearest = project_nonnegative(wanted[None, :, None], radius and Ball(center[None, :, None], radius, norm))[0]
+    nearest = project_nonnegative(target[None, :, None], radius and Ball(center[None, :, None], radius, norm))[0]
     grid = basis(torch.from_numpy(np.array(trimesh.creation.icosphere(subdivisions=3).vertices)), 6).numpy()
     c = center.numpy()
     bright = {"type": "ineq", "fun": lambda x: grid @ x, "jac": lambda x: grid}
     ball = {"type": "ineq", "fun": lambda x: radius**2 - ((x - c) ** 2).sum(), "jac": lambda x: 2 * (c - x)}
     found = optimize.minimize(
-        lambda x: ((x - wanted.numpy()) ** 2).sum(),
+        lambda x: ((x - target.numpy()) ** 2).sum(),
         nearest[:, 0].numpy(),
-        jac=lambda x: 2 * (x - wanted.numpy()),
+        jac=lambda x: 2 * (x - target.numpy()),
         bounds=[(value - radius, value + radius) for value in c] if radius and norm == "linf" else None,
         constraints=[bright, ball] if norm == "l2" else bright,
         method="SLSQP",
         options={"ftol": 1e-12},
     )
     assert found.success
-    distance, bound = float((nearest[:, 0] - wanted).norm()), found.fun**0.5
+    distance, bound = float((nearest[:, 0] - target).norm()), found.fun**0.5
     assert bound - 1e-5 <= distance <= 1.03 * bound
 
 
-def test_what_is_added_is_light_and_is_added_where_there_is_none():
+def test_light_is_added_only_where_the_radiance_is_zero():
     """The conditions of optimality (Moreau): the change is non-negative light at points, each where the radiance is
     zero; on a grid of such points it is reached as nearly as the grid is fine."""
-    wanted = random_lights(4, 0.3)
-    nearest = project_nonnegative(wanted)
-    change = nearest - wanted
+    target = random_lights(4, 0.3)
+    nearest = project_nonnegative(target)
+    change = nearest - target
     assert ((change * nearest).sum(1).abs() <= 1e-4 * change.norm(dim=1) * nearest.norm(dim=1)).all()
     harmonics = basis(DENSE, 6)
     for before, added in zip(nearest.mT.flatten(0, 1), change.mT.flatten(0, 1), strict=True):
@@ -81,17 +74,33 @@ def test_what_is_added_is_light_and_is_added_where_there_is_none():
         assert residual <= 1e-3 * added.norm()
 
 
+@pytest.mark.parametrize("radius", [0.3, 0.6, 3.0])
+def test_within_a_sphere_the_result_satisfies_the_conditions_of_optimality(radius):
+    """x is nearest to v in the sphere about c if it is nearest to c + (v - c) / (1 + λ) without it; what is added to
+    that is orthogonal to x, so that x·(v - x) = λ x·(x - c)."""
+    target = random_lights(3, 0.1)
+    center = project_nonnegative(load_light("grace").double()).expand_as(target)
+    nearest = project_nonnegative(target, Ball(center, radius, "l2"))
+    distance = (nearest - center).flatten(1).norm(dim=1)
+    assert (distance <= radius * (1 + 1e-12)).all() and (radius > 1 or (distance >= radius * (1 - 1e-6)).all())
+    products = [(nearest * offset).sum((1, 2), keepdim=True) for offset in (target - nearest, nearest - center)]
+    multiplier = (products[0] / products[1]).clamp(min=0)
+    expected = project_nonnegative(center + (target - center) / (1 + multiplier))
+    assert ((nearest - expected).flatten(1).norm(dim=1) <= 0.01 * distance).all()  # dips within the tolerance are left
+
+
 @pytest.mark.parametrize(("norm", "radius"), [("linf", None), ("linf", 0.1), ("l2", 0.01), ("l2", 1.0), ("l2", 100.0)])
 @pytest.mark.parametrize("amplitude", [0.02, 0.3, 3.0])
 def test_radiance_is_nowhere_negative(amplitude, norm, radius):
-    wanted = random_lights(5, amplitude)
-    center = project_nonnegative(load_light("grace").double()).expand_as(wanted)
-    nearest = project_nonnegative(wanted, radius and Ball(center, radius, norm))
-    assert lowest(nearest) >= -TOLERANCE
+    target = random_lights(5, amplitude)
+    center = project_nonnegative(load_light("grace").double()).expand_as(target)
+    nearest = project_nonnegative(target, radius and Ball(center, radius, norm))
+    radiance = torch.einsum("dk,nkc->ndc", basis(DENSE, 6), nearest)
+    assert (radiance.amin(1) >= -TOLERANCE * radiance.abs().amax(1)).all()
     assert not radius or ((nearest - center).flatten(1).norm(ORDERS[norm], dim=1) <= radius * (1 + 1e-12)).all()
 
 
-def test_light_that_was_in_order_stays_to_the_bit():
+def test_light_that_is_nowhere_negative_stays_to_the_bit():
     lights = load_light("grace").repeat(2, 1, 1)
     lights[1, :, 1] = ambient(torch.ones(3))[:, 1]
     nearest = project_nonnegative(lights)
@@ -100,34 +109,16 @@ def test_light_that_was_in_order_stays_to_the_bit():
     assert torch.equal(project_nonnegative(nearest), nearest)
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e5])
-def test_it_scales_with_the_light(scale):
-    light = random_lights(1, 0.1)[0]
-    nearest = project_nonnegative(light)
-    torch.testing.assert_close(project_nonnegative(scale * light), scale * nearest, rtol=1e-4, atol=0)
-
-
-def test_no_light_and_light_taken_away_everywhere_are_dark():
+def test_dark_light_and_light_that_touches_zero_along_circles_stay():
     dark = torch.zeros(49, 3)
     assert torch.equal(project_nonnegative(dark), dark)
     torch.testing.assert_close(project_nonnegative(ambient(-torch.ones(3))), dark, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("radius", [0.3, 0.6, 3.0])
-def test_in_a_sphere_it_is_what_is_nearest_to_a_place_on_the_way_as_far_as_the_sphere_goes(radius):
-    """x is nearest to v in the sphere about c if it is nearest to c + (v - c) / (1 + λ) without it; what is added to
-    that is orthogonal to x, so that x·(v - x) = λ x·(x - c)."""
-    wanted = random_lights(3, 0.1)
-    center = project_nonnegative(load_light("grace").double()).expand_as(wanted)
-    nearest = project_nonnegative(wanted, Ball(center, radius, "l2"))
-    distance = (nearest - center).flatten(1).norm(dim=1)
-    assert (distance <= radius * (1 + 1e-12)).all() and (radius > 1 or (distance >= radius * (1 - 1e-6)).all())
-    products = [(nearest * offset).sum((1, 2), keepdim=True) for offset in (wanted - nearest, nearest - center)]
-    multiplier = (products[0] / products[1]).clamp(min=0)
-    expected = project_nonnegative(center + (wanted - center) / (1 + multiplier))
-    assert ((nearest - expected).flatten(1).norm(dim=1) <= 0.01 * distance).all()  # dips within the tolerance are left
-
-
-def test_a_light_that_touches_zero_along_circles_stays():
     squared = project(lambda directions: (directions[:, :1] ** 3 + directions[:, 1:2] ** 3) ** 2 * torch.ones(3), 6)
     torch.testing.assert_close(project_nonnegative(squared), squared, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e5])
+def test_the_projection_scales_with_the_light(scale):
+    light = random_lights(1, 0.1)[0]
+    nearest = project_nonnegative(light)
+    torch.testing.assert_close(project_nonnegative(scale * light), scale * nearest, rtol=1e-4, atol=0)

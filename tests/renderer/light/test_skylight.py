@@ -1,13 +1,16 @@
+import itertools
 import math
 import os
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from oracles import random_directions
 from safetensors.torch import load_file
 from scipy.integrate import cubature
 from scipy.spatial.transform import Rotation
@@ -66,34 +69,23 @@ def polar(zenith, azimuth) -> np.ndarray:
     return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
 
-def random_sky_directions(count: int, seed: int = 0) -> torch.Tensor:
-    vectors = np.random.default_rng(seed).normal(size=(count, 3))
-    vectors[:, 2] = np.abs(vectors[:, 2])
-    return torch.from_numpy(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+def random_sky_directions(count: int) -> torch.Tensor:
+    directions = random_directions(count)
+    return torch.cat([directions[:, :2], directions[:, 2:].abs()], dim=1)
 
 
-def parameters(*values: float, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
-    return tuple(torch.tensor(value, dtype=dtype, requires_grad=True) for value in values)
+def parameters(*values: float) -> tuple[torch.Tensor, ...]:
+    return tuple(torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values)
 
 
-def projected_gradient(function, *values: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """A random projection of what the function returns, and its three derivatives by autograd, (3,)."""
-    values = parameters(*values)
-    result = projection(function(*values))
-    return result.detach(), torch.stack(torch.autograd.grad(result, values))
+def relative_error(approximate: torch.Tensor, exact: torch.Tensor) -> float:
+    return float((approximate - exact).norm() / exact.norm())
 
 
 def projection(light: torch.Tensor) -> torch.Tensor:
     """Of unit length, so that bounds on the coefficients' norm hold for it."""
     weights = torch.from_numpy(np.random.default_rng(0).normal(size=light.shape))
     return (weights * light).sum() / weights.norm()
-
-
-def relative(error: torch.Tensor, to: torch.Tensor) -> float:
-    return float(error.norm() / to.norm())
-
-
-# --------------------------------------------------------------------------------------------- radiance
 
 
 @pytest.mark.parametrize("sky", SKIES)
@@ -122,9 +114,6 @@ def test_radiance_has_the_derivatives_of_finite_differences(sky):
     assert torch.autograd.gradcheck(radiance, (directions, *parameters(*sky)))
 
 
-# ------------------------------------------------------------------------------------------- quadrature
-
-
 @pytest.mark.parametrize("sky", SKIES)
 def test_quadrature_agrees_with_adaptive_cubature_of_the_published_formula(sky):
     zenith, azimuth, turbidity = sky
@@ -139,28 +128,17 @@ def test_quadrature_agrees_with_adaptive_cubature_of_the_published_formula(sky):
     limits = [0, azimuth - math.pi], [HORIZON, azimuth + math.pi]
     result = cubature(integrand, *limits, rule="gk21", rtol=1e-6, atol=1e-6, points=middle)
     exact = torch.from_numpy(result.estimate.reshape(49, 3))
-    assert relative(coefficients_by_quadrature(*sky) - exact, exact) < 2e-8
+    assert relative_error(coefficients_by_quadrature(*sky), exact) < 2e-8
 
 
-@pytest.mark.parametrize("sky", SKIES)
-@pytest.mark.parametrize(("nodes", "bound"), [(24, 1e-5), (48, 2e-8)])
-def test_quadrature_converges_as_documented(sky, nodes, bound):
-    exact = coefficients_by_quadrature(*sky, nodes=96)
-    assert relative(coefficients_by_quadrature(*sky, nodes=nodes) - exact, exact) < bound
-
-
-# -------------------------------------------------------------------------------------------------- fit
-
-
-def test_the_fit_is_off_by_at_most_7e_5_of_the_norm():
+def test_errors_of_quadrature_and_fit_are_as_documented():
+    for sky in SKIES:
+        exact = coefficients_by_quadrature(*sky, nodes=96)
+        assert relative_error(coefficients_by_quadrature(*sky, nodes=24), exact) < 1e-5
+        assert relative_error(coefficients_by_quadrature(*sky, nodes=48), exact) < 2e-8
     assert fit_error(load_file(FIT)["fit"], 25, torch.Generator().manual_seed(1)) < 7e-5
-
-
-@pytest.mark.parametrize("zenith", [0.0, HORIZON])
-@pytest.mark.parametrize("turbidity", [2.0, 10.0])
-def test_the_fit_is_off_by_at_most_4e_4_of_the_norm_at_the_corners_of_the_domain(zenith, turbidity):
-    exact = coefficients_by_quadrature(zenith, 1.0, turbidity)
-    assert relative(coefficients(zenith, 1.0, turbidity) - exact, exact) < 4e-4
+    for corner in itertools.product([0.0, HORIZON], [1.0], [2.0, 10.0]):
+        assert relative_error(coefficients(*corner), coefficients_by_quadrature(*corner)) < 4e-4
 
 
 @pytest.mark.parametrize("sky", [(0.3, 0.0, 2.5), (0.7, 1.0, 3.5), (1.1, 4.0, 7.0), (1.5, 2.0, 9.5)])
@@ -173,15 +151,14 @@ def test_the_fit_has_the_derivatives_of_the_quadrature(sky):
             for h in (-1e-4, 1e-4)
         )
         exact = (above - below) / 2e-4
-        assert relative(fitted[parameter] - exact, exact) < bound
+        assert relative_error(fitted[parameter], exact) < bound
 
 
-def test_a_refit_is_the_committed_fit():
+def test_a_new_fit_is_the_committed_one():
     """The first Chebyshev coefficients do not depend on the degree: what aliases at these points is beyond 11."""
-    committed, refit = load_file(FIT)["fit"], fit_polynomials(6, 4, nodes=16)
+    committed, fit = load_file(FIT)["fit"], fit_polynomials(6, 4, nodes=16)
     # Quadratures of 16 nodes are off by up to 1e-4 of the norm, 140.
-    torch.testing.assert_close(committed[:7, :5].double(), refit, rtol=0, atol=1e-2)
-    assert committed.shape == (14, 12, 28, 3) and committed.dtype == torch.float32
+    torch.testing.assert_close(committed[:7, :5].double(), fit, rtol=0, atol=1e-2)
 
 
 @pytest.mark.slow
@@ -195,7 +172,7 @@ def test_the_script_makes_the_committed_fit(tmp_path):
 
 @pytest.mark.parametrize("function", PATHS)
 @pytest.mark.parametrize("azimuth", [0.5, -2.0, 9.0])
-def test_the_azimuth_turns_the_light_as_a_rotation_does(function, azimuth):
+def test_the_azimuth_rotates_the_light(function, azimuth):
     """By +φ: the paper prints -φ. 100 roundings of a norm of about 60."""
     rotation = torch.from_numpy(Rotation.from_euler("z", azimuth).as_matrix())
     at_zero = function(0.8, 0.0, 3.0)
@@ -203,9 +180,6 @@ def test_the_azimuth_turns_the_light_as_a_rotation_does(function, azimuth):
     sun_and_opposite = torch.from_numpy(np.stack([polar(0.8, azimuth), polar(0.8, azimuth + math.pi)]))
     brightness = basis(sun_and_opposite, 6) @ function(0.8, azimuth, 3.0) @ LUMINANCE
     assert brightness[0] > 1.5 * brightness[1]
-
-
-# ------------------------------------------------------------------------------------------ both paths
 
 
 @pytest.mark.parametrize("function", PATHS)
@@ -221,35 +195,30 @@ def test_gradients_are_those_of_finite_differences(function, sky):
 @pytest.mark.parametrize(("zenith", "step"), [(0.0, 1e-4), (HORIZON, -1e-4)])
 def test_gradients_at_the_ends_of_the_domain_are_one_sided_differences(function, zenith, step):
     for turbidity, turbidity_step in [(2.0, 1e-4), (10.0, -1e-4)]:
-        sky = (zenith, 0.0, turbidity)
-        value, gradient = projected_gradient(function, *sky)
-        for parameter, h in [(0, step), (2, turbidity_step)]:
-            once, twice = (
-                projection(function(*(p + i * h * (k == parameter) for k, p in enumerate(sky)))) for i in (1, 2)
-            )
+        sky = parameters(zenith, 0.0, turbidity)
+        value = projection(function(*sky))
+        gradient = torch.autograd.grad(value, sky)
+        for index, h in [(0, step), (2, turbidity_step)]:
+            steps = [torch.eye(3, dtype=torch.float64)[index] * h * count for count in (1, 2)]
+            once, twice = (projection(function(*(torch.stack(sky).detach() + offset))) for offset in steps)
             # The truncation is h² times a third derivative, which on the horizon grows with log h.
-            assert float(gradient[parameter]) == pytest.approx(float(-3 * value + 4 * once - twice) / (2 * h), rel=1e-4)
+            difference = float(-3 * value.detach() + 4 * once - twice) / (2 * h)
+            assert float(gradient[index]) == pytest.approx(difference, rel=1e-4)
 
 
-@pytest.mark.parametrize("function", [*PATHS, lambda *sky: radiance(random_sky_directions(3), *sky)])
+@pytest.mark.parametrize("function", [*PATHS, partial(radiance, random_sky_directions(3))])
 @pytest.mark.parametrize(
     ("sky", "message"),
     [
         ((0.5, 0.0, 1.99), "turbidity=1.99 is outside the sky model's domain: give 2 to 10"),
         ((0.5, 0.0, 10.1), "turbidity=10.1 is"),
-        ((0.5, 0.0, math.nan), "turbidity=nan is"),
         ((-0.01, 0.0, 3.0), "zenith=-0.01 is outside the sky model's domain: give 0 to π/2, with the sun above"),
         ((1.6, 0.0, 3.0), "zenith=1.6 is"),
         ((math.nan, 0.0, 3.0), "zenith=nan is"),
-        ((math.inf, 0.0, 3.0), "zenith=inf is"),
         ((0.5, math.nan, 3.0), "azimuth holds NaN"),
-        ((0.5, -math.inf, 3.0), "azimuth holds NaN"),
     ],
 )
-def test_what_is_outside_the_domain_is_refused_by_name(function, sky, message):
+def test_a_sky_outside_the_domain_is_refused_by_name(function, sky, message):
     for values in (sky, parameters(*sky)):
         with pytest.raises(InputError, match=re.escape(message)):
             function(*values)
-
-
-# -------------------------------------------------------------------------------------- dtypes, batches
