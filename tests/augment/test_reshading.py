@@ -8,6 +8,7 @@ from torch import Tensor
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
 from renderer.image import ENCODINGS, decode, encode, tonemap
+from renderer.light.harmonics import nonzero_coefficients
 from renderer.rasterizer import choose
 from renderer.transfer import build_operators
 
@@ -43,7 +44,7 @@ def composed(scene: Scene, lights: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize(("dtype", "rounding"), [(torch.float32, ROUNDING * EPS32 / EPS), (torch.float64, ROUNDING)])
-def test_under_light_alone_images_are_those_of_the_views_one_by_one(make_scene, dtype, rounding, encoding):
+def test_images_equal_the_operators_of_each_view(make_scene, dtype, rounding, encoding):
     """In the dtype of the light, whatever the backgrounds have."""
     scene = make_scene(dtype=dtype, encoding=encoding, albedo_scale=1.2)
     lights = own_lights(scene)
@@ -53,8 +54,19 @@ def test_under_light_alone_images_are_those_of_the_views_one_by_one(make_scene, 
     torch.testing.assert_close(images, composed(scene, lights), rtol=0, atol=rounding)
 
 
+def test_uncovered_pixels_and_zero_coefficients_have_no_gradient(make_scene):
+    scene, nonzero = make_scene(), nonzero_coefficients(6)
+    zero = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero, False)
+    lights = scene.lights.clone().requires_grad_()
+    images = scene.render(Conditions(lights), EVERY)
+    (gradient,) = torch.autograd.grad(images.sum(), lights, retain_graph=True)
+    assert zero.sum() == 18 and not gradient[:, zero].any() and (gradient[:, nonzero] != 0).any(2).all()
+    uncovered = (images == scene.backgrounds[:, None]).double()
+    assert uncovered.any() and not torch.autograd.grad(images, lights, uncovered)[0].any()
+
+
 @pytest.mark.parametrize("part", ["light", "vertices", "albedo", "pixels"])
-def test_any_examples_in_any_order_are_rendered_as_all_are(make_scene, part):
+def test_examples_in_any_order_have_the_same_images(make_scene, part):
     scene, draws = make_scene(), torch.Generator().manual_seed(1)
     shape = {"vertices": (12, 3), "albedo": (20, 3), "pixels": (2, 3, 6, 6)}
     change = {} if part == "light" else {part: 0.05 * torch.randn(3, *shape[part], generator=draws).double()}
@@ -69,7 +81,7 @@ def test_any_examples_in_any_order_are_rendered_as_all_are(make_scene, part):
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_nothing_changes_where_the_other_conditions_are_the_scenes_own(make_scene, encoding):
+def test_unchanged_vertices_albedo_and_pixels_leave_the_image(make_scene, encoding):
     """By operators and by shading, which share no code between the albedo and the image."""
     scene = make_scene(encoding=encoding, albedo_scale=1.2)
     light = scene.conditions(EVERY).light
@@ -83,7 +95,7 @@ def test_nothing_changes_where_the_other_conditions_are_the_scenes_own(make_scen
         torch.testing.assert_close(scene.render(Conditions(light, **change), EVERY), plain, rtol=0, atol=ROUNDING)
 
 
-def test_moved_vertices_are_seen_as_another_mesh_would_be(make_scene, stone):
+def test_moved_vertices_look_like_a_mesh_built_with_them(make_scene, stone):
     """Its outline too: half of the pixels change at least a little."""
     scene, draws = make_scene(), np.random.default_rng(0)
     moved = stone.vertices + 0.1 * draws.normal(size=(3, *stone.vertices.shape))
@@ -96,7 +108,7 @@ def test_moved_vertices_are_seen_as_another_mesh_would_be(make_scene, stone):
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_a_change_of_albedo_is_seen_as_another_paint_would_be(make_scene, stone, encoding):
+def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, encoding):
     """The linear albedo changes, whatever the encoding, and keeps to [0, 1]."""
     scene = make_scene(encoding=encoding)
     offset = torch.rand(3, 20, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
@@ -111,7 +123,7 @@ def test_a_change_of_albedo_is_seen_as_another_paint_would_be(make_scene, stone,
         torch.testing.assert_close(images[row], expected, rtol=0, atol=13 * 4 * EPS32)
 
 
-def test_changes_of_pixels_come_last_and_are_clamped(make_scene):
+def test_pixel_changes_are_added_last_and_clamped(make_scene):
     scene = make_scene()
     change = 2 * torch.rand(3, 2, 3, 6, 6, generator=torch.Generator().manual_seed(0)).double() - 1
     plain = scene.render(scene.conditions(EVERY), EVERY)
@@ -120,7 +132,7 @@ def test_changes_of_pixels_come_last_and_are_clamped(make_scene):
     assert (images == 0).any() and (images == 1).any()
 
 
-def test_black_and_white_pixels_and_paints_have_the_gradients_of_others(make_scene, stone):
+def test_clamped_pixels_and_colors_keep_their_gradient(make_scene, stone):
     """At the bounds of a clamp, where `torch.clamp` has none or half of one, an attack would start in a dead corner."""
     backgrounds = torch.zeros(3, 3, 6, 6)
     backgrounds[1:] = 1
