@@ -8,10 +8,9 @@ from PIL import Image
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import AttackProblem, LampPlaces, LampPowers, Lighting, ProjectorPattern, Skylight
+from augment.attacks.parameters import AttackProblem, LampPlaces, LampPowers, Lighting, ProjectorPattern
 from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
-from augment.service import TrainingAttackSettings
 from renderer.cache import OperatorCache
 from renderer.errors import InputError
 from renderer.light.basis import parts_of
@@ -99,9 +98,9 @@ def test_an_adversary_with_local_lights_is_reloaded_and_rendered_alike_by_mitsub
     torch.testing.assert_close(pattern, written.light[49:85], rtol=0, atol=projector.power / 255)
 
     pytest.importorskip("mitsuba")
-    from augment.attacks.evaluate import rendered
+    from augment.attacks.evaluate import _rendered
 
-    seen = rendered(tmp_path, ["mitsuba"], choose("numpy"))["mitsuba"]
+    seen = _rendered(tmp_path, ["mitsuba"], choose("numpy"))["mitsuba"]
     assert (seen - done.images[0]).abs().median() < 2 / 255
 
 
@@ -125,20 +124,6 @@ def test_a_table_receives_the_projection_and_the_shadow():
     expected = torch.tensor([0.2, 0.5, 0.7]) * (4 / (4 + below)) ** 2
     torch.testing.assert_close(beside.amax(1), expected.float(), rtol=1e-5, atol=0)
     assert 4 <= (beside[1] > 0.9 * expected[1]).sum() < beside.shape[1]
-
-
-@pytest.mark.parametrize("arm", ["random", "adversarial"])
-def test_training_draws_and_attacks_patterns_beside_the_light(arm):
-    step = StepSettings("linf", 0.5, "sign", 0.2)
-    attack = TrainingAttackSettings(lighting=step, projector=step, max_steps=2)
-    settings = augment.AugmentationSettings(arm=arm, attack=attack)
-    service = augment.AugmentationService.from_meshes(
-        [("solid:orange", 0)], SIZE, settings, views=2, backgrounds=[0.5], rasterizer="numpy", projector=PROJECTOR
-    )
-    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * SIZE**2, 3))
-    torch.nn.init.normal_(network[1].weight, std=0.01, generator=torch.Generator().manual_seed(0))
-    renders = service.regenerate(network, 0)
-    assert renders.images.shape == (2, 3, SIZE, SIZE) and renders.diagnostics["light_change"] > 0.5
 
 
 @pytest.mark.parametrize(
@@ -271,10 +256,3 @@ def test_a_joint_attack_lowers_the_cost_and_reloads_to_the_same_image(parameters
         write_adversary(Adversary.of(done.problem.scene, example, done.conditions, *images), tmp_path)
         seen = reload(tmp_path).render(choose("numpy"))
         torch.testing.assert_close(seen, done.images[example], rtol=0, atol=1 / 255)
-
-
-def test_a_sky_is_attacked_beside_a_projector():
-    shown = scene(**CUP, lamps=None)
-    problem = AttackProblem(shown, [Skylight(shown, augment.SkylightSettings("linf", None, "unit", 0.2))])
-    light = problem.conditions(problem.start, EVERY).light
-    assert torch.equal(light[:, 49:], shown.lights[:, 49:]) and not torch.equal(light[:, :49], shown.lights[:, :49])

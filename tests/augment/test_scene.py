@@ -16,7 +16,7 @@ from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting
 from augment.backgrounds import load_backgrounds
 from augment.build import build_scene, count_views
-from augment.objects import ObjectSettings, PropSettings, SceneObject, load_object
+from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.reshading import NEAR
 from augment.scene import Conditions, Example, Scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
@@ -97,25 +97,6 @@ def built(items: list[ObjectSettings], cameras: list, settings: ImageSettings, *
     return Scene.grid(objects, cameras, behind, probe("grace"), settings, RASTERIZER, *cache)
 
 
-def test_a_file_is_turned_upright_and_its_albedo_scale_multiplies(tmp_path):
-    """A wall in the file's xy plane, 2 wide and 1 high: seen from π/3, it is upright only when y is up."""
-    path = tmp_path / "wall.obj"
-    path.write_text("v -1 0 0\nv 1 0 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n")
-    walls = [
-        ObjectSettings(str(path), "wall"),
-        ObjectSettings(str(path), "wall", up="y"),
-        ObjectSettings(str(path), "wall", up="y", albedo_scale=2.0),
-    ]
-    (stack,) = built(walls, [orbit_cameras(4, 4.0)[1]], ImageSettings(size=32, samples=4)).stacks
-    # From azimuth π/2: as wide as it was and sin π/3 high standing, cos π/3 high lying; half a sample's width of 1/64
-    # off along the outline of 6 at the most.
-    for coverage, foreshortening in zip(stack.coverage, (0.5, np.sqrt(3) / 2), strict=False):
-        assert float(coverage.sum()) / 64 == pytest.approx(2 * foreshortening, abs=6 / 64)
-    covered = stack.coverage[1, 0] > 0
-    torch.testing.assert_close(stack.albedo[2][:, covered], 2 * stack.albedo[1][:, covered], rtol=0, atol=0)
-    assert torch.equal(stack.transfer[2], stack.transfer[1])
-
-
 def test_the_clamped_fraction_counts_covered_values_alone():
     """Radiance ±L₀₀ at three pixels of coverage 1, 1/2 and 1; a second view covers a fourth pixel, always in range."""
     unit, settings, ones = torch.zeros(3, 31, 3), ImageSettings(size=2), torch.ones
@@ -163,17 +144,6 @@ def test_a_scene_stores_no_background_pixels_copies_per_background_or_zero_coeff
     # 31 nonzero coefficients of 49, and the row of zeros that makes the product fast
     assert stack.transfer.shape == (4, 3, 32, len(covered)) and not stack.transfer[:, :, 31].any()
     assert stack.coverage.shape == (4, 1, len(covered)) and stack.pixels.tolist() == sorted(covered)
-
-
-def test_a_second_scene_from_the_same_folder_builds_nothing(tmp_path, rasterized):
-    items = [ObjectSettings("solid:plate", "plate"), ObjectSettings("solid:plate:1", "plate", albedo_scale=2.0)]
-    images = []
-    for calls in ([3, 3], [3, 3]):
-        cache = OperatorCache(tmp_path)
-        images.append(render(built(items, orbit_cameras(3, 2), SETTINGS, cache), random_lights(18)))
-        assert rasterized == calls
-    assert (cache.views, cache.built) == (6, 0)
-    assert torch.equal(*images)
 
 
 # ---------------------------------------------------------------------------------------- rows of every kind
@@ -347,18 +317,3 @@ def test_shadows_are_recomputed_for_large_changes_of_shape_and_reused_for_small_
     assert off(0.02) < 1000 * EPS32
     assert 1e-4 < off(0.02 + 0.9 * NEAR) < 0.2
     assert off(0.0) < 1000 * EPS32
-
-
-def with_apple(*at: float, **more: float) -> torch.Tensor:
-    """From +x, the image of an orange, and of an apple beside it if places are given."""
-    beside = [PropSettings("solid:apple", list(at), 0.5)] if at else []
-    orange, seen = ObjectSettings("solid:orange", "orange", props=beside), {"polar": 90.0, "width": 5.0}
-    scene = build_scene([orange], 16, samples=1, rasterizer=RASTERIZER, **seen | more)
-    return scene.render(scene.conditions(torch.arange(1)), torch.arange(1))
-
-
-@pytest.mark.parametrize("along", [-10.0, 10.0])
-def test_parallel_rays_show_props_alike_near_and_far(along):
-    there = with_apple(0.0, 1.6)
-    assert not torch.equal(there, with_apple())
-    torch.testing.assert_close(with_apple(along, 1.6), there, rtol=0, atol=64 * EPS32)
