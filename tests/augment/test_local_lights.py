@@ -51,10 +51,10 @@ def test_the_image_under_several_lights_is_the_sum_of_those_under_each():
     torch.testing.assert_close(images[0], sum(images[1:]), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", [Lighting, ProjectorPattern, LampPowers])
-def test_each_light_changes_alone_with_the_gradient_of_finite_differences(kind):
+@pytest.mark.parametrize("parameter", [Lighting, ProjectorPattern, LampPowers])
+def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parameter):
     shown = scene(exposure=0.3)
-    problem = AttackProblem(shown, [kind(shown, StepSettings())])
+    problem = AttackProblem(shown, [parameter(shown, StepSettings())])
     draws = torch.Generator().manual_seed(0)
     values = problem.start.clone().requires_grad_(True)
     images = problem.render(values, EVERY)
@@ -70,8 +70,8 @@ def test_each_light_changes_alone_with_the_gradient_of_finite_differences(kind):
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 def test_patterns_and_powers_stay_in_range_and_in_their_norm_ball(norm):
     shown = scene()
-    for kind, most in ((ProjectorPattern, 2.0), (LampPowers, 10.0)):
-        changed = kind(shown, StepSettings(norm, 0.4))
+    for parameter, most in ((ProjectorPattern, 2.0), (LampPowers, 10.0)):
+        changed = parameter(shown, StepSettings(norm, 0.4))
         wanted = changed.start + 9 * torch.randn(changed.start.shape, generator=torch.Generator().manual_seed(1))
         for values in (changed.project(wanted, EVERY), changed.sample(torch.Generator().manual_seed(2), EVERY)):
             assert values.min() >= 0 and values.max() <= most
@@ -165,7 +165,7 @@ def test_moved_lamps_stay_in_their_norm_ball_and_are_reloaded_where_they_ended(t
 
 
 def test_the_gradient_by_lamp_positions_is_the_finite_difference_where_views_share_lamps():
-    """On an orange, most of which no shadow falls on: within a share of what moves."""
+    """On an orange, most of which no shadow falls on: within 2 % of the change."""
     shown = augment.build_scene(
         [("solid:orange", "orange")], SIZE, 2, shared=True, rasterizer="numpy", light="st_peters", exposure=0.3,
         lamps=LAMPS, samples=4,
@@ -175,11 +175,11 @@ def test_the_gradient_by_lamp_positions_is_the_finite_difference_where_views_sha
     values = problem.start.clone().requires_grad_(True)
     images = problem.render(values, torch.arange(1))
     assert torch.allclose(images, shown.render(shown.conditions(torch.arange(1)), torch.arange(1)), rtol=0, atol=1e-6)
-    weights, way = torch.rand(images.shape, generator=draws), torch.randn(values.shape, generator=draws)
+    weights, direction = torch.rand(images.shape, generator=draws), torch.randn(values.shape, generator=draws)
     (gradient,) = torch.autograd.grad((images * weights).sum(), values)
-    ends = [problem.render(problem.start + step * way, torch.arange(1)) for step in (1e-2, -1e-2)]
+    ends = [problem.render(problem.start + step * direction, torch.arange(1)) for step in (1e-2, -1e-2)]
     slope = (weights.double() * (ends[0] - ends[1]).double()).sum() / 2e-2
-    torch.testing.assert_close((gradient * way).double().sum(), slope, rtol=2e-2, atol=0)
+    torch.testing.assert_close((gradient * direction).double().sum(), slope, rtol=2e-2, atol=0)
 
 
 def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator(tmp_path, monkeypatch):
@@ -209,8 +209,7 @@ def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator
 @pytest.mark.parametrize("shadows", [False, True])
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
 def test_a_moved_mesh_under_local_lights_looks_like_a_mesh_built_so(normals, shadows):
-    """By operators, which share with shading neither the sum over the lights nor that over the samples. Shadows of the
-    sky are those of a shape close by."""
+    """By operators, which sum over lights and samples in code of their own. Shadows of the sky are frozen."""
     shown = scene(**CUP, normals=normals, shadows=shadows)
     draws = torch.Generator().manual_seed(0)
     far = 1e-3 if shadows else 0.1

@@ -11,7 +11,7 @@ CLASSES = torch.tensor([0, 1, 2, 3, 4, 0])
 EXCLUDED = torch.tensor([complementary_label(label) for label in CLASSES.tolist()])
 
 
-def test_a_complementary_label_costs_minus_the_logarithm_of_all_other_classes_probability():
+def test_a_complementary_label_costs_the_negative_log_probability_of_all_other_classes():
     others = 1 - softmax(LOGITS.numpy(), axis=1)[range(6), CLASSES]
     torch.testing.assert_close(label_loss(LOGITS, EXCLUDED), -torch.from_numpy(others).log(), rtol=0, atol=32 * EPS)
     smoothed = label_loss(LOGITS, EXCLUDED, label_smoothing=0.1)
@@ -36,7 +36,7 @@ def test_a_class_is_right_for_its_label_and_for_complementary_labels_of_others(p
     assert is_right(torch.tensor([predicted]), torch.tensor([label])).tolist() == [right]
 
 
-def test_log_odds_are_the_probability_s_logit():
+def test_log_odds_are_the_logit_of_the_probability():
     expected = logit(softmax(LOGITS.numpy(), axis=1)[:, 2])
     torch.testing.assert_close(log_odds(LOGITS, 2), torch.from_numpy(expected), rtol=64 * EPS, atol=64 * EPS)
 

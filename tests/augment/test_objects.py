@@ -50,8 +50,8 @@ def test_props_stand_on_the_objects_ground_shifted_and_turned():
 
 def test_another_instance_has_the_same_props():
     props, color = [PropSettings("solid:cup", [1.0, 0.0], 0.5)], [0.2, 0.3, 0.4]
-    kinds = [ObjectSettings(name, "apple", props=props) for name in ("solid:apple", "solid:apple:5")]
-    item, expected = (on_ground(load_object(kind), color) for kind in kinds)
+    items = [ObjectSettings(name, "apple", props=props) for name in ("solid:apple", "solid:apple:5")]
+    item, expected = (on_ground(load_object(item), color) for item in items)
     other = another_instance(item, 5)
     np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
     np.testing.assert_array_equal(other.own_faces, expected.own_faces)

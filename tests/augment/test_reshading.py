@@ -82,7 +82,7 @@ def test_examples_in_any_order_have_the_same_images(make_scene, part):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_unchanged_vertices_albedo_and_pixels_leave_the_image(make_scene, encoding):
-    """By operators and by shading, which share no code between the albedo and the image."""
+    """By operators and by shading, which have no code in common between the albedo and the image."""
     scene = make_scene(encoding=encoding, albedo_scale=1.2)
     light = scene.conditions(EVERY).light
     assert torch.equal(light, scene.lights)
@@ -116,10 +116,10 @@ def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, enc
     own = decode(torch.from_numpy(stone.corner_colors).double(), encoding)
     assert ((own + offset[:, :, None]) < 0).any()
     for row in range(3):
-        paint = encode((own + offset[row][:, None]).clamp(0, 1), encoding)
-        other = make_scene(mesh=replace(stone, corner_colors=paint.float().numpy()), encoding=encoding)
+        color = encode((own + offset[row][:, None]).clamp(0, 1), encoding)
+        other = make_scene(mesh=replace(stone, corner_colors=color.float().numpy()), encoding=encoding)
         expected = other.render(Conditions(own_lights(scene)), EVERY)[row]
-        # The paint is stored in float32.
+        # The color is stored in float32.
         torch.testing.assert_close(images[row], expected, rtol=0, atol=13 * 4 * EPS32)
 
 
@@ -133,7 +133,7 @@ def test_pixel_changes_are_added_last_and_clamped(make_scene):
 
 
 def test_clamped_pixels_and_colors_keep_their_gradient(make_scene, stone):
-    """At the bounds of a clamp, where `torch.clamp` has none or half of one, an attack would start in a dead corner."""
+    """At its bounds `torch.clamp` has none or half of a gradient, and an attack could not start there."""
     backgrounds = torch.zeros(3, 3, 6, 6)
     backgrounds[1:] = 1
     scene = make_scene(backgrounds=backgrounds)
@@ -143,9 +143,9 @@ def test_clamped_pixels_and_colors_keep_their_gradient(make_scene, stone):
     assert torch.equal(torch.autograd.grad(images.sum(), pixels)[0], torch.ones_like(pixels))
 
     sums = []
-    for paint in (0.0, 0.5, 1.0):
-        painted = replace(stone, corner_colors=np.full_like(stone.corner_colors, paint))
-        scene = make_scene(mesh=painted)
+    for color in (0.0, 0.5, 1.0):
+        colored = replace(stone, corner_colors=np.full_like(stone.corner_colors, color))
+        scene = make_scene(mesh=colored)
         albedo = torch.zeros(3, 20, 3, dtype=torch.float64, requires_grad=True)
         images = scene.render(replace(scene.conditions(EVERY), albedo=albedo), EVERY)
         sums.append(torch.autograd.grad(images.sum(), albedo)[0])

@@ -146,12 +146,12 @@ def test_a_scene_stores_no_background_pixels_copies_per_background_or_zero_coeff
     assert stack.coverage.shape == (4, 1, len(covered)) and stack.pixels.tolist() == sorted(covered)
 
 
-# ---------------------------------------------------------------------------------------- rows of every kind
+# ---------------------------------------------------------------------------------------- several meshes
 
 
 @pytest.fixture(scope="module", params=[relighting.STACKED, 1], ids=["one stack", "a stack per view"])
 def several(request) -> Iterator[Scene]:
-    """Two meshes of different sizes in no order, two views per row, own lights, exposures and backgrounds."""
+    """Two meshes of different sizes in mixed order: rows of two views, with a light, exposure and background each."""
     views, draws = orbit_cameras(3, 2.2), torch.Generator().manual_seed(3)
     rows = [
         Example(1, (views[0], views[1]), 0),
@@ -185,11 +185,11 @@ def test_several_meshes_are_rendered_as_each_is_alone(several, examples, by):
     assert several.labels == ["cup", "plate", "cup", "plate"]
 
 
-@pytest.mark.parametrize("kind", [Geometry, Albedo])
-def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_its_own_values_only(several, kind):
+@pytest.mark.parametrize("parameter", [Geometry, Albedo])
+def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_only_its_values(several, parameter):
     """Unused values have no gradient and are never drawn; the L2 ball is that of the used values."""
-    own = kind(several, StepSettings("l2", 0.2))
-    sizes = [len(item.mesh.vertices if kind is Geometry else item.mesh.faces) for item in several.objects]
+    own = parameter(several, StepSettings("l2", 0.2))
+    sizes = [len(item.mesh.vertices if parameter is Geometry else item.mesh.faces) for item in several.objects]
     everything, used = torch.arange(4), torch.tensor([3 * sizes[row.object] for row in several.examples])
     assert len(set(sizes)) == 2 and own.start.shape == (4, 3 * max(sizes))
     drawn = own.sample(torch.Generator().manual_seed(0), everything)

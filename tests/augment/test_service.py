@@ -47,7 +47,7 @@ def labels(scene) -> Tensor:
 
 @pytest.fixture(scope="module")
 def model(scene, labels) -> nn.Module:
-    """A small network that has learned the two solids in the initial light, so that there is something to fool."""
+    """A small network that has learned the two solids in the initial light, so that an attack can succeed."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         network = nn.Sequential(
@@ -250,7 +250,7 @@ def test_both_arms_change_shape_and_albedo_within_their_norm_balls(few, model, a
 
 
 def test_a_service_works_in_any_loop_and_its_renders_are_a_data_set(model, monkeypatch, tmp_path):
-    """Built from meshes, label indices and a size; what it gives is what a service around the same scene gives."""
+    """Built from meshes, label indices and a size; its renders equal those of a service around the same scene."""
     monkeypatch.chdir(tmp_path)
     meshes = [("solid:plate", 0), (solid("table"), 2)]
     attack = TrainingAttackSettings(max_steps=2)

@@ -108,13 +108,13 @@ def test_backgrounds_come_from_the_images_of_a_folder(scene, tmp_path):
 
 
 def test_instances_are_drawn_of_solids_without_a_seed_only(scene):
-    kinds = ["solid:plate", "solid:plate:0", "solid:orange"]
-    objects = [load_object(ObjectSettings(name, name)) for name in kinds]
+    names = ["solid:plate", "solid:plate:0", "solid:orange"]
+    objects = [load_object(ObjectSettings(name, name)) for name in names]
     settings, row = ImageSettings(SIZE, samples=2), scene.examples[0]
     rows = [replace(row, object=index) for index in range(3)]
     mixed = Scene(objects, rows, load_backgrounds([0.0], SIZE), LIGHT, settings, choose("numpy"))
     first, second = (drawn(mixed, seed, instances=True).objects for seed in (0, 1))
-    assert first[1] is objects[1] and [item.label for item in first] == kinds
+    assert first[1] is objects[1] and [item.label for item in first] == names
     for index in (0, 2):
         colors = [each[index].mesh.corner_colors for each in (objects, first, second)]
         assert not any(np.array_equal(a, b) for a, b in itertools.combinations(colors, 2))
@@ -174,7 +174,7 @@ def test_a_fraction_of_the_examples_is_in_directional_light(scene):
     assert (lit.lights[~own, 0] > 0).all()
 
 
-def test_a_lit_background_is_a_wall_that_faces_the_camera():
+def test_a_lit_background_is_shaded_as_a_wall_facing_the_camera():
     """It looks as the middle of a white ball does, and is white or gray in the same light."""
     ball = trimesh.creation.icosphere(subdivisions=4)
     settings = ImageSettings(SIZE, samples=2, encoding="srgb", normals="smooth")
