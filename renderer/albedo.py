@@ -23,10 +23,34 @@ class Texture:
     texels: Callable[[Tensor], Tensor]
 
 
-def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str) -> Tensor:
-    """(S, 3) float64 linear albedo at the samples: corner color × texture, each decoded before it is interpolated."""
-    textures = mesh_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
-    return _albedo(mesh, fragments, textures, encoding)
+def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None) -> Tensor:
+    """(S, 3) float64 linear albedo at the samples: corner color × texture, each decoded before it is interpolated.
+
+    textures: in place of the mesh's: linear albedo (H, W, 3), float; differentiable in them. InputError: NaN.
+    """
+    faces = fragments.faces.cpu().numpy()
+    albedo = _colors(mesh, faces, fragments, encoding)
+    if textures is None:
+        sources = mesh_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
+    else:
+        sources = [_texture(texture) for texture in textures]
+    if not sources:
+        return albedo
+    uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(albedo)).T
+    texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)
+    if len(sources) == 1 and not texture_ids.any():
+        return albedo * bilinear(sources[0], uvs).T
+    albedo, texture_ids = albedo.T, texture_ids.index_select(0, fragments.face)
+    for index, source in enumerate(sources):
+        here = torch.nonzero(texture_ids == index).squeeze(1)
+        value = bilinear(source, uvs.index_select(1, here))
+        albedo = albedo.index_copy(1, here, albedo.index_select(1, here) * value)
+    return albedo.T
+
+
+def _texture(linear: Tensor) -> Texture:
+    require_bounded(texture=linear)
+    return Texture(linear.shape[0], linear.shape[1], partial(torch.index_select, linear.flatten(0, 1).T, 1))
 
 
 def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
@@ -38,21 +62,8 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
         channels = (packed.index_select(0, index) >> bits) & 255
         return decoded.index_select(0, channels.long().flatten()).view(3, -1)
 
-    packed = [torch.from_numpy(each).to(like.device) for each in mesh.packed_textures]
-    return [Texture(each.shape[0], each.shape[1], partial(texels, each.flatten())) for each in packed]
-
-
-def textured_albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Tensor], encoding: str) -> Tensor:
-    """`surface_albedo` with other textures in place of the mesh's: linear albedo (H, W, 3), float, each.
-
-    Differentiable in them. InputError: NaN.
-    """
-    for texture in textures:
-        require_bounded(texture=texture)
-    rows = [
-        Texture(each.shape[0], each.shape[1], partial(torch.index_select, each.flatten(0, 1).T, 1)) for each in textures
-    ]
-    return _albedo(mesh, fragments, rows, encoding)
+    packed = [torch.from_numpy(texture).to(like.device) for texture in mesh.packed_textures]
+    return [Texture(*texture.shape, partial(texels, texture.flatten())) for texture in packed]
 
 
 def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:
@@ -88,24 +99,6 @@ def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, albedo_scale
 
 def _within(changed: Tensor, albedo: Tensor) -> Tensor:
     return clamp(changed, albedo.clamp(min=1))
-
-
-def _albedo(mesh: Mesh, fragments: Fragments, textures: Sequence[Texture], encoding: str) -> Tensor:
-    """Corner color × texture at the samples."""
-    faces = fragments.faces.cpu().numpy()
-    albedo = _colors(mesh, faces, fragments, encoding)
-    if not textures:
-        return albedo
-    uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(albedo)).T
-    texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)
-    if len(textures) == 1 and not texture_ids.any():
-        return albedo * bilinear(textures[0], uvs).T
-    albedo, texture_ids = albedo.T, texture_ids.index_select(0, fragments.face)
-    for index, texture in enumerate(textures):
-        here = torch.nonzero(texture_ids == index).squeeze(1)
-        value = bilinear(texture, uvs.index_select(1, here))
-        albedo = albedo.index_copy(1, here, albedo.index_select(1, here) * value)
-    return albedo.T
 
 
 def _colors(mesh: Mesh, faces: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
@@ -75,8 +75,7 @@ def render(
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
     if vertices is not None and vertices.shape != mesh.vertices.shape:
-        given = tuple(vertices.shape)
-        raise InputError(f"vertices of shape {given} does not fit the mesh: give {mesh.vertices.shape}")
+        raise InputError(f"vertices of shape {tuple(vertices.shape)} does not fit the mesh: give {mesh.vertices.shape}")
     local = [_with_coefficients(local) for local in lights]
     like = next((values for _, values in [(None, light), *local] if values is not None), torch.zeros(0))
     vertices = (torch.from_numpy(mesh.vertices) if vertices is None else vertices).to(like)
@@ -181,7 +180,7 @@ def _albedo(mesh: Mesh, view: Fragments, albedo: Tensor | None, encoding: str) -
     if albedo.shape == mesh.faces.shape:
         return face_albedo(albedo, view)
     if albedo.ndim == 3 and albedo.shape[2] == 3 and len(mesh.textures) == 1:
-        return textured_albedo(mesh, view, [albedo], encoding)
+        return surface_albedo(mesh, view, encoding, [albedo])
     raise InputError(
         f"albedo of shape {tuple(albedo.shape)} does not fit the mesh: give {tuple(mesh.faces.shape)}, a color per "
         "face, or (H, W, 3) for a mesh that has one texture"

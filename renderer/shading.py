@@ -9,7 +9,7 @@ from 2 on are one homogeneous polynomial p of degree d on the sphere, whose valu
 theorem, p(n) = n · ∇p(n) / d. So one product of monomials with the slope's coefficients gives both E and ∂E/∂n, of
 which the part tangent to the sphere, (∇E − n (n · ∇E)) / |normal|, is the derivative by the normal (appendix D).
 
-Visibility and texture coordinates are held fixed (Section 3 and appendix B.3): the derivative by the vertices contains
+Visibility and texture coordinates are fixed (Section 3 and appendix B.3): the derivative by the vertices contains
 how normals turn and not how outlines move. For the light alone, `renderer.transfer` is faster.
 """
 

@@ -59,7 +59,7 @@ class EnvironmentBasis(LightBasis):
 class LightPaths(NamedTuple):
     """E connections from lights to surface points. point, function: (E,) int64, the surface point and the function of
     the basis. source: (E, 3), where the light starts. irradiance: (E,) per unit of the function's coefficient,
-    differentiable in the points and normals; which connections there are is held fixed."""
+    differentiable in the points and normals; which connections there are is fixed."""
 
     point: Tensor
     function: Tensor
@@ -90,22 +90,13 @@ class SumBasis:
         return " and ".join(map(str, self.parts))
 
     @property
-    def name(self) -> str:
-        return "+".join(part.name for part in self.parts)
-
-    @property
-    def allow_negative(self) -> bool:
-        return any(part.allow_negative for part in self.parts)
-
-    @property
     def size(self) -> int:
         return sum(part.size for part in self.parts)
 
     def project_nonnegative(self, coefficients: Tensor) -> Tensor:
         """The projection of each part."""
-        split = coefficients.split([part.size for part in self.parts], dim=-2)
-        parts = zip(self.parts, split, strict=True)
-        return torch.cat([part.project_nonnegative(values) for part, values in parts], dim=-2)
+        projected = [part.project_nonnegative(coefficients[..., rows, :]) for rows, part in parts_of(self)]
+        return torch.cat(projected, dim=-2)
 
 
 Basis = EnvironmentBasis | LocalBasis | SumBasis

@@ -281,17 +281,14 @@ def project(
     polynomial of degree `quadrature_degree - degree`; or an environment map laid out by `equirectangular`.
     """
     if not callable(radiance):
-        return _project_map(torch.as_tensor(radiance), degree)
+        radiance = torch.as_tensor(radiance)
+        require_finite(radiance=radiance)
+        grid = zip(*equirectangular(*radiance.shape[:2]), radiance, strict=True)  # by rows: maps may have 10⁸ texels
+        return sum(basis(row, degree).T @ (weights[:, None] * texels.to(row)) for row, weights, texels in grid)
     directions, weights = quadrature(quadrature_degree)
     values = radiance(directions).to(torch.float64)
     require_finite(radiance=values)
     return basis(directions, degree).T @ (weights[:, None] * values)
-
-
-def _project_map(radiance: Tensor, degree: int) -> Tensor:
-    require_finite(radiance=radiance)
-    grid = zip(*equirectangular(*radiance.shape[:2]), radiance, strict=True)  # by rows: maps may have 10⁸ texels
-    return sum(basis(row, degree).T @ (weights[:, None] * texels.to(row)) for row, weights, texels in grid)
 
 
 def rotate(

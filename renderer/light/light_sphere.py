@@ -34,15 +34,10 @@ def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Bas
     light = light.detach().cpu()
     for rows, part in parts_of(basis):
         if isinstance(part, LocalBasis):
-            radiance[:, inside] += _local_radiance(normals, light[rows], part)
+            paths = part.connect(normals, normals)  # to the ball's points, which are its normals
+            arriving = paths.irradiance[:, None] * light[rows].to(normals)[paths.function]
+            radiance[:, inside] += torch.zeros_like(normals).index_add_(0, paths.point, arriving).T
         else:
             radiance[:, inside] += irradiance(normals, light if part is basis else light[rows]) / math.pi
     radiance, coverage = (avg_pool2d(layer, _SAMPLES).flatten(1) for layer in (radiance, inside[None].double()))
     return tonemap(radiance, coverage, background=torch.ones(1, 1), encoding="srgb").unflatten(1, (size, size)).float()
-
-
-def _local_radiance(normals: Tensor, light: Tensor, basis: LocalBasis) -> Tensor:
-    """(3, N) at the ball's points, which are its normals (N, 3)."""
-    reach = basis.connect(normals, normals)
-    arriving = reach.irradiance[:, None] * light.to(normals)[reach.function]
-    return torch.zeros_like(normals).index_add_(0, reach.point, arriving).T

@@ -13,7 +13,7 @@ from renderer.errors import FACTOR, InputError, require_range
 from renderer.light.basis import Basis, LightPaths, LocalBasis, SumBasis, parts_of
 from renderer.normals import tangent_axes
 
-SHARES, RAYS = 4, 8  # neighboring samples cast rays to different points of a disc: SHARES sets of RAYS points
+SETS, RAYS = 4, 8  # neighboring samples cast rays to different points of a disc: SETS of RAYS points
 LARGEST = 256  # pixels per side of a projector
 
 
@@ -34,7 +34,7 @@ class Lamps(LocalBasis):
     name = "lamps"
 
     def __post_init__(self) -> None:
-        if not self.positions or not all(len(place) == 3 and any(place) for place in self.positions):
+        if not self.positions or not all(len(position) == 3 and any(position) for position in self.positions):
             raise InputError(
                 f"lamps.positions={self.positions}: give [x, y, z] of at least one lamp, none at the origin"
             )
@@ -54,20 +54,20 @@ class Lamps(LocalBasis):
         """positions: (L, 3), instead of the basis'; the irradiance is differentiable in them, too."""
         positions = points.new_tensor(self.positions) if positions is None else positions
         sources = self._discs(positions) if self.radius else positions[None, :, None]
-        share = torch.arange(len(points), device=points.device) % len(sources)
+        of_point = torch.arange(len(points), device=points.device) % len(sources)
         with torch.no_grad():
-            toward = sources[share] - points[:, None, None]
+            toward = sources[of_point] - points[:, None, None]
             received = self._irradiance(toward, normals[:, None, None], positions[:, None])
             point, lamp, ray = torch.nonzero(received > 0, as_tuple=True)
-        source = sources[share[point], lamp, ray]
+        source = sources[of_point[point], lamp, ray]
         received = self._irradiance(source - points[point], normals[point], positions[lamp])
         return LightPaths(point, lamp, source, received / sources.shape[2])
 
     def _discs(self, positions: Tensor) -> Tensor:
-        """(SHARES, L, RAYS, 3) points that divide each disc equally: Vogel's spiral (1979), turned in each share."""
-        share, ray = torch.meshgrid(torch.arange(SHARES), torch.arange(RAYS), indexing="ij")
-        distance = self.radius * ((ray + (share + 0.5) / SHARES) / RAYS).sqrt()
-        angle = ray * math.pi * (3 - math.sqrt(5)) + share * 2 * math.pi / SHARES
+        """(SETS, L, RAYS, 3) points that divide each disc equally: Vogel's spiral (1979), turned in each set."""
+        number, ray = torch.meshgrid(torch.arange(SETS), torch.arange(RAYS), indexing="ij")
+        distance = self.radius * ((ray + (number + 0.5) / SETS) / RAYS).sqrt()
+        angle = ray * math.pi * (3 - math.sqrt(5)) + number * 2 * math.pi / SETS
         across = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2).to(positions)
         return positions[:, None] + torch.einsum("sra,laj->slrj", across, _disc_axes(F.normalize(positions, dim=1)))
 

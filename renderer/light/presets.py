@@ -55,9 +55,9 @@ def load_light(light: str) -> Tensor:
     if light == UNIFORM:
         return ambient(torch.full((3,), 1 / math.pi))
     if suffix == ".json":
-        found, coefficients = read_light(Path(light), Harmonics)
-        if found != HARMONICS:
-            raise InputError(f"light {light} is of {found}: give one of {HARMONICS}")
+        basis_read, coefficients = read_light(Path(light), Harmonics)
+        if basis_read != HARMONICS:
+            raise InputError(f"light {light} is of {basis_read}: give one of {HARMONICS}")
         return coefficients
     if suffix in SUFFIXES:
         return _read_light_map(Path(light)).float()
@@ -93,8 +93,8 @@ def directional(direction: Tensor, color: Tensor) -> Tensor:
 def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, generator: torch.Generator) -> Tensor:
     """Random lights (count, 49, 3) around one light (49, 3).
 
-    Uniform in ±amplitude on every coefficient (the paper's random arm: 0.5). With a radius, the live coefficients'
-    perturbation is scaled to that L2 norm and the dead ones, which reach no pixel, stay.
+    Uniform in ±amplitude on every coefficient (the paper's random arm: 0.5). With a radius, the perturbation of
+    the coefficients that reach a pixel is scaled to that L2 norm, and the others stay.
     """
     require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude

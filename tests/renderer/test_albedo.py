@@ -9,7 +9,7 @@ import torch
 import trimesh
 from scipy.ndimage import map_coordinates
 
-from renderer.albedo import face_albedo, painted_albedo, surface_albedo, textured_albedo
+from renderer.albedo import face_albedo, painted_albedo, surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ENCODINGS, ImageSettings
@@ -124,7 +124,7 @@ TEXTURED = [(patchwork(), OrthographicCamera(1.0, 0.4, 1.7)), (poster(random_tex
 def test_the_textures_of_a_mesh_as_parameters_give_its_albedo(mesh, camera, encoding):
     fragments = view(mesh, 6, 3, camera)
     textures = [torch.from_numpy(linear_of(texture / 255, encoding)) for texture in mesh.textures]
-    albedo = textured_albedo(mesh, fragments, textures, encoding)
+    albedo = surface_albedo(mesh, fragments, encoding, textures)
     torch.testing.assert_close(albedo, surface_albedo(mesh, fragments, encoding), rtol=0, atol=16 * EPS)
 
 
@@ -132,7 +132,7 @@ def test_the_textures_of_a_mesh_as_parameters_give_its_albedo(mesh, camera, enco
 def test_albedo_per_texel_has_the_derivative_of_central_differences(mesh, camera):
     fragments = view(mesh, 3, 2, camera)
     inputs = [draw(*texture.shape).requires_grad_(True) for texture in mesh.textures]
-    assert torch.autograd.gradcheck(lambda *given: textured_albedo(mesh, fragments, given, "srgb"), inputs)
+    assert torch.autograd.gradcheck(lambda *given: surface_albedo(mesh, fragments, "srgb", given), inputs)
 
 
 def test_albedo_per_face_is_that_of_the_face_that_a_sample_sees_and_its_gradient_counts_the_samples():

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError, require_bounded, require_finite
 from renderer.fragments import build_fragments
@@ -53,7 +53,7 @@ FINITE = [  # the tensor's name, a good one, who takes it: positions and directi
     ("normals", torch.ones(2, 3), lambda x: irradiance(x, torch.ones(9, 3))),
 ]  # fmt: skip
 BOUNDED = [  # what is multiplied with each other
-    ("texture", torch.ones(2, 2, 3), lambda x: textured_albedo(MESH, FRAGMENTS, [torch.ones(3, 3, 3), x], "linear")),
+    ("texture", torch.ones(2, 2, 3), lambda x: surface_albedo(MESH, FRAGMENTS, "linear", [torch.ones(3, 3, 3), x])),
     ("albedo", torch.ones(2, 3), lambda x: face_albedo(x, FRAGMENTS)),
     ("corner_colors", torch.ones(2, 3, 3), lambda x: surface_albedo(painted(x), FRAGMENTS, "srgb")),
     ("light", torch.ones(9, 3), lambda x: irradiance(torch.ones(2, 3), x)),

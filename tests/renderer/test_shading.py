@@ -14,7 +14,7 @@ import torch
 import trimesh
 from oracles import draw, patchwork, scipy_irradiance
 
-from renderer.albedo import face_albedo, surface_albedo, textured_albedo
+from renderer.albedo import face_albedo, surface_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.fragments import Fragments, build_fragments
@@ -157,7 +157,7 @@ class Image:
     def parts(self, vertices, light, *textures) -> tuple[Fragments, tuple]:
         """What `tonemap` takes."""
         fragments = self.scene.fragments
-        albedo = textured_albedo(self.scene.mesh, fragments, textures, self.encoding)
+        albedo = surface_albedo(self.scene.mesh, fragments, self.encoding, textures)
         lit = radiance(fragments, vertices, light, albedo, self.scene.all_faces(self.smooth))
         background = torch.tensor([[0.3], [0.6], [0.1]], dtype=lit.dtype)
         return fragments, (lit, fragments.coverage[None].to(lit), background, self.encoding)

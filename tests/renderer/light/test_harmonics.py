@@ -168,5 +168,5 @@ def test_rotated_light_in_a_rotated_direction_is_the_light_in_the_direction(degr
 @pytest.mark.parametrize("degree", [-1, MAX_DEGREE + 1])
 @pytest.mark.parametrize("function", [basis, basis_gradient])
 def test_degrees_out_of_range_are_refused(function, degree):
-    with pytest.raises(ValueError, match=f"degree {degree}"):
+    with pytest.raises(ValueError, match=f"degree={degree}"):
         function(random_directions(1), degree)
