@@ -4,25 +4,29 @@ A diffuse face reflects albedo / π of its irradiance and our radiance leaves th
 times π is one of ours. It draws directions by the cosine: its noise is then the light's variation alone.
 """
 
-import functools
 import math
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from types import ModuleType
 
+import hard_meshes as hard
 import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.special import sph_harm_y
+from oracles import mitsuba_sensor, mitsuba_shape, scipy_basis
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.mesh import Mesh, concatenate
+from renderer.io.mitsuba import mitsuba
+from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.transfer import ImageSettings, build_operators
 from renderer.transport import rays
 
-mi = pytest.importorskip("mitsuba")
+pytest.importorskip("mitsuba")
 
-SEEDS = 32  # independent images of Mitsuba's, which tell its noise
+SEEDS = 32  # independent images of Mitsuba's, from which its noise is estimated
 SIGMAS = 5  # a right image fails a bound once in a million times
 FEW = 0.02  # of a pixel: less surface is hit too seldom for a normal distribution
 MAP_ROWS = 192  # linear interpolation dims band l by l(l + 1) (π / 191)² / 12: 5e-5 of band 1, 1e-3 of the faint band 6
@@ -37,30 +41,17 @@ VIEWS = {
 
 
 @pytest.fixture(scope="module", autouse=True)
-def scalar_variant():
-    """Mitsuba's variant is global: here the one that needs no LLVM, afterwards the one before."""
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield
-    if before:
-        mi.set_variant(before)
-
-
-# ---------------------------------------------------------------------------- light
+def mi() -> Iterator[ModuleType]:
+    with mitsuba() as module:
+        yield module
 
 
 def light_map(light: np.ndarray) -> np.ndarray:
-    """(H, W, 3) radiance by scipy's harmonics, laid out as `mitsuba_light` needs it, with a row at either pole."""
-    polar = np.linspace(0, math.pi, MAP_ROWS)
+    """(H, W, 3) radiance by scipy's harmonics, as Mitsuba's maps have it, with a row at either pole."""
+    polar = np.linspace(0, math.pi, MAP_ROWS)[:, None]
     azimuth = math.pi - 2 * math.pi * (np.arange(2 * MAP_ROWS) + 0.5) / (2 * MAP_ROWS)
-    total = np.zeros((MAP_ROWS, 2 * MAP_ROWS, 3))
-    for l in range(7):
-        for m in range(-l, l + 1):
-            around = np.cos(m * azimuth) if m >= 0 else np.sin(-m * azimuth)
-            scale = 1 if m == 0 else math.sqrt(2) * (-1) ** m  # scipy has the Condon-Shortley sign
-            harmonic = scale * np.outer(sph_harm_y(l, abs(m), polar, 0).real, around)
-            total += harmonic[..., None] * light[l * l + l + m]
-    return total
+    axes = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth
+    return (scipy_basis(np.stack(axes, axis=-1).reshape(-1, 3), 6) @ light).reshape(MAP_ROWS, -1, 3)
 
 
 def positive_light(seed: int) -> np.ndarray:
@@ -73,10 +64,8 @@ def positive_light(seed: int) -> np.ndarray:
 
 LIGHT = positive_light(1)
 
-# ---------------------------------------------------------------------------- convex solids
 
-
-def facets() -> Mesh:
+def ball() -> Mesh:
     sphere = trimesh.creation.icosphere(subdivisions=1)
     return Mesh.plain(sphere.vertices, sphere.faces, (0.9, 0.5, 0.2))
 
@@ -100,43 +89,11 @@ def textured_hull() -> Mesh:
     )
 
 
-def pocked() -> Mesh:
-    """A ball with dents, whose sides shadow each other."""
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    rng = np.random.default_rng(3)
-    return Mesh.plain(ball.vertices * rng.uniform(0.5, 1, (len(ball.vertices), 1)), ball.faces, (0.9, 0.5, 0.2))
-
-
-def heap() -> Mesh:
-    """Open, thin, touching itself and of several parts: a ball on a plate, before a wall that is seen from behind."""
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
-    plate = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
-    wall = Mesh.plain([[-0.7, -0.8, 0], [-0.7, 0.8, 0], [-0.6, 0.7, 0.9]], [[0, 1, 2]], (0.8, 0.3, 0.1))
-    return concatenate([Mesh.plain(ball.vertices + np.array([0, 0, 0.4]), ball.faces), plate, wall])
-
-
 def bowl() -> Mesh:
     """The lower half of a ball, seen from within."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.9)
     lower = ball.vertices[ball.faces].mean(axis=1)[:, 2] < 0
     return Mesh.plain(ball.vertices, ball.faces[lower], (0.8, 0.8, 0.3))
-
-
-each_case = pytest.mark.parametrize(
-    ("solid", "view"),
-    [
-        (facets, "near the pole"),
-        (facets, "from above"),
-        (colored_cube, "from above"),
-        (colored_cube, "from below"),
-        (textured_hull, "near the pole"),
-        (textured_hull, "from below"),
-        (colored_cube, "from close by"),
-        (textured_hull, "from close by"),
-    ],
-)
-
-# ---------------------------------------------------------------------------- images
 
 
 def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, **settings) -> np.ndarray:
@@ -149,78 +106,41 @@ def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, **settings) -
     return canvas.reshape(size, size, 4)
 
 
-@functools.cache
-def mitsuba_image(solid, view: str, size: int, rays: int, bounces: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def mitsuba_image(mi, mesh: Mesh, camera: Camera, size: int, spp: int, bounces: int = 0) -> tuple[np.ndarray, ...]:
     """The mean (size, size, 4) of SEEDS images of so many rays per pixel, and its standard error."""
     direct = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
     path = {"type": "path", "max_depth": bounces + 2, "rr_depth": 1000}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {**(path if bounces else direct), "hide_emitters": True},
-            "light": mitsuba_light(),
-            "mesh": mitsuba_mesh(solid()),
-            "sensor": mitsuba_sensor(VIEWS[view], size),
-        }
-    )
-    images = np.stack([np.array(mi.render(scene, spp=rays, seed=seed)) for seed in range(SEEDS)]).astype(float)
+    # Mitsuba's maps have y up and +z in the middle column; ours have z up and +x there.
+    to_world = mi.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    bitmap = mi.Bitmap(light_map(LIGHT).astype(np.float32))
+    parts = {
+        "type": "scene",
+        "integrator": {**(path if bounces else direct), "hide_emitters": True},
+        "light": {"type": "envmap", "bitmap": bitmap, "to_world": to_world},
+        "mesh": mitsuba_shape(mi, mesh),
+        "sensor": mitsuba_sensor(mi, camera, size),
+    }
+    scene = mi.load_dict(parts)
+    images = np.stack([np.array(mi.render(scene, spp=spp, seed=seed)) for seed in range(SEEDS)]).astype(float)
     images[..., :3] *= math.pi
     return images.mean(axis=0), images.std(axis=0, ddof=1) / math.sqrt(SEEDS)
 
 
-def mitsuba_light() -> dict:
-    """Mitsuba's maps have y up and +z in the middle column; ours have z up and +x there."""
-    turn = mi.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    return {"type": "envmap", "bitmap": mi.Bitmap(light_map(LIGHT).astype(np.float32)), "to_world": turn}
-
-
-def mitsuba_sensor(camera: Camera, size: int) -> dict:
-    right, up, back = camera.axes()
-    aim = -camera.right * right - camera.up * up
-    look = mi.ScalarTransform4f().look_at(origin=list(aim + camera.distance * back), target=list(aim), up=list(up))
-    half = camera.width / 2
-    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "rfilter": {"type": "box"}}
-    if isinstance(camera, PerspectiveCamera):
-        return {"type": "perspective", "fov": 2 * math.degrees(math.atan(half / camera.distance)), "to_world": look} | {
-            "film": film
-        }
-    # Mitsuba's image spans [-1, 1]
-    return {"type": "orthographic", "to_world": look @ mi.ScalarTransform4f().scale([half, half, 1]), "film": film}
-
-
-def mitsuba_mesh(mesh: Mesh):
-    """Every face gets corners of its own, as our colors are kept."""
-    properties = mi.Properties()
-    properties["face_normals"] = True
-    diffuse = {"type": "diffuse", "reflectance": mitsuba_albedo(mesh)}
-    properties["bsdf"] = mi.load_dict({"type": "twosided", "material": diffuse})
-    corners = 3 * len(mesh.faces)
-    result = mi.Mesh("mesh", corners, len(mesh.faces), props=properties, has_vertex_texcoords=True)
-    result.add_attribute("vertex_color", 3, mesh.corner_colors.ravel())
-    buffers = mi.traverse(result)
-    buffers["faces"] = np.arange(corners, dtype=np.uint32)
-    buffers["vertex_positions"] = mesh.vertices[mesh.faces].astype(np.float32).ravel()
-    buffers["vertex_texcoords"] = (mesh.corner_uvs * [1, -1] + [0, 1]).astype(np.float32).ravel()  # v runs down
-    buffers.update()
-    return result
-
-
-def mitsuba_albedo(mesh: Mesh) -> dict:
-    """The texture where there is one, else the corners' colors."""
-    if not mesh.textures:
-        return {"type": "mesh_attribute", "name": "vertex_color"}
-    [texture] = mesh.textures
-    return {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": True}
-
-
-# ---------------------------------------------------------------------------- claims
-
-
-@each_case
+@pytest.mark.parametrize(
+    ("solid", "view"),
+    [
+        (ball, "near the pole"),
+        (ball, "from above"),
+        (colored_cube, "from below"),
+        (textured_hull, "from below"),
+        (colored_cube, "from close by"),
+        (textured_hull, "from close by"),
+    ],
+)
 @pytest.mark.parametrize(
     ("size", "samples", "rays"), [(32, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)]
 )
-def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(solid, view, size, samples, rays):
+def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(mi, solid, view, size, samples, rays):
     """Our error, in Mitsuba's standard errors: its root mean square is one and its mean is zero.
 
     A standard error from n images makes a Student's t of n - 1 degrees of freedom: the mean and the variance of its
@@ -230,7 +150,7 @@ def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(solid, view,
     a pixel, against Mitsuba's noise of up to 0.8 % there (0.06 and 0.4 % in the slow runs), too little to show.
     """
     ours = our_image(solid(), VIEWS[view], size, samples)
-    theirs, noise = mitsuba_image(solid, view, size, rays)
+    theirs, noise = mitsuba_image(mi, solid(), VIEWS[view], size, rays)
     covered = np.maximum(ours, theirs)[..., 3] > FEW
     errors = (ours - theirs)[covered, :3] / noise[covered, :3]
     freedom = SEEDS - 1
@@ -247,25 +167,25 @@ def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(solid, view,
     ("solid", "view", "bounces"),
     [
         (bowl, "near the pole", 0),
-        (heap, "from above", 3),
+        (hard.heap, "from above", 3),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
             for case in [
                 (bowl, "near the pole", 1),
                 (bowl, "near the pole", 3),
-                (heap, "from above", 0),
-                (heap, "from above", 1),
-                (pocked, "from above", 0),
-                (pocked, "from above", 1),
-                (pocked, "from above", 3),
+                (hard.heap, "from above", 0),
+                (hard.heap, "from above", 1),
+                (partial(hard.sphere, 2, 0.5), "from above", 0),
+                (partial(hard.sphere, 2, 0.5), "from above", 1),
+                (partial(hard.sphere, 2, 0.5), "from above", 3),
             ]
         ),
     ],
 )
-def test_shadows_and_bounces_equal_mitsuba_within_its_noise(solid, view, bounces, monkeypatch):
+def test_shadows_and_bounces_are_mitsubas_within_its_noise(mi, solid, view, bounces, monkeypatch):
     """With rays enough for a quadrature of 0.5 % of the brightest, root mean square, and 0.1 % on average."""
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
-    theirs, noise = mitsuba_image(solid, view, 32, 128, bounces)
+    theirs, noise = mitsuba_image(mi, solid(), VIEWS[view], 32, 128, bounces)
     inside, brightest = theirs[..., 3] == 1, theirs[..., :3].max()
     ours, less = (
         our_image(solid(), VIEWS[view], 32, 8, **options)

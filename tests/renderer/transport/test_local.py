@@ -1,4 +1,4 @@
-"""Light from places against Mitsuba 3's projector, point and area emitters, on convex and concave meshes."""
+"""Lamps and projectors against Mitsuba 3's projector, point and area emitters, on convex and concave meshes."""
 
 import math
 from dataclasses import replace
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from oracles import mitsuba_pose, mitsuba_sensor, mitsuba_shape
 
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
@@ -59,78 +60,36 @@ def mitsuba_image(mesh: Mesh, basis: LocalBasis, light: torch.Tensor) -> np.ndar
     """(SIZE, SIZE, 3): 1,024 rays spread over each pixel, so that nothing but edges is noisy."""
     pytest.importorskip("mitsuba")
     with mitsuba() as mi:
-        rest = {
+        sampler = {"type": "multijitter", "sample_count": 1024}
+        scene = {
             "type": "scene",
             "integrator": {"type": "direct", "hide_emitters": True},
-            "sensor": mitsuba_sensor(mi),
-            **mitsuba_parts(mi, mesh),
+            "sensor": mitsuba_sensor(mi, CAMERA, SIZE, sampler=sampler),
+            "mesh": mitsuba_shape(mi, mesh),
         }
         lights = mitsuba_lights(mi, basis, light)  # one by one, since Mitsuba draws one of several
-        return sum(np.array(mi.render(mi.load_dict(rest | {"light": each})), dtype=float) for each in lights)
-
-
-def look_at(mi, camera: OrthographicCamera, distance: float):
-    _, up, back = camera.axes()
-    return mi.ScalarTransform4f().look_at(origin=list(distance * back), target=[0, 0, 0], up=list(up))
-
-
-def mitsuba_sensor(mi) -> dict:
-    half = CAMERA.width / 2
-    return {
-        "type": "orthographic",
-        "to_world": look_at(mi, CAMERA, 4) @ mi.ScalarTransform4f().scale([half, half, 1]),
-        "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
-        "sampler": {"type": "multijitter", "sample_count": 1024},
-    }
-
-
-def mitsuba_parts(mi, mesh: Mesh) -> dict:
-    """A shape per color."""
-    parts = {}
-    for index, color in enumerate(np.unique(mesh.corner_colors[:, 0], axis=0)):
-        here = (mesh.corner_colors[:, 0] == color).all(axis=1)
-        corners = mesh.vertices[mesh.faces[here]].astype(np.float32)
-        properties = mi.Properties()
-        properties["face_normals"] = True
-        diffuse = {"type": "diffuse", "reflectance": {"type": "rgb", "value": color.tolist()}}
-        properties["bsdf"] = mi.load_dict({"type": "twosided", "material": diffuse})
-        part = mi.Mesh(f"part_{index}", 3 * len(corners), len(corners), props=properties)
-        buffers = mi.traverse(part)
-        buffers["faces"] = np.arange(3 * len(corners), dtype=np.uint32)
-        buffers["vertex_positions"] = corners.ravel()
-        buffers.update()
-        parts[f"part_{index}"] = part
-    return parts
+        images = [np.array(mi.render(mi.load_dict(scene | {"light": entry})), dtype=float) for entry in lights]
+        return sum(images)[..., :3]
 
 
 def mitsuba_lights(mi, basis: LocalBasis, light: torch.Tensor) -> list[dict]:
     if isinstance(basis, Projector):
         pattern = mi.Bitmap(light.view(basis.pixels, basis.pixels, 3).numpy().astype(np.float32))
         sharp = {"type": "bitmap", "bitmap": pattern, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
-        return [
-            {
-                "type": "projector",
-                "irradiance": sharp,
-                "fov": math.degrees(basis.fov),
-                "scale": basis.distance**2,
-                "to_world": look_at(mi, OrthographicCamera(basis.polar, basis.azimuth, 1.0), basis.distance),
-            }
-        ]
-    if basis.radius:
-        size = mi.ScalarTransform4f().scale([basis.radius, basis.radius, 1])
-        return [
-            {
-                "type": "disk",
-                "to_world": mi.ScalarTransform4f().look_at(origin=list(place), target=[0, 0, 0], up=[0.3, 0.2, 1])
-                @ size,
-                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
-            }
-            for place, radiance in zip(basis.positions, (light / basis.radius**2).tolist(), strict=True)
-        ]
-    return [
-        {"type": "point", "position": list(place), "intensity": {"type": "rgb", "value": power}}
-        for place, power in zip(basis.positions, (math.pi * light).tolist(), strict=True)  # we leave out 1/π
-    ]
+        pose = mitsuba_pose(mi, OrthographicCamera(basis.polar, basis.azimuth, 1.0), basis.distance)
+        fov, scale = math.degrees(basis.fov), basis.distance**2
+        return [{"type": "projector", "irradiance": sharp, "fov": fov, "scale": scale, "to_world": pose}]
+    entries = []
+    for position, power in zip(map(list, basis.positions), light, strict=True):
+        if not basis.radius:
+            intensity = {"type": "rgb", "value": (math.pi * power).tolist()}  # we leave out 1/π
+            entries.append({"type": "point", "position": position, "intensity": intensity})
+            continue
+        pose = mi.ScalarTransform4f().look_at(origin=position, target=[0, 0, 0], up=[0.3, 0.2, 1])
+        pose = pose @ mi.ScalarTransform4f().scale([basis.radius, basis.radius, 1])
+        radiance = {"type": "rgb", "value": (power / basis.radius**2).tolist()}
+        entries.append({"type": "disk", "to_world": pose, "emitter": {"type": "area", "radiance": radiance}})
+    return entries
 
 
 @pytest.mark.parametrize(
@@ -139,7 +98,7 @@ def mitsuba_lights(mi, basis: LocalBasis, light: torch.Tensor) -> list[dict]:
         *((basis, solid) for basis in (PROJECTOR, LAMPS) for solid in (ball, ball_on_a_table)),
         (DISCS, ball_on_a_table),
     ],
-    ids=lambda each: getattr(each, "name", None),
+    ids=lambda value: getattr(value, "name", None),
 )
 def test_images_and_gradients_are_mitsubas(solid, basis):
     """Direct light of a point has no noise but where edges of pattern, shadow and outline cross a pixel: most pixels
@@ -177,7 +136,7 @@ def test_a_screen_at_the_origin_shows_the_pattern_upright_and_as_bright():
 
 
 @pytest.mark.parametrize("basis", [PROJECTOR, LAMPS], ids=["projector", "lamps"])
-def test_nothing_emits_less_than_nothing_or_more_than_its_power(basis):
+def test_emission_is_projected_between_zero_and_the_power(basis):
     light = torch.tensor([-1.0, 0.5, 99.0]).expand(1, basis.size, 3)
     expected = torch.tensor([0.0, 0.5, basis.power]).expand_as(light)
     assert torch.equal(basis.project_nonnegative(light), expected)
@@ -193,42 +152,42 @@ def moved_image(
     samples: int = SAMPLES,
     basis: Lamps = LAMPS,
 ) -> tuple[TransferOperator, torch.Tensor]:
-    """The operator of the lamps, and (3, P) of its pixels under these at other places."""
+    """The operator of the lamps, and (3, P) of its pixels under these at other positions."""
     settings = ImageSettings(size, samples)
     (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=mesh.closed)
     surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding)
-    reach = unoccluded(Rays(mesh), surface, basis.connect(surface.points, surface.normals, positions))
-    return operator(mesh, basis, size, samples), local_radiance(view, albedo, reach, powers)
+    paths = unoccluded(Rays(mesh), surface, basis.connect(surface.points, surface.normals, positions))
+    return operator(mesh, basis, size, samples), local_radiance(view, albedo, paths, powers)
 
 
 @pytest.mark.parametrize("basis", [LAMPS, DISCS], ids=["lamps", "discs"])
-def test_lamps_that_are_moved_shine_and_throw_shadows_as_lamps_that_stand_there(basis):
+def test_moved_lamps_shine_and_cast_shadows_as_lamps_that_stand_there(basis):
     there = torch.tensor([[2.0, -1.0, 1.5], [-0.4, 1.7, 2.5]], dtype=torch.float64)
     powers = torch.rand(2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     shown = partial(moved_image, ball_on_a_table(), samples=4, basis=basis)
-    _, seen = shown(there, powers)
+    _, image = shown(there, powers)
     standing = operator(ball_on_a_table(), moved(basis, there), samples=4)
-    torch.testing.assert_close(seen, standing.radiance(powers), rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(image, standing.radiance(powers), rtol=1e-12, atol=1e-14)
     _, alone = shown(there[:1], powers[:1])
     assert (alone == 0).any() and alone.max() > 0.02
 
 
 @pytest.mark.parametrize("basis", [LAMPS, DISCS], ids=["lamps", "discs"])
-def test_the_derivative_by_places_and_powers_is_that_of_finite_differences_where_no_shadow_moves(basis):
+def test_derivatives_by_positions_and_powers_are_finite_differences_where_no_shadow_moves(basis):
     positions = torch.tensor(LAMPS.positions, dtype=torch.float64, requires_grad=True)
     powers = torch.rand(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True)
     small = partial(moved_image, ball(), size=6, samples=2, basis=basis)
-    assert torch.autograd.gradcheck(lambda *given: small(*given)[1], (positions, powers), eps=1e-7)
+    assert torch.autograd.gradcheck(lambda *inputs: small(*inputs)[1], (positions, powers), eps=1e-7)
 
 
 @pytest.mark.parametrize(("basis", "normals"), [(PROJECTOR, "flat"), (LAMPS, "smooth"), (DISCS, "flat")])
-def test_the_derivative_by_vertices_and_albedo_is_that_of_finite_differences_where_visibility_is_held(basis, normals):
+def test_derivatives_by_vertices_and_albedo_are_finite_differences_at_fixed_visibility(basis, normals):
     mesh, settings = ball(1), ImageSettings(5, 2, normals=normals)
     (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=True)
     powers = torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rays = Rays(mesh)
 
-    def seen(vertices: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
+    def image(vertices: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
         surface = Surface.of(mesh, view, settings, vertices)
         return local_radiance(
             view, albedo, unoccluded(rays, surface, basis.connect(surface.points, surface.normals)), powers
@@ -236,22 +195,24 @@ def test_the_derivative_by_vertices_and_albedo_is_that_of_finite_differences_whe
 
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
     albedo = surface_albedo(mesh, view, settings.encoding).contiguous().requires_grad_()
-    assert torch.autograd.gradcheck(seen, (vertices, albedo), eps=1e-7)
-    (gradient,) = torch.autograd.grad(seen(vertices, albedo).sum(), vertices)
+    assert torch.autograd.gradcheck(image, (vertices, albedo), eps=1e-7)
+    (gradient,) = torch.autograd.grad(image(vertices, albedo).sum(), vertices)
     assert gradient.abs().max() > 1e-3
 
 
-def test_the_derivative_by_places_is_mitsubas():
+def test_the_derivative_by_positions_is_mitsubas():
     """On a ball, which no shadow of its own falls on; by central differences of Mitsuba's images."""
     draws = torch.Generator().manual_seed(1)
     positions = torch.tensor(LAMPS.positions, dtype=torch.float64, requires_grad=True)
-    powers, way = (torch.rand(3, 3, generator=draws, dtype=torch.float64) for _ in range(2))
-    built, seen = moved_image(ball(), positions, powers)
-    weights = torch.rand(seen.shape, generator=draws, dtype=torch.float64)
-    (gradient,) = torch.autograd.grad((weights * seen).sum(), positions)
-    ends = [mitsuba_image(ball(), moved(LAMPS, positions.detach() + step * way), powers) for step in (0.02, -0.02)]
+    powers, direction = (torch.rand(3, 3, generator=draws, dtype=torch.float64) for _ in range(2))
+    built, image = moved_image(ball(), positions, powers)
+    weights = torch.rand(image.shape, generator=draws, dtype=torch.float64)
+    (gradient,) = torch.autograd.grad((weights * image).sum(), positions)
+    ends = [
+        mitsuba_image(ball(), moved(LAMPS, positions.detach() + step * direction), powers) for step in (0.02, -0.02)
+    ]
     change = torch.from_numpy((ends[0] - ends[1]) / 0.04).flatten(0, 1)[built.pixels].T
-    slopes = gradient * way  # which nearly cancel
+    slopes = gradient * direction  # which nearly cancel
     torch.testing.assert_close(slopes.sum(), (weights * change).sum(), rtol=0, atol=1e-3 * float(slopes.abs().sum()))
 
 
@@ -259,18 +220,18 @@ def test_a_small_disc_is_a_point_but_for_the_cosine_off_its_axis_and_dark_behind
     draws = torch.Generator().manual_seed(0)
     points, normals = torch.randn(2, 500, 3, generator=draws, dtype=torch.float64)
     normals /= normals.norm(dim=1, keepdim=True)
-    place = torch.tensor([0.5, -0.3, 0.8], dtype=torch.float64)
+    position = torch.tensor([0.5, -0.3, 0.8], dtype=torch.float64)
     received = []
     for radius in (0.0, 1e-7):
-        reach = Lamps((tuple(place.tolist()),), radius=radius).connect(points, normals)
-        received.append(torch.zeros(500, dtype=torch.float64).index_add(0, reach.point, reach.irradiance))
-    toward = place - points
-    cosine = (toward @ place / place.norm() / toward.norm(dim=1)).clamp(min=0)
+        paths = Lamps((tuple(position.tolist()),), radius=radius).connect(points, normals)
+        received.append(torch.zeros(500, dtype=torch.float64).index_add(0, paths.point, paths.irradiance))
+    toward = position - points
+    cosine = (toward @ position / position.norm() / toward.norm(dim=1)).clamp(min=0)
     assert 50 < (cosine == 0).sum() < 450
     torch.testing.assert_close(received[1], received[0] * cosine, rtol=1e-5, atol=1e-6)
 
 
-def test_what_lies_behind_a_lamp_is_not_in_its_way():
+def test_a_surface_behind_a_lamp_casts_no_shadow():
     """Halfway between two screens, of which the camera sees the lower one through a gap."""
     square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     vertices = np.concatenate([square, square * [0.2, 0.2, 0] + [0, 0, 1.0]])
@@ -280,9 +241,9 @@ def test_what_lies_behind_a_lamp_is_not_in_its_way():
     assert shown.max() == pytest.approx(4.0, rel=0.2)  # 1 / 0.5², and less away from below the lamp
 
 
-@pytest.mark.parametrize("several", [(), (2,), (2, 3)], ids=str)
+@pytest.mark.parametrize("batch", [(), (2, 3)], ids=str)
 @pytest.mark.parametrize("solid", [ball, ball_on_a_table])
-def test_what_is_little_is_multiplied_one_by_one_to_the_same_sums(monkeypatch, several, solid):
+def test_sparse_and_dense_transfer_give_the_same_radiance_and_gradient(monkeypatch, batch, solid):
     """In harmonics and a projector at once, of one color and of two."""
     both, mesh = SumBasis((HARMONICS, Projector(16, 0.5, 1.6, 3.0, 0.8))), solid()
     monkeypatch.setattr(sparse, "SMALL", 0)
@@ -292,7 +253,7 @@ def test_what_is_little_is_multiplied_one_by_one_to_the_same_sums(monkeypatch, s
     assert few.sparse is not None and whole.sparse is None and len(few.nonzero) == len(HARMONICS.nonzero)
     assert 50 * len(few.sparse.function) < whole.transfer[0, len(few.nonzero) :].numel()
     draws = torch.Generator().manual_seed(0)
-    lights = torch.rand(*several, both.size, 3, generator=draws, dtype=torch.float64)
+    lights = torch.rand(*batch, both.size, 3, generator=draws, dtype=torch.float64)
     torch.testing.assert_close(few.radiance(lights), whole.radiance(lights), rtol=1e-13, atol=1e-13)
-    upstream = torch.randn(*several, 3, len(few.pixels), generator=draws, dtype=torch.float64)
+    upstream = torch.randn(*batch, 3, len(few.pixels), generator=draws, dtype=torch.float64)
     torch.testing.assert_close(few.light_gradient(upstream), whole.light_gradient(upstream), rtol=1e-12, atol=1e-12)

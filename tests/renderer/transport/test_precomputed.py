@@ -4,6 +4,7 @@ import math
 import sys
 from dataclasses import replace
 
+import hard_meshes as hard
 import numpy as np
 import pytest
 import torch
@@ -17,7 +18,7 @@ from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.light.harmonics import basis, nonzero_coefficients
 from renderer.light.presets import ambient, load_light
-from renderer.mesh import Mesh, concatenate
+from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.rendering import precompute_transfer, render
 from renderer.transfer import TransferOperator, build_operators
@@ -42,7 +43,7 @@ def all_rows(operator: TransferOperator) -> torch.Tensor:
     return transfer.new_zeros(3, 49, transfer.shape[2]).index_copy(1, operator.nonzero, transfer)
 
 
-def sky_share(operator: TransferOperator) -> torch.Tensor:
+def sky_fraction(operator: TransferOperator) -> torch.Tensor:
     """(3, P), the radiance of white pixels under a white sky, over that under an open one."""
     return operator.radiance(ambient(torch.ones(3, dtype=torch.float64))) / operator.coverage / math.pi
 
@@ -56,14 +57,6 @@ def dented(seed=0) -> Mesh:
     ball = trimesh.creation.icosphere(subdivisions=1)
     depth = np.random.default_rng(seed).uniform(0.5, 1.0, (len(ball.vertices), 1))
     return Mesh.plain(ball.vertices * depth, ball.faces, np.random.default_rng(seed).uniform(0.1, 1, (len(depth), 3)))
-
-
-def parts() -> Mesh:
-    """A ball over a plate that it touches, beside a thin wall seen from behind: open, thin and of several parts."""
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.4)
-    plate = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
-    wall = Mesh.plain([[-0.7, -0.8, 0], [-0.7, 0.8, 0], [-0.6, 0.7, 0.9]], [[0, 1, 2]], (0.8, 0.3, 0.1))
-    return concatenate([Mesh.plain(ball.vertices + np.array([0, 0, 0.4]), ball.faces), plate, wall])
 
 
 def pit(depth: float) -> Mesh:
@@ -83,7 +76,7 @@ CONVEX = {
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
 @pytest.mark.parametrize("mesh", CONVEX.values(), ids=CONVEX)
-def test_a_convex_mesh_keeps_the_operator_of_direct_light_to_the_bit(mesh, normals):
+def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(mesh, normals):
     camera = OrthographicCamera(1.0, 0.3, 2.2)
     direct = operator_of(mesh, camera, shadows=False, normals=normals)
     for bounces in (0, 2):
@@ -103,7 +96,7 @@ def test_a_mesh_outside_the_image_has_no_pixels_and_faces_without_area_do_no_har
     monkeypatch.setattr(radiosity, "PATCHES", 2**7)
     outside = OrthographicCamera(0, 0, 1.0, right=20.0)
     assert not operator_of(dented(), outside, bounces=bounces).transfer.numel()
-    thin = replace(parts(), faces=np.concatenate([parts().faces[:-1], [[0, 0, 1]]]))
+    thin = replace(hard.heap(), faces=np.concatenate([hard.heap().faces[:-1], [[0, 0, 1]]]))
     assert operator_of(thin, bounces=bounces).transfer.isfinite().all()
 
 
@@ -124,23 +117,23 @@ def blocked(points: torch.Tensor, directions: torch.Tensor, corners: torch.Tenso
 
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
-@pytest.mark.parametrize("mesh", [dented(), parts(), pit(1.0)], ids=["dented", "parts", "pit"])
-def test_each_coefficient_is_that_of_the_slow_ray_caster(mesh, normals):
+@pytest.mark.parametrize("mesh", [dented(), hard.heap(), pit(1.0)], ids=["dented", "heap", "pit"])
+def test_coefficients_are_those_of_a_slow_ray_caster(mesh, normals):
     """One sample per pixel looks in all directions, so that both add up the same rays."""
     camera = OrthographicCamera(0.8, 0.4, 2.1)
     settings = ImageSettings(6, 1, normals=normals)
-    [seen] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, RASTERIZER, mesh.closed)
+    [view] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, RASTERIZER, mesh.closed)
     corners, directions = torch.from_numpy(mesh.vertices[mesh.faces]), sphere(DIRECTIONS)
-    own = corners[seen.faces]
-    planes = reference.unit(reference.doubled_area_vectors(own)) * seen.facing
+    own = corners[view.faces]
+    planes = reference.unit(reference.doubled_area_vectors(own)) * view.facing
     at_corners = planes[:, None].expand(-1, 3, -1)
     if normals == "smooth":
         smooth = reference.vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces))
-        at_corners = smooth[seen.corners] * seen.facing[:, None]
-    weights = seen.barycentric[..., None]
-    at = (weights * own[seen.face]).sum(1) + 1e-5 * planes[seen.face] * np.abs(mesh.vertices).max()
-    cosine = (reference.unit((weights * at_corners[seen.face]).sum(1)) @ directions.T).clamp(min=0)
-    cosine[planes[seen.face] @ directions.T <= 0] = 0
+        at_corners = smooth[view.corners] * view.facing[:, None]
+    weights = view.barycentric[..., None]
+    at = (weights * own[view.face]).sum(1) + 1e-5 * planes[view.face] * np.abs(mesh.vertices).max()
+    cosine = (reference.unit((weights * at_corners[view.face]).sum(1)) @ directions.T).clamp(min=0)
+    cosine[planes[view.face] @ directions.T <= 0] = 0
     lost = torch.where(blocked(at, directions, corners), cosine, 0) @ basis(directions, 6)
 
     direct, shadowed = (operator_of(mesh, camera, shadows=t, normals=normals) for t in (False, True))
@@ -150,51 +143,37 @@ def test_each_coefficient_is_that_of_the_slow_ray_caster(mesh, normals):
 
 
 @pytest.mark.parametrize("depth", [0.25, 0.5, 1.0])
-def test_the_middle_of_a_pit_sees_the_share_of_the_sky_that_a_square_has(depth):
+def test_the_sky_over_the_middle_of_a_pit_has_a_squares_configuration_factor(depth):
     """The configuration factor of a square parallel to a surface, over its middle (Howell's catalog, B-3)."""
     side = 0.5 / depth
     far = math.hypot(1, side)
-    share = 4 * side / (math.pi * far) * math.atan(side / far)
-    [middle] = sky_share(operator_of(pit(depth), OrthographicCamera(0, 0, 0.01), size=1))[0].tolist()
-    assert middle == pytest.approx(share, abs=QUADRATURE)
+    fraction = 4 * side / (math.pi * far) * math.atan(side / far)
+    [middle] = sky_fraction(operator_of(pit(depth), OrthographicCamera(0, 0, 0.01), size=1))[0].tolist()
+    assert middle == pytest.approx(fraction, abs=QUADRATURE)
 
 
+@pytest.mark.parametrize(
+    ("mesh", "tolerance"), [(dented(1), 1e-6), (hard.heap(), 1e-6), (pit(3.0), 0.5)], ids=["dented", "heap", "pit"]
+)
 @pytest.mark.parametrize("samples", [1, 3])
-def test_no_pixel_is_brighter_than_under_an_open_sky_or_darker_than_none(samples):
-    """What is lost is added up from directions, and what is there in closed form."""
-    for mesh in (dented(1), parts(), pit(3.0)):
-        shares = sky_share(operator_of(mesh, size=16, samples=samples)).amax(0)
-        assert shares.max() <= 1 + 1e-9
-        assert shares.min() >= -QUADRATURE
-        assert shares.min() < 0.9
-
-
-def white(mesh: Mesh) -> Mesh:
-    return replace(mesh, corner_colors=np.ones_like(mesh.corner_colors))
-
-
-@pytest.mark.parametrize("mesh", [white(dented(1)), white(parts())], ids=["dented", "parts"])
-def test_a_white_mesh_in_a_white_furnace_brightens_with_each_bounce_until_it_cannot_be_seen(mesh, monkeypatch):
-    """All light is kept, and what a direction does not bring comes from what is met there."""
+def test_a_white_mesh_in_a_white_furnace_brightens_with_bounces_to_the_sky(mesh, tolerance, samples, monkeypatch):
+    """No pixel is brighter than under an open sky or darker than black: what is lost is a sum over directions, what is
+    there a closed form. As a white mesh absorbs no light, it becomes as bright as the sky, in a deep pit slowly."""
     monkeypatch.setattr(radiosity, "PATCHES", 2**7)
-    shares = [sky_share(operator_of(mesh, size=12, samples=2, bounces=n)) for n in (1, 2, 4, 8, 100)]
-    before = sky_share(operator_of(mesh, size=12, samples=2))
-    for share in shares:
-        assert (share >= before - 1e-9).all() and share.max() <= 1 + 1e-9
-        before = share
-    torch.testing.assert_close(shares[-1], torch.ones_like(before), rtol=0, atol=1e-6)
+    white = replace(mesh, corner_colors=np.ones_like(mesh.corner_colors))
+    before = sky_fraction(operator_of(white, size=12, samples=samples))
+    assert before.min() >= -QUADRATURE and before.min() < 0.96
+    for bounces in (1, 2, 8, 100):
+        fraction = sky_fraction(operator_of(white, size=12, samples=samples, bounces=bounces))
+        assert (fraction >= before - 1e-9).all() and fraction.max() <= 1 + 1e-9
+        before = fraction
+    torch.testing.assert_close(before, torch.ones_like(before), rtol=0, atol=tolerance)
 
 
-def test_missing_embree_is_told_in_a_sentence(monkeypatch):
+def test_missing_embree_is_reported_with_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
     with pytest.raises(InputError, match=r"pip install embreex, or set shadows=false"):
         operator_of(dented())
-
-
-@pytest.mark.parametrize("bounces", [-1, 101])
-def test_too_many_bounces_are_refused(bounces):
-    with pytest.raises(InputError, match=rf"bounces={bounces}"):
-        ImageSettings(bounces=bounces)
 
 
 @pytest.mark.parametrize("degree", [2, 6])
@@ -210,23 +189,13 @@ def test_render_shows_the_operators_shadows_also_of_moved_vertices(degree):
     torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=10 * FLOAT32)
 
 
-def test_render_differentiates_shadows_by_the_light_and_holds_them_by_the_vertices():
-    def shade(shadows, light, vertices):
-        image = render(
-            dented(),
-            ABOVE,
-            light,
-            size=6,
-            vertices=vertices,
-            normals="flat",
-            shadows=shadows,
-            rasterizer="numpy",
-        )
-        return torch.autograd.grad(image.sum(), (light, vertices))
-
-    light, vertices = ambient(torch.full((3,), 0.1).double()), torch.from_numpy(dented().vertices)
-    light.requires_grad_(), vertices.requires_grad_()
-    (by_light, by_vertices), (_, direct_by_vertices) = (shade(t, light, vertices) for t in (True, False))
-    rows = all_rows(operator_of(dented(), samples=2)).sum(2).T
-    torch.testing.assert_close(by_light, rows)
-    assert torch.equal(by_vertices, direct_by_vertices)
+def test_render_differentiates_shadows_by_the_light_and_freezes_them_by_the_vertices():
+    light, vertices = ambient(torch.full((3,), 0.1).double()).requires_grad_(), torch.from_numpy(dented().vertices)
+    vertices.requires_grad_()
+    shown = {"size": 6, "normals": "flat", "rasterizer": "numpy"}
+    gradients = []
+    for shadows in (True, False):
+        image = render(dented(), ABOVE, light, vertices=vertices, shadows=shadows, **shown)
+        gradients.append(torch.autograd.grad(image.sum(), (light, vertices)))
+    torch.testing.assert_close(gradients[0][0], all_rows(operator_of(dented(), samples=2)).sum(2).T)
+    assert torch.equal(gradients[0][1], gradients[1][1])
