@@ -45,11 +45,8 @@ def test_a_file_stays_small_whatever_the_size_of_the_images(tmp_path):
     assert before.image.shape == (3, LARGEST_SIDE, LARGEST_SIDE)
 
 
-@pytest.mark.parametrize(
-    "count, edit", [(2, lambda whole: whole[:-9]), (SHOWN_EXAMPLES + 1, bytes), (2, lambda _: b"text")]
-)
-def test_a_damaged_file_is_refused_by_name(tmp_path, count, edit):
-    write_attack_examples(tmp_path / "a", attack_examples(8, count), CLASSES)
-    (tmp_path / "a").write_bytes(edit((tmp_path / "a").read_bytes()))
+def test_a_damaged_file_is_refused_by_name(tmp_path):
+    write_attack_examples(tmp_path / "a", attack_examples(8), CLASSES)
+    (tmp_path / "a").write_bytes((tmp_path / "a").read_bytes()[:-9])
     with pytest.raises(InputError, match=rf"^{tmp_path / 'a'} is damaged"):
         read_attack_examples(tmp_path / "a")

@@ -27,10 +27,7 @@ def epoch_of(count: int, batch_size: int = 7) -> list[tuple[torch.Tensor, ...]]:
     return list(training_batches(numbered(images), batch_size, 0, whole_epoch(images, 0)))
 
 
-# ---------------------------------------------------------------------------------------- crops and flips
-
-
-@pytest.mark.parametrize("shape", [(8, 8), (5, 5), (6, 11)])
+@pytest.mark.parametrize("shape", [(5, 5), (6, 11)])
 @pytest.mark.parametrize("flipped", [False, True])
 def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flipped):
     height, width = shape
@@ -73,9 +70,6 @@ def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
     assert 0 < first.sum() < 40
 
 
-# ---------------------------------------------------------------------------------------- batches
-
-
 def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last_batch_with_the_first():
     epoch = epoch_of(100)
     assert [len(labels) for _, labels, _ in epoch] == [7] * 15
@@ -84,10 +78,7 @@ def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last
     for images, labels, _ in epoch:
         assert images.dtype == torch.uint8 and images.shape == (len(labels), 3, 8, 8)
         assert torch.equal(images, labels.to(torch.uint8).view(-1, 1, 1, 1).expand_as(images))
-
-
-def test_fewer_images_than_a_batch_fill_it_several_times():
-    ((_, labels, _),) = epoch_of(3)
+    ((_, labels, _),) = epoch_of(3)  # fewer images than a batch fill it several times
     assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
 
 
@@ -98,7 +89,7 @@ def test_batches_tell_which_of_their_images_are_renders():
 
 
 @pytest.mark.parametrize("flips", ["random", "alternating"])
-@pytest.mark.parametrize("images_at_once", [1, 20, 10**6])
+@pytest.mark.parametrize("images_at_once", [1, 20])
 def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, images_at_once):
     split = numbered(noise(50, 3, 8, 8))
     whole = list(training_batches(split, 8, 0, whole_epoch(split.images, 1), flips))
@@ -110,9 +101,6 @@ def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch,
             assert all(torch.equal(*pair) for pair in zip(batch, expected, strict=True))
 
 
-# ---------------------------------------------------------------------------------------- rounds and renders
-
-
 def test_the_rounds_renders_follow_the_data_as_bytes_with_their_labels():
     data = numbered(noise(5, 3, 16, 16))
     mixed = with_room(data, 2)
@@ -121,11 +109,6 @@ def test_the_rounds_renders_follow_the_data_as_bytes_with_their_labels():
         assert torch.equal(mixed.images[:5], data.images)
         assert (mixed.images[5:] / 255 - renders).abs().max() <= 0.5 / 255 + 1e-6
         assert mixed.labels.tolist() == [*data.labels.tolist(), 1, 0]
-
-
-def test_without_rounds_an_epoch_is_one_of_all_images_and_renders():
-    (only,) = rounds_of_epoch(5, 2, seed=0, epoch=3, images_per_epoch=None, every=None)
-    assert (only.number, only.epoch, only.rows.tolist()) == (3, 3, list(range(7)))
 
 
 def test_rounds_divide_the_epochs_images_and_each_has_all_renders():
@@ -141,5 +124,6 @@ def test_rounds_divide_the_epochs_images_and_each_has_all_renders():
 def test_an_epochs_images_are_drawn_anew_and_are_never_more_than_there_are():
     (first,), (second,) = (rounds_of_epoch(100, 0, 0, epoch, 50, None) for epoch in (0, 1))
     assert first.rows.tolist() != second.rows.tolist()
-    (everything,) = rounds_of_epoch(100, 0, 0, 0, 5000, None)
-    assert everything.rows.tolist() == list(range(100))
+    for images_per_epoch in (5000, None):
+        (everything,) = rounds_of_epoch(98, 2, 0, 3, images_per_epoch, None)
+        assert (everything.number, everything.epoch, everything.rows.tolist()) == (3, 3, list(range(100)))

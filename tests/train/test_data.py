@@ -2,7 +2,6 @@ import hashlib
 import pickle
 import re
 from pathlib import Path
-from urllib.error import URLError
 
 import numpy as np
 import pytest
@@ -47,9 +46,6 @@ def save_image(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
     Image.new("RGB", size, (value, value, value)).save(path)
 
 
-# ---------------------------------------------------------------------------------------- .npz
-
-
 def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
     np.savez(tmp_path / "data.npz", **arrays())
     data = load_npz(str(tmp_path / "data.npz"))
@@ -66,17 +62,12 @@ def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
     [
         ({"test_labels": None}, "the array test_labels is missing"),
         ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"train_images is uint8 of shape \(5, 8, 8, 3\)"),
-        ({"train_images": np.zeros((5, 3, 8, 9), np.uint8)}, r"train_images is uint8 of shape \(5, 3, 8, 9\)"),
-        ({"train_images": np.zeros((5, 3, 8), np.uint8)}, r"train_images is uint8 of shape \(5, 3, 8\)"),
         ({"test_images": np.zeros((2, 3, 8, 8), np.float32)}, "test_images is float32"),
         ({"test_images": np.zeros((2, 3, 9, 9), np.uint8)}, "differ in size"),
         ({"train_labels": np.zeros(4, int)}, r"train_labels is int64 of shape \(4,\); it must be integers \(5,\)"),
-        ({"train_labels": np.zeros(5)}, "train_labels is float64"),
-        ({"train_labels": np.array([0, 1, 2, 0, 1])}, "train_labels must hold labels 0 to 1"),
         ({"test_labels": np.array([0, -1])}, "test_labels must hold labels 0 to 1"),
         ({"test_images": np.zeros((0, 3, 8, 8), np.uint8), "test_labels": np.zeros(0, int)}, "one at least"),
         ({"classes": np.array(["fig", "fig"])}, "classes must be distinct strings"),
-        ({"classes": np.array([0, 1])}, "classes must be distinct strings"),
         ({"classes": np.array(["lime", "fig"], dtype=object)}, "loads without pickle"),
     ],
 )
@@ -99,9 +90,6 @@ def test_cifar100_has_its_published_classes_and_statistics():
     means, deviations = channel_statistics(data.train.images)
     assert np.round(means, 4).tolist() == [0.5071, 0.4865, 0.4409]
     assert np.round(deviations, 4).tolist() == [0.2673, 0.2564, 0.2762]
-
-
-# ---------------------------------------------------------------------------------------- folders
 
 
 def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_path):
@@ -134,15 +122,8 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
         (None, 0.1, "is not a folder"),
         (["fig/a.png"], 0.1, "holds 1 class folders: it needs two or more"),
         (["fig/a.png", "lime/.a.png"], 0.1, "data/lime holds no image: put some there or remove the folder"),
-        (
-            ["train/fig/a.png", "val/fig/a.png"],
-            0.1,
-            "holds the folders train, val: divide it into train and test alone",
-        ),
-        (["Test/fig/a.png", "Train/fig/a.png"], 0.1, "holds the folders Test, Train: divide it"),
         (["train/fig/a.png", "test/fig/a.png", "val/fig/a.png"], 0.1, "holds the folders test, train, val: divide it"),
         (["fig/a.png", "lime/a.png"], 0.1, "data.test_fraction=0.1 of the 1 images of class 0"),
-        (["fig/a.png", "lime/a.png"], 60, "data.test_fraction=60 must lie between 0 and 1"),
     ],
 )
 def test_a_fault_in_a_folder_is_named(tmp_path, images, test, fault):
@@ -152,89 +133,57 @@ def test_a_fault_in_a_folder_is_named(tmp_path, images, test, fault):
         load_folder(str(tmp_path / "data"), 8, test)
 
 
-def test_a_broken_image_of_a_class_folder_is_named_without_advice_that_would_not_help(tmp_path):
-    for name in ("fig", "lime"):
-        save_image(tmp_path / name / "a.png", 0)
-    (tmp_path / "fig" / "b.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match=r"1 of 3 photographs cannot be read, .*fig/b\.png .*: replace them$"):
-        load_folder(str(tmp_path), 8, 0.1)
-
-
-def test_files_of_other_kinds_are_counted_and_named_before_training(tmp_path, caplog):
-    for name in ("fig", "lime"):
-        for number in range(4):
-            save_image(tmp_path / name / f"{number}.png", 0)
-        for number in range(3):
-            (tmp_path / name / f"{number}.heic").touch()
+def test_a_broken_image_of_a_class_is_an_error_and_other_files_are_counted_and_named(tmp_path, caplog):
+    for number in range(4):
+        save_image(tmp_path / "fig" / f"{number}.png", 0)
+        save_image(tmp_path / "lime" / f"{number}.png", 0)
+        (tmp_path / "fig" / f"{number}.heic").touch()
     with caplog.at_level("WARNING", "train"):
         load_folder(str(tmp_path), 8, 0.25)
-    assert (
-        f"6 files in {tmp_path} are not images that can be read: fig/0.heic, fig/1.heic, fig/2.heic, ..." in caplog.text
-    )
+    assert f"4 files in {tmp_path} are not images that can be read: fig/0.heic, fig/1.heic" in caplog.text
+    (tmp_path / "fig" / "b.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match=r"1 of 9 photographs cannot be read, .*fig/b\.png"):
+        load_folder(str(tmp_path), 8, 0.25)
 
 
-# ---------------------------------------------------------------------------------------- CIFAR-100
-
-
-def write_cifar100(root: Path, monkeypatch) -> dict[str, np.ndarray]:
+def test_torchvisions_files_are_read_where_they_are_there_already(tmp_path, monkeypatch):
     """torchvision's own layout, with few images, and the checksums that torchvision then expects."""
-    rng = np.random.default_rng(0)
-    cifar100, folder = torchvision.datasets.CIFAR100, root / torchvision.datasets.CIFAR100.base_folder
-    folder.mkdir(parents=True)
+    rng, cifar100 = np.random.default_rng(0), torchvision.datasets.CIFAR100
+    folder = tmp_path / cifar100.base_folder
+    folder.mkdir()
     names = [f"class {number:02d}" for number in range(100)]
     pixels = {part: rng.integers(0, 256, (100, 3072), dtype=np.uint8) for part in ("train", "test")}
     contents = {part: {"data": pixels[part], "fine_labels": list(range(100))} for part in pixels}
     checksums = {}
     for part, content in {**contents, "meta": {"fine_label_names": names}}.items():
-        pickled = pickle.dumps(content)
-        (folder / part).write_bytes(pickled)
-        checksums[part] = hashlib.md5(pickled).hexdigest()
-    monkeypatch.setattr(cifar100, "train_list", [["train", checksums["train"]]])
-    monkeypatch.setattr(cifar100, "test_list", [["test", checksums["test"]]])
+        (folder / part).write_bytes(pickle.dumps(content))
+        checksums[part] = hashlib.md5(pickle.dumps(content)).hexdigest()
+    for part in pixels:
+        monkeypatch.setattr(cifar100, f"{part}_list", [[part, checksums[part]]])
     monkeypatch.setattr(cifar100, "meta", {**cifar100.meta, "md5": checksums["meta"]})
-    return pixels
-
-
-def test_torchvisions_files_are_read_where_they_are_there_already(tmp_path, monkeypatch):
-    pixels = write_cifar100(tmp_path, monkeypatch)
     data = load_cifar100(str(tmp_path))
-    assert data.classes == tuple(f"class {number:02d}" for number in range(100))
+    assert data.classes == tuple(names)
     for part, split in [("train", data.train), ("test", data.test)]:
         np.testing.assert_array_equal(split.images, pixels[part].reshape(-1, 3, 32, 32))
         assert split.labels.tolist() == list(range(100))
 
 
-def test_without_files_and_network_there_is_one_error(tmp_path, monkeypatch):
-    def download(self):
-        raise URLError("no route to host")
-
-    monkeypatch.setattr(torchvision.datasets.CIFAR100, "download", download)
-    with pytest.raises(InputError, match=f"data.path={re.escape(str(tmp_path))}: CIFAR-100 .* no route to host"):
-        load_cifar100(str(tmp_path))
-
-
-# ---------------------------------------------------------------------------------------- splits and statistics
-
-
-def test_a_stratified_split_is_complete_disjoint_and_holds_out_a_share_of_every_class():
-    kept, held_out = stratified_split(numbered(200, classes=4), fraction=0.1, seed=0)
-    rows = [split.images[:, 0, 0, 0].tolist() for split in (kept, held_out)]
-    assert sorted(rows[0] + rows[1]) == list(range(200))
-    assert held_out.labels.bincount().tolist() == [5] * 4
-    for split, shown in zip((kept, held_out), rows, strict=True):
-        assert split.labels.tolist() == [row % 4 for row in shown]
-
-
-def test_a_stratified_split_depends_on_its_seed_alone():
+def test_a_stratified_split_is_complete_disjoint_and_a_function_of_its_seed():
+    """It holds out the fraction of every class."""
     torch.manual_seed(1)
-    first, again, other = (stratified_split(numbered(200, 4), 0.1, seed)[1].images for seed in (0, 0, 1))
-    assert torch.equal(first, again) and not torch.equal(first, other)
+    split, again, other = (stratified_split(numbered(200, classes=4), 0.1, seed) for seed in (0, 0, 1))
+    rows = [part.images[:, 0, 0, 0].tolist() for part in split]
+    assert sorted(rows[0] + rows[1]) == list(range(200))
+    assert split[1].labels.bincount().tolist() == [5] * 4
+    for part, numbers in zip(split, rows, strict=True):
+        assert part.labels.tolist() == [row % 4 for row in numbers]
+    assert torch.equal(split[1].images, again[1].images) and not torch.equal(split[1].images, other[1].images)
 
 
-@pytest.mark.parametrize("share", [0, 1, -0.1, float("nan"), 0.001, 0.999])
-def test_a_share_that_leaves_a_split_empty_is_an_error(share):
-    with pytest.raises(InputError, match=f"data.validation={share} "):
-        stratified_split(numbered(200, classes=4), share, seed=0)
+@pytest.mark.parametrize("fraction", [0, 1, float("nan"), 0.001, 0.999])
+def test_a_fraction_that_leaves_a_split_empty_is_an_error(fraction):
+    with pytest.raises(InputError, match=f"data.validation={fraction} "):
+        stratified_split(numbered(200, classes=4), fraction, seed=0)
 
 
 def test_channel_statistics_are_those_of_float64():

@@ -110,15 +110,11 @@ def test_losses_gradients_and_statistics_are_those_of_one_process_to_rounding(st
         torch.testing.assert_close(found["gradients"], one["gradients"], rtol=1e-9, atol=1e-13)
         torch.testing.assert_close(found["buffers"], one["buffers"], rtol=1e-12, atol=1e-14)
     assert max(gradient.abs().max() for gradient in one["gradients"].values()) > 0.1
-
-
-def test_all_processes_hold_the_same_bits(steps):
-    _, first, second = steps
     for kind in ("gradients", "buffers"):
-        assert all(torch.equal(value, second[kind][name]) for name, value in first[kind].items())
+        assert all(torch.equal(value, two[1][kind][name]) for name, value in two[0][kind].items())
 
 
-def test_processes_agree_and_their_shares_become_whole(steps):
+def test_processes_agree_and_their_shards_become_whole(steps):
     one, *two = steps
     assert one["any"] == [False, False] and one["merged"].tolist() == [0, 10, 20, 30, 40]
     for found in two:
@@ -128,11 +124,10 @@ def test_processes_agree_and_their_shares_become_whole(steps):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"affine": False}, {"momentum": None}, {"track_running_stats": False}, {"affine": False, "momentum": None}],
+    [{}, {"track_running_stats": False}, {"affine": False, "momentum": None}],
     ids=str,
 )
 def test_a_norm_over_all_processes_is_torchs_where_there_is_one_process(options):
-    """Whatever the norm's options."""
     norm = torch.nn.BatchNorm2d(3, **options).double()
     synchronized = copy.deepcopy(norm)
     synchronized.__class__ = SyncBatchNormCPU
@@ -199,23 +194,6 @@ def test_one_process_writes_for_all(runs):
 
 
 @pytest.mark.slow
-def test_a_killed_process_ends_the_run_in_one_sentence_and_its_checkpoint_is_whole(tiny_npz, tmp_path):
-    small = ["model.depth=10", "model.width=1", "train.batch_size=16", "augment=none", "train.device=cpu"]
-    data = ["data=npz", f"data.path={tiny_npz}", "compare=[]", "train.epochs=10000", "run=here"]
-    start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen([*start, *small, *data], cwd=tmp_path, env=environment, **pipes) as run:
-        next(line for line in run.stdout if line.startswith("epoch 2/"))
-        _, other = map(int, Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split())
-        os.kill(other, signal.SIGKILL)
-        _, errors = run.communicate(timeout=60)
-    assert run.returncode != 0 and "[rank0]" not in errors
-    assert errors.count("error: another process of this run has ended: mend what ended it, and go on with") == 1
-    assert checkpoint.load(tmp_path / "here" / checkpoint.LAST)["epoch"] >= 1
-
-
-@pytest.mark.slow
 def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_path):
     """The command of the README; the second call goes on where SIGTERM stopped the first."""
     small = ["model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2", "augment.examples=10"]
@@ -229,9 +207,9 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
             if line.startswith("epoch 1/"):
                 first.terminate()
                 break
-        (told,) = [line for line in first.stdout if line.startswith("ended by SIGTERM")]
+        (advice,) = [line for line in first.stdout if line.startswith("ended by SIGTERM")]
     assert first.returncode != 0
-    command = shlex.split(told.partition("to go on: ")[2])
+    command = shlex.split(advice.partition("to go on: ")[2])
     assert command[:4] == ["torchrun", "--nproc_per_node=2", "-m", "train"]
     (folder,) = (tmp_path / "runs").glob("*/*")
     epochs = checkpoint.load(folder / checkpoint.LAST)["epoch"]

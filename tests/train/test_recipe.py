@@ -15,12 +15,10 @@ from train.recipe import (
     AUGMENTATIONS,
     PGD_RADIUS,
     TRANSFORMS,
-    MovingAverage,
     TrainSettings,
     augmentation,
     cosine,
     one_cycle,
-    soup,
     step,
     training_loss,
 )
@@ -39,23 +37,11 @@ def model() -> nn.Module:
     return WideResNet(4, 10, 1, 0.3)
 
 
-# ---------------------------------------------------------------------------------------- settings
-
-
-def test_the_recipe_is_the_papers():
-    settings = TrainSettings()
-    assert (settings.epochs, settings.batch_size, settings.learning_rate) == (150, 128, 0.125)
-    assert (settings.momentum, settings.weight_decay, settings.schedule) == (0.9, 5e-4, "step")
-
-
 @pytest.mark.parametrize(
     "settings",
     [
-        {"epochs": 0}, {"batch_size": 0}, {"threads": 0}, {"checkpoint_every": 0},
-        {"learning_rate": 0.0}, {"learning_rate": math.nan}, {"learning_rate": 1e300},
-        {"ranking": -1.0}, {"distillation": 1.0}, {"soup": True}, {"momentum": 1.0}, {"momentum": -0.1},
-        {"weight_decay": math.nan}, {"weight_decay": 1e300}, {"label_smoothing": 1.0}, {"ema_decay": -0.1},
-        {"schedule": "linear"}, {"flips": "vertical"}, {"compile": "maybe"}, {"augmentation": "cutout"},
+        {"epochs": 0}, {"learning_rate": math.nan}, {"weight_decay": 1e300}, {"momentum": 1.0}, {"ranking": -1.0},
+        {"distillation": 1.0}, {"soup": True}, {"label_smoothing": 1.0}, {"ema_decay": -0.1}, {"schedule": "linear"},
     ],
     ids=str,
 )  # fmt: skip
@@ -65,29 +51,25 @@ def test_a_setting_out_of_range_is_named(settings):
         TrainSettings(**settings)
 
 
-# ---------------------------------------------------------------------------------------- schedules
-
-
-@pytest.mark.parametrize("epochs", [10, 50, 150, 200])
+@pytest.mark.parametrize("epochs", [10, 50, 150])
 def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent_of_the_epochs(epochs):
     rates = [step(epoch / epochs) for epoch in range(epochs)]
     parts = [3, 3, 2, 2]
     assert rates == [0.2**fall for fall, part in enumerate(parts) for _ in range(part * epochs // 10)]
 
 
-def test_the_cosine_schedule_is_half_a_cosine():
-    progress = np.linspace(0, 1, 101)
-    rates = [cosine(value) for value in progress]
-    np.testing.assert_allclose(rates, np.cos(math.pi / 2 * progress) ** 2, atol=1e-15)  # by the half-angle formula
+PROGRESS = np.linspace(0, 1, 1001)
 
 
-def test_one_cycle_rises_from_a_tenth_to_1_in_a_fifth_and_falls_to_0_in_straight_lines():
-    progress = np.linspace(0, 1, 1001)
-    rates = [one_cycle(value) for value in progress]
-    np.testing.assert_allclose(rates, np.interp(progress, [0, 0.2, 1], [0.1, 1, 0]), atol=1e-12)
-
-
-# ---------------------------------------------------------------------------------------- loss
+@pytest.mark.parametrize(
+    "schedule, expected",
+    [
+        (cosine, np.cos(math.pi / 2 * PROGRESS) ** 2),  # half a cosine, by the half-angle formula
+        (one_cycle, np.interp(PROGRESS, [0, 0.2, 1], [0.1, 1, 0])),
+    ],
+)
+def test_a_continuous_schedule_is_its_closed_form(schedule, expected):
+    np.testing.assert_allclose([schedule(progress) for progress in PROGRESS], expected, atol=1e-12)
 
 
 def loss_of(model, images, labels, rendered, label=None, teacher=None, **settings) -> tuple[torch.Tensor, torch.Tensor]:
@@ -119,28 +101,6 @@ def test_the_divergence_from_the_teacher_is_added_on_images_that_are_not_renders
     both, _ = loss_of(model, images, LABELS, rendered, teacher=teacher, distillation=4.0)
     p, q = (network(images[2:] / 255).softmax(1) for network in (model, teacher))
     torch.testing.assert_close(both, alone + 4 * (q * (q / p).log()).sum() / 6)
-
-
-# ---------------------------------------------------------------------------------------- averaged weights
-
-
-@pytest.mark.parametrize("kind", ["moving average", "soup"])
-def test_averages_are_of_weights_and_statistics_and_begin_with_the_first_update(kind):
-    """Of weights 3, 5, 10: the mean, or (3 × 0.8 + 5 × 0.2) × 0.8 + 10 × 0.2."""
-    module = nn.BatchNorm1d(2)
-    average = soup(module) if kind == "soup" else MovingAverage(module, 0.8)
-    for value in (3.0, 5.0, 10.0):
-        nn.init.constant_(module.weight, value)
-        module.running_mean.fill_(value)
-        module.num_batches_tracked.fill_(7)
-        average.update_parameters(module)
-    expected = torch.full((2,), 6.0 if kind == "soup" else 4.72)
-    torch.testing.assert_close(average.module.weight.detach(), expected)
-    torch.testing.assert_close(average.module.running_mean, expected)
-    assert average.n_averaged == 3 and 6 <= average.module.num_batches_tracked <= 7
-
-
-# ---------------------------------------------------------------------------------------- augmentations
 
 
 @pytest.mark.parametrize("name", AUGMENTATIONS)
