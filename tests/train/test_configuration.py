@@ -141,7 +141,7 @@ def test_the_check_of_a_nested_dataclass_gets_its_key(group):
         ),
         (["train.compile=always"], "compile=always is for a GPU"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
-        (["model.width=100000"], "width=100000 make"),
+        (["model.width=100000"], "model.width=100000: 1e+15 parameters are too many"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
         (["renderer.samples=0"], "samples=0"),
