@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -20,6 +21,7 @@ from renderer.image import LARGEST_SIZE
 from renderer.light.harmonics import nonzero_coefficients
 from renderer.transfer import COEFFICIENTS, DEGREE
 from train import checkpoint, console
+from train.configuration import keyed
 from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
 from train.errors import NO_ROOM
 from train.loop import Trainer, evaluate
@@ -146,8 +148,10 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         if item.label != OTHER:
             class_index(data.classes, item.label, f"label of {key}")
     start, objects = time.perf_counter(), list(settings.objects.values())
-    chosen = {"scene": settings.scene, "renderer": settings.renderer}
-    scene = build_scene(objects, data.size, settings.views, **chosen, device=device)
+    with keyed("scene", asdict(settings.scene)):
+        scene = build_scene(
+            objects, data.size, settings.views, scene=settings.scene, renderer=settings.renderer, device=device
+        )
     console.info("rasterizer: %s", scene.rasterizer.description)
     if not settings.augment.relights:
         console.info("operators: none are kept, since views are rasterized in every epoch")

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 import yaml
@@ -183,12 +183,15 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
 
 def decisive_settings(settings: ExperimentSettings | DictConfig) -> dict[str, object]:
     """The settings that decide a run's result, by dotted key; paths inside the run's own folder begin with `<run>`."""
-    plain = OmegaConf.to_container(settings) if isinstance(settings, DictConfig) else asdict(settings)
+    if isinstance(settings, DictConfig):
+        plain = cast(dict[str, Any], OmegaConf.to_container(settings))
+    else:
+        plain = asdict(settings)
     run = str(plain.get("run"))
 
     def relative(value: object) -> object:
         inside = isinstance(value, str) and f"{value}/".startswith(f"{run}/")
-        return f"<run>{value.removeprefix(run)}" if inside else value
+        return f"<run>{str(value).removeprefix(run)}" if inside else value
 
     return {key: relative(value) for key, value in dotted(plain) if not is_within(key, CIRCUMSTANCES)}
 

@@ -3,7 +3,7 @@
 import math
 import shlex
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import product
 
 import torch
@@ -17,6 +17,7 @@ from augment.scene import Scene
 from augment.utils import generator
 from renderer.light.presets import PROBES, UNIFORM, load_light
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
+from train.configuration import keyed
 
 POLAR, FIELD_OF_VIEW = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
 CLOSEST = 2.0  # world units from the middle of a mesh, which all of it is within
@@ -29,15 +30,16 @@ SURE = 0.5  # confidence, in every image, at which the search ends
 def scene_of(item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device) -> Scene:
     """Views × backgrounds at `size` pixels per side, as an example each, or where views share what is attacked, an
     example per background."""
-    return build_scene(
-        [item],
-        size,
-        settings.scene.views,
-        shared=settings.attack.shared,
-        scene=settings.scene,
-        renderer=settings.renderer,
-        device=device,
-    )
+    with keyed("scene", asdict(settings.scene)):
+        return build_scene(
+            [item],
+            size,
+            settings.scene.views,
+            shared=settings.attack.shared,
+            scene=settings.scene,
+            renderer=settings.renderer,
+            device=device,
+        )
 
 
 def search(
