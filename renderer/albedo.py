@@ -63,7 +63,7 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
         return decoded.index_select(0, channels.long().flatten()).view(3, -1)
 
     packed = [torch.from_numpy(texture).to(like.device) for texture in mesh.packed_textures]
-    return [Texture(*texture.shape, partial(texels, texture.flatten())) for texture in packed]
+    return [Texture(texture.shape[0], texture.shape[1], partial(texels, texture.flatten())) for texture in packed]
 
 
 def face_albedo(albedo: Tensor, fragments: Fragments) -> Tensor:

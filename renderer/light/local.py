@@ -69,7 +69,12 @@ class Lamps(LocalBasis):
         distance = self.radius * ((ray + (number + 0.5) / SETS) / RAYS).sqrt()
         angle = ray * math.pi * (3 - math.sqrt(5)) + number * 2 * math.pi / SETS
         across = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2).to(positions)
-        return positions[:, None] + torch.einsum("sra,laj->slrj", across, _disc_axes(F.normalize(positions, dim=1)))
+        x, y, z = F.normalize(positions, dim=1).unbind(1)
+        sign = torch.where(z < -0.5, -1.0, 1.0).to(
+            z
+        )  # axes are continuous but where a disc faces 30° off straight down
+        axes = torch.stack([torch.stack(axis, dim=1) for axis in tangent_axes(x, y, z, sign)], dim=1)
+        return positions[:, None] + torch.einsum("sra,laj->slrj", across, axes)
 
     def _irradiance(self, toward: Tensor, normals: Tensor, positions: Tensor) -> Tensor:
         """(...) irradiance at power 1 of surfaces with unit normals (..., 3) from lamps at positions (..., 3); toward:
@@ -79,13 +84,6 @@ class Lamps(LocalBasis):
         if not self.radius:
             return received
         return received * ((toward * F.normalize(positions, dim=-1)).sum(-1) / squared.sqrt()).clamp(min=0)
-
-
-def _disc_axes(normals: Tensor) -> Tensor:
-    """(L, 2, 3) axes of discs with unit normals (L, 3), continuous but where a disc faces 30° off straight down."""
-    x, y, z = normals.unbind(1)
-    sign = torch.where(z < -0.5, -1.0, 1.0).to(normals)
-    return torch.stack([torch.stack(axis, dim=1) for axis in tangent_axes(x, y, z, sign)], dim=1)
 
 
 def moved(basis: Basis, positions: Tensor) -> Basis:

@@ -55,21 +55,33 @@ def project_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
     channel is nowhere below -`TOLERANCE` of its largest; channels that were in order stay to the bit. Computed in
     float64, without a graph.
     """
-    programs = _programs(lights, within)
-    _exchange(programs)
+    programs = dipping = _programs(lights, within)
+    for _ in range(_ROUNDS):
+        nearest = np.concatenate([program.nearest for program in dipping])
+        original = np.concatenate([program.original for program in dipping])
+        dim = 1e-6 * np.linalg.norm(original, axis=1)  # below it, a dip is the rounding of the input
+        owner, rows = _dips(nearest, dim, _DEPTH)
+        channels = len(nearest) // len(dipping)
+        indices = np.unique(owner // channels)
+        for index in indices:
+            channel = range(index * channels, (index + 1) * channels)
+            dipping[index].add([rows[owner == light] for light in channel])
+        dipping = [dipping[index] for index in indices]
+        if not dipping:
+            break
     nearest = np.concatenate([program.nearest for program in programs])
     return torch.from_numpy(nearest).view(lights.mT.shape).to(lights).mT
 
 
 def _programs(lights: Tensor, within: Ball | None) -> "Sequence[_Program]":
     """One of each light, if a sphere holds its channels together, and else one of each channel."""
-    wanted = _by_channel(lights)
+    original = _by_channel(lights)
     if within is None:
-        return [_Program(light) for light in wanted]
+        return [_Program(light) for light in original]
     if within.norm == "linf":
-        return [_Program(*each) for each in zip(wanted, *map(_by_channel, within.ends), strict=True)]
+        return [_Program(*light) for light in zip(original, *map(_by_channel, within.ends), strict=True)]
     shape = len(lights), lights.shape[2], lights.shape[1]
-    of_lights = zip(wanted.reshape(shape), _by_channel(within.center).reshape(shape), strict=True)
+    of_lights = zip(original.reshape(shape), _by_channel(within.center).reshape(shape), strict=True)
     return [_InSphere(light, center, within.radius) for light, center in of_lights]
 
 
@@ -79,12 +91,12 @@ def _by_channel(lights: Tensor) -> Array:
 
 
 class _Program:
-    """The lights (C, K) nearest to those wanted, between bounds, and non-negative in the active directions."""
+    """The lights (C, K) nearest to the original ones, between bounds, and non-negative in the active directions."""
 
-    def __init__(self, wanted: Array, low: Array | float = -np.inf, high: Array | float = np.inf):
-        self.wanted, self.nearest = wanted, wanted.clip(low, high)
-        self.low, self.high = np.broadcast_to(low, wanted.shape), np.broadcast_to(high, wanted.shape)
-        self._active = [wanted[:0]] * len(wanted)  # R (M, K) of each light
+    def __init__(self, original: Array, low: Array | float = -np.inf, high: Array | float = np.inf):
+        self.original, self.nearest = original, original.clip(low, high)
+        self.low, self.high = np.broadcast_to(low, original.shape), np.broadcast_to(high, original.shape)
+        self._active = [original[:0]] * len(original)  # R (M, K) of each light
 
     def add(self, rows: Sequence[Array]) -> None:
         """Solve it with further rows (M, K) of each light; rows whose multiplier is zero are dropped."""
@@ -92,25 +104,26 @@ class _Program:
         self.nearest, self._active = self._solved()
 
     def _solved(self) -> tuple[Array, list[Array]]:
-        return self._nearest_to(self.wanted)
+        return self._nearest_to(self.original)
 
     def _nearest_to(self, lights: Array) -> tuple[Array, list[Array]]:
-        each = zip(lights, self._active, self.low, self.high, strict=True)
-        nearest, active = zip(*(_least_distance(*light) if len(light[1]) else light[:2] for light in each), strict=True)
+        channels = zip(lights, self._active, self.low, self.high, strict=True)
+        solved = [_least_distance(*channel) if len(channel[1]) else channel[:2] for channel in channels]
+        nearest, active = zip(*solved, strict=True)
         return np.stack(nearest), list(active)
 
 
 class _InSphere(_Program):
     """The same for lights that together lie within an L2 distance of a center; t = 1 / (1 + λ), from `_least` to 1."""
 
-    def __init__(self, wanted: Array, center: Array, radius: float):
-        super().__init__(wanted)
-        self._center, self._radius, self._offset = center, radius, wanted - center
+    def __init__(self, original: Array, center: Array, radius: float):
+        super().__init__(original)
+        self._center, self._radius, self._offset = center, radius, original - center
         self._least = self._t = min(radius / max(float(np.linalg.norm(self._offset)), _TINY), 1.0)
         self.nearest = self._target()
 
     def _target(self) -> Array:
-        return self.wanted if self._t == 1 else self._center + self._t * self._offset
+        return self.original if self._t == 1 else self._center + self._t * self._offset
 
     def _solved(self) -> tuple[Array, list[Array]]:
         for _ in range(_STEPS):
@@ -143,40 +156,23 @@ def _motion(offset: Array, added: Array, rows: Array) -> tuple[Array, Array, Arr
     return offset + rows.T @ change, multipliers, change
 
 
-def _exchange(programs: Sequence[_Program]) -> None:
-    """Add the directions of dips as constraints until there are no dips."""
-    for _ in range(_ROUNDS):
-        lights = np.concatenate([program.nearest for program in programs])
-        wanted = np.concatenate([program.wanted for program in programs])
-        dim = 1e-6 * np.linalg.norm(wanted, axis=1)  # below it, a dip is the rounding of the input
-        owner, rows = _dips(lights, dim, _DEPTH)
-        channels = len(lights) // len(programs)
-        dipping = np.unique(owner // channels)
-        for index in dipping:
-            channel = range(index * channels, (index + 1) * channels)
-            programs[index].add([rows[owner == light] for light in channel])
-        programs = [programs[index] for index in dipping]
-        if not programs:
-            break
-
-
-def _least_distance(wanted: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """The x (K,) nearest to `wanted` with rows · x ≥ 0 and low ≤ x ≤ high, and the rows of positive multipliers.
+def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """The x (K,) nearest to `original` with rows · x ≥ 0 and low ≤ x ≤ high, and the rows of positive multipliers.
 
     With G x ≥ h for all constraints together: nnls minimizes |E u − f| for E = [Gᵀ; hᵀ], f = (0, ..., 0, 1) and u ≥ 0,
-    and its residual r gives x = −r_j / r_(K+1) (Lawson and Hanson's algorithm LDP), relative to `wanted`.
+    and its residual r gives x = −r_j / r_(K+1) (Lawson and Hanson's algorithm LDP), relative to `original`.
     """
-    size, unit, bounded = len(wanted), np.linalg.norm(wanted), np.isfinite(low)
+    size, unit, bounded = len(original), np.linalg.norm(original), np.isfinite(low)
     axes = np.eye(size)[bounded]
     sides = np.concatenate([rows, axes, -axes])
-    bounds = np.concatenate([-rows @ wanted, (low - wanted)[bounded], (wanted - high)[bounded]])
+    bounds = np.concatenate([-rows @ original, (low - original)[bounded], (original - high)[bounded]])
     dual = np.concatenate([sides.T, bounds[None] / unit])
     multipliers, _ = nnls(dual, np.eye(size + 1)[size])
     residual = dual @ multipliers
     residual[size] -= 1
     if residual[size] > -(_DEPTH**2):  # the bounds leave no room beyond rounding
-        return wanted.clip(low, high), rows
-    nearest = wanted - residual[:size] / residual[size] * unit
+        return original.clip(low, high), rows
+    nearest = original - residual[:size] / residual[size] * unit
     return nearest.clip(low, high), rows[multipliers[: len(rows)] > 0]
 
 
