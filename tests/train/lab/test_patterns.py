@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from train.lab.patterns import FAMILIES, TWO_COLORED, checkers, draw_color, draw_pattern, spots, stripes
+from train.lab.patterns import FAMILIES, TWO_COLORED, checkers, draw_pattern, stripes
 
 SEEDS = range(8)
 each_seed = pytest.mark.parametrize("seed", SEEDS)
@@ -23,11 +23,6 @@ def test_an_image_is_linear_light_in_the_unit_range_and_follows_from_its_seed(fa
     assert image.min() >= 0 and image.max() <= 1
     np.testing.assert_array_equal(image, again)
     assert not np.array_equal(image, draw_pattern(family, np.random.default_rng(seed + 100), 64))
-
-
-@each_seed
-def test_a_color_has_a_full_channel(seed):
-    assert draw_color(np.random.default_rng(seed)).max() == 1
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -65,9 +60,3 @@ def test_half_divides_the_image_by_a_straight_line_through_the_object():
     fractions = [draw_pattern("half", np.random.default_rng(seed), 64).any(axis=-1).mean() for seed in range(50)]
     # A line at a distance of 0.12 from the middle of the square cuts off 0.5 - 0.06 √2 of it at least.
     assert 0.5 - 0.06 * math.sqrt(2) - 0.02 < min(fractions) < 0.5 < max(fractions) < 0.5 + 0.06 * math.sqrt(2) + 0.02
-
-
-def test_spots_light_about_a_half_on_average():
-    """Discs of 0.7 of the image's area in all leave exp(-0.7) dark, and more where they reach beyond its edge."""
-    fractions = [spots(lattice(2, 60) - 1, np.random.default_rng(seed)).mean() for seed in range(60)]
-    assert 0.4 < np.mean(fractions) < 1 - math.exp(-0.7) + 0.02
