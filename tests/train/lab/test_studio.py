@@ -7,9 +7,10 @@ import pytest
 import trimesh
 
 from renderer.mesh import Mesh
+from renderer.normals import corner_normals
 from renderer.shapes import solid
 from train.lab.shots import FOV, Shot, draw_shots
-from train.lab.studio import ROUGHNESS, lab_parts, photograph
+from train.lab.studio import ROUGHNESS, SHARP, lab_parts, photograph
 
 pytest.importorskip("mitsuba")
 
@@ -125,3 +126,15 @@ def test_an_environment_lights_from_where_its_map_says():
     shots = [frontal(environment=sky, camera=np.array([x, 0, 1.0]), table=np.zeros(3)) for x in (6.0, -6.0)]
     front, back = (photograph(parts, shot, 8, 256, bounces=1, seed=0)[3:5, 3:5].mean() for shot in shots)
     assert front > 20 * back
+
+
+@pytest.mark.parametrize("divisions", [0, 2])
+def test_right_angles_stay_sharp_and_round_surfaces_are_smooth(divisions):
+    cube, ball = trimesh.creation.box((2, 2, 2)), trimesh.creation.icosphere(subdivisions=3)
+    vertices, faces = cube.vertices, cube.faces
+    for _ in range(divisions):
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+    mesh = Mesh.plain(vertices, faces)
+    np.testing.assert_array_equal(corner_normals(mesh, "smooth", SHARP), mesh.face_normals()[:, None].repeat(3, axis=1))
+    mesh = Mesh.plain(ball.vertices, ball.faces)
+    np.testing.assert_allclose(corner_normals(mesh, "smooth", SHARP), mesh.vertices[mesh.faces], atol=0.02)
