@@ -2,11 +2,9 @@
 
 import io
 import json
-import os
 import re
 import shlex
 import shutil
-import time
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -29,7 +27,7 @@ from train.tables import fraction
 HOSTILE = "<script>alert(1)</script>|*x*"
 
 
-class Sources(HTMLParser):
+class Page(HTMLParser):
     """The page's tags, addresses and alternative texts."""
 
     def __init__(self, text: str):
@@ -70,12 +68,12 @@ def page(finished, made_up_run, tmp_path_factory) -> Path:
         return write_report([folder], folder / "out")
 
 
-def test_a_page_loads_nothing_escapes_what_files_say_and_tells_images_in_words(page):
+def test_a_page_loads_nothing_from_elsewhere_escapes_text_of_files_and_describes_its_images(page):
     text = page.read_text()
-    found = Sources(text)
-    assert {address.partition(":")[0] for address in found.addresses if address[0] != "#"} == {"data"}
-    assert "script" not in found.tags and "&lt;script&gt;" in text
-    assert found.alts and all(found.alts)
+    parsed = Page(text)
+    assert {address.partition(":")[0] for address in parsed.addresses if address[0] != "#"} == {"data"}
+    assert "script" not in parsed.tags and "&lt;script&gt;" in text
+    assert parsed.alts and all(parsed.alts)
     assert len(text) < 10 * 2**20
 
 
@@ -90,10 +88,7 @@ def test_runs_in_every_state_are_shown_or_named(page):
     assert "2 of 8 runs finished" in text
     assert re.search(r'alt="training accuracy by epoch, at the end: [^"]*unfinished: going 0.50"', text)
     assert "1 attacks" in text and "Attacks succeed on 1 of 1 examples; 1 more were wrong before any step" in text
-
-
-def test_attack_examples_are_shown_with_their_light(page):
-    assert re.search(r'alt="orange before: [^"]*; a ball in its light"', page.read_text())
+    assert re.search(r'alt="orange before: [^"]*; a ball in its light"', text)
 
 
 @pytest.mark.parametrize(
@@ -103,8 +98,8 @@ def test_the_command_makes_the_same_settings_again(tmp_path, made_up_run, overri
     config = summarize(made_up_run(tmp_path / "run", "adversarial", None, *overrides)).config
     words = shlex.split(training_command(config))[3:]
     again = read_settings(ExperimentSettings, compose("train", words))
-    expected, found = ({**decisive_settings(each), "data.images": None} for each in (config, again))
-    assert found == expected
+    before, after = ({**decisive_settings(settings), "data.images": None} for settings in (config, again))
+    assert after == before
 
 
 def test_paths_below_the_current_folder_are_relative(tmp_path, made_up_run, monkeypatch):
@@ -119,14 +114,11 @@ def test_paths_below_the_current_folder_are_relative(tmp_path, made_up_run, monk
     assert str(here) not in text.replace(paths[2], "")
 
 
-def test_where_there_is_nothing_one_sentence_says_so(tmp_path):
+def test_where_nothing_can_be_read_one_sentence_says_why(tmp_path):
+    """A run that cannot be read beside one that can is named in the page."""
     with pytest.raises(InputError, match="holds no run and no attack"):
         write_report([tmp_path], tmp_path)
     assert report_of([tmp_path / "no"], tmp_path).startswith("no report: runs: ")
-
-
-def test_where_nothing_can_be_read_one_sentence_says_why(tmp_path):
-    """A run that cannot be read beside one that can is named in the page."""
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "metrics.jsonl").write_bytes(b"\xff{\n")
@@ -136,7 +128,7 @@ def test_where_nothing_can_be_read_one_sentence_says_why(tmp_path):
     assert "/a</td><td" in write_report([tmp_path], tmp_path).read_text()
 
 
-def test_a_fault_of_the_report_is_told_with_its_place_and_raises_nothing(finished, tmp_path, monkeypatch):
+def test_a_fault_of_the_report_is_printed_with_its_traceback_and_ends_no_training(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(plots, "curves", lambda *_: 1 / 0)
     first, *frames, last = report_of([finished], tmp_path).strip().splitlines()
     assert first.startswith("no report: Traceback") and last == "ZeroDivisionError: division by zero"
@@ -171,20 +163,14 @@ def arm(made_up_run, tmp_path):
     return make
 
 
-def headline(folders: list[Path], out: Path) -> str:
-    """The alternative text of the page's first image."""
-    return Sources(write_report(folders, out).read_text()).alts[0]
-
-
-def test_the_headline_shows_changed_predictions_and_the_scores_of_every_arm(arm, tmp_path):
-    folders = [*arm("none", (2, 0)), *arm("random", (5, 1)), *arm("adversarial", (7, 2))]
-    write_report(folders, tmp_path / "out")
-    assert not (tmp_path / "out" / "report.png").exists()
-    write_examples(folders[2], 1, [0.125, 0.875], [0.75, 0.25])
-    write_examples(folders[2], 2, [0.75, 0.25], [0.75, 0.25])  # wrong before, too
-    assert headline(folders, tmp_path / "out") == (
+def test_the_headline_shows_changed_predictions_and_the_mean_scores_over_seeds_of_every_arm(arm, tmp_path):
+    folders = [*arm("none", (2, 0), (4, 0)), *arm("random", (5, 1)), *arm("adversarial", (7, 2))]
+    write_examples(folders[-1], 1, [0.125, 0.875], [0.75, 0.25])
+    write_examples(folders[-1], 2, [0.75, 0.25], [0.75, 0.25])  # wrong before, too
+    page = write_report(folders, tmp_path / "out")
+    assert Page(page.read_text()).alts[0] == (
         "Orange before and after its light changed, classified as orange, then apple; orange, then apple. "
-        "recall on photographs: none 0.20, random 0.50, adversarial 0.70. "
+        "recall on photographs: none 0.30, random 0.50, adversarial 0.70. "
         "FPR on photographs: none 0.00, random 0.10, adversarial 0.20. "
         "AUC on photographs: none 0.90, random 0.90, adversarial 0.90."
     )
@@ -192,37 +178,21 @@ def test_the_headline_shows_changed_predictions_and_the_scores_of_every_arm(arm,
         assert image.width == 1440
 
 
-def test_of_several_seeds_the_headline_has_the_mean_and_names_rendered_images(arm, tmp_path):
-    folders = [*arm("none", (2, 0), (4, 0), overrides=("+data.images=/data/a",)), *arm("adversarial", (7, 0))]
-    write_examples(folders[0], 1, [0.125, 0.875], [0.75, 0.25])
-    assert "recall on held-out renders: none 0.30, adversarial 0.70." in headline(folders, tmp_path / "out")
-
-
-# ------------------------------------------------------------------------------------- many runs
-
-
-@pytest.mark.parametrize(
-    "count, seconds", [(70, 20), pytest.param(1000, 120, marks=pytest.mark.slow)], ids=["70", "1000"]
-)
-def test_each_of_many_runs_is_shown_or_named_in_bounded_time_and_size(made_up_run, tmp_path, count, seconds):
+def test_all_of_many_runs_are_shown_or_named_in_a_page_of_bounded_size(made_up_run, tmp_path):
     """Half of them failed; of the others, five seeds share their settings."""
-    scores = {"photographs": {"recall": fraction(4, 10), "false_positive_rate": fraction(1, 10)}}
-    one = made_up_run(tmp_path / "one", "adversarial", scores)
-    files = {path.relative_to(one): path.read_text() for path in one.rglob("*") if path.is_file()}
-    config = files[Path("config.yaml")]
+    one, count = made_up_run(tmp_path / "one", "adversarial"), 70
+    config = (one / "config.yaml").read_text()
     for number in range(count):
         folder = tmp_path / "runs" / f"run{number:04d}"
-        (folder / "photographs").mkdir(parents=True)
+        folder.mkdir(parents=True)
         if number % 2:
             (folder / "failed.txt").write_text("no room")
             continue
         rate, seed = 0.001 * (1 + number // 10), number // 2 % 5
-        files[Path("config.yaml")] = config.replace("seed: 0", f"seed: {seed}").replace(": 0.05\n", f": {rate}\n")
-        for path, text in files.items():
-            (folder / path).write_text(text)
-    start = time.process_time()
+        changed = config.replace("seed: 0", f"seed: {seed}").replace(": 0.05\n", f": {rate}\n")
+        (folder / "config.yaml").write_text(changed)
+        shutil.copy(one / "metrics.jsonl", folder)
     text = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
-    assert time.process_time() - start < seconds
     assert len(text) < 10 * 2**20 and f"{count // 2} of {count} runs finished" in text
     assert all(f"/run{number:04d}" in text for number in range(count))
 
@@ -237,18 +207,18 @@ def browser():
     installed = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     with api.sync_playwright() as playwright:
         try:
-            found = playwright.chromium.launch(executable_path=installed, args=["--no-sandbox"])
+            chromium = playwright.chromium.launch(executable_path=installed, args=["--no-sandbox"])
         except api.Error as error:
             pytest.skip(f"no Chromium: {error.message.splitlines()[0]}")
-        yield found
-        found.close()
+        yield chromium
+        chromium.close()
 
 
 @pytest.mark.parametrize("width", [1280, 400])
 @pytest.mark.parametrize("scheme, paper", [("light", (255, 255, 255)), ("dark", (22, 24, 28))])
-def test_a_browser_shows_it_without_overflow_wide_and_narrow_light_and_dark(page, browser, width, scheme, paper):
-    view, asked = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme), []
-    view.on("request", lambda request: asked.append(request.url))
+def test_a_browser_shows_the_page_without_overflow_wide_and_narrow_light_and_dark(page, browser, width, scheme, paper):
+    view, urls = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme), []
+    view.on("request", lambda request: urls.append(request.url))
     view.goto(page.as_uri())
     assert view.evaluate("document.documentElement.scrollWidth") <= width
     assert view.evaluate("[...document.images].every(image => image.naturalWidth && image.alt)")
@@ -260,10 +230,5 @@ def test_a_browser_shows_it_without_overflow_wide_and_narrow_light_and_dark(page
     assert view.evaluate(smallest) >= 12
     with Image.open(io.BytesIO(view.screenshot())) as shot:
         assert shot.convert("RGB").getpixel((width - 3, 3)) == paper
-    assert [url for url in asked if not url.startswith("data:")] == [page.as_uri()]
+    assert [url for url in urls if not url.startswith("data:")] == [page.as_uri()]
     view.close()
-
-
-def test_a_pipe_in_an_images_place_is_left_out(tmp_path):
-    os.mkfifo(tmp_path / "contact_sheet.png")
-    assert plots.from_file(tmp_path / "contact_sheet.png", "answers", 100) == []

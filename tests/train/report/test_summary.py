@@ -12,16 +12,6 @@ from train.tables import format_interval, fraction
 METRICS = ["recall", "FPR", "AUC", "recall at 5% FPR", "recall at 10% FPR", "recall at 20% FPR"]
 
 
-def test_a_summary_has_the_mean_seconds_of_the_epochs_and_the_final_scores(tmp_path, made_up_run):
-    run = summarize(made_up_run(tmp_path / "run", "random", None, "seed=3"))
-    assert (run.arm, run.seed, run.photographs) == ("random", 3, {})
-    assert run.scores == {"test/accuracy": 0.76543, "test/accuracy_last": 0.75, "test/epoch": 2}
-    assert run.seconds == {
-        "attack": 0.75, "attack_classifier": 0.375, "training": 4.5, "evaluation": 1.5, "input_output": 0.75,
-        "operators": 7.0,
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("lines", [None, "", '{"epoch": 1}\n', '{"epoch": 1}\n{"test/accuracy": 1'])
 def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
     if lines is not None:
@@ -34,9 +24,6 @@ def test_a_run_that_is_not_finished_is_an_error(tmp_path, lines):
     ("file", "old", "new", "reason"),
     [
         ("config.yaml", "arm: none", "arm: [none]", r"augment\.arm is \['none'\]"),
-        ("config.yaml", "\nseed: 0", "\nseed: abc", "seed is abc"),
-        ("config.yaml", "\nlabel: orange", "\nlabel: 5", "label is 5"),
-        ("metrics.jsonl", '"test/accuracy": ', '"test/accuracy": NaN, "x": ', "test/accuracy is nan"),
         ("metrics.jsonl", '"test/accuracy": ', '"test/accuracy": 7e300, "x": ', r"test/accuracy is 7e\+300"),
     ],
 )
@@ -155,10 +142,3 @@ def test_a_line_with_any_value_is_read_or_refused_in_one_sentence(tmp_path_facto
         read_attack(folder)
     except InputError as error:
         assert str(error).startswith(f"{folder / 'attack.jsonl'} is damaged or was written by no attack (")
-
-
-@pytest.mark.parametrize("text", ["1\n", '{"checks": 3}\n', '{"example": 0}\n', "[" * 100_000 + "\n"])
-def test_a_file_that_no_attack_wrote_is_refused(tmp_path, text):
-    (tmp_path / "attack.jsonl").write_text(text)
-    with pytest.raises(InputError, match="was written by no attack"):
-        read_attack(tmp_path)
