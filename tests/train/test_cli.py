@@ -1,6 +1,5 @@
 """Commands from start to end: their statuses, their single lines of error, and interrupts."""
 
-import io
 import os
 import signal
 import subprocess
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from renderer.errors import InputError
 from train import cli
 from train.checkpoint import LAST
 from train.run_folder import locked
@@ -46,15 +44,12 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
     [
         (["data=npz", "data.path=none.npz"], "data.path=none.npz does not exist: give the path of an .npz file"),
         (["run=file/run"], "run=file/run cannot be written to (Not a directory): choose another folder"),
-        (["run=/proc/none"], "run=/proc/none cannot be written to"),
         (["run=odd"], "run=odd/train.log cannot be written (it is not a regular file)"),
-        (["run=[a]"], "run: "),
         (["train.epoch=3"], "Could not override 'train.epoch'"),
         (["compare=[non]"], "compare: "),
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs Slurm's sbatch, which is missing"),
         (["--multirun", "seed=0,0"], "the sweep has a cell twice"),
         (["--multirun", "run=a", "seed=0,1"], "run= names the folder of a single run"),
-        (["--multirun", "sweep=file/a", "seed=0,1"], "sweep=file/a cannot be written to (Not a directory)"),
         (["--multirun", "train.epoch=0,1"], "Could not override 'train.epoch'"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
@@ -76,12 +71,12 @@ def test_a_mistake_in_any_arm_stops_the_command_before_the_first_arm_trains(call
     assert not list(tmp_path.rglob(LAST))
 
 
-@pytest.mark.parametrize("held", ["here", "here/none"])
-def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_npz, held):
+@pytest.mark.parametrize("busy", ["here", "here/none"])
+def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_npz, busy):
     arms = ["run=here", "data=npz", f"data.path={tiny_npz}", "compare=[none]", "train.resume=true"]
-    with locked(tmp_path / held):
+    with locked(tmp_path / busy):
         assert call("train", *arms, *SMALL) == cli.USER_ERROR
-    assert capsys.readouterr().err.startswith(f"error: run={tmp_path / held} is being written by another process")
+    assert capsys.readouterr().err.startswith(f"error: run={tmp_path / busy} is being written by another process")
     assert not list(tmp_path.rglob("config.yaml")) and not list(tmp_path.rglob("metrics.jsonl"))
 
 
@@ -94,24 +89,13 @@ def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
 # ------------------------------------------------------------------------------------ errors and interrupts
 
 
-def raise_error(error: BaseException) -> None:
-    with cli.errors():
-        raise error
-
-
 def test_an_error_of_the_program_keeps_its_traceback():
-    with pytest.raises(ZeroDivisionError):
-        raise_error(ZeroDivisionError())
-
-
-def test_an_error_of_the_user_is_one_line(capsys):
-    with pytest.raises(SystemExit) as stop:
-        raise_error(InputError("seed=a is not a number"))
-    assert stop.value.code == cli.USER_ERROR and capsys.readouterr() == ("", "error: seed=a is not a number\n")
+    with pytest.raises(ZeroDivisionError), cli.errors():
+        raise ZeroDivisionError
 
 
 @pytest.mark.parametrize("swallowed", [False, True])
-def test_ctrl_c_is_one_line_and_status_130_also_where_a_library_makes_an_error_of_it(capsys, swallowed):
+def test_ctrl_c_is_one_line_and_status_130_even_if_a_library_turns_it_into_an_error(capsys, swallowed):
     """As trimesh does, which keeps whatever is raised while its optional parts are imported."""
     before = signal.signal(signal.SIGINT, cli._interrupt)  # a background job has it ignored
     try:
@@ -146,15 +130,7 @@ def test_an_interrupt_while_torch_is_imported_is_one_line(path):
     assert (ended.returncode, ended.stdout, ended.stderr) == (128 + signal.SIGINT, "", "ended by SIGINT\n")
 
 
-def test_every_command_imports_the_handler_of_interrupts_first():
-    for path in [ROOT / "train" / "__main__.py", *(ROOT / "scripts").glob("*.py")]:
-        imports = [line for line in path.read_text().splitlines() if line.startswith(("import ", "from "))]
-        modules = [line.split()[1].partition(".")[0] for line in imports]
-        assert "from train import cli" in imports[modules.index("train")], path
-        assert set(modules[: modules.index("train")]) <= sys.stdlib_module_names, path
-
-
-def test_a_reader_that_has_gone_ends_a_command_in_silence(call, capsys, monkeypatch, tmp_path):
+def test_a_closed_output_pipe_ends_a_command_silently(call, capsys, monkeypatch, tmp_path):
     read, write = os.pipe()
     os.close(read)
     with monkeypatch.context() as patch, open(write, "w") as output:
@@ -162,10 +138,3 @@ def test_a_reader_that_has_gone_ends_a_command_in_silence(call, capsys, monkeypa
         assert call("export_light", "light=grace", "height=4", "out=a.hdr") == 128 + signal.SIGPIPE
         print("what Python may still hold at its end", flush=True)
     assert capsys.readouterr().err == "" and (tmp_path / "a.hdr").is_file()
-
-
-def test_a_terminal_of_ascii_shows_other_characters_as_escapes(call, monkeypatch):
-    terminal = io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors="strict")
-    monkeypatch.setattr(sys, "stdout", terminal)
-    assert call("export_light", "light=grace", "height=4", "out=a.hdr") == 0
-    assert rb"8 \xd7 4 texels" in terminal.buffer.getvalue()

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from augment.variation import VariationSettings
 from renderer.errors import InputError, require_range
 from train.attacks.settings import AttackExperimentSettings
 from train.configuration import as_override, compose, dotted, quoted, read_settings
@@ -18,21 +17,17 @@ from train.settings import ExperimentSettings
 
 
 @pytest.mark.parametrize(
-    ("command", "kind", "overrides", "by_the_clock_or_required"),
+    ("command", "kind", "overrides", "different"),
     [
         ("train", ExperimentSettings, ["experiment=paper", "data=shapes"], {"run", "data.images"}),
         ("attack", AttackExperimentSettings, ["attack=[]"], {"out"}),
     ],
 )
-def test_the_dataclasses_have_the_defaults_of_the_configuration(command, kind, overrides, by_the_clock_or_required):
+def test_the_dataclasses_have_the_defaults_of_the_configuration(command, kind, overrides, different):
+    """But for keys that are required or contain the time."""
     config = dict(dotted(OmegaConf.to_container(compose(command, overrides))))
     schema = dict(dotted(OmegaConf.to_container(OmegaConf.structured(kind))))
-    assert {key for key in config if config[key] != schema.get(key, "missing")} == by_the_clock_or_required
-
-
-def test_the_papers_experiment_renders_a_fixed_grid():
-    settings = read_settings(ExperimentSettings, compose("train", ["experiment=paper", "run=here"]))
-    assert settings.augment.vary == VariationSettings() and settings.scene.hard_negatives == []
+    assert {key for key in config if config[key] != schema.get(key, "missing")} == different
 
 
 @pytest.mark.parametrize("experiment", ["best", "cpu", "demo", "fast", "harden", "paper"])
@@ -42,12 +37,7 @@ def test_every_experiment_takes_other_data(experiment):
     assert (settings.data.name, settings.data.path, settings.evaluate.photos) == ("npz", "a.npz", None)
 
 
-def test_the_demonstration_is_scored_on_the_images_that_it_renders():
-    settings = read_settings(ExperimentSettings, compose("train", ["run=here"]))
-    assert settings.evaluate.photos == settings.data.images == "here/rendered_images"
-
-
-def test_training_takes_the_parameters_of_the_attack_command_and_the_papers_where_none_is_named():
+def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by_default():
     def parameters(*overrides: str) -> dict:
         return read_settings(ExperimentSettings, compose("train", overrides)).augment.attack.parameters
 
@@ -68,28 +58,19 @@ def test_training_takes_the_parameters_of_the_attack_command_and_the_papers_wher
         (["data=npz", "data.pth=x"], "Could not override 'data.pth'"),
         (["data=mnist"], "In 'train': Could not find 'data/mnist' Available options in 'data': cifar100 folder npz sh"),
         (["scene.meshes=[~/a.obj]"], "LexerNoViableAltException: scene.meshes=[~/a.obj]"),
-        (["train.epochs=[1"], "train.epochs=[1: no viable alternative at input '[1'"),
         (["seed=0,1"], "Ambiguous value for argument 'seed=0,1'"),
         (["~seed"], "~seed: a setting cannot be removed"),
         (["run="], "run is empty: give a name"),
         (["+train.epoch=3"], "train.epoch: Key 'epoch' not in 'TrainSettings'"),
         (["data=npz"], "data.path is not set: give data.path=..."),
-        (["data=npz", "data.path=${nowhere}"], "data.path: Interpolation key 'nowhere' not found"),
         (["train=3"], "train: Merge error: int is not a subclass of TrainSettings. value: 3"),
         (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
-        (["augment.attack.step_size=abc"], "augment.attack.step_size: Value 'abc'"),
-        (["evaluate.skip_unreadable=perhaps"], "evaluate.skip_unreadable: Value 'perhaps'"),
         (["scene.meshes=solid:orange"], "scene.meshes: Invalid value assigned"),
-        (["scene.projector=[]"], "scene.projector: Cannot merge DictConfig with ListConfig"),
         (["compare=[[none]]"], "compare[0]: give a plain value, not a list or mapping"),
         ([f"scene.exposure={10**400}"], "scene.exposure: int too large to convert to float"),
         (["seed=-1"], "seed=-1 must be at least 0"),
         (["train.epochs=0"], "train.epochs: epochs=0 must be at least 1"),
-        (["train.learning_rate=-1"], "train.learning_rate: learning_rate=-1.0 must be positive"),
-        (["data=folder", "data.path=a", "data.size=1"], "data.size: size=1 must be at least 5"),
         (["scene.exposure=1e30"], "scene.exposure: exposure=1e+30 must be at least 0 and at most 100000"),
-        (["scene.views=1000000000000"], "scene.views: views=1000000000000 must be at least 1 and at most 100000"),
-        (["evaluate.photos={a/b: /x}"], "evaluate.photos: photos: a/b must be a name of letters"),
         (["evaluate.photos={renders: /x}"], "evaluate.photos: photos: renders must be a name of letters"),
         (["evaluate.photos=[/x]"], "evaluate.photos: photos=['/x'] must be a folder, or a mapping"),
     ],
@@ -134,7 +115,6 @@ def test_the_check_of_a_nested_dataclass_gets_its_key(group):
         (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12"),
         (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable: Key 'lable'"),
         (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
-        (["scene.meshes=['']"], "mesh is '': give a file or solid:NAME"),
         (
             ["scene.hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
             "scene.hard_negatives[0] is of the class orange: name it in scene.meshes",
@@ -144,7 +124,6 @@ def test_the_check_of_a_nested_dataclass_gets_its_key(group):
         (["model.width=100000"], "model.width=100000: 1e+15 parameters are too many"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
-        (["renderer.samples=0"], "samples=0"),
         (["renderer.rasterizer=opengll"], "opengll"),
         (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab does not exist"),
     ],
@@ -172,8 +151,6 @@ def test_quoted_text_is_read_as_it_is(text):
         ("photos=2024", "photos='2024'"),
         ("evaluate.photos=1.10", "evaluate.photos='1.10'"),
         ("+data.path=1e3", "+data.path='1e3'"),
-        ("out=true", "out='true'"),
-        ("run=schäl", "run='schäl'"),
         ("run=a\udcff", "run='a\udcff'"),
         ("out=a;b", "out='a;b'"),
         *((same, same) for same in ["train.epochs=3", "photos=none", "photos=2024,2025", "run=a/b.c", "2024"]),

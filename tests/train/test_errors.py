@@ -2,25 +2,16 @@ import io
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from renderer.errors import InputError
 from train import errors
 from train.errors import one_sentence, writable_file, writable_folder
 
 
-def interpolation_error() -> Exception:
-    try:
-        return OmegaConf.create({"path": "${nowhere}"}).path
-    except Exception as error:
-        return error
-
-
 @pytest.mark.parametrize(
     ("error", "sentence"),
     [
         (InputError("light=x is not known"), "light=x is not known"),
-        (interpolation_error(), "path: Interpolation key 'nowhere' not found"),
         (PermissionError(13, "Permission denied", "/a/b"), "/a/b cannot be read or written: Permission denied"),
         (OSError(28, "No space left on device"), "there is no room for the output: No space left on device"),
         (RuntimeError("[/gloo/x.cc:1] Connection closed by peer"), "another process of this run has ended: "),
@@ -34,9 +25,9 @@ def interpolation_error() -> Exception:
     ],
 )
 def test_an_error_is_one_sentence_where_the_user_can_fix_it(error, sentence):
-    found = one_sentence(error)
-    assert (found is None) == (sentence is None)
-    assert found is None or (found.startswith(sentence) and "\n" not in found)
+    result = one_sentence(error)
+    assert (result is None) == (sentence is None)
+    assert result is None or (result.startswith(sentence) and "\n" not in result)
 
 
 def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):
@@ -49,13 +40,9 @@ def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):
         writable_file(file, "out")
     assert sorted(tmp_path.rglob("*")) == [tmp_path / "there", tmp_path / "there" / "file"]
     assert (tmp_path / "there" / "file").read_text() == "old"
-
-
-@pytest.mark.parametrize("name", ["/proc/none", "/dev/null/a", "/dev/full", "x" * 300])
-def test_an_output_that_cannot_be_written_is_refused_by_its_key(name):
-    for try_it in (writable_folder, writable_file):
+    for check in (writable_folder, writable_file):
         with pytest.raises(InputError, match=r"^out=[^\n]* cannot be written [^\n]*: choose another (file|folder)$"):
-            try_it(name, "out")
+            check("/dev/null/a", "out")
 
 
 def test_a_full_disk_is_noticed_before_the_work(tmp_path, monkeypatch):

@@ -1,7 +1,7 @@
 import pytest
 from scipy.stats import norm
 
-from train.tables import aligned, format_fraction, format_interval, fraction
+from train.tables import format_fraction, format_interval, fraction
 
 
 @pytest.mark.parametrize(("hits", "n"), [(0, 1), (1, 1), (0, 40), (40, 40), (1, 527), (263, 527), (1, 10**6)])
@@ -17,17 +17,4 @@ def test_a_fraction_has_the_wilson_interval(hits, n):
 
 def test_a_fraction_of_nothing_is_unknown():
     assert fraction(0, 0) == {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
-    assert (format_fraction(fraction(0, 0)), format_interval(fraction(0, 0)), format_interval({})) == (
-        "none of 0",
-        "-",
-        "-",
-    )
-
-
-def test_columns_are_aligned():
-    assert aligned(["a", "long"], [["xyz", 1.23456], [None, True]]).splitlines() == [
-        "| a   | long |",
-        "| --- | ---- |",
-        "| xyz | 1.23 |",
-        "|     | yes  |",
-    ]
+    assert (format_fraction(fraction(0, 0)), format_interval(fraction(0, 0))) == ("none of 0", "-")
