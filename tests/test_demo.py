@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.slow
-def test_the_demonstration_ends_with_a_table_that_shows_the_effect_and_a_image(tmp_path):
+def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-m", "train"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True

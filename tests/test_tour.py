@@ -18,15 +18,15 @@ def tour() -> nbformat.NotebookNode:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:subprocess:ResourceWarning")  # nbclient ends the kernel and does not wait for it
-def test_the_tour_runs_from_the_root_of_a_clone_and_fools_the_network(tour):
+def test_the_attacks_of_the_tour_succeed_from_the_root_of_a_clone(tour):
     NotebookClient(tour, timeout=600, resources={"metadata": {"path": str(ROOT)}}).execute()
     gc.collect()  # so that no later test is warned of the kernel
-    said = "".join(output.get("text", "") for cell in tour.cells for output in cell.get("outputs", []))
-    fooled, _, recognized, *_ = said.split()
-    assert int(recognized) > 0 and int(fooled) >= 0.9 * int(recognized)
+    printed = "".join(output.get("text", "") for cell in tour.cells for output in cell.get("outputs", []))
+    successes, _, recognized, *_ = printed.split()
+    assert int(recognized) > 0 and int(successes) >= 0.9 * int(recognized)
 
 
-def test_the_tour_is_kept_with_its_images_and_without_a_machines_path(tour):
+def test_the_tour_contains_its_images_and_no_path_of_a_machine(tour):
     cells = [cell for cell in tour.cells if cell.cell_type == "code"]
     images = [output for cell in cells for output in cell.outputs if "image/png" in output.get("data", {})]
     assert len(images) >= 7 and not any(output.output_type == "error" for cell in cells for output in cell.outputs)

@@ -37,7 +37,7 @@ EVALUATE = ["evaluate_photos", "run=1.10", "photos=2024", "device=cpu", "precisi
 EXPORT = ["export_light", "light=grace", "height=4"]
 
 
-def test_a_network_is_scored_at_its_size_on_photographs_whose_names_are_numbers_or_no_utf_8(call, here, capsys):
+def test_a_network_is_scored_on_photographs_in_folders_named_by_numbers_or_not_in_utf_8(call, here, capsys):
     assert call(*EVALUATE, "out=1e3") == 0
     assert "1 images of orange, 1 of other things" in capsys.readouterr().out
     assert {path.name for path in (here / "1e3").iterdir()} == {
@@ -54,7 +54,7 @@ def test_a_network_is_scored_at_its_size_on_photographs_whose_names_are_numbers_
     assert float(first[header.split(",").index("orange_log_odds")]) == pytest.approx(log_odds, abs=1e-4)
 
 
-OWN = """
+USER_NETWORK = """
 import torch
 
 class Redness(torch.nn.Module):
@@ -68,7 +68,7 @@ def build():
 
 
 def test_a_network_that_a_python_function_makes_is_scored_at_its_size_and_on_its_classes(call, tmp_path):
-    (tmp_path / "own.py").write_text(OWN)
+    (tmp_path / "own.py").write_text(USER_NETWORK)
     for name, color in {"lime": (0, 255, 0), "orange": (255, 128, 0)}.items():
         (tmp_path / "lit" / name).mkdir(parents=True)
         Image.new("RGB", (40, 30), color).save(tmp_path / "lit" / name / "one.png")
@@ -79,33 +79,23 @@ def test_a_network_that_a_python_function_makes_is_scored_at_its_size_and_on_its
 
 WRONG = [
     ([*EVALUATE, "skip_unreadable=maybe"], "Error merging override skip_unreadable=maybe: Value 'maybe' is not"),
-    ([*EVALUATE, "photos=[a,b]"], "Error merging override photos=[a,b]: "),
     ([*EVALUATE, "label=pear"], "classifier=run:1.10: 'pear' is not a class of the model"),
     ([*EVALUATE, "classifier=python:own:build"], "give one network"),
-    ([*EVALUATE, "run=null"], "give one network"),
     ([*EVALUATE, "run=null", "classifier=python:own:build", "model=python:a:b"], "model=python:a:b is for"),
     ([*EVALUATE, "run=null", "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
     ([*EVALUATE, "weights=b"], "weights=b is not for classifier=run:1.10"),
     ([*EVALUATE, "out=file"], "out=file cannot be written to (Not a directory): choose another folder"),
-    ([*EVALUATE, "out=/dev/full/out"], "out=/dev/full/out cannot be written to"),
     (["compare_runs"], "runs is not set: give runs=..."),
     (["compare_runs", "runs=[]"], "runs is empty"),
-    (["compare_runs", "runs=runs/a"], "Error merging override runs=runs/a: "),
     (["compare_runs", "runs=[a,b,./a]"], "runs names a twice"),
-    (["compare_runs", "runs=[[a]]"], "runs[0]: give a plain value"),
     (["compare_runs", "runs=[2024]"], "2024 holds no finished run"),
     (["compare_runs", "--multirun"], "--multirun is not an option"),
-    (["report", "runs=[]"], "runs is empty"),
     (["report", "a", f"out={'x' * 300}"], "out=xxx"),
     ([*EXPORT, "height=1000000000", "out=a.hdr"], "height=1000000000 must be at least 1 and at most 8192"),
     ([*EXPORT, "out=a.jpg"], "out: "),
-    ([*EXPORT, "out=/proc/none/out.hdr"], "out=/proc/none/out.hdr cannot be written"),
-    (["publish", "run=[a]", "out=out"], "Error merging override run=[a]: "),
     (["publish", "run=1.10", "out=file/out"], "out=file/out cannot be written to"),
-    (["fit_skylight", "zenith_degree=-1", "out=a.safetensors"], "zenith_degree=-1 must be at least 0"),
     (["fit_skylight", "out=photo.png"], "out=photo.png: name a .safetensors file"),
     (["fit_skylight", "out=2024"], "out=2024 cannot be written (it is not a regular file): choose another file"),
-    (["lab", "size=0", "out=a"], "size=0 must be at least 1"),
     (["lab", "out=file/out"], "out=file/out cannot be written to"),
 ]
 
@@ -134,8 +124,3 @@ def test_a_light_is_not_written_over_itself(call, here, capsys):
     assert call("export_light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
     assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself, which would be lost")
     assert (here / "a.npy").read_bytes() == whole
-
-
-def test_help_shows_every_setting(call, capsys):
-    assert call("evaluate_photos", "--help") == 0
-    assert "photos: ???" in capsys.readouterr().out
