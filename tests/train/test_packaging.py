@@ -3,7 +3,6 @@ import importlib.util
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import tomllib
@@ -37,23 +36,18 @@ def dependencies() -> list[Requirement]:
 def test_the_versions_that_are_tested_as_the_oldest_are_the_lower_bounds():
     lines = [line for line in (ROOT / "tests" / "oldest.txt").read_text().splitlines() if not line.startswith("#")]
     oldest = dict(line.split("==") for line in lines)
-    assert oldest.keys() == {each.name for each in dependencies()}
-    for each in dependencies():
-        (lower,) = (Version(bound.version) for bound in each.specifier if bound.operator == ">=")
-        assert Version(oldest[each.name]).release[: len(lower.release)] == lower.release, each
+    assert oldest.keys() == {requirement.name for requirement in dependencies()}
+    for requirement in dependencies():
+        (lower,) = (Version(bound.version) for bound in requirement.specifier if bound.operator == ">=")
+        assert Version(oldest[requirement.name]).release[: len(lower.release)] == lower.release, requirement
 
 
-@pytest.mark.parametrize("name", [each.name for each in dependencies()])
-def test_what_is_needed_is_under_a_licence_that_binds_no_user(name):
+@pytest.mark.parametrize("name", [requirement.name for requirement in dependencies()])
+def test_dependencies_have_permissive_licenses(name):
     about = importlib.metadata.metadata(name)
     classifiers = [line for line in about.get_all("Classifier", []) if line.startswith("License")]
     words = " ".join([about.get("License-Expression") or "", (about.get("License") or "")[:100], *classifiers])
     assert re.search(r"MIT|BSD|Apache|Python Software Foundation|MPL-2.0", words) and "GPL" not in words
-
-
-def test_the_tests_themselves_reach_no_network():
-    with pytest.raises(AssertionError, match="without the user's word"), socket.socket() as door:
-        door.connect(("192.0.2.1", 80))  # reserved for documentation
 
 
 @pytest.fixture(scope="module")
@@ -92,27 +86,25 @@ def test_an_installation_runs_from_any_folder(installed, tmp_path):
     assert "experiment: best, cpu, demo, fast" in done.stdout and "learning_rate" in done.stdout
 
 
-DOORS = """
+README_BLOCKS = """
 import pathlib, re, sys
 import torch, trimesh
 from torch import nn
 import augment, renderer, train
 readme, where = sys.argv[1:]
-assert all(pathlib.Path(each.__file__).is_relative_to(where) for each in (augment, renderer, train))
+assert all(pathlib.Path(module.__file__).is_relative_to(where) for module in (augment, renderer, train))
 trimesh.creation.icosphere(2).export("orange.glb")
 CLASSES = [*map(str, range(99)), "orange"]
-data = torch.utils.data.TensorDataset(torch.rand(8, 3, 32, 32), torch.arange(8))
-data = [(image, int(label)) for image, label in data]
 class Data(torch.utils.data.Dataset):
-    __len__ = lambda self: len(data)
-    __getitem__ = lambda self, index: data[index]
+    __len__ = lambda self: 8
+    __getitem__ = lambda self, index: (torch.full((3, 32, 32), index / 8), index)
 for block in re.findall(r"```python\\n(.*?)```", pathlib.Path(readme).read_text(), re.DOTALL):
     network = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 100))
     network[2].bias.data[99] = 9.0
     optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
     exec(block, dict(torch=torch, network=network, CLASSES=CLASSES, data=Data(), optimizer=optimizer))
 """
-OWN_NETWORK = """
+USER_NETWORK = """
 from torch import nn
 def build():
     return nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(3, 2)), 24, ["orange", "plum"]
@@ -120,12 +112,12 @@ def build():
 
 
 @pytest.mark.slow
-def test_the_doors_of_the_readme_open_from_an_installation_in_an_empty_folder(installed, tmp_path):
-    (tmp_path / "mine.py").write_text(OWN_NETWORK)
-    own = "classifier=python:mine:build"
-    attack = [str(ROOT / "scripts" / "attack.py"), own, "attack.force=true", "attack.checks=false", "out=found"]
+def test_the_examples_of_the_readme_run_from_an_installation_in_an_empty_folder(installed, tmp_path):
+    (tmp_path / "mine.py").write_text(USER_NETWORK)
+    network = "classifier=python:mine:build"
+    attack = [str(ROOT / "scripts" / "attack.py"), network, "attack.force=true", "attack.checks=false", "out=attacked"]
     env = os.environ | {"PYTHONPATH": str(installed), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    for arguments in (["-c", DOORS, str(ROOT / "README.md"), str(installed)], attack):
+    for arguments in (["-c", README_BLOCKS, str(ROOT / "README.md"), str(installed)], attack):
         done = subprocess.run([sys.executable, *arguments], cwd=tmp_path, env=env, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
-    assert (tmp_path / "adversaries" / "attack.jsonl").is_file() and any((tmp_path / "found").rglob("attack.jsonl"))
+    assert (tmp_path / "adversaries" / "attack.jsonl").is_file() and any((tmp_path / "attacked").rglob("attack.jsonl"))
