@@ -51,9 +51,9 @@ class ProjectorSettings:
 
 @dataclass
 class LampsSettings:
-    """`Lamps` at places [x, y, z], above four corners unless told otherwise, points or discs of a radius. start: the
-    powers that attacks begin with, a number, [r, g, b] of each lamp, or the lamps.json of an adversary, whose places,
-    power and radius take the others' place."""
+    """`Lamps` at positions [x, y, z], by default above four corners; points, or discs with a radius. start: the powers
+    that attacks begin with, a number, [r, g, b] of each lamp, or the lamps.json of an adversary, whose positions, power
+    and radius replace the others."""
 
     positions: list[Any] = field(default_factory=lambda: [[x, y, 2.0] for x in (2.0, -2.0) for y in (2.0, -2.0)])
     power: float = 10.0

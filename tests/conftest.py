@@ -31,7 +31,7 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def interrupts() -> None:
-    """LightPaths what tests start, also where the tests run in the background."""
+    """SIGINT reaches the processes that tests start, even if the tests run in the background of a shell."""
     heed_interrupts()
 
 

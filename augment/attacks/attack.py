@@ -83,7 +83,7 @@ class AttackSettings:
         """The parameters to change of a scene, whose light is made physically possible unless it may be negative."""
         if not self.allow_negative:
             scene = replace(scene, lights=scene.basis.project_nonnegative(scene.lights))
-        parameters = PARAMETERS | {Lighting.name: partial(Lighting, physical=not self.allow_negative)}
+        parameters = PARAMETERS | {Lighting.name: partial(Lighting, nonnegative=not self.allow_negative)}
         return AttackProblem(scene, [parameters[name](scene, settings) for name, settings in self.parameters.items()])
 
 

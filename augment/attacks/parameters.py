@@ -37,7 +37,7 @@ class Parameter(ABC):
         """The conditions of examples (A,) with this part of them set to values (A, D)."""
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        """The nearest values (A, D) of the examples (A,) within the norm-ball and what is physically possible."""
+        """The nearest values (A, D) of the examples (A,) within the norm-ball and its domain."""
         return self.settings.project(values, self.start[examples], self.within_domain)
 
     def sample(self, generator: torch.Generator, examples: Tensor) -> Tensor:
@@ -93,21 +93,26 @@ class OfMesh(Parameter):
 
 class OfLight(Parameter):
     """Every coefficient of one of the bases that a scene's light is of. The start is the examples' own; or, where light
-    is to be physical, what is nearest to it that something can emit, and so is every light from there on."""
+    is not to be negative, the nearest light that can be emitted, and so is every light from there on."""
 
     def __init__(
-        self, scene: Scene, settings: StepSettings, where: slice, basis: EnvironmentBasis | LocalBasis, physical: bool
+        self,
+        scene: Scene,
+        settings: StepSettings,
+        where: slice,
+        basis: EnvironmentBasis | LocalBasis,
+        nonnegative: bool,
     ):
         """where: the coefficients of the basis among the scene's."""
-        self.basis, self.physical, self._where = basis, physical or not basis.allow_negative, where
+        self.basis, self.nonnegative, self._where = basis, nonnegative or not basis.allow_negative, where
         start = scene.lights[:, where]
-        super().__init__(scene, (basis.project_nonnegative(start) if self.physical else start).flatten(1), settings)
+        super().__init__(scene, (basis.project_nonnegative(start) if self.nonnegative else start).flatten(1), settings)
 
     def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return _relit(conditions, self._where, values.unflatten(1, (-1, 3)))
 
     def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        if not self.physical:
+        if not self.nonnegative:
             return super().within_domain(values, within)
         of_lights = None if within is None else within.unflatten(-1, 3)
         return self.basis.project_nonnegative(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
@@ -126,15 +131,15 @@ class Lighting(OfLight):
 
     name = "lighting"
 
-    def __init__(self, scene: Scene, settings: StepSettings, physical: bool = False):
-        super().__init__(scene, settings, *parts_of(scene.basis)[0], physical)
+    def __init__(self, scene: Scene, settings: StepSettings, nonnegative: bool = False):
+        super().__init__(scene, settings, *parts_of(scene.basis)[0], nonnegative)
 
 
-class OfPlace(OfLight):
-    """The light from places, of which a scene has one kind each. InputError where it has none."""
+class OfLocalLight(OfLight):
+    """The local light of one basis, of which a scene has one each. InputError where it has none."""
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        super().__init__(scene, settings, *_of_name(scene, self.name, self.name), physical=True)
+        super().__init__(scene, settings, *_of_name(scene, self.name, self.name), nonnegative=True)
 
 
 def _of_name(scene: Scene, name: str, attacked: str) -> tuple[slice, Any]:
@@ -145,13 +150,13 @@ def _of_name(scene: Scene, name: str, attacked: str) -> tuple[slice, Any]:
     raise InputError(f"attack={attacked}: the scene has no {name}: set scene.{name}")
 
 
-class ProjectorPattern(OfPlace):
+class ProjectorPattern(OfLocalLight):
     """What a projector throws: each pixel's three channels, from 0 to its power."""
 
     name = Projector.name
 
 
-class LampPowers(OfPlace):
+class LampPowers(OfLocalLight):
     """What each lamp emits, three channels from 0 to the largest power."""
 
     name = Lamps.name

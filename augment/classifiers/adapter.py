@@ -21,7 +21,7 @@ class Classifier(nn.Module):
     """A frozen classifier: images, RGB in [0, 1], to logits of C classes; differentiable in the pixels.
 
     name: for messages. size: pixels per side; images are to be rendered at it, nothing is resized here. classes:
-    the C names, each once. The parameters need no gradient and the mode is eval, whatever `train` is told.
+    the C names, each once. The parameters need no gradient and the mode stays eval, also after `train()`.
     """
 
     def __init__(self, function: Callable[[Tensor], Tensor], size: int, classes: Sequence[str], name: str = "callable"):

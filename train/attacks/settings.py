@@ -16,7 +16,7 @@ LIT = 2.0  # power of the default lamps whose places alone are attacked
 
 @dataclass
 class AttackCommandSettings(AttackSettings):
-    """shared: the views share what is attacked. force: go on where nothing is recognized. checks: see `Checks`.
+    """shared: the views share what is attacked. force: go on where nothing is clean-correct. checks: see `Checks`.
 
     radius_scales: of the radii to draw success against; see `augment.success_by_radius`.
     verify: what renders the adversaries anew from their files, "reload" or "mitsuba" or both joined by +; or None.

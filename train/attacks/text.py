@@ -26,7 +26,7 @@ def format_attack(
         lines += [
             f"cost {checks.cost_before:.2f} before and {checks.cost:.2f} after; it fell in {checks.cost_fell:.0%}; "
             f"first gradients that are zero: {checks.zero_gradient:.0%}",
-            f"fooled by as many random draws: {checks.random_search:.0%}; by longer attacks: {by_steps} steps",
+            f"success of as many random draws: {checks.random_search:.0%}; by longer attacks: {by_steps} steps",
             *(f"warning: {warning}" for warning in checks.warnings),
         ]
     success = attacked.success & attacked.clean_correct
@@ -35,10 +35,11 @@ def format_attack(
 
 
 def _survival(rerender_check: RerenderCheck, success: Tensor) -> str:
-    """How many of the adversaries fool in another version, and how far its values are from theirs, of 255."""
+    """How many of the adversaries succeed in another version, and how far its values are from theirs, of 255."""
     largest, mean = 255 * rerender_check.largest[success].max(), 255 * rerender_check.mean[success].mean()
+    survivors = int(rerender_check.success[success].sum())
     return (
-        f"{rerender_check.version}: {int(rerender_check.success[success].sum())} of {int(success.sum())} still fool; "
+        f"{rerender_check.version}: {survivors} of {int(success.sum())} still succeed; "
         f"values differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
     )
 
