@@ -113,6 +113,7 @@ def test_images_and_gradients_by_the_light_go_to_mitsubas_noise(mesh, paths):
         assert error < 1.3 * row[f"{of}_noise"] if mesh.startswith("convex") else converged < error < 0.02 < direct
 
 
+@pytest.mark.slow
 def test_training_is_timed_beside_a_plain_loop(tmp_path):
     """With attacks that take all their steps."""
     tiny = ["--images", "32", "--rounds", "1", "--depth", "10", "--width", "1", "--workers", "0"]

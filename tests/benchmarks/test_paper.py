@@ -136,7 +136,7 @@ class Line:
 
 def test_the_descent_stops_where_it_fools_and_then_goes_on_for_as_many_steps_as_were_asked():
     """From 0.42 in steps of 0.05 it is 5 steps to below 0.2, and from 0.92 it is 15."""
-    settings = AttackSettings(lighting=StepSettings())
+    settings = AttackSettings(lighting=StepSettings(), margin=0.0, rounded=False)
     first, further = transfer.adversaries(by_brightness(), Line(), settings, "orange", views=1)
     # Sums of at most 25 float32 steps of size 0.05, each rounded to 2⁻²⁵.
     torch.testing.assert_close(first, torch.tensor([[0.17], [0.17]]), rtol=0, atol=1e-6)

@@ -384,4 +384,4 @@ def test_renders_beyond_the_memory_are_refused_before_any_is_made(data, capfd, t
     asked = [word.replace("examples=4", "examples=200000") for word in TRAINING]
     assert run_here("train", f"run={tmp_path}/run", *asked, folder=data) == 2
     errors = capfd.readouterr().err
-    assert re.fullmatch(r"error: 200000 renders of 16 pixels per side .* and 1\.0 GB are free: .*\n", errors)
+    assert re.fullmatch(r"error: scene: 200000 renders of 16 pixels per side .* and 1\.0 GB are free: .*\n", errors)

@@ -71,7 +71,7 @@ def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by
         (["seed=-1"], "seed=-1 must be at least 0"),
         (["train.epochs=0"], "train.epochs: epochs=0 must be at least 1"),
         (["scene.exposure=1e30"], "scene.exposure: exposure=1e+30 must be at least 0 and at most 100000"),
-        (["evaluate.photos={renders: /x}"], "evaluate.photos: photos: renders must be a name of letters"),
+        (["evaluate.photos={renders: /x}"], "evaluate.photos: renders must be a name of letters"),
         (["evaluate.photos=[/x]"], "evaluate.photos: photos=['/x'] must be a folder, or a mapping"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",

@@ -258,7 +258,7 @@ BESIDE = [
     ([{"mesh": "solid:cup", "at": [0, 1], "scale": 0}], "props: solid:cup: scale=0.0 must be at least 0.1"),
     (
         [{"mesh": "solid:cup", "at": [0, 1], "albedo_scale": 2}],
-        r"meshes\[3\].props\[0\].albedo_scale: Key 'gain' not in",
+        r"meshes\[3\].props\[0\].albedo_scale: Key 'albedo_scale' not in",
     ),
     (["solid:cup"], r"meshes\[3\].props: give a list of mappings"),
     ("solid:cup", r"meshes\[3\].props: give a list of mappings"),
