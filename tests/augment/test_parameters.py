@@ -230,11 +230,11 @@ def ringing(scene: Scene) -> Scene:
 
 
 @pytest.mark.parametrize("norm", ["linf", "l2"])
-def test_physical_light_is_the_nearest_within_the_ball_that_something_emits(make_scene, norm):
+def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm):
     """q is nearest to v exactly when (v - q)·(p - q) ≤ 0 for all p of the set: here other lights that were projected
     into it, the center, and the light's own way there and beyond."""
     scene, draws = ringing(make_scene()), torch.Generator().manual_seed(3)
-    light = Lighting(scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), physical=True)
+    light = Lighting(scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), nonnegative=True)
     assert not torch.equal(light.start, scene.lights.flatten(1))
     wanted = light.start + 0.1 * torch.randn(3, 147, generator=draws, dtype=torch.float64)
     nearest, offset = light.project(wanted, EVERY), light.start - wanted
@@ -248,10 +248,10 @@ def test_physical_light_is_the_nearest_within_the_ball_that_something_emits(make
     torch.testing.assert_close(light.project(nearest, EVERY), nearest, rtol=0, atol=10 * TOLERANCE)
 
 
-def test_a_descent_in_physical_light_ends_in_light_that_an_environment_map_holds(make_scene, make_linear, tmp_path):
+def test_a_descent_in_nonnegative_light_ends_in_light_that_an_environment_map_holds(make_scene, make_linear, tmp_path):
     """And begins with the nearest to the scene's: RGBE, which has no negative numbers, gives the images back."""
     scene, classes = ringing(make_scene()), torch.zeros(3, 2, dtype=torch.int64)
-    problem = AttackProblem(scene, [Lighting(scene, StepSettings(step_size=0.5), physical=True)])
+    problem = AttackProblem(scene, [Lighting(scene, StepSettings(step_size=0.5), nonnegative=True)])
     values, images = attack(make_linear(2, bias=50.0), problem, Goal(classes, classes + 1), steps=6)
     assert (values - problem.start).norm(dim=1).min() > 1
     written = []
