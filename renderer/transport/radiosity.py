@@ -55,7 +55,7 @@ class Patches:
         facing, faces = np.repeat(sides, count)[:, None], np.tile(np.arange(count), len(sides))
         middles = pieces.vertices[pieces.faces].mean(axis=1)[faces]
         alike = np.hstack([np.floor(middles / math.sqrt(area)), np.rint(pieces.face_normals()[faces]), facing])
-        _, patch = np.unique(alike, axis=0, return_inverse=True)
+        patch = np.unique(alike, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0.0 gives it a second axis
         order = np.argsort(patch, kind="stable")
         pixel, piece = torch.from_numpy(patch[order]), torch.from_numpy(faces[order])
         areas = torch.from_numpy(pieces.face_areas())[piece]
