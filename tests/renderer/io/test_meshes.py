@@ -357,7 +357,7 @@ def test_an_image_that_is_missing_or_damaged_is_refused(tmp_path, make, content)
         (tmp_path / "peel.png").mkdir()
     elif content is not None:
         write(tmp_path / "peel.png", content)
-    require_refusal(path, "image")
+    require_refusal(path, "(image|peel)")  # older releases of trimesh name the file alone
 
 
 @pytest.mark.parametrize("content", [None, "", "newmtl other\n", "\0\0", *(f"newmtl peel\nKd {x}\n" for x in
