@@ -2,6 +2,7 @@
 
 import logging
 import runpy
+import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
@@ -12,7 +13,6 @@ import pytest
 import torch
 
 from renderer.rasterizer import Rasterizer
-from train.runtime import heed_interrupts
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,7 +32,7 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def interrupts() -> None:
     """SIGINT reaches the processes that tests start, even if the tests run in the background of a shell."""
-    heed_interrupts()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="session")

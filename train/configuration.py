@@ -117,9 +117,9 @@ def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
         if not key or message.startswith(key):
             raise
         name = re.match(r"\w*", message)[0]  # type: ignore[index]
-        if name in names and message.startswith(f"{name}: "):
-            raise InputError(_join(key, message)) from error
-        raise InputError(f"{_join(key, name) if name in names else key}: {message}") from error
+        if name in names:
+            key, message = _join(key, name), message.removeprefix(f"{name}: ")
+        raise InputError(f"{key}: {message}") from error
 
 
 def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

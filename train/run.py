@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -148,7 +147,7 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         if item.label != OTHER:
             class_index(data.classes, item.label, f"label of {key}")
     start, objects = time.perf_counter(), list(settings.objects.values())
-    with keyed("scene", asdict(settings.scene)):
+    with keyed("scene", vars(settings.scene)):
         scene = build_scene(
             objects, data.size, settings.views, scene=settings.scene, renderer=settings.renderer, device=device
         )

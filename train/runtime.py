@@ -315,8 +315,3 @@ class Interruption:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         self._handlers = {}
-
-
-def heed_interrupts() -> None:
-    """Let Ctrl-C end this process and those that it starts: a shell has what runs in the background ignore it."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from benchmarks.paper.common import last_run
+from train import tables
 
 Row = dict[str, Any]
 Table = Iterator[Sequence[object]]  # the header first
@@ -30,8 +30,8 @@ def fraction(outcomes: Iterable[bool]) -> str:
 
 def interval(outcomes: Sequence[bool]) -> tuple[float, float]:
     """95 %, by Wilson's score."""
-    bounds = binomtest(int(sum(outcomes)), len(outcomes)).proportion_ci(method="wilson")
-    return bounds.low, bounds.high
+    result = tables.fraction(int(sum(outcomes)), len(outcomes))
+    return result["low"], result["high"]
 
 
 def quartiles(values: Sequence[float] | np.ndarray, digits: int = 1) -> str:

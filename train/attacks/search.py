@@ -3,7 +3,7 @@
 import math
 import shlex
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import product
 
 import torch
@@ -30,7 +30,7 @@ SURE = 0.5  # confidence, in every image, at which the search ends
 def scene_of(item: ObjectSettings, settings: AttackExperimentSettings, size: int, device: torch.device) -> Scene:
     """Views × backgrounds at `size` pixels per side, as an example each, or where views share what is attacked, an
     example per background."""
-    with keyed("scene", asdict(settings.scene)):
+    with keyed("scene", vars(settings.scene)):
         return build_scene(
             [item],
             size,
