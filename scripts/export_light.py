@@ -10,8 +10,8 @@ from omegaconf import MISSING
 from renderer.errors import InputError, require_range
 from renderer.light.environment import check_map_name, negative_fraction, to_map, write_map
 from renderer.light.presets import load_light
-from train.configuration import keyed
 from train.errors import writable_file
+from train.settings import keyed
 
 
 @dataclass

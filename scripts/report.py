@@ -10,9 +10,9 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 from omegaconf import MISSING
 
 from renderer.errors import InputError
-from train.configuration import quoted
 from train.errors import writable_folder
 from train.report.page import write_report
+from train.settings import quoted
 
 
 @dataclass

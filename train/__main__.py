@@ -19,7 +19,6 @@ from omegaconf import DictConfig
 from augment import utils
 from renderer.errors import InputError
 from train import console
-from train.configuration import as_override, compose, keyed, quoted, read_settings
 from train.data import DataSet
 from train.errors import writable_file, writable_folder
 from train.report.page import report_of
@@ -27,7 +26,7 @@ from train.report.summary import format_table, summarize
 from train.run import load_data, prepare, write_images
 from train.run_folder import sole_writer
 from train.runtime import Interrupted, broadcast, first_process_first, process_group
-from train.settings import ExperimentSettings
+from train.settings import ExperimentSettings, as_override, compose, keyed, quoted, read_settings
 from train.sweep import run_cell, sweep
 
 NAMED_MODEL = re.compile(r"^model=(?!\{)")  # short for model.name=
@@ -42,7 +41,7 @@ def main(config: DictConfig) -> None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         run_cell(config, folder)
         return
-    with cli.errors():  # here, too, or Hydra adds a line
+    with cli.handled_errors():  # here, too, or Hydra adds a line
         run_arms(read_settings(ExperimentSettings, config), folder)
 
 
@@ -87,7 +86,7 @@ def resume_command(folder: Path) -> str:
 def start() -> None:
     """Run `main` in this process, or in each that torchrun starts; all take the first one's folder."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # or Hydra prints its errors itself, in several lines
-    with cli.errors(), process_group():
+    with cli.handled_errors(), process_group():
         arguments = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
         sys.argv[1:] = arguments = [as_override(argument) for argument in arguments]
         flags = {argument for argument in arguments if argument.startswith("-")}

@@ -33,7 +33,7 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's b
 
 
 @contextmanager
-def errors() -> Iterator[None]:
+def handled_errors() -> Iterator[None]:
     """Print what the user can fix as one line, without a traceback, and exit with status 2.
 
     Ctrl-C ends in one line and status 130. A reader of the output who has gone ends the command in silence with
@@ -68,13 +68,13 @@ def script(function: Callable[[Any], object], settings: type, arguments: Sequenc
 
     Their defaults are in conf/NAME.yaml or, without such a file, in the dataclass.
     """
-    with errors():
+    with handled_errors():
         from hydra.core.config_store import ConfigStore
         from omegaconf import OmegaConf
 
         import conf
         from renderer.errors import InputError
-        from train.configuration import compose, read_settings
+        from train.settings import compose, read_settings
 
         name, arguments = Path(sys.argv[0]).stem, sys.argv[1:] if arguments is None else arguments
         if not (Path(conf.__path__[0]) / f"{name}.yaml").exists():

@@ -20,7 +20,6 @@ from renderer.image import LARGEST_SIZE
 from renderer.light.harmonics import nonzero_coefficients
 from renderer.transfer import COEFFICIENTS, DEGREE
 from train import checkpoint, console
-from train.configuration import keyed
 from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
 from train.errors import NO_ROOM
 from train.loop import Trainer, evaluate
@@ -38,7 +37,7 @@ from train.runtime import (
     set_deterministic,
     set_threads,
 )
-from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings
+from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, keyed
 
 
 def run(settings: ExperimentSettings, data: DataSet, folder: Path) -> dict[str, float]:

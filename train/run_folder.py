@@ -27,8 +27,7 @@ from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
 from train.attack_examples import SUFFIX, write_attack_examples
 from train.checkpoint import write_whole
-from train.configuration import dotted, is_within
-from train.settings import ExperimentSettings
+from train.settings import ExperimentSettings, dotted, is_within
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
 LARGEST_CONFIG, LARGEST_FILE = 2**20, 2**28  # bytes; a run writes about 300 per epoch

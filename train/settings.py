@@ -1,26 +1,39 @@
-"""The schema of conf/train.yaml: the types, ranges, keys and defaults of a run."""
+"""The schema of conf/train.yaml, a dataclass, and how a command's configuration is read into its dataclass."""
 
 import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast, get_type_hints
 
-from omegaconf import OmegaConf
+import hydra
+from hydra import initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from augment.build import RendererSettings, SceneSettings, count_views
 from augment.objects import ObjectSettings, PropSettings
 from augment.service import AugmentationSettings
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError, in_one_line, require_range
 from renderer.image import LARGEST_SIZE
-from train.configuration import read_settings
+from train.errors import one_sentence
 from train.networks import WIDERESNET
 from train.recipe import TrainSettings
 
+Settings = TypeVar("Settings")
 OTHER = "other"  # in place of the class of a hard negative that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
 RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
 SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, LARGEST_SEED = 10**6, 2**63 - 1
+TEXTS = {  # keys whose values are names or paths, also where they look like numbers
+    *("run", "sweep", "init_from", "out", "photos", "path", "images", "cache"),
+    *("weights", "light", "label", "target", "classifier", "name", "reload"),
+}
 
 
 @dataclass
@@ -158,3 +171,121 @@ def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "
         for number, prop in enumerate(props)
     ]
     return replace(read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), entry), props=props)
+
+
+# ------------------------------------------------------------------------------------- reading configurations
+
+
+def quoted(text: str) -> str:
+    """The text as a value that Hydra reads as it is."""
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    return "'" + re.sub(r"(\\+)$", r"\1\1", escaped) + "'"
+
+
+def as_override(argument: str) -> str:
+    """An argument of a command; names and paths are quoted where Hydra would read 1.10 as 1.1, or refuse an umlaut.
+
+    InputError for an empty name, which would stand for the current folder, and for the removal of a setting.
+    """
+    if argument.startswith("~"):
+        raise InputError(f"{argument}: a setting cannot be removed: set another value")
+    key, equals, value = argument.partition("=")
+    if not equals or TEXTS.isdisjoint(key.lstrip("+").split(".")):
+        return argument
+    if not value:
+        raise InputError(f"{key} is empty: give a name, or leave it out")
+    if value[0] in "'\"~":  # quoted already, or a home folder, which Hydra refuses
+        return argument
+    try:
+        parsed = OverridesParser.create().parse_override(argument).value()
+        as_given = parsed == value or not isinstance(parsed, str | int | float)  # otherwise null, a list, a sweep ...
+    except HydraException:
+        as_given = False
+    return argument if as_given else f"{key}={quoted(value)}"
+
+
+def compose(command: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """The configuration of a command under overrides; InputError with the text of Hydra, which names the override."""
+    singleton = GlobalHydra.instance()
+    running, singleton.hydra = singleton.hydra, None  # that of `python -m train`
+    try:
+        with initialize_config_module("conf", version_base="1.3"):
+            return hydra.compose(command, [as_override(override) for override in overrides])
+    except Exception as error:  # Hydra raises several types for what it cannot read
+        raise InputError(one_sentence(error) or in_one_line(error)) from error
+    finally:
+        singleton.hydra = running
+
+
+def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Settings:
+    """The dataclass from its configuration, which stands at a key.
+
+    InputError names the key that is unknown, unset, of the wrong type or, by the dataclass's own check, out of range.
+    """
+    try:
+        merged: Any = OmegaConf.merge(OmegaConf.structured(kind), config)
+        if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
+            raise InputError(f"{_join(key, min(unset))} is not set: give {_join(key, min(unset))}=...")
+        _check(merged, key)
+        return cast(Settings, OmegaConf.to_object(merged))
+    except (OmegaConfBaseException, OverflowError) as error:  # the latter for a whole number that no float holds
+        raise InputError(_fault(kind, config, key) or _join(key, one_sentence(error) or in_one_line(error))) from error
+
+
+def _check(node: DictConfig, key: str) -> None:
+    """InputError with the key of the innermost dataclass that refuses its values, or of a list of other things."""
+    types: dict[Any, Any] = get_type_hints(OmegaConf.get_type(node))
+    for name, child in node.items():
+        inner = _join(key, str(name))
+        if isinstance(child, DictConfig) and OmegaConf.get_type(child) is not dict:
+            _check(child, inner)
+        elif types[name] in (list[str], list[float]) and any(map(OmegaConf.is_config, child)):  # OmegaConf lets it pass
+            raise InputError(f"{inner}: give a list of plain values, without lists or mappings in it")
+    with keyed(key, types):
+        OmegaConf.to_object(node)
+
+
+def _fault(kind: type, config: DictConfig, key: str) -> str | None:
+    """The key of the first value that is wrong by itself, with the reason; OmegaConf may name only its group."""
+    plain: Any = OmegaConf.to_container(config)
+    for name, value in dotted(plain):
+        alone = OmegaConf.create()
+        OmegaConf.update(alone, name, value, force_add=True)
+        try:
+            OmegaConf.merge(OmegaConf.structured(kind), alone)
+        except (OmegaConfBaseException, OverflowError) as error:
+            return f"{_join(key, name)}: {str(getattr(error, 'msg', error)).splitlines()[0]}"
+    return None
+
+
+def _join(key: str, name: str) -> str:
+    return f"{key}.{name}" if key else name
+
+
+@contextmanager
+def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
+    """Add the key to an InputError, whose message begins with one of a dataclass's names or with another text."""
+    try:
+        yield
+    except InputError as error:
+        message = str(error)
+        if not key or message.startswith(key):
+            raise
+        name = re.match(r"\w*", message)[0]  # type: ignore[index]
+        if name in names:
+            key, message = _join(key, name), message.removeprefix(f"{name}: ")
+        raise InputError(f"{key}: {message}") from error
+
+
+def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested settings, by dotted keys."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from dotted(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def is_within(key: str, groups: Collection[str]) -> bool:
+    """Whether a dotted key is one of the groups, or within one."""
+    return any(key == group or key.startswith(f"{group}.") for group in groups)

@@ -19,7 +19,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from renderer.errors import InputError
 from train import checkpoint, console
-from train.configuration import compose, read_settings
 from train.errors import one_sentence, writable_folder
 from train.report.page import report_of
 from train.report.summary import format_spread, format_table, is_finished, summarize
@@ -32,7 +31,7 @@ from train.run_folder import (
     require_same_settings,
     state,
 )
-from train.settings import ExperimentSettings
+from train.settings import ExperimentSettings, compose, read_settings
 
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 

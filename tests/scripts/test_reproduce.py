@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import training
-from train.configuration import compose, read_settings
-from train.settings import ExperimentSettings
+from train.settings import ExperimentSettings, compose, read_settings
 
 ROOT = Path(__file__).parents[2]
 

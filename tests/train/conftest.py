@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from train.configuration import compose, read_settings
 from train.run import load_data, run
 from train.run_folder import write_config
-from train.settings import ExperimentSettings
+from train.settings import ExperimentSettings, compose, read_settings
 
 CLASSES = ["apple", "orange", "pear"]
 TINY = [

@@ -90,7 +90,7 @@ def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
 
 
 def test_an_error_of_the_program_keeps_its_traceback():
-    with pytest.raises(ZeroDivisionError), cli.errors():
+    with pytest.raises(ZeroDivisionError), cli.handled_errors():
         raise ZeroDivisionError
 
 
@@ -99,7 +99,7 @@ def test_ctrl_c_is_one_line_and_status_130_even_if_a_library_turns_it_into_an_er
     """As trimesh does, which keeps whatever is raised while its optional parts are imported."""
     before = signal.signal(signal.SIGINT, cli._interrupt)  # a background job has it ignored
     try:
-        with pytest.raises(SystemExit) as stop, cli.errors():
+        with pytest.raises(SystemExit) as stop, cli.handled_errors():
             try:
                 signal.raise_signal(signal.SIGINT)
             except KeyboardInterrupt:

@@ -20,12 +20,11 @@ from PIL import Image
 
 from augment import utils
 from train import checkpoint, loop
-from train.configuration import read_settings
 from train.networks import WideResNet
 from train.run import load_data, run
 from train.run_folder import read_metrics
 from train.runtime import Interrupted, SyncBatchNormCPU, any_process, process_group, replicated, summed
-from train.settings import ExperimentSettings
+from train.settings import ExperimentSettings, read_settings
 
 ROOT = Path(__file__).parents[2]
 BATCH = torch.rand(12, 3, 8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))

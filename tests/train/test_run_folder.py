@@ -13,7 +13,6 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from renderer.errors import InputError
-from train.configuration import read_settings
 from train.report.compare import format_comparison
 from train.report.summary import summarize
 from train.run_folder import (
@@ -30,7 +29,7 @@ from train.run_folder import (
     sole_writer,
     write_config,
 )
-from train.settings import ExperimentSettings
+from train.settings import ExperimentSettings, read_settings
 
 
 def test_a_folder_has_one_writer_at_a_time_and_a_refusal_locks_no_folder(tmp_path):

@@ -17,7 +17,7 @@ from augment.scene import Scene
 from augment.utils import generator
 from renderer.light.presets import PROBES, UNIFORM, load_light
 from train.attacks.settings import AttackExperimentSettings, AttackSceneSettings
-from train.configuration import keyed
+from train.settings import keyed
 
 POLAR, FIELD_OF_VIEW = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
 CLOSEST = 2.0  # world units from the middle of a mesh, which all of it is within

@@ -9,7 +9,7 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 
 from augment.attacks.parameters import PARAMETERS
-from train.configuration import compose, dotted, is_within, quoted
+from train.settings import compose, dotted, is_within, quoted
 
 CIRCUMSTANCES = ("run", "sweep", "compare", "versions", "inputs", "out", "train.resume", "data.images")
 DATA = ("cifar100", "npz", "folder")  # besides the default

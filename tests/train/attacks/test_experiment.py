@@ -20,8 +20,7 @@ from renderer.light.presets import probe
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack
-from train.configuration import compose, read_settings
-from train.settings import read_object
+from train.settings import compose, read_object, read_settings
 
 CPU = torch.device("cpu")
 CLASSES = ("orange", "lime", "sky", "night")

@@ -19,8 +19,7 @@ from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
 from train.attacks.experiment import attack_mesh
 from train.attacks.settings import AttackExperimentSettings
-from train.configuration import compose, read_settings
-from train.settings import read_object
+from train.settings import compose, read_object, read_settings
 
 CLASSES = ("orange", "lime", "sky")
 

@@ -13,8 +13,7 @@ from renderer.errors import InputError
 from train.attacks.experiment import attacks
 from train.attacks.search import LENS, LIGHT_GRAY, _candidates, overrides, search
 from train.attacks.settings import AttackExperimentSettings
-from train.configuration import compose, read_settings
-from train.settings import read_object
+from train.settings import compose, read_object, read_settings
 
 CPU = torch.device("cpu")
 CHANGED = ("polar", "azimuth", "width", "fov", "light", "exposure")

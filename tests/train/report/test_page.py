@@ -15,13 +15,12 @@ from PIL import Image
 from augment.service import AttackExamples
 from renderer.errors import InputError
 from train.attack_examples import write_attack_examples
-from train.configuration import compose, read_settings
 from train.report import plots
 from train.report.command import training_command
 from train.report.page import report_of, write_report
 from train.report.summary import summarize
 from train.run_folder import decisive_settings, locked
-from train.settings import ExperimentSettings
+from train.settings import ExperimentSettings, compose, read_settings
 from train.tables import fraction
 
 HOSTILE = "<script>alert(1)</script>|*x*"
