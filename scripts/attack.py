@@ -1,6 +1,7 @@
 """Attack a classifier through a mesh's light, shape, color or pixels: python scripts/attack.py attack=lighting ..."""
 
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -60,7 +61,7 @@ def main(settings: AttackExperimentSettings) -> None:
         if sweeps:
             write_curve(curve(sweeps), {kind: each.norm for kind, each in settings.attack.parameters.items()}, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
-        write_config(out, settings)
+        write_config(out, settings, command=shlex.join(["python", "scripts/attack.py", *sys.argv[1:]]))
 
 
 def as_overrides(arguments: list[str]) -> list[str]:

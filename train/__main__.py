@@ -26,7 +26,7 @@ from train.report.summary import format_table, summarize
 from train.run import load_data, prepare, write_images
 from train.run_folder import sole_writer
 from train.runtime import Interrupted, broadcast, first_process_first, process_group
-from train.settings import ExperimentSettings, as_override, compose, keyed, quoted, read_settings
+from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, quoted, read_settings
 from train.sweep import run_cell, sweep
 
 NAMED_MODEL = re.compile(r"^model=(?!\{)")  # short for model.name=
@@ -76,11 +76,7 @@ def _train_arms(arms: Mapping[Path, ExperimentSettings], data: DataSet, folder: 
 
 def resume_command(folder: Path) -> str:
     """The command that resumes this run."""
-    count = utils.world_size()
-    command = ["torchrun", f"--nproc_per_node={count}", "-m", "train"] if count > 1 else ["python", "-m", "train"]
-    overrides = HydraConfig.get().overrides.task
-    kept = [override for override in overrides if not override.startswith(("run=", "train.resume="))]
-    return shlex.join([*command, *kept, f"run={folder}", "train.resume=true"])
+    return f"{given_command()} {shlex.join([f'run={folder}', 'train.resume=true'])}"
 
 
 def start() -> None:

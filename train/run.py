@@ -37,7 +37,7 @@ from train.runtime import (
     set_deterministic,
     set_threads,
 )
-from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, keyed
+from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, given_command, keyed
 
 
 def run(settings: ExperimentSettings, data: DataSet, folder: Path) -> dict[str, float]:
@@ -186,7 +186,7 @@ def _open_folder(trainer: Trainer, settings: ExperimentSettings) -> None:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
     if utils.rank() == 0:
         hardware = {"device": str(trainer.device), "precision": trainer.model.precision}
-        write_config(folder, settings, hardware=hardware)
+        write_config(folder, settings, hardware=hardware, command=given_command())
 
 
 @contextmanager

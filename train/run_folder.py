@@ -36,8 +36,8 @@ logging.raiseExceptions = False  # on a full disk train.log lacks lines, and onl
 
 # Settings that say where and how a run is made. They do not decide its result, nor name a sweep's cell.
 CIRCUMSTANCES = (
-    *("run", "sweep", "launcher", "compare", "hardware", "versions", "inputs", "renderer.cache"),
-    *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
+    *("run", "sweep", "launcher", "compare", "command", "hardware", "versions", "inputs"),
+    *("renderer.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (
     "data.path",
@@ -138,10 +138,14 @@ def read_config(path: Path) -> DictConfig:
 
 
 def write_config(folder: Path, settings: Any, **facts: object) -> None:
-    """Write config.yaml: a command's settings, a dataclass; facts found at the start; hashes of inputs; versions."""
+    """Write config.yaml: a command's settings, a dataclass; facts found at the start; hashes of inputs; versions.
+
+    Facts with an interpolation, which `read_config` refuses, are left out.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     packages = {name: version(name) for name in ("torchvision", "numpy")}
     versions = {"python": platform.python_version(), "torch": str(torch.__version__), **packages}
+    facts = {name: fact for name, fact in facts.items() if "${" not in str(fact)}
     content = {**asdict(settings), **facts, "inputs": fingerprints(settings), "versions": versions}
     write_whole(folder / CONFIG, yaml.safe_dump(content, sort_keys=False, allow_unicode=True).encode())
 

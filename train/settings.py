@@ -1,6 +1,7 @@
 """The schema of conf/train.yaml, a dataclass, and how a command's configuration is read into its dataclass."""
 
 import re
+import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -10,6 +11,7 @@ from typing import Any, TypeVar, cast, get_type_hints
 import hydra
 from hydra import initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -18,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from augment.build import RendererSettings, SceneSettings, count_views
 from augment.objects import ObjectSettings, PropSettings
 from augment.service import AugmentationSettings
+from augment.utils import world_size
 from renderer.errors import InputError, in_one_line, require_range
 from renderer.image import LARGEST_SIZE
 from train.errors import one_sentence
@@ -202,6 +205,16 @@ def as_override(argument: str) -> str:
     except HydraException:
         as_given = False
     return argument if as_given else f"{key}={quoted(value)}"
+
+
+def given_command() -> str:
+    """The command of this process's run as it was given, without the run's folder; "" outside `python -m train`."""
+    if not HydraConfig.initialized():
+        return ""
+    count = world_size()
+    command = ["torchrun", f"--nproc_per_node={count}", "-m", "train"] if count > 1 else ["python", "-m", "train"]
+    overrides = HydraConfig.get().overrides.task
+    return shlex.join([*command, *(text for text in overrides if not text.startswith(("run=", "train.resume=")))])
 
 
 def compose(command: str, overrides: Sequence[str] = ()) -> DictConfig:

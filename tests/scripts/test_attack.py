@@ -1,5 +1,6 @@
 import csv
 import json
+import shlex
 from collections.abc import Callable
 from functools import partial
 from itertools import product
@@ -50,7 +51,9 @@ def test_every_kind_and_several_at_once_run_and_write_what_they_promise(run, tmp
     assert example["cost"] < example["cost_before"]
     assert example["versions"]["reload"]["largest_difference"] <= 1 / 255
     assert 0 <= last["checks"]["random_search"] <= 1 and last["checks"]["cost_fell"] == 1
-    assert set(OmegaConf.load(tmp_path / "out" / "config.yaml").attack) >= set(names.split("+"))
+    config = OmegaConf.load(tmp_path / "out" / "config.yaml")
+    assert set(config.attack) >= set(names.split("+"))
+    assert config.command == shlex.join(["python", "scripts/attack.py", "out=out", *SMALL, f"attack={kinds}"])
 
 
 def example_is_physical(folder: Path) -> bool:

@@ -1,12 +1,14 @@
 """Commands from start to end: their statuses, their single lines of error, and interrupts."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from train import cli
 from train.checkpoint import LAST
@@ -36,6 +38,8 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
     for folder in (tmp_path / "here", tmp_path / "here" / "none"):
         assert (folder / LAST).is_file() and (folder / "photographs" / "contact_sheet.png").is_file()
     assert (tmp_path / "here" / "train.log").read_text() == done.stdout
+    config = yaml.safe_load((tmp_path / "here" / "config.yaml").read_text())
+    assert shlex.split(config["command"]) == ["python", "-m", "train", *overrides[1:], *SMALL]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
 
 

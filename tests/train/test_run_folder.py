@@ -46,8 +46,9 @@ def test_a_folder_has_one_writer_at_a_time_and_a_refusal_locks_no_folder(tmp_pat
 
 def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny, tmp_path):
     settings = tiny("train.learning_rate=3e-7", "label=pear", "+data.images=null", "scene.lamps={power: 3}")
-    write_config(tmp_path, settings, precision="bfloat16")
+    write_config(tmp_path, settings, precision="bfloat16", command="python -m train 'run=${label}'")
     config = read_config(tmp_path / CONFIG)
+    assert "command" not in config  # which would be refused, as every interpolation is
     assert config.pop("precision") == "bfloat16"
     assert config.pop("versions").torch == torch.__version__ and config.pop("inputs").keys() == {settings.data.path}
     assert read_settings(ExperimentSettings, config) == settings
