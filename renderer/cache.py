@@ -77,20 +77,17 @@ RENDERER = source_key(Path(__file__).parent)  # on import, so that it is the cod
 class TensorCache:
     """Named tensors in files of a folder, under content keys.
 
-    folder: made when first written to; None: nothing is written. problem: why nothing can be written, or None; that
-    stops no run, since everything can be computed again.
+    folder: made when first written to; None: nothing is written. Where nothing can be written, no run stops: everything
+    can be computed again.
     """
 
     def __init__(self, folder: Path | None = None):
-        self.folder = folder
-        self.problem: str | None = None
+        self.folder, self.writable = folder, folder is not None
 
     def read(self, key: str) -> dict[str, Tensor] | None:
         """The tensors that were written under the key; None where there are none, or where a bit has changed."""
-        if self.folder is None:
-            return None
         try:
-            content = (self.folder / key).read_bytes()
+            content = (self.folder / key).read_bytes() if self.folder else b""
         except OSError:
             return None
         checksum, tensors = content[:32], content[32:]
@@ -98,7 +95,7 @@ class TensorCache:
 
     def write(self, key: str, tensors: Mapping[str, Tensor]) -> None:
         """Write CPU tensors. Another process sees the old file or the new one, and `read` passes over a torn one."""
-        if self.folder is None or self.problem:
+        if self.folder is None or not self.writable:
             return
         content = safetensors.torch.save(dict(tensors))
         try:
@@ -107,23 +104,16 @@ class TensorCache:
                 file = Path(temporary) / key
                 file.write_bytes(_checksum(key, content) + content)
                 os.replace(file, self.folder / key)
-        except OSError as error:
-            self.problem = str(error)
+        except OSError:
+            self.writable = False  # it is not tried for every file
 
 
 def _checksum(key: str, content: bytes) -> bytes:
-    digest = hashlib.sha256(key.encode())
-    digest.update(content)
-    return digest.digest()
+    return hashlib.sha256(key.encode() + content).digest()
 
 
 class OperatorCache(TensorCache):
-    """Transfer operators, a file per mesh and view: 5 views find those that a run with 10 has built.
-
-    views: how many were asked for; built: how many of them were computed.
-    """
-
-    views = built = 0
+    """Transfer operators, a file per mesh and view: 5 views find those that a run with 10 has built."""
 
     def operators(
         self,
@@ -138,19 +128,16 @@ class OperatorCache(TensorCache):
         """`transfer.build_operators`, to the bit, but only the views that are not on disk are built."""
         scene = content_key(RENDERER, mesh, settings, rasterizer.name, float(albedo_scale), basis, dtype)
         keys = {camera: content_key(scene, camera) for camera in cameras}
-        operators = {}
-        for camera, key in keys.items():
-            if (tensors := self.read(key)) is not None:
-                names = SparseTransfer._fields if "weight" in tensors else ()
-                sparse = SparseTransfer(*map(tensors.pop, names)) if names else None
+        files = {camera: self.read(key) for camera, key in keys.items()}
+        missing = [camera for camera, tensors in files.items() if tensors is None]
+        new = build_operators(mesh, missing, settings, rasterizer, albedo_scale, basis, dtype) if missing else []
+        operators = dict(zip(missing, new, strict=True))
+        for camera, operator in operators.items():
+            sparse = operator.sparse._asdict() if operator.sparse else {}
+            self.write(keys[camera], {name: getattr(operator, name) for name in TENSORS} | sparse)
+        for camera, tensors in files.items():
+            if tensors is not None:
+                parts = [tensors.pop(name) for name in SparseTransfer._fields if name in tensors]
+                sparse = SparseTransfer(*parts) if parts else None
                 operators[camera] = TransferOperator(**tensors, settings=settings, basis=basis, sparse=sparse)
-        missing = [camera for camera in keys if camera not in operators]
-        if missing:
-            new = build_operators(mesh, missing, settings, rasterizer, albedo_scale, basis, dtype)
-            for camera, operator in zip(missing, new, strict=True):
-                operators[camera] = operator
-                sparse_tensors = operator.sparse._asdict() if operator.sparse else {}
-                self.write(keys[camera], {name: getattr(operator, name) for name in TENSORS} | sparse_tensors)
-        self.views += len(keys)
-        self.built += len(missing)
         return [operators[camera] for camera in cameras]

@@ -1,6 +1,5 @@
-"""A package's front door that imports a module when one of its names is first used (PEP 562)."""
+"""A package's names, each imported with its module when it is first used (PEP 562)."""
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 
@@ -19,9 +18,6 @@ def attach(
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = import_module(f"{package}.{home[name]}")
-        itself = (module,) if home[name].rpartition(".")[2] == name else ()
-        value = getattr(module, name, *itself)
-        setattr(sys.modules[package], name, value)
-        return value
+        return getattr(module, name, module)
 
     return getattribute, lambda: sorted(home), sorted(home)

@@ -9,12 +9,11 @@ RGB in [0, 1], sRGB-encoded.
 import colorsys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from renderer.errors import InputError, require_range
+from renderer.errors import require_choice, require_range
 from renderer.mesh import Mesh, concatenate
 
 STALK = (0.36, 0.27, 0.15)
@@ -32,9 +31,7 @@ def solid(name: str, seed: int = 0) -> Mesh:
     """
     require_range("seed", seed, 0, 2**63 - 1)
     known = SOLIDS | HARD_NEGATIVES
-    if name not in known:
-        nearest = get_close_matches(name, known, n=1, cutoff=0)[0]
-        raise InputError(f"No solid is called '{name}': use '{nearest}', or another of {', '.join(known)}.")
+    require_choice("name", name, known)
     return known[name](np.random.default_rng(seed))
 
 

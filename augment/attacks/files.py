@@ -108,4 +108,4 @@ def _damage(result: AttackResult, after: Conditions, example: int) -> dict[str, 
     if after.vertices is None:
         return {}
     vertices = after.vertices[example, : len(mesh.vertices)].detach().cpu().double().numpy()
-    return {"shape": asdict(mesh_damage(mesh.vertices, vertices, mesh.faces))}
+    return {"shape": mesh_damage(mesh.vertices, vertices, mesh.faces)}

@@ -1,7 +1,5 @@
 """Faces that a deformation of a mesh flipped or collapsed."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from renderer.mesh import doubled_area_vectors
@@ -11,30 +9,22 @@ from renderer.mesh import doubled_area_vectors
 _SMALLEST_HEIGHT = 2.0**-22
 
 
-@dataclass(frozen=True)
-class MeshDamage:
-    """Faces turned by more than 90°, faces that lost their area, and the largest |displacement| along x, y and z."""
-
-    flipped: int
-    degenerate: int
-    displacement: tuple[float, float, float]
-
-
-def mesh_damage(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> MeshDamage:
+def mesh_damage(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> dict[str, int | list[float]]:
     """Compare the vertices (V, 3) before and after a deformation of a mesh with faces (F, 3), in world units.
 
-    A face has no area where its smallest height is at most 2⁻²² of its largest coordinate, which is float32's rounding.
-    Faces that had none before are not counted; those that lost it, which have no normal, are not flipped.
+    flipped: faces turned by more than 90°. degenerate: faces that lost their area, whose smallest height is at most
+    2⁻²² of their largest coordinate, float32's rounding; they are not flipped. Faces that had none before do not count.
+    displacement: the largest along x, y and z in either direction.
     """
-    before, after = before.astype(np.float64), after.astype(np.float64)
-    old, new = doubled_area_vectors(before, faces), doubled_area_vectors(after, faces)
-    had_area, has_area = _has_area(before, faces, old), _has_area(after, faces, new)
-    turned = np.einsum("fi,fi->f", old, new) < 0
-    return MeshDamage(
-        flipped=int((turned & had_area & has_area).sum()),
-        degenerate=int((had_area & ~has_area).sum()),
-        displacement=tuple(np.abs(after - before).max(axis=0).tolist()),
-    )
+    shapes = before.astype(np.float64), after.astype(np.float64)
+    areas = [doubled_area_vectors(vertices, faces) for vertices in shapes]
+    had_area, has_area = map(_has_area, shapes, [faces, faces], areas)
+    turned = np.einsum("fi,fi->f", *areas) < 0
+    return {
+        "flipped": int((turned & had_area & has_area).sum()),
+        "degenerate": int((had_area & ~has_area).sum()),
+        "displacement": np.abs(shapes[1] - shapes[0]).max(axis=0).tolist(),
+    }
 
 
 def _has_area(vertices: np.ndarray, faces: np.ndarray, doubled_areas: np.ndarray) -> np.ndarray:

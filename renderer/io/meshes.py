@@ -1,17 +1,16 @@
 """The parts of a mesh file, as trimesh reads them, with their colors and textures.
 
-trimesh leaves out, without a word, an image or material that it cannot find or decode, and ignores parts of glTF 2.0.
-Where that would show a wrong surface, the file is refused.
+trimesh leaves out an image or material that it cannot read, with no more than a line in its log, and ignores parts of
+glTF 2.0. Where that would show a wrong surface, the file is refused.
 """
 
-import codecs
 import io
 import json
+import logging
 import re
 import struct
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -28,13 +27,10 @@ from renderer.io.images import eight_bits
 from renderer.mesh import Mesh
 
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}  # not read: the names in them cannot be checked first
-MATERIALS = "materials.mtl"  # the name under which trimesh gets the used materials of an .obj file
-LIBRARY, USED = (re.compile(rf"^[ \t]*{key}[ \t]+(.*?)[ \t\r]*$", re.MULTILINE) for key in ("mtllib", "usemtl"))
-NEW_MATERIAL = re.compile(r"^[ \t]*newmtl[ \t]+", re.MULTILINE | re.IGNORECASE)
-COLOR, OBJ_IMAGE = (
-    re.compile(rf"^[ \t]*{key}[ \t]+(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE) for key in ("kd", "map_kd")
+LIBRARY, DEFINED, USED = (
+    re.compile(rb"^[ \t]*%b[ \t]+(.*?)[ \t\r]*$" % key, re.MULTILINE) for key in (b"mtllib", b"newmtl", b"usemtl")
 )
-PLY_IMAGE = re.compile(r"^comment[ \t]+TextureFile[ \t]+(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+OMISSION = re.compile(r"(unable|failed) to (load|store|convert)|unsupported|index failed")  # in trimesh's log
 FLOAT = 5126  # a component type of glTF 2.0 (section 3.6.2.2)
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of a primitive (section 5.24.4); trimesh skips fans
 HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")  # extensions that move no vertex, as they begin
@@ -46,19 +42,19 @@ def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
     linear: the file's colors, textures aside, are linear. InputError: as `renderer.mesh.load_mesh`.
     """
     require_file(path, "give the path of a mesh file")
-    formats = set(trimesh.available_formats()) - ARCHIVES
     suffix = path.suffix.lower().lstrip(".")
+    formats = set(trimesh.available_formats()) - ARCHIVES
     if suffix not in formats:
         raise InputError(f"{path} has no known mesh format: use one of {', '.join(sorted(formats))}")
     try:
-        content, files, textured_parts = _open(path)
-        scene = trimesh.load(io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False)
-        surfaces = {
-            name: geometry
+        content, files = path.read_bytes(), _Files(path)
+        textured_parts = _textured_parts(content) if suffix in ("gltf", "glb") else 0
+        scene = _load(_utf8(content) if suffix == "obj" else content, suffix, files)
+        parts = {
+            name: _part(geometry, linear)
             for name, geometry in scene.geometry.items()
             if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)
         }
-        parts = {name: _part(geometry, linear) for name, geometry in surfaces.items()}
         if sum(len(part.textures) for part in parts.values()) < textured_parts:
             raise ValueError("the image of a texture is missing, or cannot be decoded")
     except Exception as error:  # readers of meshes and images raise almost anything at a damaged file
@@ -68,83 +64,63 @@ def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
 
 
 class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyped, see pyproject.toml
-    """Files that a mesh names, also as other systems write paths. Regular files alone: a pipe would never end."""
+    """Files that a mesh names, also as other systems write paths. Regular files alone: a pipe would never end.
+
+    materials: the content of the .mtl files.
+    """
 
     def __init__(self, path: Path):
         super().__init__(str(path))
-        self.folders, self.materials = [path.parent], ""
+        self.folders, self.materials = [path.parent], b""
 
-    def get(self, name: str) -> bytes | str:
-        return self.materials if name == MATERIALS else self.find(name).read_bytes()
-
-    def find(self, name: str) -> Path:
+    def get(self, name: str) -> bytes:
         """FileNotFoundError where no file has the name: with \\ for /, %20 for a blank, or in another's folder.
 
         Options, as in `map_Kd -s 1 1 1 peel.png`, come before the name.
         """
         plain = name.strip('" \t').replace("\\", "/")
         last = plain.split()[-1] if plain.startswith("-") else plain
-        names = dict.fromkeys([plain, unquote(plain), last, plain.lstrip("/"), plain.rpartition("/")[2]])
-        for file in (folder / name for folder in self.folders for name in names if name):
+        for file in (folder / name for folder in self.folders for name in (unquote(plain), last, Path(last).name)):
+            if file.is_file() and file.suffix.lower() == ".mtl":
+                self.materials += b"\n" + _utf8(file.read_bytes())
+                self.folders.append(file.parent)
+                return self.materials
             if file.is_file():
-                return file
+                return file.read_bytes()
         raise FileNotFoundError(f"it names {name}, which is not there")
 
-    def add_materials(self, text: str) -> str:
-        """Gather the materials that an .obj's text uses; returns the text that names them as one file, `MATERIALS`."""
-        contents = []
-        for line in LIBRARY.findall(text):
-            try:
-                libraries = [self.find(line)]  # a name may have blanks
-            except FileNotFoundError:
-                libraries = [self.find(name) for name in line.split()]
-            contents += [_decoded(library.read_bytes()) for library in libraries]
-            self.folders += [library.parent for library in libraries]
-        if not contents:
-            return text
-        blocks = {block.partition("\n")[0].strip(): block for block in NEW_MATERIAL.split("\n".join(contents))[1:]}
-        used = sorted(set(USED.findall(text)))
-        if missing := [name for name in used if name not in blocks]:
-            raise ValueError(f"it uses the material {missing[0]}, which no file that it names has")
-        self.materials = "".join(f"newmtl {blocks[name]}\n" for name in used)
-        for color in COLOR.findall(self.materials):
-            np.broadcast_to(np.array(color.split(), dtype=np.float64), 3)  # ValueError where trimesh would take white
-        return f"mtllib {MATERIALS}\n{text}"
 
+def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
+    """ValueError where trimesh leaves out a part of the surface, which it writes to its log alone, or less."""
+    log, level, omissions = trimesh.util.log, trimesh.util.log.level, []
 
-def _open(path: Path) -> tuple[bytes, _Files, int]:
-    """(content in UTF-8, the files that it names, the least number of textures). Raises almost anything."""
-    content, files, images, textured_parts = path.read_bytes(), _Files(path), [], 0
-    match path.suffix.lower():
-        case ".obj":
-            content = files.add_materials(_decoded(content)).encode()
-            images = OBJ_IMAGE.findall(files.materials)
-        case ".ply":
-            header, end, body = content.partition(b"end_header")
-            text = _decoded(header)
-            content, images = text.encode() + end + body, PLY_IMAGE.findall(text)
-        case ".off" | ".stl":
-            if len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):  # as a binary .stl of so many faces
-                content = _decoded(content).encode()
-        case ".gltf" | ".glb":
-            textured_parts = _textured_parts(content)
-    for name in images:
-        try:
-            with Image.open(files.find(name)) as image:
-                eight_bits(image)
-        except Exception as error:
-            raise ValueError(f"its image {name} cannot be read ({error}): save it as PNG or JPEG of 8 bits") from error
-    return content, files, textured_parts
+    def note(record: logging.LogRecord) -> bool:
+        if OMISSION.search(record.getMessage()):
+            omissions.append(f"{record.getMessage()} {record.exc_info[1] if record.exc_info else ''}")
+        return False
 
-
-def _decoded(content: bytes) -> str:
-    """Text in UTF-8, or in UTF-16 with its mark, or else in Latin-1, in which every byte is a character."""
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return content.decode("utf-16", errors="replace")
+    log.addFilter(note)
+    log.setLevel(logging.DEBUG)
     try:
-        return content.decode("utf-8-sig")
+        scene = trimesh.load(io.BytesIO(content), file_type=suffix, resolver=files, force="scene", process=False)
+    finally:
+        log.removeFilter(note)
+        log.setLevel(level)
+    if suffix == "obj" and LIBRARY.search(content):
+        unknown = set(USED.findall(content)) - set(DEFINED.findall(files.materials))
+        omissions += [f"its first .mtl file does not have the material {name.decode()}" for name in unknown]
+    if omissions:
+        raise ValueError(omissions[0])
+    return scene
+
+
+def _utf8(text: bytes) -> bytes:
+    """Text in UTF-8; other bytes are taken for Latin-1."""
+    try:
+        text.decode()
     except UnicodeDecodeError:
-        return content.decode("latin-1")
+        return text.decode("latin-1").encode()
+    return text
 
 
 def _textured_parts(content: bytes) -> int:
@@ -159,26 +135,26 @@ def _textured_parts(content: bytes) -> int:
     for name in tree.get("extensionsRequired", []):
         if not name.startswith(HARMLESS):
             raise ValueError(f"it needs the extension {name}, which is not supported")
-    parts = [part for mesh in tree.get("meshes", []) for part in mesh["primitives"]]
-    parts = [part for part in parts if part.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
+    textured, parts = 0, [part for mesh in tree.get("meshes", []) for part in mesh["primitives"]]
     for part in parts:
+        if part.get("mode", TRIANGLES) not in (TRIANGLES, STRIP, FAN):
+            continue
         accessors = [tree["accessors"][index] for index in (*part["attributes"].values(), part.get("indices", 0))]
         uvs = tree["accessors"][part["attributes"].get("TEXCOORD_0", part["attributes"]["POSITION"])]
         if part.get("mode") == FAN or any("sparse" in accessor for accessor in accessors):
             raise ValueError("triangle fans and sparse accessors are not supported")
         if uvs["componentType"] != FLOAT:
             raise ValueError("texture coordinates that are not floating-point numbers are not supported")
-    textures = [_color_textures(tree["materials"][part["material"]]) for part in parts if "material" in part]
-    for texture in (texture for references in textures for texture in references):
-        if texture.get("texCoord") or "KHR_texture_transform" in texture.get("extensions", {}):
+        material = tree["materials"][part["material"]] if "material" in part else {}
+        glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+        colors = material.get("pbrMetallicRoughness", {}).get("baseColorTexture"), glossy.get("diffuseTexture")
+        textures = [texture for texture in colors if texture is not None]
+        if any(
+            texture.get("texCoord") or "KHR_texture_transform" in texture.get("extensions", {}) for texture in textures
+        ):
             raise ValueError("a texture has a second set of coordinates or is transformed, which is not supported")
-    return sum(map(bool, textures))
-
-
-def _color_textures(material: dict[str, Any]) -> list[dict[str, Any]]:
-    glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-    both = material.get("pbrMetallicRoughness", {}).get("baseColorTexture"), glossy.get("diffuseTexture")
-    return [texture for texture in both if texture is not None]
+        textured += bool(textures)
+    return textured
 
 
 def _part(geometry: trimesh.Trimesh, linear: bool) -> Mesh:

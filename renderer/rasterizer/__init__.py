@@ -53,29 +53,24 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
     an unknown name, "opengl" on a machine that cannot, or "numba" without numba.
     """
     require_choice("rasterizer", rasterizer, NAMES)
-    if rasterizer == "numpy":
-        return Rasterizer("numpy", "numpy")
-    if rasterizer == "numba":
-        return _numba()
-    try:
-        device = opengl.device()
-    except InputError as error:
-        if rasterizer == "opengl":
-            raise
-        return _on_cpu(str(error))
-    if rasterizer == "auto" and _SOFTWARE_OPENGL.search(device):
-        return _on_cpu("no GPU drives OpenGL")
-    return Rasterizer("opengl", f"opengl ({device})")
+    reason = ""
+    if rasterizer in ("auto", "opengl"):
+        try:
+            device = opengl.device()
+        except InputError as error:
+            if rasterizer == "opengl":
+                raise
+            reason = f" ({error})"
+        else:
+            if rasterizer == "opengl" or not _SOFTWARE_OPENGL.search(device):
+                return Rasterizer("opengl", f"opengl ({device})")
+            reason = " (no GPU drives OpenGL)"
+    if rasterizer != "numpy":
+        try:
+            from renderer.rasterizer import numba  # takes half a second to import
 
-
-def _on_cpu(reason: str) -> Rasterizer:
-    try:
-        return _numba()
-    except InputError:
-        return Rasterizer("numpy", f"numpy ({reason})")
-
-
-def _numba() -> Rasterizer:
-    from renderer.rasterizer import numba  # takes half a second to import
-
-    return Rasterizer("numba", f"numba ({numba.VERSION})")
+            return Rasterizer("numba", f"numba ({numba.VERSION})")
+        except InputError:
+            if rasterizer == "numba":
+                raise
+    return Rasterizer("numpy", f"numpy{reason}")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,6 @@ try:
 except ImportError as error:  # also where it does not know this version of NumPy
     raise InputError(f"numba does not start ({error}): pip install numba, or set rasterizer=numpy") from error
 
-Function = TypeVar("Function", bound=Callable[..., Any])
 VERSION = numba.__version__
 TYPES = "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, ::1], float32[:, ::1])"
 
@@ -40,30 +39,26 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
 _njit: Callable[..., Any] = partial(numba.njit, nogil=True, error_model="numpy")  # no divisor is 0, so none is checked
 
 
-def _inlined(function: Function) -> Function:
-    return _njit(function)
-
-
-def _compiled(function: Function) -> Function:
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     try:
         return _njit(TYPES, cache=True)(function)
     except Exception:  # its cache cannot be written or is damaged: numba has no narrower class
         return _njit(TYPES)(function)
 
 
-@_inlined
+@_njit
 def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
     return (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
 
 
-@_inlined
+@_njit
 def _covered_range(along: Any, a: int, b: int, c: int, bits: int, resolution: int) -> tuple[int, int]:
     """The first row or column at or after a triangle's least coordinate, and at or after its greatest."""
     least, greatest = min(along[a], along[b], along[c]), max(along[a], along[b], along[c])
     return max(-(-least >> bits), 0), min(-(-greatest >> bits), resolution)
 
 
-@_inlined
+@_njit
 def _crossing(x: int, y: int, to_x: int, to_y: int, row: int, bits: int) -> int:
     """The first column at or after where a row crosses an edge, all but the column in subsamples."""
     return -(((to_x - x) * (y - row) - x * (to_y - y)) // ((to_y - y) << bits))

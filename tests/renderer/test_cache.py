@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from renderer import cache as cache_module
-from renderer import transfer
+from renderer import cache, transfer
 from renderer.cache import OperatorCache, TensorCache, cache_folder, content_key, source_key
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.image import ImageSettings
@@ -69,11 +68,9 @@ def same(first: list[TransferOperator], second: list[TransferOperator]) -> bool:
 def test_a_second_run_builds_nothing_and_has_the_same_operators_to_the_bit(mesh, tmp_path, rasterized):
     cameras = orbit_cameras(3, 2.0)
     expected = build_operators(mesh, cameras, SETTINGS, RASTERIZER, 1.5)
-    rasterized.clear()
-    for built, calls in [(3, [3]), (0, [3]), (0, [3])]:
-        cache = OperatorCache(tmp_path)
-        assert same(cache.operators(mesh, cameras, SETTINGS, RASTERIZER, 1.5), expected)
-        assert (cache.built, cache.views, rasterized) == (built, 3, calls)
+    for _ in range(3):
+        assert same(OperatorCache(tmp_path).operators(mesh, cameras, SETTINGS, RASTERIZER, 1.5), expected)
+    assert rasterized == [3, 3]
 
 
 def test_without_a_folder_every_run_builds_and_a_view_asked_for_twice_is_built_once(tmp_path, monkeypatch, rasterized):
@@ -86,14 +83,11 @@ def test_without_a_folder_every_run_builds_and_a_view_asked_for_twice_is_built_o
 
 def test_orbits_share_the_views_that_they_have_in_common(tmp_path, rasterized):
     """Every other view of 10 is one of 5; the order is that of the cameras."""
-    ten, five = orbit_cameras(10, 2.0), orbit_cameras(5, 2.0)
-    OperatorCache(tmp_path).operators(PLATE, five, SETTINGS, RASTERIZER)
-    cache = OperatorCache(tmp_path)
-    everything = cache.operators(PLATE, ten, SETTINGS, RASTERIZER)
-    assert rasterized == [5, 5] and cache.views == 2 * cache.built == 10
-    assert same(everything, build_operators(PLATE, ten, SETTINGS, RASTERIZER))
-    cache = OperatorCache(tmp_path)
-    assert same(cache.operators(PLATE, five, SETTINGS, RASTERIZER), everything[::2]) and cache.built == 0
+    ten, five = (
+        OperatorCache(tmp_path).operators(PLATE, orbit_cameras(views, 2.0), SETTINGS, RASTERIZER) for views in (10, 5)
+    )
+    assert rasterized == [10] and same(five, ten[::2])
+    assert same(ten, build_operators(PLATE, orbit_cameras(10, 2.0), SETTINGS, RASTERIZER))
 
 
 # ---------------------------------------------------------------------------------------- what is not
@@ -130,20 +124,15 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, tmp_path, monkeypatch):
+def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, tmp_path, monkeypatch, rasterized):
     monkeypatch.setitem(sys.modules, "renderer.rasterizer.other", numpy_rasterizer)
 
-    def built(
-        mesh=TEXTURED, camera=CAMERA, settings=SETTINGS, rasterizer=RASTERIZER, code=cache_module.RENDERER, **options
-    ):
-        monkeypatch.setattr(cache_module, "RENDERER", code)
-        cache = OperatorCache(tmp_path)
-        cache.operators(mesh, [camera], settings, rasterizer, **options)
-        return cache.built
+    def run(mesh=TEXTURED, camera=CAMERA, settings=SETTINGS, rasterizer=RASTERIZER, code=cache.RENDERER, **options):
+        monkeypatch.setattr(cache, "RENDERER", code)
+        OperatorCache(tmp_path).operators(mesh, [camera], settings, rasterizer, **options)
+        return len(rasterized)
 
-    assert built() == 1
-    assert built(**change) == 1
-    assert built() == built(**change) == 0
+    assert [run(), run(**change), run(), run(**change)] == [1, 2, 2, 2]
 
 
 @pytest.mark.parametrize(
@@ -151,14 +140,10 @@ def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, 
     [
         (("ab", "c"), ("a", "bc")),
         ((("a",), "b"), ("a", ("b",))),
-        (((), "a"), ("a", ())),
         ((1,), (1.0,)),
-        ((1,), ("1",)),
         (("a;'b",), ("a", "b")),
         ((np.zeros((2, 3)),), (np.zeros((3, 2)),)),
-        ((np.zeros(2, np.int32),), (np.zeros(1, np.int64),)),
         ((np.zeros(1), np.zeros(2)), (np.zeros(2), np.zeros(1))),
-        ((np.zeros((0, 3)),), (np.zeros((0, 2)),)),
     ],
 )
 def test_keys_differ_where_the_parts_only_look_alike_when_joined(first, second):
@@ -166,7 +151,7 @@ def test_keys_differ_where_the_parts_only_look_alike_when_joined(first, second):
     assert content_key(*first) == content_key(*first)
 
 
-@pytest.mark.parametrize("part", [torch.zeros(2), {"a": 1}, {1}, object(), None])
+@pytest.mark.parametrize("part", [torch.zeros(2), {"a": 1}, None])
 def test_values_without_a_key_are_refused(part):
     with pytest.raises(TypeError, match="has no content key"):
         content_key(part)
@@ -174,16 +159,16 @@ def test_values_without_a_key_are_refused(part):
 
 def test_any_change_of_the_sources_is_another_key(tmp_path):
     package = tmp_path / "package"
-    shutil.copytree(Path(cache_module.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
-    assert source_key(package) == cache_module.RENDERER
-    keys = {source_key(package)}
-    module = package / "rasterizer" / "numpy.py"
-    module.write_text(module.read_text() + "\n")
-    keys.add(source_key(package))
-    module.rename(package / "numpy.py")
-    keys.add(source_key(package))
-    (package / "new.py").touch()
-    keys.add(source_key(package))
+    shutil.copytree(Path(cache.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    assert source_key(package) == cache.RENDERER
+    module, keys = package / "mesh.py", {source_key(package)}
+    for change in (
+        lambda: module.write_text(module.read_text() + "\n"),
+        lambda: module.rename(package / "other.py"),
+        lambda: (package / "new.py").touch(),
+    ):
+        change()
+        keys.add(source_key(package))
     assert len(keys) == 4
 
 
@@ -192,50 +177,48 @@ def test_any_change_of_the_sources_is_another_key(tmp_path):
 
 @pytest.fixture
 def written(tmp_path) -> tuple[TensorCache, Path]:
-    cache = TensorCache(tmp_path)
-    cache.write(KEY, TENSORS)
-    return cache, tmp_path / KEY
+    tensors = TensorCache(tmp_path)
+    tensors.write(KEY, TENSORS)
+    return tensors, tmp_path / KEY
 
 
 def test_tensors_come_back_to_the_bit_and_not_under_another_key(written):
-    cache, path = written
-    loaded = cache.read(KEY)
+    tensors, path = written
+    loaded = tensors.read(KEY)
     assert loaded.keys() == TENSORS.keys()
     for name, tensor in TENSORS.items():
         assert loaded[name].dtype == tensor.dtype and loaded[name].shape == tensor.shape
         assert loaded[name].numpy().tobytes() == tensor.numpy().tobytes()
     shutil.copy(path, path.with_name("another key"))
-    assert cache.read("another key") is None
+    assert tensors.read("another key") is None
 
 
-@pytest.mark.parametrize("content", [b"", b"not a file of tensors" * 20])
-def test_a_damaged_file_is_built_anew_and_written_over(content, tmp_path):
+def test_a_damaged_file_is_built_anew_and_written_over(tmp_path, rasterized):
     expected = OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, RASTERIZER)
     (path,) = tmp_path.iterdir()
-    path.write_bytes(content)
-    for built in (1, 0):
-        cache = OperatorCache(tmp_path)
-        assert same(cache.operators(PLATE, [CAMERA], SETTINGS, RASTERIZER), expected)
-        assert (cache.built, cache.problem) == (built, None)
+    path.write_bytes(b"not a file of tensors" * 20)
+    for _ in range(2):
+        assert same(OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, RASTERIZER), expected)
+    assert rasterized == [1, 1]
 
 
 def test_no_flipped_bit_and_no_cut_is_taken_for_the_file(written):
     """Every bit of every byte, header and checksum as well, and every length."""
-    cache, path = written
+    tensors, path = written
     content = path.read_bytes()
     for position in range(len(content)):
         path.write_bytes(content[:position])
-        assert cache.read(KEY) is None, position
+        assert tensors.read(KEY) is None, position
         for bit in range(8) if position % 16 == 0 else [position % 8]:
             flipped = content[position] ^ 1 << bit
             path.write_bytes(content[:position] + bytes([flipped]) + content[position + 1 :])
-            assert cache.read(KEY) is None, (position, bit)
+            assert tensors.read(KEY) is None, (position, bit)
     path.write_bytes(content)
-    assert cache.read(KEY) is not None
+    assert tensors.read(KEY) is not None
 
 
 def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(written, monkeypatch):
-    cache, path = written
+    tensors, path = written
     before = path.read_bytes()
 
     def interrupted(self, content):
@@ -245,73 +228,49 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(written, monk
 
     monkeypatch.setattr(Path, "write_bytes", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        cache.write(KEY, {"ratios": torch.zeros(9)})
+        tensors.write(KEY, {"ratios": torch.zeros(9)})
     assert list(path.parent.iterdir()) == [path] and path.read_bytes() == before
 
 
 # ---------------------------------------------------------------------------------------- folders
 
 
-def full(*_):
-    raise OSError(errno.ENOSPC, "No space left on device")
-
-
 def test_a_full_disk_stops_no_run_and_is_tried_once(tmp_path, monkeypatch):
     tries = []
-    monkeypatch.setattr(Path, "write_bytes", lambda *arguments: tries.append(1) or full())
-    cache = OperatorCache(tmp_path)
-    operators = cache.operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER)
+
+    def full(*_):
+        tries.append(1)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    operators = OperatorCache(tmp_path).operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER)
     assert same(operators, build_operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER))
-    assert "No space left on device" in cache.problem and len(tries) == 1
-    assert not list(tmp_path.iterdir())
+    assert len(tries) == 1 and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("subfolder", ["", "below/that"])
 def test_a_folder_that_cannot_be_made_stops_no_run(subfolder, tmp_path):
     (tmp_path / "file").touch()
-    cache = OperatorCache(tmp_path / "file" / subfolder)
-    operators = cache.operators(PLATE, [CAMERA], SETTINGS, RASTERIZER)
+    operators = OperatorCache(tmp_path / "file" / subfolder).operators(PLATE, [CAMERA], SETTINGS, RASTERIZER)
     assert same(operators, build_operators(PLATE, [CAMERA], SETTINGS, RASTERIZER))
-    assert str(tmp_path / "file") in cache.problem
-
-
-def test_a_folder_that_is_deleted_between_two_views_or_while_one_is_written_stops_no_run(tmp_path, monkeypatch):
-    cache, expected = (
-        OperatorCache(tmp_path / "cache"),
-        build_operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER),
-    )
-    cache.operators(PLATE, orbit_cameras(3, 2.0)[:1], SETTINGS, RASTERIZER)
-    shutil.rmtree(cache.folder)
-    assert same(cache.operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER), expected) and cache.problem is None
-    shutil.rmtree(cache.folder)
-    whole = Path.write_bytes
-    monkeypatch.setattr(Path, "write_bytes", lambda path, content: shutil.rmtree(cache.folder) or whole(path, content))
-    assert same(cache.operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER), expected)
-    assert "No such file" in cache.problem and not cache.folder.exists()
 
 
 def test_runs_may_share_a_folder_at_once(tmp_path):
-    cameras = orbit_cameras(3, 2.0)
-
     def run(_) -> list[TransferOperator]:
-        return OperatorCache(tmp_path).operators(PLATE, cameras, SETTINGS, RASTERIZER)
+        return OperatorCache(tmp_path).operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER)
 
     with ThreadPoolExecutor(4) as pool:
         runs = list(pool.map(run, range(8)))
     assert all(same(runs[0], other) for other in runs)
-    cache = OperatorCache(tmp_path)
-    cache.operators(PLATE, cameras, SETTINGS, RASTERIZER)
-    assert cache.views - cache.built == 3 == len(list(tmp_path.iterdir()))
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 @pytest.mark.parametrize(
     ("choice", "environment", "folder"),
     [
         ("auto", {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"}, "/caches/parametric-norm-balls"),
-        ("auto", {"XDG_CACHE_HOME": "", "HOME": "/home/user"}, "/home/user/.cache/parametric-norm-balls"),
         ("auto", {"HOME": "/home/user"}, "/home/user/.cache/parametric-norm-balls"),
         ("auto", {"XDG_CACHE_HOME": "relative", "HOME": "/home/user"}, None),
-        ("here", {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"}, "here"),
         ("~/here", {"HOME": "/home/user"}, "/home/user/here"),
         (None, {"XDG_CACHE_HOME": "/caches", "HOME": "/home/user"}, None),
     ],

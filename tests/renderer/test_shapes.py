@@ -6,7 +6,6 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from renderer.errors import InputError
 from renderer.shapes import HARD_NEGATIVES, SOLIDS, solid
 
 ALL = SOLIDS | HARD_NEGATIVES
@@ -57,12 +56,6 @@ def test_a_seed_picks_one_instance(name):
         np.testing.assert_array_equal(getattr(one, field), getattr(again, field))
     assert name == "ball" or not np.array_equal(one.vertices, other.vertices)
     assert not np.array_equal(one.corner_colors, other.corner_colors)
-
-
-def test_an_unknown_name_is_answered_with_the_nearest_and_all_known():
-    with pytest.raises(InputError, match="'ornage': use 'orange'") as error:
-        solid("ornage")
-    assert all(name in str(error.value) for name in ALL)
 
 
 def test_a_solid_has_faces_of_some_area_about_the_unit_box_in_display_colors(named):

@@ -113,7 +113,7 @@ def test_the_check_of_a_nested_dataclass_gets_its_key(group):
         (["augment.arm=adverserial"], "arm=adverserial: choose one of"),
         (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12"),
         (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable: Key 'lable'"),
-        (["scene.meshes=['solid:ornage']", "augment.examples=2"], "use 'orange'"),
+        (["scene.meshes=['solid:ornage']", "augment.examples=2"], "choose one of orange"),
         (
             ["scene.hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
             "scene.hard_negatives[0] is of the class orange: name it in scene.meshes",

