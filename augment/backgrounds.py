@@ -24,21 +24,15 @@ def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor
 def load_background(choice: float | str | Path, size: int, name: str = "backgrounds") -> Tensor:
     """A gray value (1, size, size), or an image's center square (3, size, size), in [0, 1]. name: of the argument in
     errors."""
-    if isinstance(choice, Path):
-        return _image(choice, size, name)
     try:
-        gray = float(choice)
+        gray = float(choice)  # type: ignore[arg-type]  # of a path it raises
     except (ValueError, TypeError, OverflowError):
-        if isinstance(choice, str):
-            return _image(Path(choice), size, name)
         gray = math.nan
+    if math.isnan(gray) and isinstance(choice, str | Path):
+        try:
+            return read_image(Path(choice), size)
+        except InputError as error:
+            raise InputError(f"{name}: {error} or a gray value") from error
     if not 0 <= gray <= 1:
         raise InputError(f"{name}={reprlib.repr(choice)}: give gray values in [0, 1] or image files")
     return torch.full((1, size, size), gray)
-
-
-def _image(path: Path, size: int, name: str) -> Tensor:
-    try:
-        return read_image(path, size)
-    except InputError as error:
-        raise InputError(f"{name}: {error} or a gray value") from error

@@ -1,7 +1,7 @@
 """A scene from meshes in one call, with the settings of scene, renderer and local lights."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -138,20 +138,17 @@ class RendererSettings:
 
 
 Shown = str | Path | Mesh
-Member = ObjectSettings | tuple[Shown, str]
 SCENE = {item.name for item in fields(SceneSettings)} - {"meshes", "views"}
-RENDERER = {item.name for item in fields(RendererSettings)} - {"cache"}
 
 
 def build_scene(
-    meshes: Sequence[Member],
+    meshes: Sequence[ObjectSettings | tuple[Shown, str]],
     size: int,
     views: int = 1,
     *,
     shared: bool = False,
     scene: SceneSettings | None = None,
     renderer: RendererSettings | None = None,
-    operators: OperatorCache | None = None,
     device: torch.device | str = "cpu",
     **options: Any,
 ) -> Scene:
@@ -159,8 +156,8 @@ def build_scene(
 
     meshes: pairs of a file, solid:NAME or `Mesh`, and the name of its class; or `ObjectSettings`. shared: the views of
     an example share one light, shape or color; otherwise each view is an example. scene, renderer: all further choices
-    (their own `meshes` and `views` are ignored). options: fields of either, which take precedence. operators: the cache
-    of rendered views; by default the renderer's `cache`, or without `renderer`, the memory.
+    (their own `meshes` and `views` are ignored). options: fields of either, which take precedence. Without `renderer`,
+    views are cached on the disk only where options have a `cache`.
     InputError: what is missing, unknown or out of bounds, and more renders than there is memory for.
 
     >>> meshes = [("solid:orange", "orange"), ("solid:apple", "apple")]
@@ -168,12 +165,9 @@ def build_scene(
     >>> len(scene), scene.labels[0]
     (12, 'orange')
     """
-    if unknown := sorted(options.keys() - SCENE - RENDERER):
-        raise TypeError(f"build_scene() got an unexpected keyword argument {unknown[0]!r}")
-    if operators is None:
-        operators = OperatorCache(cache_folder(renderer.cache)) if renderer else OperatorCache()
-    shown = replace(scene or SceneSettings(), views=views, **_among(options, SCENE))
-    drawn = replace(renderer or RendererSettings(), **_among(options, RENDERER))
+    of_scene = {name: options.pop(name) for name in SCENE & options.keys()}
+    shown = replace(scene or SceneSettings(), views=views, **of_scene)
+    drawn = replace(renderer or RendererSettings(cache=None), **options)
     environment: Any = load_light(shown.light) if isinstance(shown.light, str) else shown.light
     local = [light.build() for light in (shown.projector, shown.lamps) if light is not None]
     basis, lights = with_local_lights(environment * shown.exposure, local)
@@ -185,20 +179,16 @@ def build_scene(
         lights.to(as_device(device)),
         drawn.image(size),
         choose(drawn.rasterizer) if isinstance(drawn.rasterizer, str) else drawn.rasterizer,
-        operators,
+        OperatorCache(cache_folder(drawn.cache)),
         shared=shared,
         basis=basis,
     )
 
 
-def _among(options: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if name in names}
-
-
-def _object(member: Member, vertices: int) -> SceneObject:
-    if isinstance(member, ObjectSettings):
-        return load_object(member, vertices)
-    mesh, label = member
+def _object(item: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObject:
+    if isinstance(item, ObjectSettings):
+        return load_object(item, vertices)
+    mesh, label = item
     if isinstance(mesh, Mesh):
         return SceneObject(label, normalize(subdivide(mesh, vertices)))
     return load_object(ObjectSettings(str(mesh), label), vertices)
@@ -211,19 +201,13 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
     """
     if not objects or not backgrounds:
         raise InputError("scene.meshes and scene.backgrounds must not be empty: name one mesh and one background")
-    if examples is None:
-        if views is None:
-            raise InputError("augment.examples=null makes as many renders as scene.views says: set either")
+    if examples is None and views is not None:
         return views
-    derived, rest = divmod(examples, objects * backgrounds)
-    if rest or derived < 1:
+    derived, rest = divmod(examples or 0, objects * backgrounds)
+    if rest or derived < 1 or views not in (None, derived):
+        product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
         raise InputError(
-            f"augment.examples={examples} is not a multiple of {objects} meshes × {backgrounds} backgrounds: "
-            f"set it to a multiple of {objects * backgrounds}"
-        )
-    if views is not None and views != derived:
-        raise InputError(
-            f"augment.examples={examples} is not {objects} meshes × {views} views × {backgrounds} backgrounds = "
-            f"{objects * views * backgrounds}: change one of them, or set scene.views=null to derive the views"
+            f"augment.examples={examples} is not {product}: change one of them, or derive the one from the other by "
+            "scene.views=null or augment.examples=null"
         )
     return derived

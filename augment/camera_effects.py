@@ -20,9 +20,6 @@ class CameraEffectSettings:
     pattern_fraction: of the images, under a projected pattern. pattern_fill: [least, most] of the scene's own light
     that stays beneath it. white_balance: stops, up or down, of each channel. blur: standard deviation in pixels.
     noise: standard deviation of the image's values.
-
-    >>> CameraEffectSettings().changes, CameraEffectSettings(noise=0.02).changes
-    (False, True)
     """
 
     pattern_fraction: float = 0.0
@@ -35,11 +32,6 @@ class CameraEffectSettings:
         for name, most in (("pattern_fraction", 1), ("white_balance", 5), ("blur", BLUR_RADIUS / 2), ("noise", 1)):
             require_range(name, getattr(self, name), 0, most)
         require_limits("pattern_fill", self.pattern_fill, 0, 1)
-
-    @property
-    def changes(self) -> bool:
-        """Whether any effect is on."""
-        return max(self.pattern_fraction, self.white_balance, self.blur, self.noise) > 0
 
 
 @dataclass(frozen=True)
@@ -56,9 +48,6 @@ class CameraEffects:
     noise: Tensor
     encoding: str
 
-    def to(self, device: torch.device) -> "CameraEffects":
-        return CameraEffects(self.gains.to(device), self.blur.to(device), self.noise.to(device), self.encoding)
-
     def __call__(self, images: Tensor, examples: Tensor) -> Tensor:
         """Images (A, V, 3, size, size) of examples (A,) with their effects; differentiable in the images."""
         light = decode(images, self.encoding) * self.gains[examples, None]
@@ -67,9 +56,13 @@ class CameraEffects:
 
 
 def draw_camera_effects(
-    settings: CameraEffectSettings, count: int, image: ImageSettings, draws: torch.Generator
+    settings: CameraEffectSettings,
+    count: int,
+    image: ImageSettings,
+    draws: torch.Generator,
+    device: torch.device | str = "cpu",
 ) -> CameraEffects:
-    """Random effects for `count` examples, on the CPU."""
+    """Random effects for `count` examples."""
     patterns = draw_patterns(count, image.size, draws)
     low, high = settings.pattern_fill
     fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
@@ -79,7 +72,7 @@ def draw_camera_effects(
     blur = settings.blur * torch.rand(count, generator=draws)
     deviation = settings.noise * torch.rand(count, 1, 1, 1, generator=draws)
     noise = deviation * torch.randn(count, 3, image.size, image.size, generator=draws)
-    return CameraEffects(light * 2**stops, blur, noise, image.encoding)
+    return CameraEffects((light * 2**stops).to(device), blur.to(device), noise.to(device), image.encoding)
 
 
 def _blurred(images: Tensor, sigma: Tensor) -> Tensor:
@@ -110,33 +103,18 @@ def _pattern(points: Tensor, draws: torch.Generator) -> Tensor:
     rotation = torch.stack([torch.stack([angle.cos(), -angle.sin()]), torch.stack([angle.sin(), angle.cos()])])
     rotated = torch.einsum("ij,jyx->iyx", rotation, points)
     family = FAMILIES[int(torch.randint(len(FAMILIES), (), generator=draws))]
-    weight = family(rotated / (0.25 + 0.75 * period), torch.stack(shift))
+    weight = family(rotated / (0.25 + 0.75 * period), torch.stack(shift)[:, None, None]).float()
     first, second = _color(draws), _color(draws) * torch.rand(1, generator=draws)  # the darker one down to black
     return second[:, None, None] + weight * (first - second)[:, None, None]
 
 
-def _stripes(points: Tensor, shift: Tensor) -> Tensor:
-    return ((points[0] + shift[0]) % 1 < 0.5).float()
-
-
-def _checkers(points: Tensor, shift: Tensor) -> Tensor:
-    return (((points + shift[:, None, None]) % 1 < 0.5).sum(0) == 1).float()
-
-
-def _spots(points: Tensor, shift: Tensor) -> Tensor:
-    """Discs on a square grid, over half of its area."""
-    return (((points + shift[:, None, None]) % 1 - 0.5).norm(dim=0) < 0.4).float()
-
-
-def _half(points: Tensor, shift: Tensor) -> Tensor:
-    return (points[0] > shift[0] - 0.5).float()
-
-
-def _solid(points: Tensor, shift: Tensor) -> Tensor:
-    return torch.ones_like(points[0])
-
-
-FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (_stripes, _checkers, _spots, _half, _solid)
+FAMILIES: tuple[Callable[[Tensor, Tensor], Tensor], ...] = (  # masks of points and a shift, both of x and y
+    lambda points, shift: ((points + shift) % 1 < 0.5)[0],  # stripes
+    lambda points, shift: ((points + shift) % 1 < 0.5).sum(0) == 1,  # checkers
+    lambda points, shift: ((points + shift) % 1 - 0.5).norm(dim=0) < 0.4,  # spots on a square grid, over half its area
+    lambda points, shift: (points > shift - 0.5)[0],  # a half
+    lambda points, shift: torch.ones_like(points[0]),  # a solid color
+)
 
 
 def _color(draws: torch.Generator) -> Tensor:

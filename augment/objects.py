@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 
-from augment.utils import underway
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.mesh import Mesh, concatenate, load_mesh, normalize
 from renderer.shapes import solid
@@ -32,7 +31,7 @@ class MeshSettings:
         if not self.mesh:
             raise InputError("mesh is '': give a file or solid:NAME")
         if self.color is not None:
-            _require_color(f"{self.mesh}: color", self.color)
+            _require_color("color", self.color)
 
 
 @dataclass
@@ -49,12 +48,10 @@ class PropSettings(MeshSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.at) != 2:
-            raise InputError(f"props: {self.mesh}: at={self.at} must be x and y")
-        for coordinate in self.at:
-            require_range(f"props: {self.mesh}: at", coordinate, -FARTHEST, FARTHEST)
-        require_range(f"props: {self.mesh}: scale", self.scale, 1 / FARTHEST, FARTHEST)
-        require_range(f"props: {self.mesh}: azimuth", self.azimuth, -360, 360)
+        if len(self.at) != 2 or not all(-FARTHEST <= coordinate <= FARTHEST for coordinate in self.at):
+            raise InputError(f"at={self.at} must be x and y from {-FARTHEST:g} to {FARTHEST:g}")
+        require_range("scale", self.scale, 1 / FARTHEST, FARTHEST)
+        require_range("azimuth", self.azimuth, -360, 360)
 
 
 @dataclass
@@ -74,7 +71,7 @@ class ObjectSettings(MeshSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range(f"{self.mesh}: albedo_scale", self.albedo_scale, 1 / FACTOR, FACTOR)
+        require_range("albedo_scale", self.albedo_scale, 1 / FACTOR, FACTOR)
 
 
 @dataclass(frozen=True)
@@ -127,8 +124,7 @@ def load_object(item: ObjectSettings, vertices: int = 0) -> SceneObject:
 
     InputError: as `load_mesh` and `solid`.
     """
-    with underway(f"preparing {item.mesh}"):
-        mesh = normalize(subdivide(_load(item), vertices))
+    mesh = normalize(subdivide(_load(item), vertices))
     return with_props(SceneObject(item.label, mesh, item.albedo_scale, item.mesh), [_prop(prop) for prop in item.props])
 
 
@@ -173,25 +169,20 @@ def _prop(item: PropSettings) -> Mesh:
 
 
 def _load(item: MeshSettings) -> Mesh:
-    mesh = _read(item)
+    kind, _, name = item.mesh.partition(":")
+    if kind == "solid":
+        name, _, seed = name.partition(":")
+        try:
+            mesh = solid(name, int(seed or 0))
+        except ValueError as error:  # of the name or the seed
+            raise InputError(f"{item.mesh}: {error}") from error
+    else:
+        mesh = load_mesh(item.mesh, up=item.up)
     if item.color is None:
         return mesh
     if mesh.textures or (mesh.corner_colors != 1).any():
         raise InputError(f"{item.mesh} brings colors of its own: leave color out; albedo_scale brightens or dims them")
     return Mesh.plain(mesh.vertices, mesh.faces, np.array(item.color))
-
-
-def _read(item: MeshSettings) -> Mesh:
-    kind, _, name = item.mesh.partition(":")
-    if kind != "solid":
-        return load_mesh(item.mesh, up=item.up)
-    name, _, seed = name.partition(":")
-    if seed and not seed.isdecimal():
-        raise InputError(f"{item.mesh}: the seed must be a whole number, as in solid:orange:3")
-    try:
-        return solid(name, int(seed or 0))
-    except InputError as error:
-        raise InputError(f"{item.mesh}: {error}") from error
 
 
 def _require_color(name: str, color: Sequence[float]) -> None:

@@ -1,8 +1,9 @@
 """Images of objects in other light: stacked transfer operators, and nothing is rasterized again."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from itertools import groupby
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -19,18 +20,15 @@ from renderer.transport.local import SparseTransfer, joined
 Rows = list[int] | None
 
 
-@dataclass(frozen=True)
-class Layer:
+class Layer(NamedTuple):
     """Covered pixels (P,) of B images, which are `rows` of a batch; None for all of it in order.
 
-    composite: (B, 3, P) linear radiance and background. coverage: (O, 1, P) of O views; `shown` (B,) is each image's.
+    composite: (B, 3, P) linear radiance and background.
     """
 
     rows: Rows
     pixels: Tensor
     composite: Tensor
-    coverage: Tensor
-    shown: Tensor | list[int]
 
 
 def in_place(canvas: Tensor, layers: Sequence[Layer], covered: Sequence[Tensor]) -> Tensor:
@@ -54,13 +52,12 @@ class _InPlace(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, *(_gathered(upstream, *target) for target in ctx.targets)
+        def gathered(rows: Rows, pixels: Tensor) -> Tensor:
+            if rows is None:  # of two axes, torch selects ten times as fast as of three
+                return upstream.flatten(0, 1).index_select(1, pixels).unflatten(0, (-1, 3))
+            return torch.stack([upstream[row].index_select(1, pixels) for row in rows])
 
-
-def _gathered(images: Tensor, rows: Rows, pixels: Tensor) -> Tensor:
-    if rows is None:  # of two axes, torch selects ten times as fast as of three
-        return images.flatten(0, 1).index_select(1, pixels).unflatten(0, (-1, 3))
-    return torch.stack([images[row].index_select(1, pixels) for row in rows])
+        return None, None, *(gathered(*target) for target in ctx.targets)
 
 
 class OperatorStack:
@@ -127,15 +124,14 @@ def _joined(
     operators: Sequence[TransferOperator], pixels: Tensor, device: torch.device | str
 ) -> tuple[SparseTransfer | None, Tensor]:
     """(the sparse entries of all operators, over common pixels; (O + 1,) the first entry of each operator)."""
-    counts, parts = [0], []
-    for operator in operators:
-        sparse = operator.sparse
-        counts.append(0 if sparse is None else len(sparse.function))
-        if sparse is not None:
-            columns = torch.searchsorted(pixels, operator.pixels)
-            parts.append(sparse._replace(pixel=columns[sparse.pixel]))
+    counts = [0 if operator.sparse is None else len(operator.sparse.function) for operator in operators]
+    parts = [
+        operator.sparse._replace(pixel=torch.searchsorted(pixels, operator.pixels)[operator.sparse.pixel])
+        for operator in operators
+        if operator.sparse is not None
+    ]
     entries = joined(parts)
-    return entries and entries.to(device), torch.tensor(counts, device=device).cumsum(0)
+    return entries and entries.to(device), torch.tensor([0, *counts], device=device).cumsum(0)
 
 
 def _stack(operators: Sequence[TransferOperator], pixels: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -171,13 +167,13 @@ class Relighting:
         behind: Tensor,
         backgrounds: Tensor,
         settings: ImageSettings,
-        build: Callable[[SceneObject, Sequence[Camera]], Sequence[TransferOperator]],
+        build: Callable[..., Sequence[TransferOperator]],
     ):
         """views: (object's number, camera) of each image. behind: (N,) the background of each. build: the operators
-        of an object from cameras."""
+        of a mesh from cameras, for an albedo_scale."""
         self._objects, self._behind, self._backgrounds = objects, behind, backgrounds
         self._settings, self._build = settings, build
-        self._distinct = sorted(dict.fromkeys(views), key=lambda view: view[0])  # (object, camera) of each operator
+        self._distinct = sorted(dict.fromkeys(views), key=itemgetter(0))  # (object, camera) of each operator
         number = {view: index for index, view in enumerate(self._distinct)}
         self._operator = torch.tensor([number[view] for view in views], device=backgrounds.device)
         self._per_stack = max(1, STACKED // settings.size**2)
@@ -202,8 +198,7 @@ class Relighting:
     def _layer(self, index: int, rows: Rows, light: Tensor, images: Tensor) -> Layer:
         stack, rank, behind = self._stack(index)
         images = rank[images]
-        composite = stack.radiance(light, images) + behind[images]
-        return Layer(rows, stack.pixels, composite, stack.coverage, stack.shown[images])
+        return Layer(rows, stack.pixels, stack.radiance(light, images) + behind[images])
 
     def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         if index not in self._stacks:
@@ -219,8 +214,9 @@ class Relighting:
         P))."""
         first = index * self._per_stack
         views, operators = self._distinct[first : first + self._per_stack], list[TransferOperator]()
-        for number in dict.fromkeys(number for number, _ in views):
-            operators += self._build(self._objects[number], [camera for other, camera in views if other == number])
+        for number, group in groupby(views, key=itemgetter(0)):
+            item, cameras = self._objects[number], [camera for _, camera in group]
+            operators += self._build(item.mesh, cameras, albedo_scale=item.albedo_scale)
         here = self._operator // self._per_stack == index
         stack = OperatorStack(operators, (self._operator[here] - first).cpu(), self._backgrounds.device)
         backgrounds = self._backgrounds.index_select(2, stack.pixels)

@@ -4,9 +4,9 @@ Shadows and bounces of environment light are frozen at a shape close by (`Frozen
 those of the moved shape itself (`renderer.transport.local`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -38,29 +38,25 @@ class FrozenTransport:
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Basis):
         self.mesh, self._settings = mesh, settings
         self._transport = build_transport(mesh, settings, albedo_scale, basis)
-        self._views: dict[Camera, tuple[Tensor, Tensor] | None] = {}
+        self.views: dict[Camera, tuple[Tensor, Tensor] | None] = {}
 
     def is_near(self, vertices: np.ndarray) -> bool:
         """Whether vertices (V, 3) are near the mesh's."""
         return bool(np.abs(vertices - self.mesh.vertices).max() <= NEAR)
 
-    def has(self, camera: Camera) -> bool:
-        return camera in self._views
-
     def add(self, camera: Camera, fragments: Fragments, albedo: Tensor) -> None:
         """Add a view of the mesh, with its albedo at the samples (S, 3)."""
         surface = Surface.of(self.mesh, fragments.to("cpu"), self._settings)
         change = self._transport.change(surface, albedo.cpu().double()) if self._transport else None
-        if change is None:
-            self._views[camera] = None
-        else:
+        self.views[camera] = None
+        if change is not None:
             canvas = change.new_zeros(*change.shape[:2], fragments.size**2)
             canvas[..., surface.fragments.pixels] = change
-            self._views[camera] = canvas.to(albedo), _by_pixel(fragments, albedo)
+            self.views[camera] = canvas.to(albedo), _by_pixel(fragments, albedo)
 
     def radiance(self, camera: Camera, fragments: Fragments, albedo: Tensor, light: Tensor) -> Tensor:
         """(3, P) at the fragments of an added view, with albedo (S, 3) in light (size, 3); differentiable in both."""
-        view = self._views[camera]
+        view = self.views[camera]
         if view is None:
             return light.new_zeros(3, len(fragments.pixels))
         change, before = (values[..., fragments.pixels] for values in view)
@@ -135,57 +131,50 @@ class Reshading:
         example: whose shapes change little from call to call. vertices: (V, 3), and positions of lamps: (L, 3); None
         where they have not moved. added: offsets of each face's linear albedo, (F, 3).
         """
-        mesh, albedo_scale = self._objects[number].mesh, self._objects[number].albedo_scale
-        local_view: Callable[[], LocalLightView]
+        item, settings = self._objects[number], self._settings
         if vertices is None:
-            vertices, shape = self.vertices[number], mesh.vertices
+            corners, shape = self.vertices[number], item.mesh.vertices
             fragments, albedo = self.view(number, camera)
-            local_view = partial(self.local_view, number, camera)
         else:
-            shape = vertices.detach().cpu().double().numpy()
+            corners, shape = vertices, vertices.detach().cpu().double().numpy()
             fragments, albedo = self._rasterized(number, camera, shape)
-            # only where the scene has local lights: a moved mesh is checked as it is made
-            local_view = cache(partial(self._moved_local_view, mesh, shape, fragments, vertices))
         if added is not None:
-            albedo = painted_albedo(mesh, fragments, self._settings.encoding, albedo_scale, added)
-        smooth_faces = self._faces[number] if self._settings.normals == "smooth" else None
+            albedo = painted_albedo(item.mesh, fragments, settings.encoding, item.albedo_scale, added)
+        smooth_faces = self._faces[number] if settings.normals == "smooth" else None
         lights = [(part, light[where]) for where, part in parts_of(self._basis)]
+
+        @cache  # called only where the scene has local lights
+        def local_view() -> LocalLightView:
+            if vertices is None:
+                return self.local_view(number, camera)
+            rays = Rays(replace(item.mesh, vertices=shape))
+            return LocalLightView(rays, item.mesh, fragments, settings, vertices)
 
         def indirect(albedo: Tensor, light: Tensor) -> Tensor:
             frozen = self._transport_near(example, number, camera, shape)
             return frozen.radiance(camera, fragments, albedo, light)
 
-        extra = indirect if self._settings.global_illumination else None
-        return fragments, view_radiance(fragments, vertices, albedo, lights, smooth_faces, local_view, extra, positions)
-
-    def _moved_local_view(
-        self, mesh: Mesh, shape: np.ndarray, fragments: Fragments, vertices: Tensor
-    ) -> LocalLightView:
-        return LocalLightView(Rays(replace(mesh, vertices=shape)), mesh, fragments, self._settings, vertices)
+        extra = indirect if settings.global_illumination else None
+        return fragments, view_radiance(fragments, corners, albedo, lights, smooth_faces, local_view, extra, positions)
 
     def _transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""
-        mesh = self._objects[number].mesh
+        mesh, fixed = self._objects[number].mesh, (self._settings, self._objects[number].albedo_scale, self._basis)
         if number not in self._unmoved_transport:
-            self._unmoved_transport[number] = self._transport(number, mesh)
+            self._unmoved_transport[number] = FrozenTransport(mesh, *fixed)
         frozen = self._unmoved_transport[number]
         if not frozen.is_near(vertices):
-            last = self._moved_transport.get(example)
-            frozen = (
-                last if last and last.is_near(vertices) else self._transport(number, replace(mesh, vertices=vertices))
-            )
+            frozen = self._moved_transport.get(example, frozen)
+            if not frozen.is_near(vertices):
+                frozen = FrozenTransport(replace(mesh, vertices=vertices), *fixed)
             self._moved_transport[example] = frozen
-        if not frozen.has(camera):
+        if camera not in frozen.views:
             frozen.add(camera, *self._rasterized(number, camera, frozen.mesh.vertices))
         return frozen
-
-    def _transport(self, number: int, mesh: Mesh) -> FrozenTransport:
-        return FrozenTransport(mesh, self._settings, self._objects[number].albedo_scale, self._basis)
 
     def _rasterized(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
         """Fragments of an object with these vertices, and its albedo at the samples (S, 3)."""
         item, settings = self._objects[number], self._settings
-        closed = item.mesh.closed
-        (fragments,) = build_fragments(vertices, item.mesh.faces, [camera], settings, self._rasterizer, closed=closed)
-        fragments = fragments.to(self._like.device)
+        drawn = vertices, item.mesh.faces, [camera], settings, self._rasterizer
+        fragments = build_fragments(*drawn, closed=item.mesh.closed)[0].to(self._like.device)
         return fragments, (surface_albedo(item.mesh, fragments, settings.encoding) * item.albedo_scale).to(self._like)

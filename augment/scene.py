@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -18,12 +18,11 @@ from augment.utils import require_memory
 from renderer.cache import OperatorCache
 from renderer.camera import Camera
 from renderer.errors import InputError, require_bounded
-from renderer.image import ImageSettings, background_term, clamp, clamped, tonemap_composite
+from renderer.image import ImageSettings, background_term, clamp, tonemap_composite
 from renderer.light.basis import HARMONICS, Basis, parts_of
 from renderer.light.local import Lamps, moved
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
-from renderer.transfer import TransferOperator
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -88,51 +87,33 @@ class Scene:
     camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def __post_init__(self) -> None:
-        self._require_consistent()
+        size, device = self.settings.size, self.lights.device
+        if not self.examples:
+            raise InputError("examples is empty: give at least one mesh, one view and one background")
+        if self.lights.shape[-2:] != (self.basis.size, 3):
+            raise InputError(f"lights has shape {tuple(self.lights.shape)}: give {self.basis.size} rows")
+        if self.backgrounds.shape[1:] not in ((1, size, size), (3, size, size)):
+            raise InputError(f"backgrounds has shape {tuple(self.backgrounds.shape)}: give (B, 3, {size}, {size})")
+        if not (self.backgrounds.min() >= 0 and self.backgrounds.max() <= 1):
+            raise InputError("backgrounds: give values in [0, 1]")
         self.examples = [self._with_whole_object(example) for example in self.examples]
         self.backgrounds = self.backgrounds.to(self.lights)
         self.lights = self.lights.expand(len(self.examples), *self.lights.shape[-2:])
         self.views = len(self.examples[0].cameras)  # per example
-        self.object_of = self._column(example.object for example in self.examples)  # (E,)
-        self._background = self._column(example.background for example in self.examples)
+        self.object_of = torch.tensor([example.object for example in self.examples], device=device)  # (E,)
+        self._background = torch.tensor([example.background for example in self.examples], device=device)
         exposures = torch.tensor([example.exposure for example in self.examples])
         self._exposure = exposures.to(self.lights)[:, None, None]
-        size, images = self.settings.size, len(self.examples) * self.views
-        self.at_once = max(1, AT_ONCE // (self.views * size**2))  # examples
-        renders = f"{images} renders of {size} pixels per side (meshes × views × backgrounds)"
-        require_memory(renders, 24 * images * size**2, self.lights.device)
-        self._relighting = self._relit_views()
-        self._reshading = Reshading(self.objects, self.settings, self.rasterizer, self.basis, self.lights)
-
-    def _require_consistent(self) -> None:
-        if not self.examples:
-            raise InputError("examples is empty: give at least one mesh, one view and one background")
-        if self.lights.shape[-2:] != (self.basis.size, 3):
-            raise InputError(
-                f"lights has shape {tuple(self.lights.shape)}: give {self.basis.size} rows, for {self.basis}"
-            )
-        behind, size = self.backgrounds, self.settings.size
-        if not (behind.is_floating_point() and behind.shape[1:] in ((1, size, size), (3, size, size))):
-            raise InputError(
-                f"backgrounds has {behind.dtype} {tuple(behind.shape)}: give images (B, 3, {size}, {size})"
-            )
-        if not (behind.min() >= 0 and behind.max() <= 1):
-            raise InputError("backgrounds: give values in [0, 1]")
-        for name, items in (("object", self.objects), ("background", behind)):
-            if not all(0 <= getattr(example, name) < len(items) for example in self.examples):
-                raise InputError(f"examples: an index of {name}s is not below {len(items)}")
-
-    def _relit_views(self) -> Relighting:
-        # a closure without `self`, which every epoch replaces: a cycle would keep old scenes in memory
-        cache, settings, rasterizer = self.operators, self.settings, self.rasterizer
-        basis, dtype = self.basis, self.lights.dtype
-
-        def build(item: SceneObject, cameras: Sequence[Camera]) -> Sequence[TransferOperator]:
-            return cache.operators(item.mesh, cameras, settings, rasterizer, item.albedo_scale, basis, dtype)
-
         views = [(example.object, camera) for example in self.examples for camera in example.cameras]
+        self.at_once = max(1, AT_ONCE // (self.views * size**2))  # examples
+        renders = f"{len(views)} renders of {size} pixels per side (meshes × views × backgrounds)"
+        require_memory(renders, 24 * len(views) * size**2, device)
+        shading: dict[str, Any] = {"settings": self.settings, "rasterizer": self.rasterizer, "basis": self.basis}
+        # no method of `self`, which every epoch replaces: a cycle would keep old scenes in memory
+        build = partial(self.operators.operators, **shading, dtype=self.lights.dtype)
         behind = self._background.repeat_interleave(self.views)
-        return Relighting(self.objects, views, behind, self.backgrounds.flatten(2), settings, build)
+        self._relighting = Relighting(self.objects, views, behind, self.backgrounds.flatten(2), self.settings, build)
+        self._reshading = Reshading(self.objects, like=self.lights, **shading)
 
     @classmethod
     def grid(
@@ -140,19 +121,15 @@ class Scene:
         objects: Sequence[SceneObject],
         cameras: Sequence[Camera],
         backgrounds: Tensor,
-        light: Tensor,
-        settings: ImageSettings,
-        rasterizer: Rasterizer,
-        operators: OperatorCache | None = None,
-        *,
+        *of_scene: Any,
         shared: bool = False,
-        basis: Basis = HARMONICS,
+        **options: Any,
     ) -> Scene:
         """Every object from every camera over every background, in that order; or with `shared`, where the views share
-        one light or shape, every object over every background from all cameras."""
+        one light or shape, every object over every background from all cameras. of_scene, options: of `Scene`."""
         views = [tuple(cameras)] if shared else [(camera,) for camera in cameras]
         examples = [Example(*row) for row in product(range(len(objects)), views, range(len(backgrounds)))]
-        return cls(objects, examples, backgrounds, light, settings, rasterizer, operators or OperatorCache(), basis)
+        return cls(objects, examples, backgrounds, *of_scene, **options)
 
     def __len__(self) -> int:
         return len(self.examples)
@@ -196,32 +173,20 @@ class Scene:
         """
         layers = list(self._layers(conditions, examples))
         canvas = self.backgrounds.flatten(2).index_select(0, self._background[examples].repeat_interleave(self.views))
-        canvas = canvas.expand(-1, 3, -1).contiguous()
         covered = [tonemap_composite(layer.composite, self.settings.encoding) for layer in layers]
-        images = in_place(canvas, layers, covered)
+        images = in_place(canvas.expand(-1, 3, -1).contiguous(), layers, covered)
         images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
-        images = images if self.camera_effects is None else self.camera_effects(images, examples)
+        images = self.camera_effects(images, examples) if self.camera_effects else images
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
-
-    @torch.no_grad()
-    def clamped_fraction(self, conditions: Conditions, examples: Int[Tensor, " A"]) -> Float[Tensor, " A"]:
-        """(A,) the fraction of its covered pixels' values that the clamp changes."""
-        counts_of_images = self.lights.new_zeros(2, len(examples) * self.views)
-        for layer in self._layers(conditions, examples):
-            covered = (layer.coverage[layer.shown] > 0).expand_as(layer.composite)
-            counts = torch.stack([clamped(layer.composite) & covered, covered]).sum((2, 3)).to(counts_of_images)
-            counts_of_images[:, slice(None) if layer.rows is None else layer.rows] += counts
-        changed, covered = counts_of_images.unflatten(1, (-1, self.views)).sum(2)
-        return changed / covered.clamp(min=1)
 
     def _layers(self, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
         require_bounded(light=conditions.light)
         light = conditions.light * self._exposure[examples]
-        if conditions.vertices is None and conditions.albedo is None:
-            if conditions.positions is None:
-                return self._relit(light, examples)
+        if conditions.vertices is not None or conditions.albedo is not None:
+            return self._reshaded(light, conditions, examples)
+        if conditions.positions is not None:
             return self._under_moved_lamps(light, conditions.positions, examples)
-        return self._reshaded(light, conditions, examples)
+        return self._relit(light, examples)
 
     def _relit(self, light: Tensor, examples: Tensor) -> Iterator[Layer]:
         """One product per stack of operators."""
@@ -232,38 +197,36 @@ class Scene:
     def _under_moved_lamps(self, light: Tensor, positions: Tensor, examples: Tensor) -> Iterator[Layer]:
         """The same products for all other light, and the lamps image by image."""
         where, lamps = next((where, part) for where, part in parts_of(self.basis) if isinstance(part, Lamps))
-        rest = torch.cat([light[:, : where.start], torch.zeros_like(light[:, where]), light[:, where.stop :]], dim=1)
-        for layer in self._relit(rest, examples):
+        rest = light.clone()
+        rest[:, where] = 0
+        for rows, pixels, composite in self._relit(rest, examples):
             added = []
-            for image in range(len(layer.composite)) if layer.rows is None else layer.rows:
+            for image in range(len(composite)) if rows is None else rows:
                 row, view = divmod(image, self.views)
                 example = self.examples[int(examples[row])]
                 shown = example.object, example.cameras[view]
                 view_in_lamps, (fragments, albedo) = self._reshading.local_view(*shown), self._reshading.view(*shown)
                 radiance = view_in_lamps.radiance(lamps, albedo, light[row, where], positions[row])
-                covered = torch.searchsorted(layer.pixels, fragments.pixels)
-                added.append(radiance.new_zeros(3, len(layer.pixels)).index_copy(1, covered, radiance))
-            yield replace(layer, composite=layer.composite + torch.stack(added))
+                covered = torch.searchsorted(pixels, fragments.pixels)
+                added.append(radiance.new_zeros(3, len(pixels)).index_copy(1, covered, radiance))
+            yield Layer(rows, pixels, composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
         """View by view."""
-        views = [(row, index, view) for row, index in enumerate(examples.tolist()) for view in range(self.views)]
-        for image, (row, index, view) in enumerate(views):
-            example = self.examples[index]
-            mesh, shown = self.mesh(index), (index, example.object, example.cameras[view])
+        for image, (row, view) in enumerate(product(range(len(examples)), range(self.views))):
+            index = int(examples[row])
+            example, mesh = self.examples[index], self.mesh(index)
             vertices = None if conditions.vertices is None else conditions.vertices[row, : len(mesh.vertices)]
             added = None if conditions.albedo is None else conditions.albedo[row, : len(mesh.faces)]
             positions = None if conditions.positions is None else conditions.positions[row]
+            shown = index, example.object, example.cameras[view]
             fragments, radiance = self._reshading.radiance(*shown, light[row], vertices, added, positions)
             coverage = fragments.coverage.to(radiance)[None]
             behind = self.backgrounds[example.background].flatten(1).index_select(1, fragments.pixels)
             composite = radiance + background_term(coverage, behind, self.settings.encoding)
-            yield Layer([image], fragments.pixels, composite[None], coverage[None], [0])
+            yield Layer([image], fragments.pixels, composite[None])
 
     def _with_whole_object(self, row: Example) -> Example:
         """The row with cameras whose depth range holds the whole object."""
         radius = self.objects[row.object].radius
         return replace(row, cameras=tuple(camera.seeing(radius) for camera in row.cameras))
-
-    def _column(self, values: Iterable[int]) -> Tensor:
-        return torch.tensor(list(values), device=self.lights.device)

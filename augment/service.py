@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -101,10 +100,10 @@ class AugmentationSettings:
         require_choice("init", self.init, INITS)
         require_range("examples", self.examples, 0, MOST_EXAMPLES)
         require_range("every", self.every, 1, MOST_EVERY)
-        if self.arm == "random" or self.init == "random":
-            for name, settings in self.attack.parameters.items():
-                if name != Lighting.name and settings.radius is None:
-                    raise InputError(f"attack.{name}.radius is None, which has no random draw: set a radius")
+        random = "random" in (self.arm, self.init)
+        for name, settings in self.attack.parameters.items():
+            if random and name != Lighting.name and settings.radius is None:
+                raise InputError(f"attack.{name}.radius is None, which has no random draw: set a radius")
         if self.warm_start and self.vary.instances:
             raise InputError("warm_start=True keeps the last attack's shapes: set vary.instances=False")
 
@@ -181,11 +180,8 @@ class AugmentationService:
     _last_values: Tensor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        settings = self.settings
-        if self.scene is None and settings.renders:
-            raise InputError(
-                f"scene is None, and arm={settings.arm} renders {settings.examples} examples: give a scene"
-            )
+        if self.scene is None and self.settings.renders:
+            raise InputError(f"scene is None, and arm={self.settings.arm} renders examples: give a scene")
 
     @classmethod
     def from_meshes(
@@ -227,7 +223,6 @@ class AugmentationService:
         model: images (N, 3, size, size) in [0, 1] → logits. number: counts a run's regenerations from 0. The draw
         depends on it and on the seed alone, so a resumed run repeats it. InputError: a label that has no logit.
         """
-        require_range("number", number, 0, math.inf)
         if self.scene is None or not self.settings.renders:
             return Renders(torch.zeros(0, 3, 1, 1), self.labels[:0], {})
         scene = vary(self.scene, self.settings.vary, generator(self.seed, number, "rows"))
@@ -243,10 +238,8 @@ class AugmentationService:
         if not state:
             return
         if len(state["values"]) != len(self.labels):
-            raise InputError(
-                f"the checkpoint continues {len(state['values'])} examples and the scene has "
-                f"{len(self.labels)}; resume with the settings of the run"
-            )
+            counts = f"{len(state['values'])} examples and the scene has {len(self.labels)}"
+            raise InputError(f"the checkpoint continues {counts}; resume with the settings of the run")
         self._last_values = state["values"].to(self.labels.device)
 
     def _random(self, model: nn.Module, problem: AttackProblem, number: int) -> Renders:
@@ -262,61 +255,32 @@ class AugmentationService:
         return Renders(images[:, 0], self.labels, diagnostics | _changes(problem, values), examples)
 
     def _adversarial(self, model: nn.Module, problem: AttackProblem, number: int) -> Renders:
-        attack, total = self.settings.attack, len(problem.start)
+        attack, total, goal = self.settings.attack, len(problem.start), Goal(self.labels[:, None])
+        if self.label is not None:
+            source = torch.where(self.labels < 0, NO_CLASS, self.labels)
+            target = torch.where(self.labels == self.label, NO_CLASS, self.label)
+            goal = Goal(source[:, None], target[:, None])
+        start = self._last_values
+        if start is None:
+            start = self._random_values(problem, number) if self.settings.init == "random" else problem.start
         shard = utils.shard(total, self.rank, self.world_size).to(problem.start.device)
-        part = Part(problem, shard, self._start(problem, number)[shard])
         draws = generator(self.seed, number, "restart")
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
         result = descend(
             attack.preprocessed_model(model),
-            part,
-            self._goal().of(shard),
+            Part(problem, shard, start[shard]),
+            goal.of(shard),
             attack,
             self.phases,
             starts=restarts,
             at_once=problem.scene.at_once,
             seed=stream_seed(self.seed, number),
         )
-        gathered = {item.name: getattr(result, item.name) for item in fields(result)}
-        result = DescentResult(
-            **{name: utils.merged(rows, shard, total, self.world_size) for name, rows in gathered.items()}
-        )
+        shards = [getattr(result, item.name) for item in fields(result)]
+        result = DescentResult(*(utils.merged(rows, shard, total, self.world_size) for rows in shards))
         if self.settings.warm_start:
             self._last_values = result.values
-        diagnostics = self._attack_diagnostics(result) | _changes(problem, result.values)
-        new_success = result.success & ~result.success_before
-        examples = choose_attack_examples(model, problem, result.values, new_success, self.labels)
-        return Renders(result.images[:, 0], self.labels, diagnostics, examples)
-
-    def _goal(self) -> Goal:
-        if self.label is None:
-            return Goal(self.labels[:, None])
-        source = torch.where(self.labels < 0, NO_CLASS, self.labels)
-        target = torch.where(self.labels == self.label, NO_CLASS, self.label)
-        return Goal(source[:, None], target[:, None])
-
-    def _start(self, problem: AttackProblem, number: int) -> Tensor:
-        if self._last_values is not None:
-            return self._last_values
-        return self._random_values(problem, number) if self.settings.init == "random" else problem.start
-
-    def _random_values(self, problem: AttackProblem, number: int) -> Tensor:
-        """Random values (E, D) within the norm-balls."""
-        random, parts = self.settings.random_light, []
-        for parameter, start in zip(problem.parameters, problem.split(problem.start), strict=True):
-            if isinstance(parameter, Lighting):
-                zero = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
-                draws = generator(self.seed, number, "lights")
-                offsets = perturb(zero, len(start), random.amplitude, random.radius, draws)
-                parts.append(start + offsets.flatten(1).to(start))
-            else:
-                draws = generator(self.seed, number, parameter.name)
-                parts.append(parameter.sample(draws, problem.everything).to(start))
-        return problem.project(torch.cat(parts, dim=1), problem.everything)
-
-    def _attack_diagnostics(self, result: DescentResult) -> dict[str, float]:
-        attack = self.settings.attack
-        return {
+        diagnostics = {
             "attack_success_before": _mean(result.success_before),
             "attack_success": _mean(result.success),
             "steps": _mean(result.steps),
@@ -325,6 +289,25 @@ class AugmentationService:
             "loss": -_mean(result.cost),
             "zero_gradient": _mean(result.zero_gradient),
         }
+        new_success = result.success & ~result.success_before
+        examples = choose_attack_examples(model, problem, result.values, new_success, self.labels)
+        return Renders(result.images[:, 0], self.labels, diagnostics | _changes(problem, result.values), examples)
+
+    def _random_values(self, problem: AttackProblem, number: int) -> Tensor:
+        """Random values (E, D) within the norm-balls."""
+        random, parts = self.settings.random_light, []
+        for parameter, start in zip(problem.parameters, problem.split(problem.start), strict=True):
+            if isinstance(parameter, Lighting):
+                zero, draws = (
+                    torch.zeros(start.shape[1] // 3, 3).to(start.dtype),
+                    generator(self.seed, number, "lights"),
+                )
+                offsets = perturb(zero, len(start), random.amplitude, random.radius, draws)
+                parts.append(start + offsets.flatten(1).to(start))
+            else:
+                draws = generator(self.seed, number, parameter.name)
+                parts.append(parameter.sample(draws, problem.everything).to(start))
+        return problem.project(torch.cat(parts, dim=1), problem.everything)
 
 
 def choose_attack_examples(
@@ -341,27 +324,17 @@ def choose_attack_examples(
     with as_found(model), torch.no_grad():
         images = [problem.scene.render(conditions, rows)[:, 0] for conditions in (before, after)]
         predictions = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
-    return AttackExamples(
-        images[0],
-        images[1],
-        before.light,
-        after.light,
-        predictions[0],
-        predictions[1],
-        labels[rows],
-        problem.scene.basis,
-    )
+    return AttackExamples(*images, before.light, after.light, *predictions, labels[rows], problem.scene.basis)
 
 
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:
-    """The mean L2 norm of each condition's change, and the fraction of image values that are clamped."""
+    """The mean L2 norm of each condition's change."""
     before, after = (problem.conditions(end, problem.everything) for end in (problem.start, values))
-    changes = {
+    return {
         f"{part.name}_change": _mean((value - getattr(before, part.name)).flatten(1).norm(dim=1))
         for part in fields(Conditions)
         if (value := getattr(after, part.name)) is not None
     }
-    return changes | {"clamped": _mean(problem.scene.clamped_fraction(after, problem.everything))}
 
 
 def _mean(values: Tensor) -> float:

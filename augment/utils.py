@@ -1,7 +1,6 @@
 """Random streams, memory, progress bars, seconds per phase, a model's state, and shards of processes."""
 
 import logging
-import math
 import sys
 import time
 import zlib
@@ -19,10 +18,9 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from renderer.errors import InputError, is_out_of_memory, require_range
+from renderer.errors import InputError, is_out_of_memory
 
 MEMORY, GROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")  # of Linux, and of a container (cgroup v2)
-PATIENCE = 5  # seconds without a progress bar
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -32,8 +30,6 @@ Result = TypeVar("Result")
 
 def stream_seed(*key: int | str) -> int:
     """A 63-bit seed from a key such as (run seed, epoch, "order"); different keys give independent streams."""
-    for part in key:
-        require_range("seed", None if isinstance(part, str) else part, 0, math.inf)
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
     return int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> 1)
 
@@ -84,10 +80,8 @@ def require_memory(name: str, needed: int, device: torch.device) -> None:
     """InputError naming what needs more bytes than are free, before the system ends the process for it."""
     free = _free(device)
     if free is not None and needed > free:
-        raise InputError(
-            f"{name} need {needed / 2**30:.1f} GB of memory and {free / 2**30:.1f} GB are free: ask for fewer or "
-            "smaller ones"
-        )
+        sizes = f"{needed / 2**30:.1f} GB of memory and {free / 2**30:.1f} GB are free"
+        raise InputError(f"{name} need {sizes}: ask for fewer or smaller ones")
 
 
 def _free(device: torch.device) -> int | None:
@@ -109,19 +103,11 @@ def _free(device: torch.device) -> int | None:
 
 
 def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterable[Item]:
-    """The items, with a bar on a terminal after some seconds; without a terminal, just the items.
+    """The items, with a bar on a terminal after 5 seconds.
 
     total: their number, where they have no length. done: how many came before.
     """
-    hidden = not sys.stderr.isatty()
-    return tqdm(items, description, total, delay=PATIENCE, leave=False, disable=hidden, initial=done)
-
-
-@contextmanager
-def underway(description: str) -> Iterator[None]:
-    """A bar at 0 % on a terminal, at once, during work that has no parts to count."""
-    with tqdm(total=1, desc=description, leave=False, disable=not sys.stderr.isatty()):
-        yield
+    return tqdm(items, description, total, leave=False, delay=5, disable=not sys.stderr.isatty(), initial=done)
 
 
 class Phases:
@@ -169,9 +155,8 @@ def eval_mode(model: nn.Module) -> Iterator[None]:
 @contextmanager
 def as_found(model: nn.Module) -> Iterator[None]:
     """Eval mode and no gradients for parameters inside; mode, requires_grad and random state restored after."""
-    parameters = list(model.parameters())
-    trainable = [parameter for parameter in parameters if parameter.requires_grad]
-    devices = {parameter.device for parameter in parameters if parameter.is_cuda}
+    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    devices = {parameter.device for parameter in model.parameters() if parameter.is_cuda}
     for parameter in trainable:
         parameter.requires_grad_(False)
     try:
@@ -207,6 +192,6 @@ def merged(part: Tensor, examples: Tensor, total: int, world_size: int) -> Tenso
     parts = [(part, examples)] * world_size  # to be overwritten
     dist.all_gather_object(parts, (part.cpu(), examples.cpu()))
     whole = part.new_empty(total, *part.shape[1:])
-    for rows, places in parts:
-        whole[places.to(whole.device)] = rows.to(whole.device)
+    for rows, indices in parts:
+        whole[indices.to(whole.device)] = rows.to(whole.device)
     return whole

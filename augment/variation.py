@@ -23,7 +23,7 @@ from renderer.light.presets import directional, load_light
 from renderer.transfer import DEGREE
 
 UNCHANGED = (1.0, 1.0)
-DIRECTIONAL_ANGLE = 70.0  # degrees between camera and directional light, around the mesh and up or down, at most
+DIRECTIONAL_ANGLE = math.radians(70)  # between camera and directional light, around the mesh and up or down, at most
 
 
 @dataclass
@@ -67,13 +67,6 @@ class VariationSettings:
         """Whether views change, which then are rasterized in every regeneration."""
         return self.shift > 0 or tuple(self.scale) != UNCHANGED or self.azimuth > 0 or self.instances
 
-    @property
-    def varies(self) -> bool:
-        """Whether anything is drawn at all."""
-        light = tuple(self.exposure) != UNCHANGED or self.environments or self.directional_fraction > 0
-        views = self.moves or self.backgrounds is not None or self.lit_background
-        return bool(views or light or self.camera.changes)
-
 
 def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
     """The scene with rows drawn anew around its own; the scene itself where nothing varies.
@@ -82,32 +75,33 @@ def vary(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> S
     """
     if settings.moves or settings.backgrounds is not None:
         scene = _with_moved_rows(scene, settings, draws)
-    return _with_other_light(scene, settings, draws) if settings.varies else scene
+    return scene if settings == VariationSettings() else _with_other_light(scene, settings, draws)
 
 
 def _with_moved_rows(scene: Scene, settings: VariationSettings, draws: torch.Generator) -> Scene:
     """The scene with other views, instances and backgrounds."""
-    shifts = settings.shift * (2 * torch.rand(len(scene), 2, generator=draws, dtype=torch.float64) - 1)
+    shifts = _offsets(settings.shift, len(scene), draws)
     scales = _log_uniform(settings.scale, len(scene), draws)
-    angles = _angles(settings.azimuth, len(scene), draws)
-    rows = [
-        _moved(row, right, up, scale, *angle)
-        for row, (right, up), scale, angle in zip(scene.examples, shifts.tolist(), scales, angles, strict=True)
-    ]
-    changed: dict[str, Any] = {}
+    angles = _offsets(math.radians(settings.azimuth), len(scene), draws)
+    rows, changed = list[Example](), dict[str, Any]()
+    for row, (right, up), scale, angle in zip(scene.examples, shifts, scales, angles, strict=True):
+        cameras = []
+        for camera in row.cameras:
+            width = camera.width / scale
+            shift = {"right": camera.right + right * width, "up": camera.up + up * width}
+            cameras.append(replace(_turned(camera, *angle), width=width, **shift))
+        rows.append(replace(row, cameras=tuple(cameras)))
     if settings.backgrounds is not None:
         changed["backgrounds"] = _images(Path(settings.backgrounds), len(scene), scene.settings.size, draws)
         rows = [replace(row, background=index) for index, row in enumerate(rows)]
     if settings.instances:
         views = list(dict.fromkeys((row.object, row.cameras) for row in scene.examples))
         seeds = torch.randint(2**31, (len(views),), generator=draws).tolist()
-        changed["objects"] = [
-            another_instance(scene.objects[index], seed) for (index, _), seed in zip(views, seeds, strict=True)
-        ]
-        number = {view: index for index, view in enumerate(views)}
-        rows = [
-            replace(row, object=number[old.object, old.cameras]) for row, old in zip(rows, scene.examples, strict=True)
-        ]
+        instances = zip(views, seeds, strict=True)
+        changed["objects"] = [another_instance(scene.objects[index], seed) for (index, _), seed in instances]
+        numbers = {view: index for index, view in enumerate(views)}
+        shown = [numbers[row.object, row.cameras] for row in scene.examples]
+        rows = [replace(row, object=number) for row, number in zip(rows, shown, strict=True)]
     if settings.moves:  # views that never come again are not kept on the disk
         changed["operators"] = OperatorCache()
     return replace(scene, examples=rows, **changed)
@@ -124,9 +118,9 @@ def _with_other_light(scene: Scene, settings: VariationSettings, draws: torch.Ge
         changed["lights"] = lights[chosen].to(scene.lights)
     if settings.directional_fraction > 0:
         changed["lights"] = _in_directional_light(changed.get("lights", scene.lights), scene, settings, draws)
-    if settings.camera.changes:
-        effects = draw_camera_effects(settings.camera, len(rows), scene.settings, draws)
-        changed["camera_effects"] = effects.to(scene.lights.device)
+    if settings.camera != CameraEffectSettings():
+        device = scene.lights.device
+        changed["camera_effects"] = draw_camera_effects(settings.camera, len(rows), scene.settings, draws, device)
     varied = replace(scene, examples=rows, **changed)
     return _with_lit_walls(varied) if settings.lit_background else varied
 
@@ -136,19 +130,9 @@ def _log_uniform(limits: Sequence[float], count: int, draws: torch.Generator) ->
     return (low + (high - low) * torch.rand(count, generator=draws, dtype=torch.float64)).exp().tolist()
 
 
-def _angles(most: float, count: int, draws: torch.Generator) -> list[list[float]]:
-    """(count, 2) in radians, uniform; `most` in degrees."""
-    return (math.radians(most) * (2 * torch.rand(count, 2, generator=draws, dtype=torch.float64) - 1)).tolist()
-
-
-def _moved(row: Example, right: float, up: float, scale: float, polar: float, azimuth: float) -> Example:
-    """right, up: fractions of the frame's width, which shows the mesh `scale` times as large; angles in radians."""
-    cameras = []
-    for camera in row.cameras:
-        width = camera.width / scale
-        shift = {"right": camera.right + right * width, "up": camera.up + up * width}
-        cameras.append(replace(_turned(camera, polar, azimuth), width=width, **shift))
-    return replace(row, cameras=tuple(cameras))
+def _offsets(most: float, count: int, draws: torch.Generator) -> list[list[float]]:
+    """(count, 2), uniform in ±most."""
+    return (most * (2 * torch.rand(count, 2, generator=draws, dtype=torch.float64) - 1)).tolist()
 
 
 def _turned(camera: Camera, polar: float, azimuth: float) -> Camera:
@@ -174,7 +158,7 @@ def _in_directional_light(lights: Tensor, scene: Scene, settings: VariationSetti
     fill = low + (high - low) * torch.rand(shape, generator=draws)
     chosen = torch.rand(shape, generator=draws) < settings.directional_fraction
     directionals = []
-    for row, angles in zip(scene.examples, _angles(DIRECTIONAL_ANGLE, len(scene), draws), strict=True):
+    for row, angles in zip(scene.examples, _offsets(DIRECTIONAL_ANGLE, len(scene), draws), strict=True):
         towards = torch.from_numpy(_turned(row.cameras[0], *angles).axes()[2])
         if scene.objects[row.object].ground is not None:
             towards[2].abs_()

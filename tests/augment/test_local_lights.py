@@ -11,7 +11,6 @@ from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import AttackProblem, LampPlaces, LampPowers, Lighting, ProjectorPattern
 from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
-from renderer.cache import OperatorCache
 from renderer.errors import InputError
 from renderer.light.basis import parts_of
 from renderer.rasterizer import choose
@@ -170,7 +169,7 @@ def test_moved_lamps_stay_in_their_norm_ball_and_are_reloaded_where_they_ended(t
 def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator(tmp_path, monkeypatch):
     """Against the operators one by one, with examples left out, repeated and in another order; read from a cache."""
     monkeypatch.setattr(sparse, "SMALL", 0)
-    few = {"projector": ProjectorSettings(pixels=16, power=2.0), "operators": OperatorCache(tmp_path)}
+    few = {"projector": ProjectorSettings(pixels=16, power=2.0), "cache": str(tmp_path)}
     for shown in (scene(**few), scene(**few)):  # built, and read back
         draws = torch.Generator().manual_seed(0)
         rows = torch.tensor([1, 0, 0, 1])

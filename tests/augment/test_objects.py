@@ -31,7 +31,7 @@ def test_a_mesh_with_its_own_colors_refuses_another():
 
 @pytest.mark.parametrize("color", [[1.0, 0.5], [0.0, 0.0, 1.5], [0.0, float("nan"), 0.0]])
 def test_a_color_needs_three_channels_from_0_to_1(plain, color):
-    with pytest.raises(InputError, match=r"plain\.stl: color=.* must be red, green and blue from 0 to 1"):
+    with pytest.raises(InputError, match=r"color=.* must be red, green and blue from 0 to 1"):
         ObjectSettings(plain, "orange", color=color)
 
 

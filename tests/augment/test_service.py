@@ -24,7 +24,7 @@ EPS32 = torch.finfo(torch.float32).eps
 LIGHT = probe("grace")
 CLASSES = {"plate": 0, "table": 2}
 SHORT = TrainingAttackSettings(max_steps=5)
-FRACTIONS = {"attack_success_before", "attack_success", "used_all_steps", "zero_gradient", "clamped"}
+FRACTIONS = {"attack_success_before", "attack_success", "used_all_steps", "zero_gradient"}
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +244,7 @@ def test_both_arms_change_shape_and_albedo_within_their_norm_balls(few, model, a
     assert first.images.shape == (2, 3, 8, 8) and torch.equal(first.images, again.images)
     found, values = first.diagnostics, 3 * max(len(item.mesh.vertices) for item in few[0].objects)
     assert 0 < found["vertices_change"] <= 0.02 * values**0.5 and found["albedo_change"] > 0
-    assert found["light_change"] == 0 and 0 <= found["clamped"] <= 1
+    assert found["light_change"] == 0
     if arm == "adversarial":
         assert found["loss"] > found["loss_before"]
 

@@ -284,7 +284,7 @@ def test_metrics_have_each_epochs_losses_attack_and_seconds_and_the_final_scores
         assert {
             "train/loss", "train/accuracy", "train/learning_rate", "validation/loss", "validation/accuracy",
             "augment/attack_success_before", "augment/attack_success", "augment/steps", "augment/loss_before",
-            "augment/loss", "augment/light_change", "augment/clamped",
+            "augment/loss", "augment/light_change",
             "seconds/attack", "seconds/training", "seconds/evaluation", "seconds/input_output",
         } <= line.keys()  # fmt: skip
     summary = json.loads((finished / "photographs" / "summary.json").read_text())

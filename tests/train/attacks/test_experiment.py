@@ -252,9 +252,9 @@ def test_a_mesh_that_is_none_is_refused_by_its_place(item):
 
 BESIDE = [
     ([{"mesh": "solid:cup"}], r"scene.meshes\[3\].props\[0\].at is not set: give scene.meshes\[3\].props\[0\].at="),
-    ([{"mesh": "solid:cup", "at": [1]}], r"props: solid:cup: at=\[1.0\] must be x and y"),
-    ([{"mesh": "solid:cup", "at": [0, float("nan")]}], "props: solid:cup: at=nan must be at least -10"),
-    ([{"mesh": "solid:cup", "at": [0, 1], "scale": 0}], "props: solid:cup: scale=0.0 must be at least 0.1"),
+    ([{"mesh": "solid:cup", "at": [1]}], r"meshes\[3\].props\[0\].at: at=\[1.0\] must be x and y"),
+    ([{"mesh": "solid:cup", "at": [0, float("nan")]}], r"at=\[0.0, nan\] must be x and y from -10 to 10"),
+    ([{"mesh": "solid:cup", "at": [0, 1], "scale": 0}], "scale=0.0 must be at least 0.1"),
     (
         [{"mesh": "solid:cup", "at": [0, 1], "albedo_scale": 2}],
         r"meshes\[3\].props\[0\].albedo_scale: Key 'albedo_scale' not in",
