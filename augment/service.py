@@ -324,7 +324,8 @@ def choose_attack_examples(
     with as_found(model), torch.no_grad():
         images = [problem.scene.render(conditions, rows)[:, 0] for conditions in (before, after)]
         predictions = [model(side).float().softmax(1) if len(rows) else side.new_zeros(0, 0) for side in images]
-    return AttackExamples(*images, before.light, after.light, *predictions, labels[rows], problem.scene.basis)
+    sides = images[0], images[1], before.light, after.light, predictions[0], predictions[1]
+    return AttackExamples(*sides, labels[rows], problem.scene.basis)
 
 
 def _changes(problem: AttackProblem, values: Tensor) -> dict[str, float]:
