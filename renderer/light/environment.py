@@ -9,7 +9,7 @@ shade with albedo / π where this project leaves out the π: a strength of π gi
 """
 
 import math
-import os
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -61,9 +61,10 @@ def read_map(path: Path) -> Tensor:
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     try:
         texels, names = _read_array(path) if path.suffix.lower() == ".npy" else _read_image(path)
-    except UnicodeDecodeError as error:  # OpenImageIO's own, of a name in the header or of its message about it
-        raise InputError(f"environment map {path} is damaged: its header is not text") from error
-    radiance = texels[..., _color_channels(path, names)]
+        radiance = texels[..., _color_channels(names)]
+    except Exception as error:  # both libraries raise many kinds for a damaged header
+        message = str(error).partition("\n")[0]
+        raise InputError(f"environment map {path} cannot be read: {message}") from error
     if not np.isfinite(radiance).all():
         raise InputError(f"environment map {path} holds NaN or infinity: give a map of finite radiance")
     return torch.from_numpy(radiance)
@@ -96,55 +97,39 @@ def write_map(path: Path, radiance: Tensor) -> None:
     InputError where the suffix is another or the file cannot be written.
     """
     check_map_name(path)
-    suffix = path.suffix.lower()
     radiance = radiance.detach().cpu().float()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if suffix == ".npy":
+        if path.suffix.lower() == ".npy":
             with path.open("wb") as file:  # given a path, NumPy appends .npy to .NPY
                 np.save(file, radiance.numpy())
         else:
-            _write_image(path, _to_rgbe_precision(radiance) if suffix == ".hdr" else radiance)
-    except OSError as error:
+            texels = _to_rgbe_precision(radiance) if path.suffix.lower() == ".hdr" else radiance
+            image = _openimageio().ImageBuf(texels.contiguous().numpy())
+            if not image.write(str(path)):
+                raise OSError(image.geterror())
+    except (OSError, ValueError) as error:  # OpenImageIO takes no name that is not UTF-8
         raise InputError(f"environment map {path} cannot be written: {error}") from error
 
 
-def _read_array(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    try:
-        array = read_numbers(path)
-    except Exception as error:  # Python's parser raises many kinds for a damaged header
-        raise InputError(f"environment map {path} is not a readable .npy file: {_first_line(str(error))}") from error
-    names = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(array.shape[-1] if array.ndim == 3 else 0)
+def _read_array(path: Path) -> tuple[np.ndarray, Sequence[str]]:
+    array = read_numbers(path)
+    names = {1: "Y", 3: "RGB", 4: "RGBA"}.get(array.shape[-1]) if array.ndim == 3 else None
     if names is None:
-        raise InputError(
-            f"environment map {path} has shape {array.shape}: it must be (height, width, channels), 1, 3 or 4 channels"
-        )
+        raise InputError(f"its shape is {array.shape}, give (height, width, channels) with 1, 3 or 4 channels")
     return array, names
 
 
-def _read_image(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    openimageio = _openimageio(path)
-    file = openimageio.ImageInput.open(str(path))
-    if file is None:
-        raise InputError(f"environment map {path} is not a readable image: {_first_line(openimageio.geterror())}")
-    if file.format_name() not in ("hdr", "openexr"):
-        raise InputError(f"environment map {path} is a {file.format_name()} image: give an .hdr or .exr file")
-    spec = file.spec()
-    if spec.roi != spec.roi_full or spec.get_int_attribute("Orientation", 1) != 1:
-        raise InputError(f"environment map {path} is stored cropped or turned: save it whole, its top row first")
-    texels = file.read_image("float")
-    if texels is None:
-        raise InputError(f"environment map {path} is damaged: {_first_line(file.geterror())}")
+def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str]]:
+    image = _openimageio().ImageBuf(str(path))
+    texels, spec = image.get_pixels("float"), image.spec()
+    if image.has_error:
+        raise InputError(image.geterror())
+    if image.file_format_name not in ("hdr", "openexr"):
+        raise InputError(f"it is a {image.file_format_name} image, give an .hdr or .exr file")
+    if spec.roi != spec.roi_full or image.orientation != 1:
+        raise InputError("it is stored cropped or turned, save it whole, its top row first")
     return texels, spec.channelnames
-
-
-def _write_image(path: Path, radiance: Tensor) -> None:
-    openimageio = _openimageio(path)
-    height, width, channels = radiance.shape
-    file = openimageio.ImageOutput.create(str(path))
-    spec = openimageio.ImageSpec(width, height, channels, "float")
-    if not (file.open(str(path), spec) and file.write_image(radiance.contiguous().numpy()) and file.close()):
-        raise OSError(_first_line(file.geterror()))
 
 
 def _to_rgbe_precision(radiance: Tensor) -> Tensor:
@@ -155,7 +140,7 @@ def _to_rgbe_precision(radiance: Tensor) -> Tensor:
     return (radiance / unit).round().clamp(max=255) * unit
 
 
-def _color_channels(path: Path, names: tuple[str, ...]) -> list[int]:
+def _color_channels(names: Sequence[str]) -> list[int]:
     """Indices of red, green and blue, equal for a gray channel."""
     split = [name.casefold().rpartition(".")[::2] for name in names]  # (layer, channel)
     for layer, _ in split:  # the library puts the unnamed layer first
@@ -166,23 +151,15 @@ def _color_channels(path: Path, names: tuple[str, ...]) -> list[int]:
     gray = [index for index, (_, channel) in enumerate(split) if channel not in ("a", "alpha")]
     if len(gray) == 1:
         return gray * 3
-    raise InputError(
-        f"environment map {path} has the channels {', '.join(names)}: it must have R, G and B, or one gray channel"
-    )
+    raise InputError(f"its channels are {', '.join(names)}, give R, G and B, or one gray channel")
 
 
-def _openimageio(path: Path) -> ModuleType:
+def _openimageio() -> ModuleType:
     try:
         import OpenImageIO
     except ImportError as error:
-        raise InputError(f"environment map {path} needs OpenImageIO: pip install openimageio") from error
-    if os.fsencode(path) != str(path).encode(errors="replace"):
-        raise InputError(f"environment map {path} has a name that is not UTF-8, as OpenImageIO needs it: rename it")
+        raise InputError("this needs OpenImageIO: pip install openimageio") from error
     OpenImageIO.attribute("threads", 1)  # no pool of threads beside torch's own
     OpenImageIO.attribute("exr_threads", -1)
     OpenImageIO.attribute("limits:imagesize_MB", LARGEST_MAP)
     return OpenImageIO
-
-
-def _first_line(message: str) -> str:
-    return message.partition("\n")[0]
