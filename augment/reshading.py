@@ -23,8 +23,7 @@ from renderer.rasterizer import Rasterizer
 from renderer.rendering import view_radiance
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
-from renderer.transport.rays import Rays
-from renderer.transport.surface import Surface
+from renderer.transport.rays import Rays, Surface
 
 NEAR = 0.001  # world units: shadows and bounces are computed again once a coordinate has moved farther
 

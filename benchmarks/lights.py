@@ -41,7 +41,7 @@ from renderer.rasterizer import choose
 from renderer.shapes import solid
 from renderer.subdivision import subdivide
 from renderer.transfer import TransferOperator, build_operators
-from renderer.transport import radiosity, rays
+from renderer.transport import precomputed, rays
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
 LIGHT_PATHS = {"direct": {}, "shadows": {"shadows": True}, "bounces:3": {"bounces": 3}}
@@ -92,15 +92,15 @@ def megabytes(built: TransferOperator) -> float:
 
 @contextmanager
 def quadrature(
-    directions: int, patches: int = radiosity.PATCHES, of_patch: int = radiosity.DIRECTIONS
+    directions: int, patches: int = precomputed.PATCHES, of_patch: int = precomputed.PATCH_DIRECTIONS
 ) -> Iterator[None]:
     """Other numbers of rays per pixel, of patches that light bounces between, and of rays per patch."""
-    before = rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS
+    before = rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS
     try:
-        rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS = directions, patches, of_patch
+        rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS = directions, patches, of_patch
         yield
     finally:
-        rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS = before
+        rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS = before
 
 
 # ---------------------------------------------------------------------------- tables

@@ -15,7 +15,7 @@ from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, composite
-from renderer.light.basis import EnvironmentBasis, Harmonics, LocalBasis, SumBasis
+from renderer.light.basis import Harmonics, LocalBasis, SumBasis
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
@@ -23,8 +23,7 @@ from renderer.shading import radiance
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
-from renderer.transport.rays import Rays
-from renderer.transport.surface import Surface
+from renderer.transport.rays import Rays, Surface
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -84,7 +83,7 @@ def render(
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
     smooth_faces = torch.from_numpy(mesh.faces).to(like.device) if normals == "smooth" else None
     moved = replace(mesh, vertices=positions)
-    emitters: list[tuple[EnvironmentBasis | LocalBasis, Tensor]]
+    emitters: list[tuple[Harmonics | LocalBasis, Tensor]]
     emitters = [(basis, values.to(like)) for basis, values in local]
     if light is not None:
         emitters.insert(0, (Harmonics(degree_of(light)), light))
@@ -107,7 +106,7 @@ def view_radiance(
     fragments: Fragments,
     vertices: Tensor,
     albedo: Tensor,
-    lights: Sequence[tuple[EnvironmentBasis | LocalBasis, Tensor]],
+    lights: Sequence[tuple[Harmonics | LocalBasis, Tensor]],
     smooth_faces: Tensor | None,
     in_local_light: Callable[[], LocalLightView],
     indirect: Callable[[Tensor, Tensor], Tensor] | None = None,

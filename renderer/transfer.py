@@ -22,13 +22,12 @@ from renderer.camera import Camera
 from renderer.errors import InputError, as_device, require_bounded
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, composite
-from renderer.light.basis import HARMONICS, Basis, EnvironmentBasis, LocalBasis, parts_of
+from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, parts_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
 from renderer.transport.local import SparseTransfer, joined, local_transfer
 from renderer.transport.precomputed import Transport, build_transport
-from renderer.transport.rays import Rays
-from renderer.transport.surface import Surface
+from renderer.transport.rays import Rays, Surface
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -49,7 +48,7 @@ class TransferOperator:
     coverage: in (0, 1], the fraction of a pixel's samples that the mesh covers.
     pixels: row-major indices of the covered pixels; row 0 is the top of the image.
     nonzero: ascending indices of the coefficients that reach a pixel: of harmonics of degree 6, 31 of the 49
-    under an open sky (`EnvironmentBasis.nonzero`), and all in a view with shadows.
+    under an open sky (`Harmonics.nonzero`), and all in a view with shadows.
     settings: of the image. basis: of the lights.
     sparse: of three channels, added to the dense transfer: that of patterns, most of whose entries are zero; or None.
 
@@ -254,7 +253,7 @@ def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> T
     return by_pixel if (spread <= torch.finfo(dtype).eps * albedo).all() else None
 
 
-def _box_filter(surface: Surface, albedo: Tensor, basis: EnvironmentBasis, dtype: torch.dtype) -> Tensor:
+def _box_filter(surface: Surface, albedo: Tensor, basis: Harmonics, dtype: torch.dtype) -> Tensor:
     """(C, K, P): albedo (S, C) × A_l Y_lm(n), summed over each pixel's samples, by blocks of pixels in float64."""
     fragments, smooth = surface.fragments, surface.smooth_faces is not None
     pixels = len(fragments.pixels)

@@ -14,8 +14,7 @@ from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.harmonics import unit_vectors
 from renderer.light.local import Lamps
 from renderer.mesh import Mesh
-from renderer.transport.rays import Rays
-from renderer.transport.surface import Surface
+from renderer.transport.rays import Rays, Surface
 
 SPARSE = 1 / 16  # fraction of nonzero entries below which multiplying them one by one takes less time,
 SMALL = 2**16  # unless the dense matrix has no more entries than this

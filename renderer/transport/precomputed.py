@@ -1,20 +1,101 @@
 """Shadows and bounces of environment light: precomputed radiance transfer (Sloan, Kautz and Snyder 2002), per pixel.
 
 A pixel's transfer is that under an open sky, in closed form, less the light from directions that the mesh blocks, plus
-the light that the surface there reflects (`renderer.transport.radiosity`).
+the light that the surface there reflects. That is radiosity (Goral et al. 1984), per coefficient of the light: with
+albedo ρ_i, patch i sends the radiance B_i (size,) per unit of each coefficient,
+
+    B_i = ρ_i / π (S_i + Σ_j F_ij B_j),
+
+where S_i is the irradiance from the part of the sky that the patch sees and F_ij the irradiance of i per unit radiance
+of j: the solid angle of j times the cosine, by rays. Both are constants of the shape, so B is linear in the light, and
+N bounces are N − 1 substitutions of B on the right, from B = ρ S / π on. A pixel adds Σ_j F_pixel,j B_j.
+
+A patch is one side of several small faces that lie in one cell of a grid and face the same way, or of a piece of a
+large face. Its S and F are those of a pixel that shows the patch alone, so the code of `rays` serves both.
 """
 
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
 import torch
+from scipy.sparse import csr_matrix, vstack
 from torch import Tensor
 
+from renderer.albedo import surface_albedo
 from renderer.errors import InputError
+from renderer.fragments import Fragments
 from renderer.image import ImageSettings
-from renderer.light.basis import Basis, EnvironmentBasis, LocalBasis, parts_of
+from renderer.light.basis import Basis, Harmonics, LocalBasis, parts_of
 from renderer.mesh import Mesh
+from renderer.subdivision import refine
 from renderer.transport import rays
-from renderer.transport.radiosity import Patches, Radiosity
-from renderer.transport.rays import Rays, sphere
-from renderer.transport.surface import Surface
+from renderer.transport.rays import RayHits, Rays, Surface, sphere
+
+PATCH_DIRECTIONS = 2**9  # over the whole sphere, in which a patch looks
+PATCHES = 2**11  # the mesh's area over that is about the area of a patch
+MIDDLE = [[-1.0, -1.0], [1.0, -1.0], [0.0, 2.0]]  # a triangle around the only sample of an image
+
+
+@dataclass(frozen=True)
+class Patches:
+    """N patches of a mesh's F pieces. view: a pixel for each patch, with the centers of its pieces as samples (S,).
+
+    fractions: (S, 1), of a piece in the area of its patch. of_side: (2, F), the patches of each piece's front and back.
+    """
+
+    pieces: Mesh
+    view: Fragments
+    fractions: Tensor
+    of_side: Tensor
+
+    @staticmethod
+    def of(mesh: Mesh) -> "Patches":
+        area = float(mesh.face_areas().sum()) / PATCHES
+        pieces = refine(mesh, area)
+        count, sides = len(pieces.faces), [1.0] if pieces.closed else [1.0, -1.0]
+        facing, faces = np.repeat(sides, count)[:, None], np.tile(np.arange(count), len(sides))
+        middles = pieces.vertices[pieces.faces].mean(axis=1)[faces]
+        alike = np.hstack([np.floor(middles / math.sqrt(area)), np.rint(pieces.face_normals()[faces]), facing])
+        patch = np.unique(alike, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0.0 gives it a second axis
+        order = np.argsort(patch, kind="stable")
+        pixel, piece = torch.from_numpy(patch[order]), torch.from_numpy(faces[order])
+        areas = torch.from_numpy(pieces.face_areas())[piece]
+        totals = areas.new_zeros(int(pixel[-1]) + 1).index_add_(0, pixel, areas)
+        view = Fragments(
+            size=1,
+            samples=1,
+            pixels=torch.arange(len(totals)),
+            coverage=torch.ones_like(totals),
+            faces=piece,
+            corners=torch.from_numpy(pieces.faces)[piece],
+            facing=torch.from_numpy(facing[order]),
+            outlines=areas.new_tensor(MIDDLE).expand(len(piece), 3, 2),
+            pixel=pixel,
+            face=torch.arange(len(piece)),
+            sample=torch.zeros_like(piece),
+        )
+        fractions = areas / totals.clamp(min=torch.finfo(areas.dtype).tiny)[pixel]
+        of_side = torch.from_numpy(patch).view(len(sides), -1).expand(2, -1)
+        return Patches(pieces, view, fractions[:, None], of_side)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """(N, D) of values (S, D) at the samples."""
+        summed = values.new_zeros(len(self.view.pixels), values.shape[1])
+        return summed.index_add_(0, self.view.pixel, values * self.fractions)
+
+    def weights_by_patch(self, hits: RayHits, weights: Tensor) -> csr_matrix:
+        """(B, N) sums of the weights (B, D) of directions over the patch that is hit there."""
+        pixel, direction = torch.nonzero(weights, as_tuple=True)
+        face = hits.face[pixel, direction]
+        behind = (self._normals[face] * hits.directions[direction]).sum(1) > 0
+        entries = pixel.numpy(), self.of_side[behind.long(), face].numpy()
+        return csr_matrix((weights[pixel, direction].numpy(), entries), (len(weights), len(self.view.pixels)))
+
+    @cached_property
+    def _normals(self) -> Tensor:
+        return torch.from_numpy(self.pieces.face_normals())
 
 
 class Transport:
@@ -23,14 +104,16 @@ class Transport:
     colors: whether bounced light has another color than the sky's. rays: among the mesh's faces.
     """
 
-    def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: EnvironmentBasis):
+    def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Harmonics):
         """albedo_scale: of the surfaces that light bounces off."""
-        patches = Patches.of(mesh) if settings.bounces else None
-        self.rays = Rays(patches.pieces if patches else mesh)
-        self._radiosity = Radiosity(patches, self.rays, settings, albedo_scale, basis) if patches else None
+        self._patches = Patches.of(mesh) if settings.bounces else None
+        self.rays = Rays(self._patches.pieces if self._patches else mesh)
         self._directions = sphere(rays.DIRECTIONS)
         self._sky = basis.radiance(self._directions)
-        self.colors = self._radiosity is not None and self._radiosity.colors
+        self.colors = False
+        if self._patches:
+            self._sent = _radiosity(self._patches, self.rays, settings, albedo_scale, basis)
+            self.colors = self._sent.shape[2] > 1
 
     def change(self, surface: Surface, albedo: Tensor) -> Tensor | None:
         """(C, size, P) float64: the change of the radiance of a view's pixels per unit coefficient, weighted with
@@ -46,8 +129,10 @@ class Transport:
             for channel, (added, weight) in enumerate(zip(change, weights, strict=True)):
                 blocked = hits.weight * weight[hits.sample]
                 added[:, hits.pixels] = -(blocked @ self._sky).T
-                if self._radiosity is not None:
-                    added[:, hits.pixels] += self._radiosity.gather(hits, blocked, channel).T
+                if self._patches:
+                    sent = self._sent[..., channel if self.colors else 0].numpy()
+                    received = self._patches.weights_by_patch(hits, blocked) @ sent
+                    added[:, hits.pixels] += torch.from_numpy(received).T
         return change
 
     def radiance(self, surface: Surface, albedo: Tensor, light: Tensor) -> Tensor:
@@ -68,3 +153,33 @@ def build_transport(mesh: Mesh, settings: ImageSettings, albedo_scale: float, ba
     if not environment or not settings.global_illumination:
         return None
     return Transport(mesh, settings, albedo_scale, environment[0])
+
+
+def _radiosity(patches: Patches, rays: Rays, settings: ImageSettings, albedo_scale: float, basis: Harmonics) -> Tensor:
+    """B (N, size, 3), or (N, size, 1) where all patches are gray. rays: among the patches' pieces."""
+    albedo = patches.mean(surface_albedo(patches.pieces, patches.view, settings.encoding)) * albedo_scale
+    colors = bool((albedo != albedo[:, :1]).any())
+    reflected = albedo[:, None, : 3 if colors else 1] / math.pi
+    from_sky, receiving, links = _first_bounce(patches, rays, basis)
+    sent = from_sky * reflected
+    for _ in range(settings.bounces - 1):
+        arriving = torch.from_numpy(links @ sent.flatten(1).numpy()).view(-1, *sent.shape[1:])
+        sent = from_sky.expand_as(sent).index_add(0, receiving, arriving) * reflected
+    return sent
+
+
+def _first_bounce(patches: Patches, rays: Rays, basis: Harmonics) -> tuple[Tensor, Tensor, csr_matrix]:
+    """S (N, size, 1), the irradiance of the patches from the sky; the M patches that see others; their F (M, N)."""
+    surface = Surface(patches.view, torch.from_numpy(patches.pieces.vertices))
+    from_sky = surface.planes.new_zeros(len(patches.view.pixels), basis.size)
+    from_sky[:, basis.nonzero] = patches.mean(basis.irradiance(surface.planes))
+    directions = sphere(PATCH_DIRECTIONS)
+    receiving, links, radiance = [], [], basis.radiance(directions)
+    for hits in rays.hits(surface, directions):
+        weights = hits.weight * patches.fractions[hits.sample, 0]
+        from_sky[hits.pixels] -= weights @ radiance
+        receiving.append(hits.pixels)
+        links.append(patches.weights_by_patch(hits, weights))
+    if not links:
+        return from_sky[..., None], torch.arange(0), csr_matrix((0, len(from_sky)))
+    return from_sky[..., None], torch.cat(receiving), vstack(links, format="csr")

@@ -1,4 +1,4 @@
-"""Rays from a view's samples among the faces of a mesh, cast by Embree (Wald et al. 2014).
+"""The surface at a view's samples, and rays from there among the faces of a mesh, cast by Embree (Wald et al. 2014).
 
 All pixels use the same directions and divide them among their samples: so edges of shadow, of albedo and of the mesh
 are averaged alike, and the cost of a pixel does not depend on its number of samples. Pixels that can see no other
@@ -10,16 +10,19 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from renderer.errors import InputError
-from renderer.light.harmonics import per_degree
+from renderer.fragments import Fragments
+from renderer.image import ImageSettings
+from renderer.light.harmonics import per_degree, unit
 from renderer.mesh import Mesh
-from renderer.transport.surface import Surface
+from renderer.normals import face_normals
+from renderer.shading import smooth_normals
 
 DIRECTIONS = 512  # over the whole sphere; a flat pixel casts rays in half of them
 OFFSET = 1e-5  # of the mesh's extent: rays start so far above the surface, since Embree computes in float32
@@ -28,7 +31,47 @@ BLOCK = 2**17  # directions of pixels at a time: bounds the memory
 
 
 @dataclass(frozen=True)
-class RayHits:
+class Surface:
+    """Points and normals at the S samples of a view, in float64, as they are needed; differentiable in vertices (V, 3).
+
+    smooth_faces: (F, 3), all faces of the mesh, to shade with interpolated vertex normals.
+    """
+
+    fragments: Fragments
+    vertices: Tensor
+    smooth_faces: Tensor | None = None
+
+    @staticmethod
+    def of(mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None) -> "Surface":
+        """vertices: (V, 3), in place of the mesh's."""
+        smooth_faces = torch.from_numpy(mesh.faces) if settings.normals == "smooth" else None
+        vertices = torch.from_numpy(mesh.vertices) if vertices is None else vertices
+        return Surface(fragments, vertices.double(), smooth_faces)
+
+    @cached_property
+    def planes(self) -> Tensor:
+        """(S, 3) unit normals of their faces, on the side that the camera sees."""
+        return self.face_planes[self.fragments.face]
+
+    @cached_property
+    def face_planes(self) -> Tensor:
+        """(G, 3) the same of each visible face."""
+        return face_normals(self.vertices, self.fragments.corners) * self.fragments.facing
+
+    @cached_property
+    def normals(self) -> Tensor:
+        """(S, 3) unit normals to shade with."""
+        if self.smooth_faces is None:
+            return self.planes
+        return unit(smooth_normals(self.fragments, self.vertices, self.smooth_faces).T).T
+
+    @cached_property
+    def points(self) -> Tensor:
+        """(S, 3)"""
+        return self.fragments.interpolate(self.vertices[self.fragments.corners])
+
+
+class RayHits(NamedTuple):
     """The faces of the mesh that B of a view's pixels see in D directions; sample, weight, face: (B, D).
 
     pixels: (B,), indices among the view's. directions: (D, 3). sample: from which the ray starts. weight: of the
@@ -72,9 +115,8 @@ class Rays:
             cosine = torch.einsum("bdi,di->bd", normals[sample], directions).clamp(min=0)
             above = torch.einsum("bdi,di->bd", planes[sample], directions)
             cast = torch.nonzero((cosine > 0) & (above > 0), as_tuple=True)
-            face = self.first_hit(
-                surface.points[sample[cast]] + self.offset * planes[sample[cast]], directions[cast[1]]
-            )
+            start = sample[cast]
+            face = self.first_hit(surface.points[start] + self.offset * planes[start], directions[cast[1]])
             face = torch.full_like(sample, -1).index_put_(cast, face)
             weight = (cosine * of_pixel * solid_angle).masked_fill(face < 0, 0)
             yield RayHits(some, directions, sample, weight, face)

@@ -13,7 +13,7 @@ from renderer.errors import InputError
 from renderer.io.mitsuba import DIFFERENTIABLE, mitsuba
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
-from renderer.transport import radiosity, rays
+from renderer.transport import precomputed, rays
 
 
 def test_calls_take_turns_in_every_round(monkeypatch):
@@ -66,7 +66,7 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
     bases = {name: lights.BASES[name] for name in ("harmonics", "3 lamps")}
     for name, value in {"BASES": bases, "VIEWS": 1, "REFERENCE": 8, "CONVERGED": (2**10, 64, 64)}.items():
         monkeypatch.setattr(lights, name, value)
-    monkeypatch.setattr(radiosity, "PATCHES", 64)
+    monkeypatch.setattr(precomputed, "PATCHES", 64)
     path = tmp_path / "lights.csv"
     lights.main(["--csv", str(path), "--sizes", "12", "--vertices", "0", "--rounds", "1"])
     rows = read(path)
@@ -76,11 +76,11 @@ def test_cost_and_accuracy_of_lights(tmp_path, monkeypatch):
 
 
 def test_another_number_of_rays_is_undone():
-    before = rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS
+    before = rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS
     with pytest.raises(InputError), lights.quadrature(32, 16, 8):
-        assert (rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS) == (32, 16, 8)
+        assert (rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS) == (32, 16, 8)
         raise InputError("anything")
-    assert before == (rays.DIRECTIONS, radiosity.PATCHES, radiosity.DIRECTIONS)
+    assert before == (rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS)
 
 
 def test_mitsubas_image_is_in_the_place_of_ours(monkeypatch):

@@ -17,7 +17,7 @@ from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
-from renderer.transport.surface import Surface
+from renderer.transport.rays import Surface
 
 EPS = np.finfo(np.float64).eps
 CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)

@@ -23,8 +23,7 @@ from renderer.rasterizer import choose
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import local as sparse
 from renderer.transport.local import local_radiance, unoccluded
-from renderer.transport.rays import Rays
-from renderer.transport.surface import Surface
+from renderer.transport.rays import Rays, Surface
 
 CAMERA = OrthographicCamera(0.9, 0.4, 2.2)
 PROJECTOR = Projector(pixels=7, polar=0.5, azimuth=1.6, distance=3.0, fov=math.radians(35))

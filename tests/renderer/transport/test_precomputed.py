@@ -22,7 +22,7 @@ from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.rendering import precompute_transfer, render
 from renderer.transfer import TransferOperator, build_operators
-from renderer.transport import radiosity, rays
+from renderer.transport import precomputed, rays
 from renderer.transport.rays import DIRECTIONS, sphere
 
 RASTERIZER = choose("numpy")
@@ -93,7 +93,7 @@ def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monke
 
 @pytest.mark.parametrize("bounces", [0, 1])
 def test_a_mesh_outside_the_image_has_no_pixels_and_faces_without_area_do_no_harm(bounces, monkeypatch):
-    monkeypatch.setattr(radiosity, "PATCHES", 2**7)
+    monkeypatch.setattr(precomputed, "PATCHES", 2**7)
     outside = OrthographicCamera(0, 0, 1.0, right=20.0)
     assert not operator_of(dented(), outside, bounces=bounces).transfer.numel()
     thin = replace(hard.heap(), faces=np.concatenate([hard.heap().faces[:-1], [[0, 0, 1]]]))
@@ -159,7 +159,7 @@ def test_the_sky_over_the_middle_of_a_pit_has_a_squares_configuration_factor(dep
 def test_a_white_mesh_in_a_white_furnace_brightens_with_bounces_to_the_sky(mesh, tolerance, samples, monkeypatch):
     """No pixel is brighter than under an open sky or darker than black: what is lost is a sum over directions, what is
     there a closed form. As a white mesh absorbs no light, it becomes as bright as the sky, in a deep pit slowly."""
-    monkeypatch.setattr(radiosity, "PATCHES", 2**7)
+    monkeypatch.setattr(precomputed, "PATCHES", 2**7)
     white = replace(mesh, corner_colors=np.ones_like(mesh.corner_colors))
     before = sky_fraction(operator_of(white, size=12, samples=samples))
     assert before.min() >= -QUADRATURE and before.min() < 0.96
