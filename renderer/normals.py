@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from renderer.errors import require_choice, require_finite
 from renderer.image import NORMALS
-from renderer.light.harmonics import unit_vectors
+from renderer.light.harmonics import unit
 from renderer.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -60,11 +60,6 @@ def corner_normals(mesh: Mesh, normals: str, crease: float = -2.0) -> np.ndarray
     return np.where(flat.any(axis=-1, keepdims=True), flat, [0.0, 0.0, 1.0])
 
 
-def unit(vectors: Tensor) -> Tensor:
-    """Vectors (3, N) at unit length; a zero vector stays zero, with a gradient of zero."""
-    return _Unit.apply(vectors)
-
-
 def area_vectors(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float64[Tensor, "3 F"]:
     """Normals with the faces' areas as their lengths, up to one factor for all of them.
 
@@ -98,21 +93,6 @@ class _AreaVectors(torch.autograd.Function):
         corners = torch.cat([-by_second - by_third, by_second, by_third], dim=1)
         gradient = upstream.new_zeros(shape[::-1]).index_add_(1, faces.T.flatten(), corners)
         return (gradient / scale).T.to(dtype), None
-
-
-class _Unit(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, vectors: Tensor) -> Tensor:
-        unit, length = unit_vectors(vectors)
-        ctx.save_for_backward(unit, length)
-        return unit
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> Tensor:
-        unit, length = ctx.saved_tensors
-        tangential = upstream - unit * (unit * upstream).sum(0)
-        return tangential / length.masked_fill(length == 0, torch.inf)
 
 
 def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:

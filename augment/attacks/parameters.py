@@ -14,7 +14,7 @@ from torch.nn.utils.rnn import pad_sequence
 from augment.attacks.norm_ball import StepSettings, anywhere
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
-from renderer.light.basis import EnvironmentBasis, LocalBasis, parts_of
+from renderer.light.basis import Harmonics, LocalBasis, parts_of
 from renderer.light.convex import Ball, nearest_in_box
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import mean_luminance
@@ -100,7 +100,7 @@ class OfLight(Parameter):
         scene: Scene,
         settings: StepSettings,
         where: slice,
-        basis: EnvironmentBasis | LocalBasis,
+        basis: Harmonics | LocalBasis,
         nonnegative: bool,
     ):
         """where: the coefficients of the basis among the scene's."""

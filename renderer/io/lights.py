@@ -10,11 +10,11 @@ from torch import Tensor
 
 from renderer.errors import FACTOR, InputError, require_bounded, require_file
 from renderer.image import to_bytes
-from renderer.light.basis import HARMONICS, EnvironmentBasis, LocalBasis
+from renderer.light.basis import HARMONICS, Harmonics, LocalBasis
 from renderer.light.local import Projector
 
 
-def save_light(path: Path, coefficients: Tensor, basis: EnvironmentBasis | LocalBasis = HARMONICS) -> None:
+def save_light(path: Path, coefficients: Tensor, basis: Harmonics | LocalBasis = HARMONICS) -> None:
     """Write a basis and coefficients (size, 3), a row [r, g, b] each, as JSON; and a projector's pattern as a .png of
     eight bits beside it, in which white is its power.
 

@@ -26,7 +26,7 @@ from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import ImageSettings, decode
 from renderer.io.texture_bake import with_added_albedo
-from renderer.light.basis import EnvironmentBasis, LocalBasis
+from renderer.light.basis import Harmonics, LocalBasis
 from renderer.light.environment import light_radiance, write_map
 from renderer.light.harmonics import equirectangular
 from renderer.light.local import Lamps, Projector
@@ -227,7 +227,7 @@ def write_mitsuba_scene(
     cameras: Sequence[Camera],
     settings: ImageSettings,
     light: str,
-    placed: Sequence[tuple[EnvironmentBasis | LocalBasis, torch.Tensor]] = (),
+    placed: Sequence[tuple[Harmonics | LocalBasis, torch.Tensor]] = (),
 ) -> None:
     """Write a folder whose scene.xml shows a mesh to each camera, a sensor each. light: the map's file, as seen from
     there. placed: projectors and lamps, with their coefficients."""
@@ -265,7 +265,7 @@ def _append(parent: xml.Element, name: str, value: Any) -> None:
 
 
 def _emitters(
-    folder: Path, basis: EnvironmentBasis | LocalBasis, coefficients: torch.Tensor, albedo_scale: float
+    folder: Path, basis: Harmonics | LocalBasis, coefficients: torch.Tensor, albedo_scale: float
 ) -> Iterator[Scene]:
     """Lamps, or a projector, whose radiance is over π already.
 

@@ -1,7 +1,7 @@
 """Bases of light. An image is linear in the coefficients of a light of fixed position, so each basis has operators.
 
-A new basis is a frozen dataclass of `EnvironmentBasis` (as `Harmonics` below) or of `LocalBasis` (as
-`light.local.Lamps`); it needs no registration: whatever takes a light's basis takes it.
+A new basis of lights in the scene is a frozen dataclass of `LocalBasis` (as `light.local.Lamps`); it needs no
+registration.
 """
 
 from abc import ABC, abstractmethod
@@ -17,43 +17,54 @@ from renderer.light.convex import Ball, nearest_in_box
 from renderer.light.harmonics import MAX_DEGREE, basis, irradiance_basis, nonzero_coefficients
 
 
-class LightBasis(ABC):
-    """`size` functions of light; a light is a coefficient (size, 3) of each, RGB. Equal ones have equal fields.
+@dataclass(frozen=True)
+class Harmonics:
+    """Environment light as real spherical harmonics: from infinitely far away, the same at each point of a scene.
 
-    name: in files and messages. allow_negative: whether negative light may be asked for.
+    `size` functions, of which a light has a coefficient (size, 3) each, RGB. name: in files and messages.
+    allow_negative: any coefficients render, negative radiance included (the paper's), though only light exists whose
+    radiance is nowhere negative. InputError: a degree beyond 20.
     """
 
-    name: ClassVar[str]
-    allow_negative: ClassVar[bool] = False
+    degree: int = 6
+
+    name: ClassVar[str] = "harmonics"
+    allow_negative: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        require_range("the degree of harmonics", self.degree, 0, MAX_DEGREE)
+
+    def __str__(self) -> str:
+        return f"{self.name} of degree {self.degree}"
 
     @property
-    @abstractmethod
     def size(self) -> int:
-        """How many functions there are."""
+        return (self.degree + 1) ** 2
 
-    @abstractmethod
+    @property
+    def nonzero(self) -> Tensor:
+        """(K,) ascending indices of the functions that reach a diffuse surface under an open sky."""
+        return nonzero_coefficients(self.degree)
+
+    def irradiance(self, normals: Tensor) -> Tensor:
+        """(N, K) at unit normals (N, 3), per unit of each nonzero coefficient."""
+        return irradiance_basis(normals, self.degree)
+
+    def radiance(self, directions: Tensor) -> Tensor:
+        """(N, size) from unit directions (N, 3), per unit of each coefficient."""
+        return basis(directions, self.degree)
+
     def project_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
         """The nearest coefficients (..., size, 3) of light that can be emitted.
 
         within: for coefficients (A, size, 3), a ball in which the result lies; its centers can be emitted.
         """
+        from renderer.light.nonnegative import project_nonnegative  # scipy's optimizers take long to import
+
+        return project_nonnegative(coefficients, within)
 
 
-class EnvironmentBasis(LightBasis):
-    """Light from infinitely far away, the same at each point of a scene."""
-
-    @property
-    @abstractmethod
-    def nonzero(self) -> Tensor:
-        """(K,) ascending indices of the functions that reach a diffuse surface under an open sky."""
-
-    @abstractmethod
-    def irradiance(self, normals: Tensor) -> Tensor:
-        """(N, K) at unit normals (N, 3), per unit of each nonzero coefficient."""
-
-    @abstractmethod
-    def radiance(self, directions: Tensor) -> Tensor:
-        """(N, size) from unit directions (N, 3), per unit of each coefficient."""
+HARMONICS = Harmonics()
 
 
 class LightPaths(NamedTuple):
@@ -67,12 +78,20 @@ class LightPaths(NamedTuple):
     irradiance: Tensor
 
 
-class LocalBasis(LightBasis):
-    """Light from sources within the scene, which casts shadows. Coefficients are in [0, power]."""
+class LocalBasis(ABC):
+    """Light from sources within the scene, which casts shadows. Coefficients (size, 3) are in [0, power]."""
 
+    name: ClassVar[str]
+    allow_negative: ClassVar[bool] = False
     power: float
 
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """How many functions there are."""
+
     def project_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
+        """As `Harmonics.project_nonnegative`."""
         return nearest_in_box(coefficients, 0, self.power, within)
 
     @abstractmethod
@@ -84,7 +103,7 @@ class LocalBasis(LightBasis):
 class SumBasis:
     """Lights of several bases at once: the coefficients of one after the other."""
 
-    parts: tuple[EnvironmentBasis | LocalBasis, ...]
+    parts: tuple[Harmonics | LocalBasis, ...]
 
     def __str__(self) -> str:
         return " and ".join(map(str, self.parts))
@@ -99,55 +118,16 @@ class SumBasis:
         return torch.cat(projected, dim=-2)
 
 
-Basis = EnvironmentBasis | LocalBasis | SumBasis
+Basis = Harmonics | LocalBasis | SumBasis
 
 
-def parts_of(basis: Basis) -> list[tuple[slice, EnvironmentBasis | LocalBasis]]:
+def parts_of(basis: Basis) -> list[tuple[slice, Harmonics | LocalBasis]]:
     """(rows of coefficients, basis) of each part of a sum, or of the basis itself."""
     parts, first = [], 0
     for part in basis.parts if isinstance(basis, SumBasis) else (basis,):
         parts.append((slice(first, first + part.size), part))
         first += part.size
     return parts
-
-
-@dataclass(frozen=True)
-class Harmonics(EnvironmentBasis):
-    """Environment light as real spherical harmonics. Any coefficients render, negative radiance included (the paper's);
-    only such exist whose radiance is nowhere negative."""
-
-    degree: int = 6
-
-    name = "harmonics"
-    allow_negative = True
-
-    def __post_init__(self) -> None:
-        require_range("the degree of harmonics", self.degree, 0, MAX_DEGREE)
-
-    def __str__(self) -> str:
-        return f"{self.name} of degree {self.degree}"
-
-    @property
-    def size(self) -> int:
-        return (self.degree + 1) ** 2
-
-    @property
-    def nonzero(self) -> Tensor:
-        return nonzero_coefficients(self.degree)
-
-    def irradiance(self, normals: Tensor) -> Tensor:
-        return irradiance_basis(normals, self.degree)
-
-    def radiance(self, directions: Tensor) -> Tensor:
-        return basis(directions, self.degree)
-
-    def project_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
-        from renderer.light.nonnegative import project_nonnegative  # scipy's optimizers take long to import
-
-        return project_nonnegative(coefficients, within)
-
-
-HARMONICS = Harmonics()
 
 
 def with_local_lights(sky: Tensor, lights: Sequence[tuple[LocalBasis, Tensor]]) -> tuple[Basis, Tensor]:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_SECANTS = 20  # four are usual; what they end with is within the ball, at most that much short of the nearest
+_STEPS = 20  # four are usual; after fewer than needed the result is within the ball, but not at its surface
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Ball:
     norm: str
 
     def unflatten(self, *shape: int) -> Ball:
-        """That of values (A, *shape), of one of values (A, D)."""
+        """The ball of values (A, *shape), of a ball of values (A, D)."""
         return Ball(self.center.unflatten(1, shape), self.radius, self.norm)
 
     @property
@@ -42,35 +42,21 @@ def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = No
 
 
 def _nearest_in_box_and_sphere(values: Tensor, low: Any, high: Any, ball: Ball) -> Tensor:
-    """The box's nearest points to points on the way from the center to the values, as far as the radius goes.
+    """With a multiplier λ for the ball, the nearest point is the box's nearest to c + (v - c) / (1 + λ).
 
-    With a multiplier λ for the ball, what is nearest to values v is the box's nearest to c + (v - c) / (1 + λ), and
-    the farther on the way, the farther from the center. How far is found by secants of the squared distance over the
-    squared fraction of the way, which is straight between the corners that the box cuts off.
+    Its squared distance from the center c is a concave and piecewise linear function of s = 1 / (1 + λ)². From s = 0
+    on, Newton's steps therefore end where the distance is the radius, without going beyond.
     """
     offset, squared = values - ball.center, ball.radius**2
-
-    def at(fraction: Tensor) -> tuple[Tensor, Tensor]:
-        nearest = torch.where(fraction < 1, ball.center + fraction.sqrt() * offset, values).clamp(low, high)
-        return nearest, _square(nearest - ball.center)
-
-    fraction = (squared / _square(offset)).clamp(max=1)  # a box's nearest points are no farther
-    nearest, distance = at(fraction)
-    other, other_distance = torch.zeros_like(fraction), torch.zeros_like(distance)
-    rounding = 8 * torch.finfo(values.dtype).eps * squared
-    for _ in range(_SECANTS):
-        left = squared - distance
-        going = (fraction < 1) & (fraction != other) & (left > rounding)
-        if not going.any():
+    fraction, slope, distance = offset.new_zeros(()), _square(offset), offset.new_zeros(())
+    for _ in range(_STEPS):
+        step = (squared - distance) / slope.clamp(min=torch.finfo(values.dtype).tiny)
+        fraction = (fraction + step.clamp(min=0)).clamp(max=1)
+        target = torch.where(fraction < 1, ball.center + fraction.sqrt() * offset, values)
+        nearest = target.clamp(low, high)
+        slope, distance = _square(offset * (nearest == target)), _square(nearest - ball.center)
+        if not ((fraction < 1) & (squared - distance > 8 * torch.finfo(values.dtype).eps * squared)).any():
             break
-        slope = ((distance - other_distance) / (fraction - other)).clamp(min=torch.finfo(values.dtype).tiny)
-        trial = torch.where(going, fraction + left / slope, fraction).clamp(max=1)
-        candidate, trial_distance = at(trial)
-        inside = trial_distance <= squared + rounding
-        other = torch.where(inside, fraction, trial)
-        other_distance = torch.where(inside, distance, trial_distance)
-        fraction, distance = torch.where(inside, trial, fraction), torch.where(inside, trial_distance, distance)
-        nearest = torch.where(inside, candidate, nearest)
     return nearest
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from renderer.errors import InputError, require_finite, require_range
 
@@ -43,61 +44,48 @@ def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
 
 
 def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch coefficients"]:
-    """Real spherical harmonics of directions. Differentiable, by `basis_gradient`.
+    """Real spherical harmonics of directions; differentiable once. (degree + 1)² values each, in the same dtype.
 
     directions: finite and of any length, since only the direction counts; a zero vector, which has none, gives finite
-    values and a gradient of zero.
-    Returns (degree + 1)² values each in the same dtype, computed in float64 and rounded once. InputError: NaN.
+    values and a gradient of zero. Computed in float64. InputError: NaN, a degree out of range.
     Source: the Legendre recurrences of the paper's appendix B.1 with sin^m θ taken out of P_l^m and put into
     Re and Im of (x + iy)^m.
     """
     require_range("degree", degree, 0, MAX_DEGREE)
     require_finite(directions=directions)
-    return _Basis.apply(directions, degree)
+    rows = select_rows(unit(directions.double().movedim(-1, 0)), range((degree + 1) ** 2))
+    return torch.stack(rows, dim=-1).to(directions.dtype)
 
 
-def basis_gradient(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch coefficients 3"]:
-    """∂Y/∂n for vectors n of any length: tangent to the sphere, as in the paper's appendix D, divided by |n|; finite at
-    the poles, zero for a zero vector.
+def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """(unit vectors (3, ...), lengths (...)) of vectors (3, ...); a zero vector stays zero.
 
-    Source: r^l Y_lm is a polynomial whose derivatives lie in band l - 1 (`gradient_matrices`); the radial part,
-    l Y_lm n, is taken off.
+    Nothing under- or overflows on the way. Components come first, since rows are what a processor adds fastest.
     """
-    require_range("degree", degree, 0, MAX_DEGREE)
-    require_finite(directions=directions)
-    tangential, length = _tangential_gradient(directions, degree)
-    return _over(tangential, length[..., None, None], directions.dtype)
+    largest = vectors.abs().amax(0)
+    scaled = vectors / largest.masked_fill(largest == 0, 1)
+    norm = scaled.square().sum(0).sqrt()  # at least 1, unless the vector is zero
+    return scaled / norm.clamp(min=1), norm * largest
 
 
-def _tangential_gradient(directions: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """(∂Y/∂n at |n| = 1 (..., (degree + 1)², 3), the lengths (...)), float64."""
-    unit, length = unit_vectors(directions.double().movedim(-1, 0))
-    values = torch.stack(select_rows(unit, range((degree + 1) ** 2)), dim=-1)
-    solid = torch.einsum("...j,djk->...kd", values, gradient_matrices(degree).to(values))
-    radial = (values * bands(degree).to(values))[..., None] * unit.movedim(0, -1)[..., None, :]
-    return solid - radial, length
+def unit(vectors: Tensor) -> Tensor:
+    """Vectors (3, ...) at unit length; a zero vector stays zero, with a gradient of zero. Differentiable once."""
+    return _Unit.apply(vectors)
 
 
-def _over(gradient: Tensor, length: Tensor, dtype: torch.dtype) -> Tensor:
-    """A gradient divided by a length: zero at length zero, and the dtype's largest number where it would overflow."""
-    largest = torch.finfo(dtype).max
-    return (gradient / torch.where(length > 0, length, torch.inf)).clamp(-largest, largest).to(dtype)
-
-
-class _Basis(torch.autograd.Function):
+class _Unit(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, directions: Tensor, degree: int) -> Tensor:
-        ctx.save_for_backward(directions)
-        ctx.degree = degree
-        unit, _ = unit_vectors(directions.double().movedim(-1, 0))
-        return torch.stack(select_rows(unit, range((degree + 1) ** 2)), dim=-1).to(directions.dtype)
+    def forward(ctx: Any, vectors: Tensor) -> Tensor:
+        unit, length = unit_vectors(vectors)
+        ctx.save_for_backward(unit, length)
+        return unit
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        (directions,) = ctx.saved_tensors
-        tangential, length = _tangential_gradient(directions, ctx.degree)
-        summed = torch.einsum("...k,...kd->...d", upstream.double(), tangential)
-        return _over(summed, length[..., None], directions.dtype), None
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> Tensor:
+        unit, length = ctx.saved_tensors
+        tangential = upstream - unit * (unit * upstream).sum(0)
+        return tangential / length.masked_fill(length == 0, torch.inf)
 
 
 def select_rows(unit: Tensor, indices: Iterable[int]) -> list[Tensor]:
@@ -194,17 +182,6 @@ def monomials(vectors: Tensor, degree: int) -> Tensor:
         torch.mul(before[count - power :], y, out=products[count:-1])  # those without x
         torch.mul(before[-1], z, out=products[-1])
     return products
-
-
-def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """(unit vectors (3, ...), lengths (...)) of vectors (3, ...); a zero vector stays zero.
-
-    Nothing under- or overflows on the way. Components come first, since rows are what a processor adds fastest.
-    """
-    largest = vectors.abs().amax(0)
-    scaled = vectors / largest.masked_fill(largest == 0, 1)
-    norm = scaled.square().sum(0).sqrt()  # at least 1, unless the vector is zero
-    return scaled / norm.clamp(min=1), norm * largest
 
 
 @per_degree

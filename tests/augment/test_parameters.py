@@ -32,7 +32,7 @@ from renderer.light.environment import read_map, to_map, write_map
 from renderer.light.harmonics import project
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
-from renderer.light.skylight import TURBIDITY, ZENITH, coefficients_by_quadrature
+from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
 from renderer.transfer import DEGREE
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -68,9 +68,9 @@ def test_a_kind_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scen
     if name == "skylight":
         light = conditions.light[0]
         assert mean_luminance(light) == pytest.approx(mean_luminance(scene.lights[0]), rel=1e-6)
-        expected = coefficients_by_quadrature(*SKY)
+        expected = coefficients(*SKY)
         expected *= mean_luminance(scene.lights[0]) / mean_luminance(expected)
-        assert (light - expected).norm() < 1e-4 * expected.norm()  # the error of the fit, see `renderer.light.skylight`
+        assert (light - expected).norm() < 1e-6 * expected.norm()
     else:
         images = scene.render(scene.conditions(EVERY), EVERY)
         rounding = 64 * torch.finfo(dtype).eps

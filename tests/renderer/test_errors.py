@@ -11,7 +11,7 @@ from renderer.camera import OrthographicCamera
 from renderer.errors import LARGEST, InputError, require_bounded, require_finite
 from renderer.fragments import build_fragments
 from renderer.image import ImageSettings, tonemap
-from renderer.light.harmonics import basis, basis_gradient, project, rotate
+from renderer.light.harmonics import basis, project, rotate
 from renderer.mesh import Mesh
 from renderer.normals import face_normals, vertex_normals
 from renderer.rasterizer import choose
@@ -40,7 +40,6 @@ def painted(corner_colors: torch.Tensor) -> Mesh:
 
 FINITE = [  # the tensor's name, a good one, who takes it: positions and directions may be of any size
     ("directions", torch.ones(2, 3), lambda x: basis(x, 6)),
-    ("directions", torch.ones(2, 3), lambda x: basis_gradient(x, 6)),
     ("radiance", torch.ones(4, 8, 3), lambda x: project(x, 2)),
     ("radiance", torch.ones(28, 3), lambda x: project(lambda _: x, 2, quadrature_degree=6)),
     ("coefficients", torch.ones(9, 3), lambda x: rotate(x, torch.eye(3))),

