@@ -2,7 +2,7 @@
 
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
-from train.lab.folder import LabSettings, write_laboratory
+from train.lab import LabSettings, write_laboratory
 
 
 def main(settings: LabSettings) -> None:

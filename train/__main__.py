@@ -27,7 +27,7 @@ from train.run import load_data, prepare, write_images
 from train.run_folder import sole_writer
 from train.runtime import Interrupted, broadcast, first_process_first, process_group
 from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, quoted, read_settings
-from train.sweep import run_cell, sweep
+from train.sweep import run_in_sweep, sweep
 
 NAMED_MODEL = re.compile(r"^model=(?!\{)")  # short for model.name=
 LOG = "train.log"
@@ -39,7 +39,7 @@ def main(config: DictConfig) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     config.run = str(folder)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        run_cell(config, folder)
+        run_in_sweep(config, folder)
         return
     with cli.handled_errors():  # here, too, or Hydra adds a line
         run_arms(read_settings(ExperimentSettings, config), folder)

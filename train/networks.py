@@ -3,7 +3,8 @@ loading them from a run's folder or a published file."""
 
 import json
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from augment.classifiers.imagenet import require_architecture
 from augment.classifiers.python_function import call_python
 from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
-from renderer.image import ENCODINGS, LARGEST_SIZE
 from train.checkpoint import BEST, VERSION, checked, load
 
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
@@ -56,12 +56,14 @@ class WideResNet(nn.Module):
         std: Sequence[float] = (0.25, 0.25, 0.25),
     ):
         super().__init__()
-        shape = f"model.depth={depth}, model.width={width}"
-        if not (isinstance(depth, int) and isinstance(width, int)) or depth < 10 or (depth - 4) % 6 or width < 1:
-            raise InputError(f"{shape}: depth is 10, 16, 22, 28, ... and width at least 1")
         parameters = 9 * (depth - 4) // 3 * width**2 * 16**2 * (1 + 4 + 16)
+        if depth < 10 or (depth - 4) % 6 or width < 1:
+            raise InputError(f"model.depth={depth}, model.width={width}: depth is 10, 16, 22, ... and width at least 1")
         if depth > DEEPEST or parameters > MOST_PARAMETERS:
-            raise InputError(f"{shape}: {parameters:.1g} parameters are too many; {MOST_PARAMETERS:g} are the limit")
+            raise InputError(
+                f"model.depth={depth}, model.width={width}: {parameters:.1g} parameters are too many; "
+                f"{MOST_PARAMETERS:g} are the limit"
+            )
         if not 0 <= dropout < 1:
             raise InputError(f"model.dropout={dropout} must be at least 0 and below 1")
         channels, blocks = [16, 16 * width, 32 * width, 64 * width], (depth - 4) // 6
@@ -159,42 +161,38 @@ def build_network(
     """
     if name == WIDERESNET:
         return WideResNet(len(classes), **shape, mean=mean, std=std)
-    if name.startswith(TORCHVISION):
-        network: nn.Module = Normalized(_torchvision_network(name, len(classes), size), mean, std)
-    elif name.startswith(PYTHON):
+    if name.startswith(PYTHON):
         network, its_size, its_classes = call_python(name.removeprefix(PYTHON), f"model={name}")
         if its_size != size:
             raise InputError(f"model={name} is for images of {its_size} pixels per side, and the data has {size}")
         if list(its_classes) != list(classes):
             raise InputError(f"model={name} has other classes than the data, or in another order: {classes[0]!r} first")
+    elif name.startswith(TORCHVISION):
+        require_architecture(name.removeprefix(TORCHVISION), f"model={name}")
     else:
         raise InputError(
             f"model={name} is not known: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION"
         )
     try:
+        if name.startswith(TORCHVISION):
+            network = Normalized(_torchvision_network(name.removeprefix(TORCHVISION), len(classes), size), mean, std)
         with eval_mode(network), torch.no_grad():
             logits = network(torch.zeros(2, 3, size, size))
-    except (RuntimeError, ValueError, AssertionError, TypeError) as error:
+        if logits.shape != (2, len(classes)):
+            raise ValueError(f"it returned {tuple(logits.shape)} for 2 images")
+    except (RuntimeError, ValueError, AssertionError, TypeError, AttributeError) as error:
         raise InputError(
-            f"model={name} takes no images of {size} pixels per side ({in_one_line(error)}): choose another"
+            f"model={name} does not give {len(classes)} logits for images of {size} pixels per side "
+            f"({in_one_line(error)}): choose another"
         ) from error
-    expected = (2, len(classes))
-    if not isinstance(logits, Tensor) or logits.shape != expected:
-        actual = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-        raise InputError(f"model={name} gives {actual} for 2 images: make it return logits {expected}")
     return network
 
 
-def _torchvision_network(name: str, classes: int, size: int) -> nn.Module:
+def _torchvision_network(architecture: str, classes: int, size: int) -> nn.Module:
     from torchvision import models
 
-    architecture = name.removeprefix(TORCHVISION)
-    require_architecture(architecture, f"model={name}")
     options = {"image_size": size} if architecture.startswith("vit_") else _OPTIONS.get(architecture, {})
-    try:
-        return models.get_model(architecture, weights=None, num_classes=classes, **options)
-    except (ValueError, AssertionError) as error:  # a transformer whose patches do not fill the image
-        raise InputError(f"model={name} takes no images of {size} pixels per side ({error}): choose another") from error
+    return models.get_model(architecture, weights=None, num_classes=classes, **options)
 
 
 def describe(network: nn.Module, classes: Sequence[str], size: int, encoding: str, **shape: Any) -> dict[str, Any]:
@@ -225,46 +223,41 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
             f"weights={weights} is not for classifier=run:{run}, which has weights of its own: leave it out"
         )
     path, state = load_selected(Path(run))
-    shape = {key: value for key, value in state["architecture"].items() if key != "version"}
+    shape = {key: value for key, value in state["architecture"].items() if key not in ("version", "encoding")}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         raise InputError(
             f"the network in {path} is made by {name}: give model={name} to run that code, which a file alone must not "
             "do; an attack takes it as classifier=python: with a function that loads its weights"
         )
-    try:
-        size, classes, encoding = shape.pop("size"), tuple(map(str, shape.pop("classes"))), shape.pop("encoding")
-        if not (isinstance(size, int) and 1 <= size <= LARGEST_SIZE and classes and encoding in ENCODINGS):
-            raise ValueError(f"size {size!r}, {len(classes)} classes, encoding {encoding!r}")
+    with _of_one_architecture(path):
+        size, classes = int(shape.pop("size")), tuple(map(str, shape.pop("classes")))
         network = build_network(classes, size, **shape)
+        network.load_state_dict(state["model"])
+        return Classifier(network, size, classes, f"run:{run}")
+
+
+@contextmanager
+def _of_one_architecture(path: Path) -> Iterator[None]:
+    """InputError naming the file where its description or its weights do not fit the network."""
+    try:
+        yield
     except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
+        reason = textwrap.shorten(in_one_line(error), 300)
         raise InputError(
-            f"checkpoint {path} is from another architecture than can be built ({in_one_line(error)}): use another one"
+            f"checkpoint {path} is from another architecture ({reason}): use the model settings that it was trained "
+            "with, or another file"
         ) from error
-    _load_weights(network, state["model"], path)
-    return Classifier(network, size, classes, f"run:{run}")
 
 
 def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     """The file of a run's selected network, best.pt or model.safetensors or such a file itself, and its content."""
-    path = run if run.is_file() else next((run / name for name in (BEST, PUBLISHED) if (run / name).is_file()), None)
+    path = next((file for file in (run, run / BEST, run / PUBLISHED) if file.is_file()), None)
     if path is None:
         raise InputError(
             f"run={run} holds neither {BEST} nor {PUBLISHED}: give a run folder that `python -m train` wrote"
         )
     return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
-
-
-def _load_weights(network: nn.Module, weights: Mapping[str, Tensor], path: Path) -> None:
-    """Fill the network; InputError naming the file where the weights belong to another architecture."""
-    try:
-        network.load_state_dict(weights)
-    except RuntimeError as error:
-        reason = textwrap.shorten(str(error), 300)
-        raise InputError(
-            f"checkpoint {path} is from another architecture ({reason}): use the model settings that it was trained "
-            "with"
-        ) from error
 
 
 def start_from(network: nn.Module, description: Mapping[str, Any], run: Path) -> None:
@@ -273,12 +266,13 @@ def start_from(network: nn.Module, description: Mapping[str, Any], run: Path) ->
     description: the network's (see `describe`). InputError where the other has other classes, another size or shape.
     """
     path, state = load_selected(run)
-    stored, description = ({"name": WIDERESNET, **each} for each in (state["architecture"], description))
+    stored, description = ({"name": WIDERESNET, **facts} for facts in (state["architecture"], description))
     for key in SHAPE:
         if stored.get(key, description.get(key)) != description.get(key):
             other = "other classes" if key == "classes" else f"{key} {stored[key]}, not {description[key]}"
             raise InputError(f"train.init_from={run} was trained with {other}: give this run the same")
-    _load_weights(network, state["model"], path)
+    with _of_one_architecture(path):
+        network.load_state_dict(state["model"])
 
 
 def publish(path: Path, state: Mapping[str, Any], **facts: object) -> None:
@@ -297,9 +291,7 @@ def _load_published(path: Path) -> dict[str, Any]:
         with safe_open(path, "pt") as file:
             architecture = json.loads(file.metadata()["architecture"])
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
-        if not isinstance(architecture, dict):
-            raise ValueError("it is not an object of keys and values")
     except Exception as error:  # safetensors and JSON raise many kinds for a damaged or foreign file
         raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error
+    weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
     return checked({"model": weights, "architecture": architecture}, path)

@@ -34,7 +34,7 @@ LARGEST_CONFIG, LARGEST_FILE = 2**20, 2**28  # bytes; a run writes about 300 per
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; other phases are parts of these
 logging.raiseExceptions = False  # on a full disk train.log lacks lines, and only the run's own error is shown
 
-# Settings that say where and how a run is made. They do not decide its result, nor name a sweep's cell.
+# Settings that say where and how a run is made. They do not decide its result, nor name a run of a sweep.
 CIRCUMSTANCES = (
     *("run", "sweep", "launcher", "compare", "command", "hardware", "versions", "inputs"),
     *("renderer.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),

@@ -1,6 +1,6 @@
-"""Sweeps, `python -m train --multirun`: a folder per cell, named by its overrides; finished cells are not run again.
+"""Sweeps, `python -m train --multirun`: a folder per run, named by its overrides; finished runs are not repeated.
 
-Hydra's launchers run the cells, in this process or in others; what became of them is read from their folders.
+Hydra's launchers start the runs, in this process or in others; their results are read from their folders.
 """
 
 import hashlib
@@ -23,25 +23,19 @@ from train.errors import one_sentence, writable_folder
 from train.report.page import report_of
 from train.report.summary import format_spread, format_table, is_finished, summarize
 from train.run import load_data, run, write_images
-from train.run_folder import (
-    CIRCUMSTANCES,
-    FAILURE,
-    locked,
-    require_same_inputs,
-    require_same_settings,
-    state,
-)
+from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_inputs, require_same_settings, state
 from train.settings import ExperimentSettings, compose, read_settings
 
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
+HYDRAS_OWN = re.compile(r"\+*hydra[./]")  # overrides that do not concern the run
 
 
-def cell_name(overrides: Sequence[str]) -> str:
-    """The name of a cell's folder, in alphabetical order: `augment-none+seed-0` for seed=0 augment=none.
+def run_name(overrides: Sequence[str]) -> str:
+    """The name of a run's folder, in alphabetical order: `augment-none+seed-0` for seed=0 augment=none.
 
     Overrides that only say where and how it runs are left out. Long texts are cut, and characters that a file system or
     Hydra's command line might refuse are replaced; both then end in @ and a hash of the original, so that different
-    cells have different names, also where capitals do not count.
+    runs have different names, also where capitals do not count.
     """
     pairs = sorted(override.partition("=")[::2] for override in overrides)
     name = "+".join(f"{_safe(key)}-{_safe(value)}" for key, value in pairs if key not in CIRCUMSTANCES) or "defaults"
@@ -57,22 +51,23 @@ def _hash(text: str) -> str:
     return f"@{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-OmegaConf.register_new_resolver("cell_name", cell_name, replace=True)  # Hydra hands it to the launchers' processes
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # Hydra hands it to the launchers' processes
 
 
 def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
-    """Run all cells with `start`, Hydra's main function, and print their table; exit status 1 if any is not finished.
+    """Make all runs with `start`, Hydra's main function, and print their table; exit status 1 if any is not finished.
 
-    InputError before the first cell where two cells are the same, or a folder holds a run with other settings.
+    InputError before the first run where two runs are the same, or a folder holds a run with other settings.
     """
-    cells = _cells(overrides)
-    parent = writable_folder(str(compose("train", cells[0]).sweep), "sweep")
-    folders = {parent / cell_name(_task(cell)): cell for cell in cells}
-    if len(folders) < len(cells):
-        raise InputError("the sweep has a cell twice: give each value once")
-    for folder, cell in folders.items():
+    runs = _runs(overrides)
+    parent = writable_folder(str(compose("train", runs[0]).sweep), "sweep")
+    names = [run_name([override for override in words if not HYDRAS_OWN.match(override)]) for words in runs]
+    folders = [parent / name for name in names]
+    if len(set(folders)) < len(runs):
+        raise InputError("the sweep has a run twice: give each value once")
+    for folder, words in zip(folders, runs, strict=True):
         if is_finished(folder) or checkpoint.exists(folder):
-            settings = read_settings(ExperimentSettings, compose("train", cell))
+            settings = read_settings(ExperimentSettings, compose("train", words))
             require_same_settings(folder, settings, finished=True)
             require_same_inputs(folder, settings)
     handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that launchers end theirs
@@ -80,14 +75,14 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
         start()
     finally:
         signal.signal(signal.SIGTERM, handler)
-        print(format_sweep([*folders]), flush=True)
+        print(format_sweep(folders), flush=True)
     print(report_of([folder for folder in folders if folder.exists()], parent))
     if not all(map(is_finished, folders)):
         sys.exit(1)
 
 
-def _cells(overrides: Sequence[str]) -> list[tuple[str, ...]]:
-    """The overrides of every cell, as Hydra's basic sweeper makes them."""
+def _runs(overrides: Sequence[str]) -> list[tuple[str, ...]]:
+    """The overrides of every run, as Hydra's basic sweeper makes them."""
     values: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.get_key_element()
@@ -101,15 +96,10 @@ def _cells(overrides: Sequence[str]) -> list[tuple[str, ...]]:
     return list(product(*values.values()))
 
 
-def _task(cell: Sequence[str]) -> list[str]:
-    """The overrides without Hydra's own."""
-    return [override for override in cell if not re.match(r"\+*hydra[./]", override)]
+def run_in_sweep(config: DictConfig, folder: Path) -> None:
+    """Make a run in its folder, or resume it, unless it is finished; the reason of a failure goes to failed.txt.
 
-
-def run_cell(config: DictConfig, folder: Path) -> None:
-    """Train a cell in its folder, or resume it, unless it is finished; the reason of a failure goes to failed.txt.
-
-    What stops the process (SystemExit, KeyboardInterrupt) stops the sweep.
+    SystemExit and KeyboardInterrupt stop the sweep.
     """
     with locked(folder) as ours:
         if is_finished(folder) or not ours:
@@ -131,9 +121,9 @@ def run_cell(config: DictConfig, folder: Path) -> None:
 
 
 def format_sweep(folders: Sequence[Path]) -> str:
-    """The table of the finished cells, means over several seeds, and the state of the other cells."""
+    """The table of the finished runs, means over several seeds, and the state of the other runs."""
     finished = [summarize(folder) for folder in folders if is_finished(folder)]
-    parts = [f"{len(finished)} of {len(folders)} cells are finished"]
+    parts = [f"{len(finished)} of {len(folders)} runs are finished"]
     if finished:
         parts += filter(None, [format_table(finished), format_spread(finished)])
     parts += [f"{folder}: {state(folder)}" for folder in folders if not is_finished(folder)]

@@ -52,7 +52,7 @@ def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz
         (["train.epoch=3"], "Could not override 'train.epoch'"),
         (["compare=[non]"], "compare: "),
         (["--multirun", "launcher=slurm", "seed=0,1"], "launcher=slurm needs Slurm's sbatch, which is missing"),
-        (["--multirun", "seed=0,0"], "the sweep has a cell twice"),
+        (["--multirun", "seed=0,0"], "the sweep has a run twice"),
         (["--multirun", "run=a", "seed=0,1"], "run= names the folder of a single run"),
         (["--multirun", "train.epoch=0,1"], "Could not override 'train.epoch'"),
     ],

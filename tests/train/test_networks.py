@@ -141,13 +141,6 @@ def test_dropout_acts_in_training_alone_and_images_may_have_any_size():
         assert torch.equal(network.eval()(images), network(images)) and network(images).shape == (4, 5)
 
 
-@pytest.mark.parametrize("settings", [{"depth": 15}, {"width": 0}, {"dropout": 1.0}])
-def test_an_impossible_architecture_names_its_key(settings):
-    (key,) = settings
-    with pytest.raises(InputError, match=f"model.{key}={settings[key]}"):
-        WideResNet(10, **settings)
-
-
 # ---------------------------------------------------------------------------------------- dropout
 
 
@@ -213,15 +206,22 @@ def test_every_family_of_torchvision_gives_logits_in_training_too(name, size):
     [
         ("resnet18", 16, "choose wideresnet, torchvision:NAME or python:MODULE:FUNCTION"),
         ("torchvision:resnet19", 16, "choose one, such as resnet18"),
-        ("torchvision:vit_b_32", 40, "40 pixels per side"),
+        ("torchvision:vit_b_32", 40, "3 logits for images of 40 pixels per side"),
         ("python:own_models:of_other_size", 16, "is for images of 32 pixels per side, and the data has 16"),
         ("python:own_models:of_other_classes", 16, "other classes than the data, or in another order"),
-        ("python:own_models:of_other_logits", 16, "(2, 4) for 2 images: make it return logits (2, 3)"),
+        ("python:own_models:of_other_logits", 16, "it returned (2, 4) for 2 images"),
     ],
 )
 def test_a_network_that_does_not_take_the_data_is_refused_by_name(name, size, message):
     with pytest.raises(InputError, match=f"^model={name} .*{re.escape(message)}"):
         build_network(CLASSES, size, name)
+
+
+@pytest.mark.parametrize("settings", [{"depth": 15}, {"width": 0}, {"dropout": 1.0}, {"depth": 6 * 10**9 + 4}], ids=str)
+def test_an_impossible_architecture_names_its_key(settings):
+    ((key, value),) = settings.items()
+    with pytest.raises(InputError, match=f"model.{key}={value}"):
+        WideResNet(10, **settings)
 
 
 # ---------------------------------------------------------------------------------------- loading
@@ -256,26 +256,10 @@ def test_other_networks_come_back_from_their_file_code_only_where_it_is_named(tm
 
 
 @pytest.mark.parametrize(
-    "name, weights, message",
-    [
-        ("run:absent", None, "run=absent holds neither best.pt nor model.safetensors"),
-        ("squeezenet_caffe", None, "classifier=squeezenet_caffe comes without weights"),
-    ],
-)
-def test_a_classifier_that_cannot_be_loaded_is_one_sentence(name, weights, message):
-    with pytest.raises(InputError, match=re.escape(message)) as caught:
-        load_classifier(name, weights)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
     "changes",
-    [
-        {"version": 99}, {"size": None}, {"size": 10**9}, {"classes": ["fig", "lime"]}, {"depth": "10"}, {"width": 2},
-        {"depth": 6 * 10**9 + 4}, {"heads": 3}, {"mean": [0.5]},
-    ],
+    [{"version": 99}, {"size": None}, {"size": 10**9}, {"classes": ["fig", "lime"]}, {"depth": "10"}, {"heads": 3}],
     ids=str,
-)  # fmt: skip
+)
 def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(network, tmp_path, changes):
     write(tmp_path, network, **changes)
     for name in (BEST, PUBLISHED):

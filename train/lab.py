@@ -1,0 +1,382 @@
+"""The laboratory: path-traced photographs of objects on a dark table under a projector, to score networks on.
+
+World units: a normalized mesh spans [-1, 1]; it stands on the table z = 0 about the origin. Light and albedo are linear
+RGB; a radiance of 1 is white at an exposure of 1.
+"""
+
+import colorsys
+import csv
+import json
+import math
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import MISSING
+from PIL import Image
+
+from augment.objects import load_object
+from augment.utils import progress, stream_seed
+from renderer.errors import FACTOR, InputError, require_choice, require_limits, require_range
+from renderer.image import LARGEST_SIZE, decode, encode
+from renderer.io.mitsuba import Part, environment, load, look_at, mitsuba, projector, sensor, shape, split_parts
+from renderer.light.environment import read_panorama
+from renderer.light.harmonics import equirectangular
+from renderer.mesh import Mesh
+from renderer.normals import corner_normals
+from renderer.shapes import HARD_NEGATIVES
+from train.errors import writable_folder
+from train.photographs.folder import DESCRIPTION, FOREIGN, TABLE
+from train.run_folder import LOCK, sole_writer
+from train.settings import LARGEST_SEED, read_object
+
+PACKAGES = ("mitsuba", "numpy", "torch")  # whose versions may change a pixel
+SOLIDS = (
+    *("orange:101", "orange:102", "orange:103", "orange:104", "orange:105", "orange:106", "apple:101", "apple:102"),
+    *("pear:101", "sweet_pepper:101", "lemon:101", "lemon:102", "peach:101", "peach:102", "ball:101", "ball:103"),
+)
+LARGEST = {"setups": 10**6, "size": LARGEST_SIZE, "spp": 10**5, "bounces": 1000}
+FOV = 25.0  # degrees, of the camera
+RESOLUTION = 512  # pixels per side of a projected image
+THROW = 2.6  # half of the width that the projector lights where it aims, in world units
+FLOOR = 100.0  # half of the table's width
+SHARP = 0.85  # cosine off the vertex normal beyond which a face keeps its own: at a right-angled edge at most 0.82
+ROUGHNESS = 0.5  # of the objects' surface: a soft gloss, as peel has
+
+# ------------------------------------------------------------------------------------- projected patterns
+
+# Points are (..., 2) in the projector's image, which spans [-1, 1]; an object in its middle spans about [-0.3, 0.3]. A
+# family gives each point a weight in [0, 1] between two colors of light.
+
+
+def solid(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return np.ones(points.shape[:-1])
+
+
+def gradient(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A ramp along x about the middle."""
+    return np.clip(points[..., 0] / rng.uniform(0.6, 1.6) + 0.5, 0, 1)
+
+
+def stripes(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Stripes along y."""
+    phase = points[..., 0] / rng.uniform(0.12, 0.5) + rng.uniform()
+    return (phase % 1 < rng.uniform(0.3, 0.7)).astype(float)
+
+
+def checkers(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Squares of a chessboard."""
+    odd = (points / rng.uniform(0.12, 0.5) + rng.uniform(size=2)) % 1 < 0.5
+    return (odd[..., 0] != odd[..., 1]).astype(float)
+
+
+def half(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One side of a line through the object."""
+    return (points[..., 0] > rng.uniform(-0.12, 0.12)).astype(float)
+
+
+def spots(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Discs of one size at random positions, over about half of the image."""
+    radius = rng.uniform(0.08, 0.25)
+    lit = np.zeros(points.shape[:-1], dtype=bool)
+    for center in rng.uniform(-1, 1, (round(2.8 / (math.pi * radius**2)), 2)):
+        lit |= ((points - center) ** 2).sum(axis=-1) < radius**2
+    return lit.astype(float)
+
+
+FAMILIES = {family.__name__: family for family in (solid, gradient, stripes, checkers, half, spots)}
+TWO_COLORED = ("gradient", "stripes", "checkers")  # the other families have darkness beside their color
+
+
+def draw_pattern(family: str, rng: np.random.Generator) -> np.ndarray:
+    """An image (RESOLUTION, RESOLUTION, 3) float32 of the family in random color, scale, angle and position, linear RGB
+    in [0, 1]."""
+    first, second = draw_color(rng), draw_color(rng) * rng.uniform() * (family in TWO_COLORED)
+    centers = (np.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1
+    angle = rng.uniform(0, 2 * math.pi)
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    points = np.stack(np.meshgrid(centers, centers, indexing="xy"), axis=-1) @ rotation
+    weight = FAMILIES[family](points, rng)[..., None]
+    return (second + weight * (first - second)).astype(np.float32)
+
+
+def draw_color(rng: np.random.Generator) -> np.ndarray:
+    """(3,) linear RGB, the largest channel 1: any hue, from white to pure in even steps of the sRGB values."""
+    srgb = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(), 1.0)
+    return decode(torch.tensor(srgb, dtype=torch.float64), "srgb").numpy()
+
+
+# ------------------------------------------------------------------------------------- light, camera and pose
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One light, camera, pose and table, for any object.
+
+    brightness: radiance of a white surface that faces the projector where its image is white, or that faces up under an
+    environment. pattern: the projected image (H, W, 3). environment: radiance (H, W, 3), laid out as in
+    `renderer.light.environment`, in place of projector and ambient. ambient: radiance from everywhere (3,). table:
+    albedo (3,). projector, camera: positions (3,). center, aim: the points (3,) that they look at. rotation: of the
+    object (3, 3). scale: the object's largest coordinate.
+    """
+
+    family: str
+    brightness: float
+    pattern: np.ndarray
+    ambient: np.ndarray
+    table: np.ndarray
+    projector: np.ndarray
+    camera: np.ndarray
+    center: np.ndarray
+    aim: np.ndarray
+    rotation: np.ndarray
+    scale: float
+    environment: np.ndarray | None = None
+
+
+def draw_shots(
+    setups: int, families: Sequence[str], brightness: Sequence[float], seed: int, environments: Mapping[str, np.ndarray]
+) -> Iterator[Shot]:
+    """`setups` shots, equally many of each pattern family and each environment (by name), in this order.
+
+    Brightness rises evenly in ratios within each. An environment is turned about the vertical by a random angle.
+    """
+    dimmest, brightest = brightness
+    kinds = [*families, *environments]
+    per_kind = setups // len(kinds)
+    for kind in kinds:
+        for index in range(per_kind):
+            rng = np.random.default_rng(stream_seed(seed, "shot", kind, index))
+            radiance = dimmest * (brightest / dimmest) ** ((index + rng.uniform()) / per_kind)
+            if kind not in environments:
+                yield _draw_shot(kind, radiance, rng)
+                continue
+            shot, sky = _draw_shot("solid", radiance, rng), environments[kind]
+            turned = np.roll(sky, rng.integers(sky.shape[1]), axis=1)
+            yield replace(shot, family=kind, environment=(radiance / _on_white(sky) * turned).astype(np.float32))
+
+
+def _on_white(environment: np.ndarray) -> float:
+    """The mean radiance of a white surface that faces up; turning the environment about the vertical leaves it."""
+    directions, solid_angles = equirectangular(*environment.shape[:2])
+    cosines = directions[..., 2].clamp(min=0) * solid_angles
+    return float((cosines[..., None] * torch.from_numpy(environment)).sum((0, 1)).mean()) / math.pi
+
+
+def _draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:
+    """A shot under a pattern of the family. The projector stands on the camera's side, up to 70° off."""
+    azimuth, half_width, scale = rng.uniform(0, 360), rng.uniform(1.2, 1.9), rng.uniform(0.75, 1)
+    center = np.array([0, 0, 0.8 * scale])
+    aim = center + rng.uniform(-0.25, 0.25, 3)
+    return Shot(
+        family=family,
+        brightness=brightness,
+        pattern=draw_pattern(family, rng),
+        ambient=rng.uniform(0.01, 0.06) * draw_color(rng),
+        table=rng.uniform(0.04, 0.16) * draw_color(rng),
+        projector=center + _position(azimuth + rng.uniform(-70, 70), rng.uniform(25, 70), rng.uniform(5, 8)),
+        camera=aim + _position(azimuth, rng.uniform(18, 60), half_width / math.tan(math.radians(FOV / 2))),
+        center=center,
+        aim=aim,
+        rotation=_turn(2, rng.uniform(0, 360)) @ _turn(0, rng.uniform(0, 60)) @ _turn(2, rng.uniform(0, 360)),
+        scale=scale,
+    )
+
+
+def _position(azimuth: float, elevation: float, distance: float) -> np.ndarray:
+    """(3,) from angles in degrees."""
+    azimuth, elevation = math.radians(azimuth), math.radians(elevation)
+    horizontal = math.cos(elevation)
+    return distance * np.array([horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(elevation)])
+
+
+def _turn(axis: int, angle: float) -> np.ndarray:
+    """(3, 3) about a coordinate axis, by degrees."""
+    sine, cosine = math.sin(math.radians(angle)), math.cos(math.radians(angle))
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[[first, first, second, second], [first, second, first, second]] = cosine, -sine, sine, cosine
+    return matrix
+
+
+# ------------------------------------------------------------------------------------- path tracing
+
+
+def lab_parts(mesh: Mesh, albedo_scale: float) -> list[Part]:
+    """The mesh by texture: smooth but at sharp edges, with linear colors and textures (H, W, 3) times `albedo_scale`
+    and at most 1."""
+
+    def scaled(linear: np.ndarray) -> np.ndarray:
+        return np.clip(albedo_scale * linear, 0, 1).astype(np.float32)
+
+    parts = []
+    for part in split_parts(mesh, corner_normals(mesh, "smooth", SHARP), "srgb"):
+        texture = part.texture
+        if texture is not None:
+            texture = scaled(decode(torch.from_numpy(texture / 255), "srgb").numpy())
+        parts.append(replace(part, colors=scaled(part.colors), texture=texture))
+    return parts
+
+
+def photograph(parts: Sequence[Part], shot: Shot, size: int, spp: int, bounces: int, seed: int) -> np.ndarray:
+    """(size, size, 3) float32 linear radiance by Mitsuba 3, from `spp` samples per pixel and light.
+
+    Projector and surroundings are rendered one by one and added: with both in one scene each path would choose one of
+    them at random, which is most of the noise. InputError: Mitsuba is not installed.
+    """
+    with mitsuba() as module:
+        scene = {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": bounces + 1},
+            "sensor": sensor(look_at(shot.camera, shot.aim), size, FOV, "rgb"),
+            "table": {
+                "type": "rectangle",
+                "to_world": np.diag([FLOOR, FLOOR, FLOOR, 1.0]),
+                "bsdf": {"type": "diffuse", "reflectance": _rgb(shot.table)},
+            },
+            **{f"part_{index}": part for index, part in enumerate(_object(module, parts, shot))},
+        }
+        scenes = [load(module, {**scene, "light": light}) for light in _lights(shot)]
+        return np.sum([np.array(module.render(scene, spp=spp, seed=seed)) for scene in scenes], axis=0)
+
+
+def _rgb(color: np.ndarray) -> dict[str, Any]:
+    return {"type": "rgb", "value": [float(channel) for channel in color]}
+
+
+def _lights(shot: Shot) -> list[dict[str, Any]]:
+    if shot.environment is not None:
+        return [environment({"bitmap": shot.environment})]
+    distance = float(np.linalg.norm(shot.projector - shot.center))
+    fov, scale = 2 * float(np.degrees(np.arctan(THROW / distance))), shot.brightness * distance**2
+    pattern = projector(look_at(shot.projector, shot.center), fov, {"bitmap": shot.pattern}, scale)
+    return [pattern, {"type": "constant", "radiance": _rgb(shot.ambient)}]
+
+
+def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
+    """The object rotated, scaled and set down on the table, a shape per part."""
+    rotated = [(shot.scale * part.positions @ shot.rotation.T).reshape(-1, 3) for part in parts]
+    lowest, shapes = min(positions[:, 2].min() for positions in rotated), []
+    for part, positions in zip(parts, rotated, strict=True):
+        albedo: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_color"}
+        if part.texture is not None:
+            albedo = {"type": "bitmap", "bitmap": part.texture, "raw": True}
+        surface = {"type": "principled", "base_color": albedo, "roughness": ROUGHNESS}
+        faces, normals = np.arange(len(positions)).reshape(-1, 3), (part.normals @ shot.rotation.T).reshape(-1, 3)
+        positions, uvs, colors = positions - [0, 0, lowest], part.uvs.reshape(-1, 2), part.colors.reshape(-1, 3)
+        twosided = {"type": "twosided", "surface": surface}
+        shapes.append(shape(module, twosided, positions, faces, normals, uvs, colors))
+    return shapes
+
+
+# ------------------------------------------------------------------------------------- the folder
+
+
+@dataclass
+class LabSettings:
+    """The settings of scripts/lab.py. A mesh is a file, `solid:NAME:SEED` or a mapping with the keys of ObjectSettings,
+    whose label is a class, or other_NAME if the network lacks it."""
+
+    out: str = MISSING  # a new folder, for photos= of scripts/evaluate_photos.py
+    label: str = "orange"  # the class under study: one of its objects and one other stand in each setup
+    meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])
+    setups: int = 180  # draws of light, camera and pose; two photographs each
+    patterns: list[str] = field(default_factory=lambda: list(FAMILIES))  # of the projector, for as many setups each
+    environments: list[str] = field(default_factory=list)  # maps (.npy, .hdr, .exr) instead, for as many setups each
+    brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])  # of white surfaces that face the light
+    exposure: float = 1.0  # multiplies radiance; at 1, a radiance of 1 is white
+    size: int = 64  # pixels per side
+    spp: int = 32  # paths per pixel and light
+    bounces: int = 4  # of light, at most
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in self.patterns:
+            require_choice("patterns", name, FAMILIES)
+        sources = [*self.patterns, *(Path(path).stem for path in self.environments)]
+        if not sources or self.setups < 1 or self.setups % len(sources):
+            raise InputError(
+                f"setups={self.setups} must be a positive multiple of the {len(sources)} patterns and environments"
+            )
+        if len(set(sources)) < len(sources):
+            raise InputError("patterns and environments must have different names, which are the photographs' sources")
+        require_limits("brightness", self.brightness, 1 / FACTOR, FACTOR)
+        require_range("exposure", self.exposure, 1 / FACTOR, FACTOR)
+        require_range("seed", self.seed, 0, LARGEST_SEED)
+        for name, most in LARGEST.items():
+            require_range(name, getattr(self, name), 1, most)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An object: the name of its class, that of its mesh, and its parts."""
+
+    label: str
+    mesh: str
+    parts: list[Part]
+
+
+def write_laboratory(settings: LabSettings) -> int:
+    """Write the folder `settings.out` and return its number of photographs; the settings decide their bytes.
+
+    The folder has class folders of PNG files, photos.csv and lab.json, as `train.photographs` reads them. InputError: a
+    folder that is not empty; meshes that cannot be read or have no label; no mesh of the label under study, or no
+    other; Mitsuba is not installed.
+    """
+    out = writable_folder(settings.out, "out")
+    subjects = [read_subject(item, index) for index, item in enumerate(settings.meshes)]
+    environments = {Path(path).stem: _read_environment(Path(path)) for path in settings.environments}
+    positives = [subject for subject in subjects if subject.label == settings.label]
+    negatives = [subject for subject in subjects if subject.label != settings.label]
+    if not (positives and negatives):
+        raise InputError(f"meshes: name at least one of label={settings.label} and one of another class")
+    shots = draw_shots(settings.setups, settings.patterns, settings.brightness, settings.seed, environments)
+    with sole_writer("out", out):
+        if any(path.name != LOCK for path in out.iterdir()):
+            raise InputError(f"out={out} is not an empty folder: name another, or delete it")
+        rows = []
+        for number, shot in progress(enumerate(shots), "setups", settings.setups):
+            seed = stream_seed(settings.seed, "samples", number) % 2**32
+            for subjects in (positives, negatives):
+                subject = subjects[number % len(subjects)]
+                radiance = photograph(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
+                image = encode(torch.from_numpy(settings.exposure * radiance).clamp(0, 1), "srgb")
+                path = Path(subject.label) / f"{number:04d}_{shot.family}.png"
+                (out / path).parent.mkdir(parents=True, exist_ok=True)
+                Image.fromarray((image * 255).round().byte().numpy()).save(out / path)
+                rows.append((path.as_posix(), shot.family, number, subject.mesh, f"{shot.brightness:.4f}"))
+        with open(out / TABLE, "w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([("path", "source_tag", "setup", "mesh", "brightness"), *sorted(rows)])
+        versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+        (out / DESCRIPTION).write_text(json.dumps({**asdict(settings), "versions": versions}, indent=2) + "\n", "utf-8")
+        return len(rows)
+
+
+def _read_environment(path: Path) -> np.ndarray:
+    """Radiance (H, W, 3); InputError where it is negative somewhere, or no light comes from above."""
+    radiance = read_panorama(path).numpy()
+    if radiance.min() < 0 or not radiance[: len(radiance) // 2].max() > 0:
+        raise InputError(f"environments: {path} is negative somewhere or dark above: give a map of emitted light")
+    return radiance
+
+
+def read_subject(item: str | dict[str, Any], index: int) -> Subject:
+    """An entry of `meshes`. The label of a solid is its own name by default, with `other_` before hard negatives.
+
+    InputError: as `load_object`; a file without a label; a label that is not a folder's name.
+    """
+    settings = read_object(item, "", index, "meshes")
+    kind, name, *_ = [*settings.mesh.split(":"), ""]
+    label = settings.label
+    if not label and kind == "solid":
+        label = FOREIGN + name if name in HARD_NEGATIVES else name
+    if not label:
+        raise InputError(f"meshes[{index}] has no label: give {{mesh: {settings.mesh}, label: CLASS or {FOREIGN}NAME}}")
+    if Path(label).name != label or label == "..":
+        raise InputError(f"meshes[{index}]: the label {label!r} names the photographs' folder: leave out slashes")
+    return Subject(label, settings.mesh, lab_parts(load_object(settings).mesh, settings.albedo_scale))
