@@ -8,31 +8,27 @@ from renderer.mesh import normalize
 from renderer.shapes import solid
 
 
-@pytest.fixture
-def plain(tmp_path) -> str:
-    """A file that brings neither colors nor textures."""
-    trimesh.creation.icosphere(1).export(tmp_path / "plain.stl")
-    return str(tmp_path / "plain.stl")
-
-
-def test_a_mesh_without_colors_takes_the_given_one(plain):
-    color = [0.9, 0.5, 0.1]
-    mesh = load_object(ObjectSettings(plain, "orange", color=color)).mesh
+def test_a_mesh_without_colors_takes_the_given_one(tmp_path):
+    plain, color = str(tmp_path / "plain.stl"), [0.9, 0.5, 0.1]
+    trimesh.creation.icosphere(1).export(plain)
+    mesh, white = (load_object(ObjectSettings(plain, "orange", color=choice)).mesh for choice in (color, None))
     np.testing.assert_array_equal(mesh.corner_colors, np.broadcast_to(np.float32(color), mesh.corner_colors.shape))
-    white = load_object(ObjectSettings(plain, "orange")).mesh
     np.testing.assert_array_equal(mesh.vertices, white.vertices)
     assert (white.corner_colors == 1).all()
 
 
-def test_a_mesh_with_its_own_colors_refuses_another():
-    with pytest.raises(InputError, match="solid:orange brings colors of its own: leave color out"):
-        load_object(ObjectSettings("solid:orange", "orange", color=[1.0, 0.0, 0.0]))
-
-
-@pytest.mark.parametrize("color", [[1.0, 0.5], [0.0, 0.0, 1.5], [0.0, float("nan"), 0.0]])
-def test_a_color_needs_three_channels_from_0_to_1(plain, color):
-    with pytest.raises(InputError, match=r"color=.* must be red, green and blue from 0 to 1"):
-        ObjectSettings(plain, "orange", color=color)
+@pytest.mark.parametrize(
+    ("mesh", "color", "message"),
+    [
+        ("solid:orange", [1.0, 0.0, 0.0], "solid:orange brings colors of its own: leave color out"),
+        ("solid:orange", [1.0, 0.5], "color=.* must be red, green and blue"),
+        ("solid:orange", [0.0, float("nan"), 0.0], "color=.* must be red, green and blue"),
+        ("solid:orange:x", None, "solid:orange:x: "),
+    ],
+)
+def test_colors_and_seeds_that_a_mesh_cannot_have_are_refused(mesh, color, message):
+    with pytest.raises(InputError, match=message):
+        load_object(ObjectSettings(mesh, "orange", color=color))
 
 
 def test_props_stand_on_the_objects_ground_shifted_and_turned():

@@ -21,7 +21,6 @@ from augment.reshading import NEAR
 from augment.scene import Conditions, Example, Scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from augment.utils import Phases
-from renderer.cache import OperatorCache
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import ImageSettings
@@ -39,48 +38,27 @@ GRAYS = [0.0, 0.25, 1.0]
 NONZERO = nonzero_coefficients(6)
 
 
-def render(scene: Scene, lights: torch.Tensor, examples: torch.Tensor | None = None) -> torch.Tensor:
-    """Of scenes whose examples have one view."""
-    everything = torch.arange(len(scene)) if examples is None else examples
-    return scene.render(Conditions(lights), everything)[:, 0]
-
-
 def random_lights(count: int, seed: int = 0) -> torch.Tensor:
     return 0.3 * torch.randn(count, 49, 3, generator=torch.Generator().manual_seed(seed)) + ambient(
         torch.full((3,), 0.3)
     )
 
 
-# A product of 31 terms below 1 in another order, and the slope of 12.92 of the sRGB curve near black.
-@pytest.mark.parametrize(
-    ("examples", "objects", "backgrounds", "views", "expected"),
-    [
-        (100, 2, 5, None, 10),
-        (100, 2, 5, 10, 10),
-        (None, 7, 5, 36, 36),
-        (100, 3, 5, None, "100 is not 3 meshes × some views × 5 backgrounds"),
-        (None, 2, 5, None, "scene.views=null or"),
-        (100, 2, 5, 9, "2 meshes × 9 views × 5 backgrounds"),
-        (100, 0, 5, None, "must not be empty"),
-    ],
-)
-def test_views_follow_from_examples_meshes_and_backgrounds(examples, objects, backgrounds, views, expected):
-    if isinstance(expected, int):
-        assert count_views(examples, objects, backgrounds, views) == expected
-    else:
-        with pytest.raises(InputError, match=expected):
-            count_views(examples, objects, backgrounds, views)
+def test_views_follow_from_examples_meshes_and_backgrounds():
+    assert count_views(100, 2, 5, None) == count_views(100, 2, 5, 10) == 10 and count_views(None, 7, 5, 36) == 36
+    for impossible in ((100, 3, 5, None), (None, 2, 5, None), (100, 2, 5, 9), (100, 0, 5, None)):
+        with pytest.raises(InputError, match=r"^augment.examples=.* is not|must not be empty"):
+            count_views(*impossible)
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"meshes": []}, "examples is empty"),
-        ({"views": 0}, "views=0 must be"),
         ({"backgrounds": ()}, "backgrounds is empty"),
         ({"light": torch.zeros(9, 3)}, r"lights has shape \(9, 3\): give 49 rows"),
         ({"ground": [0.5, 2.0, 0.5]}, "ground=.* must be red, green and blue"),
-        *(({"exposure": value}, "exposure=.* must be at least") for value in (math.nan, -1.0, 1e30)),
+        ({"exposure": math.nan}, "exposure=.* must be at least"),
     ],
 )
 def test_an_impossible_scene_is_refused(wrong, message):
@@ -88,40 +66,21 @@ def test_an_impossible_scene_is_refused(wrong, message):
         build_scene(**{"meshes": [("solid:orange", "orange")], "size": 8, "rasterizer": "numpy"} | wrong)
 
 
-def built(items: list[ObjectSettings], cameras: list, settings: ImageSettings, *cache: OperatorCache) -> Scene:
-    """Of all meshes from all cameras over GRAYS."""
-    objects = [load_object(item) for item in items]
-    behind = load_backgrounds(GRAYS, settings.size)
-    return Scene.grid(objects, cameras, behind, probe("grace"), settings, RASTERIZER, *cache)
-
-
-TWO = [ObjectSettings(f"solid:{name}", name) for name in ("plate", "cup")]
+def built(*names: str, views: int = 2, **options) -> Scene:
+    """All meshes from all cameras over GRAYS."""
+    options = {"backgrounds": GRAYS, "normals": "flat", "rasterizer": "numpy"} | options
+    return build_scene([(f"solid:{name}", name) for name in names], 8, views, **options)
 
 
 def test_each_mesh_is_rasterized_once_and_a_lighting_attack_rasterizes_nothing(rasterized):
     """Each mesh is rasterized once, in all views; 30 steps on 24 examples without success add nothing."""
-    scene = built(TWO, orbit_cameras(4, 2), SETTINGS)
+    scene = built("plate", "cup", views=4)
     assert rasterized == [] and scene.stacks and rasterized == [4, 4]
     network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 3))
     torch.nn.init.constant_(network[1].bias[0], 1000)
     settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=30))
     service = AugmentationService(settings, scene, torch.zeros(24, dtype=torch.int64), 0, Phases())
     assert service.regenerate(network, number=0).diagnostics["steps"] == 30 and rasterized == [4, 4]
-
-
-def test_a_scene_stores_no_background_pixels_copies_per_background_or_zero_coefficients():
-    bottle = ObjectSettings("solid:bottle", "bottle")
-    scene = built([bottle], orbit_cameras(4, 2), SETTINGS)
-    operators = build_operators(load_object(bottle).mesh, orbit_cameras(4, 2), SETTINGS, RASTERIZER)
-    covered = set(np.concatenate([operator.pixels for operator in operators]).tolist())
-    (stack,) = scene.stacks
-    assert len(scene) == 12 and 0 < len(covered) < 64 / 2
-    # 31 nonzero coefficients of 49, and the row of zeros that makes the product fast
-    assert stack.transfer.shape == (4, 3, 32, len(covered)) and not stack.transfer[:, :, 31].any()
-    assert stack.coverage.shape == (4, 1, len(covered)) and stack.pixels.tolist() == sorted(covered)
-
-
-# ---------------------------------------------------------------------------------------- several meshes
 
 
 @pytest.fixture(scope="module", params=[relighting.STACKED, 1], ids=["one stack", "a stack per view"])
@@ -136,9 +95,10 @@ def several(request) -> Iterator[Scene]:
     ]
     lights = 0.3 * probe("grace").double() + 0.01 * torch.randn(4, 49, 3, generator=draws).double()
     behind = 0.2 + 0.6 * torch.rand(3, 3, 8, 8, generator=draws)
+    objects = [load_object(ObjectSettings(f"solid:{name}", name)) for name in ("plate", "cup")]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(relighting, "STACKED", request.param)
-        yield Scene([load_object(item) for item in TWO], rows, behind, lights, SETTINGS, RASTERIZER)
+        yield Scene(objects, rows, behind, lights, SETTINGS, RASTERIZER)
 
 
 @pytest.mark.parametrize("by", ["light", "vertices"])
@@ -219,37 +179,21 @@ def test_a_new_basis_of_light_renders_and_is_attacked_within_its_norm_ball():
     torch.testing.assert_close(lamps[2], torch.tensor([0.0, 0.05, 0.15], dtype=torch.float64), rtol=0, atol=1e-12)
 
 
-def test_meshes_with_and_without_shadows_share_a_scene():
-    """The one has 49 coefficients and the other 31."""
-    items = [ObjectSettings("solid:cup", "cup"), ObjectSettings("solid:ball", "ball")]
-    settings, cameras = replace(SETTINGS, shadows=True), orbit_cameras(2, 2)
-    scene, lights = built(items, cameras, settings), random_lights(12)
-    images = render(scene, lights)
-    expected, kept = [], set()
-    for item in items:
-        for operator in build_operators(load_object(item).mesh, cameras, settings, RASTERIZER):
-            kept.add(len(operator.nonzero))
-            for gray in GRAYS:
-                expected.append(operator.image(lights[len(expected)], gray))
-    assert kept == {49, 31}
-    torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=100 * EPS32)
-
-
-@pytest.mark.parametrize("bounces", [0, 2])
-def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(bounces):
-    scene = built(
-        [ObjectSettings("solid:cup", "cup")], orbit_cameras(2, 2), replace(SETTINGS, shadows=True, bounces=bounces)
-    )
+@pytest.mark.parametrize(("names", "bounces"), [(["cup", "ball"], 0), (["cup"], 2)])
+def test_shadows_of_unmoved_vertices_and_colors_are_those_of_the_operators(names, bounces):
+    """The cup has 49 nonzero coefficients and the ball 31."""
+    scene = built(*names, shadows=True, bounces=bounces)
     examples, lights = torch.arange(len(scene)), random_lights(len(scene))
-    mesh = scene.mesh(0)
-    still = replace(scene.conditions(examples), light=lights)
-    expected = scene.render(still, examples)
-    for changed in (
-        {"vertices": torch.from_numpy(mesh.vertices).float().expand(len(scene), -1, -1)},
-        {"albedo": torch.zeros(len(scene), len(mesh.faces), 3)},
-    ):
-        images = scene.render(replace(still, **changed), examples)
-        torch.testing.assert_close(images, expected, rtol=0, atol=1000 * EPS32)
+    still, expected, counts = Conditions(lights), [], set()
+    for item in scene.objects:
+        for operator in build_operators(item.mesh, orbit_cameras(2, 2), scene.settings, RASTERIZER):
+            counts.add(len(operator.nonzero))
+            expected += [operator.image(lights[len(expected) + row], gray) for row, gray in enumerate(GRAYS)]
+    assert bounces or counts == {49, 31}
+    albedo = torch.zeros(len(scene), max(len(item.mesh.faces) for item in scene.objects), 3)
+    for changed in ({}, {"vertices": scene.vertices[scene.object_of]}, {"albedo": albedo}):
+        images = scene.render(replace(still, **changed), examples)[:, 0]
+        torch.testing.assert_close(images, torch.stack(expected), rtol=0, atol=1000 * EPS32)
 
 
 def test_a_table_is_shadowed_by_the_object_and_reflects_its_own_color_onto_it():
@@ -259,7 +203,7 @@ def test_a_table_is_shadowed_by_the_object_and_reflects_its_own_color_onto_it():
     def image(shadows: bool, bounces: int = 0, ground: list[float] | None = (0.1, 0.8, 0.1)) -> torch.Tensor:
         fixed = {"shadows": shadows, "bounces": bounces, "ground": ground, "rasterizer": "numpy"}
         scene = build_scene([("solid:orange", "orange")], **seen | fixed)
-        return render(scene, scene.lights)[0]
+        return scene.render(scene.conditions(torch.arange(1)), torch.arange(1))[0, 0]
 
     alone, open_sky, shadowed, lit = (image(False, ground=None), image(False), image(True), image(True, 2))
     object_, table = alone.sum(0) > 0, (alone.sum(0) == 0) & (open_sky.sum(0) > 0)
@@ -272,8 +216,7 @@ def test_a_table_is_shadowed_by_the_object_and_reflects_its_own_color_onto_it():
 
 def test_shadows_are_recomputed_for_large_changes_of_shape_and_reused_for_small_ones():
     """Each example has its own shape; back where it began, it has the mesh's own shadows."""
-    settings, cameras = replace(SETTINGS, shadows=True), orbit_cameras(2, 2)
-    scene = built([ObjectSettings("solid:cup", "cup")], cameras, settings)
+    scene = built("cup", shadows=True)
     mesh, examples, lights = scene.mesh(0), torch.arange(len(scene)), random_lights(len(scene))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(scene), *mesh.vertices.shape))
 
@@ -286,7 +229,7 @@ def test_shadows_are_recomputed_for_large_changes_of_shape_and_reused_for_small_
         expected = []
         for index, vertices in enumerate(moved.astype(np.float64)):
             shaped, [camera] = replace(mesh, vertices=vertices), scene.cameras[index]
-            [operator] = build_operators(shaped, [camera], settings, RASTERIZER)
+            [operator] = build_operators(shaped, [camera], scene.settings, RASTERIZER)
             expected.append(operator.image(lights[index], GRAYS[index % len(GRAYS)]))
         return float((images[:, 0] - torch.stack(expected)).abs().max())
 
