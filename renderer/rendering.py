@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial, reduce
@@ -11,11 +12,11 @@ import torch
 from torch import Tensor
 
 from renderer.albedo import face_albedo, surface_albedo
-from renderer.camera import Camera
+from renderer.camera import Camera, OrthographicCamera
 from renderer.errors import FACTOR, InputError, require_range
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, as_background, composite
-from renderer.light.basis import Harmonics, LocalBasis, SumBasis
+from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, SumBasis, parts_of
 from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 LocalLight = LocalBasis | tuple[LocalBasis, Tensor]  # lamps or a projector, and coefficients (size, 3)
+_OBLIQUE = OrthographicCamera(math.pi / 3, 0.0, 2.0)  # the first of `orbit_cameras`
 _choose = cache(choose)  # "auto" asks the driver, which takes longer than an image
 
 
@@ -62,14 +64,10 @@ def render(
     one by vertices and albedo keeps shadows and bounces of environment light.
     InputError: NaN, shapes that do not fit, unknown choices.
 
-    >>> apple, camera = renderer.normalize(renderer.solid("apple")), renderer.OrthographicCamera(1.0, 0.0, width=2.2)
     >>> light = renderer.load_light("grace").requires_grad_()
-    >>> image = renderer.render(apple, camera, light, size=16, rasterizer="numpy")
-    >>> image.shape
-    torch.Size([1, 3, 16, 16])
-    >>> image.mean().backward()
-    >>> light.grad.shape
-    torch.Size([49, 3])
+    >>> image = renderer.render(renderer.solid("apple"), renderer.orbit_cameras(2, 2.2), light, size=16)
+    >>> image.shape, torch.autograd.grad(image.mean(), light)[0].shape
+    (torch.Size([2, 3, 16, 16]), torch.Size([49, 3]))
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
@@ -154,8 +152,7 @@ def precompute_transfer(
 
     `operator.image(light, background)` equals the image of `render`, to rounding. Keywords as there.
 
-    >>> pear, cameras = renderer.normalize(renderer.solid("pear")), renderer.orbit_cameras(2, width=2.2)
-    >>> operators = renderer.precompute_transfer(pear, cameras, size=16, rasterizer="numpy")
+    >>> operators = renderer.precompute_transfer(renderer.solid("pear"), renderer.orbit_cameras(2, 2.2), size=16)
     >>> lights = torch.stack([renderer.load_light("grace"), renderer.load_light("st_peters")])
     >>> operators[0].image(lights).shape
     torch.Size([2, 3, 16, 16])
@@ -163,6 +160,28 @@ def precompute_transfer(
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     require_range("albedo_scale", albedo_scale, 0, FACTOR)
     return build_operators(mesh, _listed(cameras), settings, _choose(rasterizer), albedo_scale)
+
+
+def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Basis = HARMONICS) -> Tensor:
+    """A light (basis.size, 3) as an image: (3, size, size) float32, sRGB-encoded, of a diffuse white ball on white.
+
+    The ball is that of radius 1 about the origin, which says how far lights in the scene are, and fills the image as
+    the camera sees it from afar. Even light of radiance 1 is white. A mirror would show the series ringing and the
+    coefficients that reach no surface. InputError: NaN.
+    """
+    parts = [(part, light[rows].detach().cpu().float()) for rows, part in parts_of(basis)]
+    local = [(part, values) for part, values in parts if isinstance(part, LocalBasis)]
+    [sky] = [values / math.pi for part, values in parts if isinstance(part, Harmonics)] or [None]
+    camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
+    return render(_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")[0]
+
+
+@cache
+def _ball() -> Mesh:
+    from trimesh.creation import icosphere  # trimesh takes half a second
+
+    ball = icosphere(subdivisions=5)
+    return Mesh.plain(ball.vertices, ball.faces)
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> Sequence[Camera]:

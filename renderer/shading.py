@@ -60,7 +60,7 @@ def radiance(
     InputError: NaN in any of them.
     """
     require_bounded(albedo=albedo)  # the normals and the irradiance check the rest
-    wide = _computed_in(vertices.dtype)
+    wide = torch.promote_types(vertices.dtype, torch.float32)
     albedo = albedo.to(wide)
     if smooth_faces is None:
         pixel, face, weights = fragments.merge(albedo)
@@ -79,13 +79,12 @@ def radiance(
 def irradiance(normals: Float[Tensor, "N 3"], light: Float[Tensor, "coefficients 3"]) -> Float[Tensor, "3 N"]:
     """Irradiance on surfaces with normals of any length under a light of (degree + 1)² coefficients.
 
-    Differentiable in both, in the dtype of `normals`; half precision is computed in float32. The coefficients of
-    bands that cannot reach a diffuse surface have a gradient of exactly zero.
-    InputError: NaN, or a light that is not of whole bands and three channels.
+    Differentiable in both, in the dtype of `normals`; half precision is computed in float32. The gradient by bands that
+    cannot reach a diffuse surface is exactly zero. InputError: NaN, or a light of another shape.
     Source: the paper's equation for R in appendix B.2; its derivative by n in appendix D, here a polynomial too.
     """
     require_finite(normals=normals)
-    wide = _computed_in(normals.dtype)
+    wide = torch.promote_types(normals.dtype, torch.float32)
     return _irradiance(normals.T.to(wide), light, wide).to(normals.dtype)
 
 
@@ -158,7 +157,7 @@ def _slopes_per_light(degree: int, dtype: torch.dtype, device: torch.device) -> 
     """(3, J + 1, K): what one of each of a light's first K coefficients adds to the slopes in `_polynomial`: by each
     axis, those of its even bands in monomials, and that of band 1."""
     even = _even(degree)
-    slopes = torch.cat([_slopes(even), F.pad(_slopes(1), (0, (even + 1) ** 2 - 4))], dim=1) * _factors(even).T
+    slopes = torch.cat([_slopes(even), F.pad(_slopes(1), (0, (even + 1) ** 2 - 4))], dim=1) * lambertian_factors(even)
     return slopes[..., : (degree + 1) ** 2].to(device, dtype)
 
 
@@ -179,18 +178,7 @@ def _slopes(degree: int) -> Tensor:
 def _nonzero_harmonics(unit: Tensor, degree: int) -> tuple[list[int], Tensor]:
     """(the K coefficients that reach a surface, what one of each does at unit or zero vectors (3, N): (K, N))."""
     nonzero = nonzero_coefficients(degree).tolist()
-    return nonzero, torch.stack(select_rows(unit, nonzero)) * _factors(degree).to(unit)[nonzero]
-
-
-@per_degree
-def _factors(degree: int) -> Tensor:
-    """((degree + 1)², 1): what a diffuse surface keeps of each coefficient."""
-    return lambertian_factors(degree)[bands(degree)][:, None]
-
-
-def _computed_in(dtype: torch.dtype) -> torch.dtype:
-    """The dtype itself, or float32 for half precision."""
-    return torch.promote_types(dtype, torch.float32)
+    return nonzero, torch.stack(select_rows(unit, nonzero)) * lambertian_factors(degree).to(unit)[nonzero, None]
 
 
 def smooth_normals(

@@ -26,7 +26,7 @@ from renderer.light.basis import HARMONICS, Basis, Harmonics, LocalBasis, parts_
 from renderer.mesh import Mesh
 from renderer.rasterizer import Rasterizer
 from renderer.transport.local import SparseTransfer, joined, local_transfer
-from renderer.transport.precomputed import Transport, build_transport
+from renderer.transport.precomputed import build_transport
 from renderer.transport.rays import Rays, Surface
 
 if TYPE_CHECKING:
@@ -52,14 +52,10 @@ class TransferOperator:
     settings: of the image. basis: of the lights.
     sparse: of three channels, added to the dense transfer: that of patterns, most of whose entries are zero; or None.
 
-    >>> pear = renderer.normalize(renderer.solid("pear"))
-    >>> [operator] = renderer.precompute_transfer(pear, renderer.orbit_cameras(1, width=2.2), 16, rasterizer="numpy")
+    >>> [operator] = renderer.precompute_transfer(renderer.solid("pear"), renderer.orbit_cameras(1, 2.2), size=16)
     >>> light = renderer.load_light("grace")
-    >>> radiance = operator.radiance(light)  # linear in the light, before clamping
-    >>> torch.allclose(operator.radiance(2 * light), 2 * radiance)
+    >>> torch.allclose(operator.radiance(2 * light), 2 * operator.radiance(light))  # linear, before clamping
     True
-    >>> operator.light_gradient(torch.ones_like(radiance)).shape
-    torch.Size([49, 3])
     """
 
     transfer: Float[Tensor, "channels K P"]
@@ -89,10 +85,8 @@ class TransferOperator:
         """
         require_bounded(lights=lights)
         if lights.shape[-2:] != (self.basis.size, 3):
-            raise InputError(
-                f"lights of shape {tuple(lights.shape)} are not of the operator's {self.basis}: "
-                f"give {self.basis.size} rows"
-            )
+            shape, size = tuple(lights.shape), self.basis.size
+            raise InputError(f"lights of shape {shape} are not of the operator's {self.basis}: give {size} rows")
         return _Radiance.apply(lights, self)
 
     def light_gradient(
@@ -103,11 +97,6 @@ class TransferOperator:
         Exactly zero for the coefficients that reach no pixel. InputError: NaN.
         """
         require_bounded(radiance_gradient=radiance_gradient)
-        if radiance_gradient.shape[-2:] != (3, len(self.pixels)):
-            raise InputError(
-                f"radiance_gradient of shape {tuple(radiance_gradient.shape)} does not fit the operator: "
-                f"give (3, {len(self.pixels)})"
-            )
         upstream = radiance_gradient.to(self.transfer.dtype)
         if self._shared is not None:
             product = linear(upstream * self.albedo, self._shared)
@@ -115,9 +104,8 @@ class TransferOperator:
             product = torch.einsum("...cp,ckp->...ck", upstream, self.transfer)
         gradient = self._scatter @ product.mT
         if self.sparse is not None:
-            upstream = upstream.flatten(0, -3) if upstream.dim() > 2 else upstream[None]
-            entries, image = _repeated(self.sparse, len(upstream))
-            gradient = gradient + entries.light_gradient(upstream, image, self.basis.size).view_as(gradient)
+            arriving = upstream.mT.index_select(-2, self.sparse.pixel) * self.sparse.weight
+            gradient = gradient.index_add(-2, self.sparse.function, arriving)
         return gradient.to(radiance_gradient.dtype)
 
     def to(self, device: torch.device | str) -> TransferOperator:
@@ -149,22 +137,14 @@ class _Radiance(torch.autograd.Function):
         else:
             product = torch.einsum("...kc,ckp->...cp", nonzero, operator.transfer)
         if operator.sparse is not None:
-            batch = lights.to(product.dtype).reshape(-1, *lights.shape[-2:])
-            entries, image = _repeated(operator.sparse, len(batch))
-            product = product + entries.radiance(batch, image, product.shape[-1]).reshape(product.shape)
+            arriving = lights.to(product.dtype).index_select(-2, operator.sparse.function) * operator.sparse.weight
+            product = product.index_add(-1, operator.sparse.pixel, arriving.mT)
         return product.to(lights.dtype)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         return ctx.operator.light_gradient(upstream), None
-
-
-def _repeated(entries: SparseTransfer, images: int) -> tuple[SparseTransfer, Tensor]:
-    """(the entries repeated for each image, (N,) the image of each)."""
-    every = torch.arange(len(entries.function), device=entries.function.device)
-    image = torch.arange(images, device=every.device).repeat_interleave(len(every))
-    return entries if images == 1 else entries.taken(every.repeat(images)), image
 
 
 def apply_transfer(lights: Tensor, transfer: Tensor, albedo: Tensor) -> Tensor:
@@ -194,56 +174,44 @@ def build_operators(
     views = build_fragments(mesh.vertices, mesh.faces, cameras, settings, rasterizer, closed=mesh.closed)
     transport = build_transport(mesh, settings, albedo_scale, basis)
     rays = transport.rays if transport else Rays(mesh)
-    operators = []
-    for view in views:
-        surface, albedo = Surface.of(mesh, view, settings), surface_albedo(mesh, view, settings.encoding) * albedo_scale
-        operators.append(_operator(surface, albedo, rays, transport, settings, basis, dtype))
-    return operators
 
-
-def _operator(
-    surface: Surface,
-    albedo: Tensor,
-    rays: Rays,
-    transport: Transport | None,
-    settings: ImageSettings,
-    basis: Basis,
-    dtype: torch.dtype,
-) -> TransferOperator:
-    """The operator of one view, with albedo (S, 3) at its samples."""
-    fragments, pixels = surface.fragments, len(surface.fragments.pixels)
-    factor = None if transport and transport.colors else _pixel_albedo(fragments, albedo, dtype)
-    if factor is None:
-        factor = torch.ones(pixels, 3)
-    else:
-        albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
-    transfers, nonzero = [torch.empty(albedo.shape[1], 0, pixels, dtype=dtype)], [torch.arange(0)]
-    sparse = []
-    for rows, part in parts_of(basis):
-        if isinstance(part, LocalBasis):
-            entries = local_transfer(rays, surface, albedo, part)
-            if entries.few(pixels):
-                weight = (entries.weight * factor[entries.pixel]).to(dtype)
-                sparse.append(SparseTransfer(rows.start + entries.function, entries.pixel, weight))
-                continue
-            transfer, indices = entries.dense(pixels)
+    def build(fragments: Fragments) -> TransferOperator:
+        surface, pixels = Surface.of(mesh, fragments, settings), len(fragments.pixels)
+        albedo = surface_albedo(mesh, fragments, settings.encoding) * albedo_scale
+        factor = None if transport and transport.colors else _pixel_albedo(fragments, albedo, dtype)
+        if factor is None:
+            factor = torch.ones(pixels, 3)
         else:
-            transfer, indices = _box_filter(surface, albedo, part, dtype), part.nonzero
-            change = transport.change(surface, albedo) if transport else None
-            if change is not None:
-                transfer, indices = change.index_add_(1, indices, transfer.double()), torch.arange(part.size)
-        transfers.append(transfer.to(dtype))
-        nonzero.append(rows.start + indices)
-    return TransferOperator(
-        transfer=torch.cat(transfers, dim=1),
-        albedo=factor.T.to(dtype).contiguous(),
-        coverage=fragments.coverage.to(dtype),
-        pixels=fragments.pixels,
-        nonzero=torch.cat(nonzero),
-        settings=settings,
-        basis=basis,
-        sparse=joined(sparse),
-    )
+            albedo = torch.ones(len(albedo), 1, dtype=torch.float64)
+        transfers, nonzero = [torch.empty(albedo.shape[1], 0, pixels, dtype=dtype)], [torch.arange(0)]
+        sparse = []
+        for rows, part in parts_of(basis):
+            if isinstance(part, LocalBasis):
+                entries = local_transfer(rays, surface, albedo, part)
+                if entries.few(pixels):
+                    weight = (entries.weight * factor[entries.pixel]).to(dtype)
+                    sparse.append(SparseTransfer(rows.start + entries.function, entries.pixel, weight))
+                    continue
+                transfer, indices = entries.dense(pixels)
+            else:
+                transfer, indices = _box_filter(surface, albedo, part, dtype), part.nonzero
+                change = transport.change(surface, albedo) if transport else None
+                if change is not None:
+                    transfer, indices = change.index_add_(1, indices, transfer.double()), torch.arange(part.size)
+            transfers.append(transfer.to(dtype))
+            nonzero.append(rows.start + indices)
+        return TransferOperator(
+            transfer=torch.cat(transfers, dim=1),
+            albedo=factor.T.to(dtype).contiguous(),
+            coverage=fragments.coverage.to(dtype),
+            pixels=fragments.pixels,
+            nonzero=torch.cat(nonzero),
+            settings=settings,
+            basis=basis,
+            sparse=joined(sparse),
+        )
+
+    return list(map(build, views))
 
 
 def _pixel_albedo(fragments: Fragments, albedo: Tensor, dtype: torch.dtype) -> Tensor | None:

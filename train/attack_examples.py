@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate
 from augment.service import SHOWN_EXAMPLES, AttackExamples
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
-from renderer.light.light_sphere import light_sphere
+from renderer.rendering import light_sphere
 
 SUFFIX = ".safetensors"
 LARGEST_SIDE = 128  # pixels; larger images are reduced

@@ -16,7 +16,7 @@ from augment.attacks.figure import Panel, prediction_caption, save_figure
 from augment.scene import Conditions
 from renderer.io.mesh_damage import mesh_damage
 from renderer.light.basis import Basis
-from renderer.light.light_sphere import light_sphere
+from renderer.rendering import light_sphere
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
 SPHERE = 192

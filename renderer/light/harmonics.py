@@ -191,31 +191,28 @@ def bands(degree: int) -> Int[Tensor, " coefficients"]:
 
 
 @per_degree
-def lambertian_factors(degree: int) -> Float64[Tensor, " bands"]:
-    """What a diffuse surface keeps of each of degree + 1 bands: irradiance = Σ A_l U_lm Y_lm(n).
+def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
+    """What a diffuse surface keeps of each coefficient: irradiance = Σ A_l U_lm Y_lm(n).
 
     A_l = π, 2π/3, π/4, 0, -π/24, 0, π/64, ...: the clamped cosine (Ramamoorthi and Hanrahan 2001, equation 8).
     """
-    require_range("degree", degree, 0, MAX_DEGREE)
-    factors = torch.zeros(degree + 1, dtype=torch.float64)
-    factors[:2] = torch.tensor([math.pi, 2 * math.pi / 3], dtype=torch.float64)[: degree + 1]
-    for l in range(2, degree + 1, 2):
-        ratio = math.comb(l, l // 2) / 2.0**l
-        factors[l] = 2 * math.pi * (-1) ** (l // 2 - 1) / ((l + 2) * (l - 1)) * ratio
-    return factors
+    factors = [math.pi, 2 * math.pi / 3]
+    for l in range(2, degree + 1):
+        even = 2 * math.pi * (-1) ** (l // 2 - 1) / ((l + 2) * (l - 1)) * (math.comb(l, l // 2) / 2.0**l)
+        factors.append(0.0 if l % 2 else even)
+    return torch.tensor(factors, dtype=torch.float64)[bands(degree)]
 
 
 @per_degree
 def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
     """Indices of the coefficients that can reach a diffuse surface: 31 of the 49 at degree 6."""
-    return torch.nonzero(lambertian_factors(degree)[bands(degree)]).squeeze(1)
+    return torch.nonzero(lambertian_factors(degree)).squeeze(1)
 
 
 def irradiance_basis(normals: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch K"]:
     """A_l Y_lm(n) of the K nonzero coefficients: irradiance at unit normals per unit coefficient."""
     nonzero = nonzero_coefficients(degree)
-    factors = lambertian_factors(degree)[bands(degree)[nonzero]].to(normals)
-    return basis(normals, degree)[..., nonzero.to(normals.device)] * factors
+    return basis(normals, degree)[..., nonzero.to(normals.device)] * lambertian_factors(degree)[nonzero].to(normals)
 
 
 def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:
@@ -273,14 +270,12 @@ def rotate(
 ) -> Float[Tensor, "coefficients channels"]:
     """Coefficients of the light turned by a rotation: u'(ω) = u(Rᵀω).
 
-    rotation: orthonormal. Exact: the integrand is a polynomial.
-    InputError: NaN.
+    rotation: orthonormal. Exact: the integrand is a polynomial. InputError: NaN.
     """
     require_finite(coefficients=coefficients, rotation=rotation)
     degree = math.isqrt(len(coefficients)) - 1
-    turned = project(
-        lambda directions: basis(directions @ rotation.to(directions), degree) @ coefficients.to(directions),
-        degree,
-        quadrature_degree=2 * degree,
-    )
-    return turned.to(coefficients)
+
+    def turned(directions: Tensor) -> Tensor:
+        return basis(directions @ rotation.to(directions), degree) @ coefficients.to(directions)
+
+    return project(turned, degree, quadrature_degree=2 * degree).to(coefficients)

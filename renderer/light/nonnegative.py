@@ -73,7 +73,7 @@ def project_nonnegative(lights: Tensor, within: Ball | None = None) -> Tensor:
     return torch.from_numpy(nearest).view(lights.mT.shape).to(lights).mT
 
 
-def _programs(lights: Tensor, within: Ball | None) -> "Sequence[_Program]":
+def _programs(lights: Tensor, within: Ball | None) -> "list[_Program]":
     """One of each light, if a sphere holds its channels together, and else one of each channel."""
     original = _by_channel(lights)
     if within is None:
@@ -82,7 +82,7 @@ def _programs(lights: Tensor, within: Ball | None) -> "Sequence[_Program]":
         return [_Program(*light) for light in zip(original, *map(_by_channel, within.ends), strict=True)]
     shape = len(lights), lights.shape[2], lights.shape[1]
     of_lights = zip(original.reshape(shape), _by_channel(within.center).reshape(shape), strict=True)
-    return [_InSphere(light, center, within.radius) for light, center in of_lights]
+    return [_Program(light, center=center, radius=within.radius) for light, center in of_lights]
 
 
 def _by_channel(lights: Tensor) -> Array:
@@ -91,50 +91,40 @@ def _by_channel(lights: Tensor) -> Array:
 
 
 class _Program:
-    """The lights (C, K) nearest to the original ones, between bounds, and non-negative in the active directions."""
+    """The lights (C, K) nearest to the original ones that are non-negative in the active directions, between bounds or
+    together within an L2 distance of a center, of t = 1 / (1 + λ)."""
 
-    def __init__(self, original: Array, low: Array | float = -np.inf, high: Array | float = np.inf):
-        self.original, self.nearest = original, original.clip(low, high)
-        self.low, self.high = np.broadcast_to(low, original.shape), np.broadcast_to(high, original.shape)
-        self._active = [original[:0]] * len(original)  # R (M, K) of each light
-
-    def add(self, rows: Sequence[Array]) -> None:
-        """Solve it with further rows (M, K) of each light; rows whose multiplier is zero are dropped."""
-        self._active = [np.concatenate(pair) for pair in zip(self._active, rows, strict=True)]
-        self.nearest, self._active = self._solved()
-
-    def _solved(self) -> tuple[Array, list[Array]]:
-        return self._nearest_to(self.original)
-
-    def _nearest_to(self, lights: Array) -> tuple[Array, list[Array]]:
-        channels = zip(lights, self._active, self.low, self.high, strict=True)
-        solved = [_least_distance(*channel) if len(channel[1]) else channel[:2] for channel in channels]
-        nearest, active = zip(*solved, strict=True)
-        return np.stack(nearest), list(active)
-
-
-class _InSphere(_Program):
-    """The same for lights that together lie within an L2 distance of a center; t = 1 / (1 + λ), from `_least` to 1."""
-
-    def __init__(self, original: Array, center: Array, radius: float):
-        super().__init__(original)
-        self._center, self._radius, self._offset = center, radius, original - center
+    def __init__(
+        self,
+        original: Array,
+        low: Array | float = -np.inf,
+        high: Array | float = np.inf,
+        center: Array | float = 0.0,
+        radius: float = np.inf,
+    ):
+        self.original, self._center, self._radius, self._offset = original, center, radius, original - center
+        self._low, self._high = np.broadcast_to(low, original.shape), np.broadcast_to(high, original.shape)
         self._least = self._t = min(radius / max(float(np.linalg.norm(self._offset)), _TINY), 1.0)
-        self.nearest = self._target()
+        self.nearest = self._target().clip(low, high)
+        self._active = [original[:0]] * len(original)  # R (M, K) of each light
 
     def _target(self) -> Array:
         return self.original if self._t == 1 else self._center + self._t * self._offset
 
-    def _solved(self) -> tuple[Array, list[Array]]:
+    def add(self, rows: Sequence[Array]) -> None:
+        """Solve it with further rows (M, K) of each light; rows whose multiplier is zero are dropped."""
+        rows = [np.concatenate(pair) for pair in zip(self._active, rows, strict=True)]
         for _ in range(_STEPS):
             target = self._target()
-            nearest, active = self._nearest_to(target)
-            displacement = nearest - self._center
+            solved = map(_least_distance, target, rows, self._low, self._high)
+            nearest, self._active = map(list, zip(*solved, strict=True))
+            displacement = np.stack(nearest) - self._center
             distance = float(np.linalg.norm(displacement))
             left = self._radius - distance
             if abs(left) <= _ON_SPHERE * self._radius or (self._t == 1 and left > 0):
                 break
-            motions, multipliers, changes = zip(*map(_motion, self._offset, nearest - target, active), strict=True)
+            added = np.stack(nearest) - target
+            motions, multipliers, changes = zip(*map(_motion, self._offset, added, self._active), strict=True)
             along = np.stack(motions)
             speed, slope = float((along * along).sum()), float((along * displacement).sum())
             root = math.sqrt(max(slope**2 + speed * left * (self._radius + distance), 0))
@@ -144,7 +134,7 @@ class _InSphere(_Program):
                 displacement = displacement + step * along
                 break
         scale = min(1, self._radius / max(float(np.linalg.norm(displacement)), _TINY))
-        return self._center + displacement * scale, active
+        self.nearest = self._center + displacement * scale
 
 
 def _motion(offset: Array, added: Array, rows: Array) -> tuple[Array, Array, Array]:
@@ -162,6 +152,8 @@ def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tu
     With G x ≥ h for all constraints together: nnls minimizes |E u − f| for E = [Gᵀ; hᵀ], f = (0, ..., 0, 1) and u ≥ 0,
     and its residual r gives x = −r_j / r_(K+1) (Lawson and Hanson's algorithm LDP), relative to `original`.
     """
+    if not len(rows):
+        return original, rows
     size, unit, bounded = len(original), np.linalg.norm(original), np.isfinite(low)
     axes = np.eye(size)[bounded]
     sides = np.concatenate([rows, axes, -axes])

@@ -48,18 +48,11 @@ class SparseTransfer(NamedTuple):
         return SparseTransfer(*(field.to(device) for field in self))
 
     def radiance(self, lights: Tensor, image: Tensor, pixels: int) -> Tensor:
-        """(B, 3, P) of B images in a light each, (B, size, 3): entries, of three channels, are of image (N,).
+        """(B, 3, P) of B images in a light each, (B, size, 3). image: (N,), that of each entry, of three channels.
         Differentiable in the lights."""
         arriving = lights.flatten(0, 1).index_select(0, image * lights.shape[1] + self.function) * self.weight
         summed = arriving.new_zeros(len(lights) * pixels, 3).index_add(0, image * pixels + self.pixel, arriving)
         return summed.unflatten(0, (len(lights), pixels)).mT
-
-    def light_gradient(self, upstream: Tensor, image: Tensor, size: int) -> Tensor:
-        """(B, size, 3) of `radiance`, from a gradient by it (B, 3, P)."""
-        images, _, pixels = upstream.shape
-        arriving = upstream.mT.flatten(0, 1).index_select(0, image * pixels + self.pixel) * self.weight
-        gradient = arriving.new_zeros(images * size, 3).index_add(0, image * size + self.function, arriving)
-        return gradient.unflatten(0, (images, size))
 
 
 def joined(parts: Sequence[SparseTransfer]) -> SparseTransfer | None:
@@ -102,12 +95,14 @@ def unoccluded(rays: Rays, surface: Surface, paths: LightPaths) -> LightPaths:
 
 class LocalLightView:
     """A view of one shape in local light, computed on the CPU, where the rays are cast: once for lights that stay, and
-    again for lamps that moved. Derivatives hold fixed which lamps and which pixel of a pattern reach a sample."""
+    again for lamps that moved. Derivatives hold fixed which lamps and which pixel of a pattern reach a sample.
+
+    rays: among the shape's faces. vertices: of the shape (V, 3), unless they are the mesh's.
+    """
 
     def __init__(
         self, rays: Rays, mesh: Mesh, fragments: Fragments, settings: ImageSettings, vertices: Tensor | None = None
     ):
-        """rays: among the shape's faces. vertices: of the shape (V, 3), unless they are the mesh's."""
         vertices = None if vertices is None else vertices.cpu()
         self._rays, self._surface = rays, Surface.of(mesh, fragments.to("cpu"), settings, vertices)
         self._fixed: dict[LocalBasis, LightPaths] = {}
@@ -117,13 +112,11 @@ class LocalLightView:
 
         positions: (L, 3) of lamps, None where the basis has them. Differentiable in all and in the vertices.
         """
-        paths = self._paths(basis, positions)
-        return local_radiance(self._surface.fragments, albedo.cpu().double(), paths, light.cpu().double()).to(light)
-
-    def _paths(self, basis: LocalBasis, positions: Tensor | None) -> LightPaths:
-        points, normals = self._surface.points, self._surface.normals
-        if isinstance(basis, Lamps) and positions is not None:
-            return unoccluded(self._rays, self._surface, basis.connect(points, normals, positions.cpu().double()))
-        if basis not in self._fixed:
-            self._fixed[basis] = unoccluded(self._rays, self._surface, basis.connect(points, normals))
-        return self._fixed[basis]
+        surface, moved = self._surface, isinstance(basis, Lamps) and positions is not None
+        paths = None if moved else self._fixed.get(basis)
+        if paths is None:
+            others = [positions.cpu().double()] if moved else []
+            paths = unoccluded(self._rays, surface, basis.connect(surface.points, surface.normals, *others))
+            if not moved:
+                self._fixed[basis] = paths
+        return local_radiance(surface.fragments, albedo.cpu().double(), paths, light.cpu().double()).to(light)

@@ -42,7 +42,7 @@ def scipy_basis(directions: np.ndarray | torch.Tensor, degree: int) -> np.ndarra
 def scipy_irradiance(normals: np.ndarray | torch.Tensor, light: np.ndarray | torch.Tensor) -> np.ndarray:
     """(N, 3) Σ A_l U_lm Y_lm(n); test_harmonics proves the factors A_l."""
     degree = math.isqrt(len(light)) - 1
-    factors = np.repeat(lambertian_factors(degree).numpy(), 2 * np.arange(degree + 1) + 1)
+    factors = lambertian_factors(degree).numpy()
     return scipy_basis(normals, degree) @ (factors[:, None] * np.asarray(light, dtype=np.float64))
 
 

@@ -9,11 +9,12 @@ from torch import Tensor
 
 import renderer
 from renderer.errors import InputError
-from renderer.image import ENCODINGS, NORMALS, ImageSettings, as_background
-from renderer.light.basis import with_local_lights
+from renderer.image import ENCODINGS, NORMALS, ImageSettings, as_background, encode
+from renderer.light.basis import HARMONICS, SumBasis, with_local_lights
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import ambient, load_light
 from renderer.rasterizer import choose
+from renderer.rendering import light_sphere
 from renderer.transfer import build_operators
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -145,3 +146,29 @@ def test_an_image_is_linear_in_a_pattern_and_differentiable():
     image = renderer.render(renderer.solid("plate"), CAMERAS, None, lights=lights, background=0.0, **SMALL)
     (gradient,) = torch.autograd.grad(image.sum(), pattern)
     torch.testing.assert_close((gradient * pattern).sum(), image.sum())
+
+
+def on_the_ball(size: int) -> tuple[Tensor, Tensor]:
+    """Normals (size, size, 3) of a ball of radius 1 seen from above, right is +y, and the pixels well inside it."""
+    at = (torch.arange(size).double() + 0.5) * 2 / size - 1
+    right, up = at.expand(size, -1), -at[:, None].expand(-1, size)
+    back = (1 - right**2 - up**2).clamp(min=0).sqrt()
+    return torch.stack([-up, right, back], dim=2), back > 0.3
+
+
+def test_a_light_sphere_shows_even_light_on_white_and_lamps_by_inverse_squares():
+    """c · cos / d². The ball's edges of 0.036 leave its faces 0.036² / 8 inside of it; sRGB's slope is 1.7 at 0.1.
+    Within a pixel the lamp's terminator is a kink."""
+    position, power = torch.tensor([0.3, -0.4, 2.5]).double(), torch.tensor([0.5, 1.0, 2.0]).double()
+    light = torch.cat([ambient(torch.full((3,), 0.1)), power[None].float()])
+    basis = SumBasis((HARMONICS, Lamps((tuple(position.tolist()),))))
+    image = light_sphere(light, 64, renderer.OrthographicCamera(0.0, 0.0, 2.0), basis)
+    normal, inside = on_the_ball(64)
+    toward = position - normal
+    arriving = ((toward * normal).sum(2) / toward.norm(dim=2) ** 3).clamp(min=0)
+    expected = encode((0.1 + power[:, None, None] * arriving).clamp(max=1), "srgb").float()
+    assert expected[:, inside].std() > 0.05 and (image[:, ::63, ::63] == 1).all()
+    torch.testing.assert_close(image[:, inside], expected[:, inside], rtol=0, atol=6e-3)
+    alone = light_sphere(ambient(torch.tensor([0.1, 0.4, 0.9])), 16)
+    expected = encode(torch.tensor([0.1, 0.4, 0.9]), "srgb")
+    torch.testing.assert_close(alone[:, 8, 8], expected, rtol=0, atol=1e-6)

@@ -5,8 +5,8 @@ from augment.service import SHOWN_EXAMPLES, AttackExamples
 from renderer.errors import InputError
 from renderer.image import to_bytes
 from renderer.light.basis import HARMONICS, SumBasis
-from renderer.light.light_sphere import light_sphere
 from renderer.light.local import Projector
+from renderer.rendering import light_sphere
 from train.attack_examples import LARGEST_SIDE, SPHERE, read_attack_examples, write_attack_examples
 
 CLASSES = ["apple", "orange"]
