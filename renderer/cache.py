@@ -77,12 +77,13 @@ RENDERER = source_key(Path(__file__).parent)  # on import, so that it is the cod
 class TensorCache:
     """Named tensors in files of a folder, under content keys.
 
-    folder: made when first written to; None: nothing is written. Where nothing can be written, no run stops: everything
-    can be computed again.
+    folder: made when first written to; None: nothing is written. problem: why nothing can be written, or None; that
+    stops no run, since everything can be computed again.
     """
 
     def __init__(self, folder: Path | None = None):
-        self.folder, self.writable = folder, folder is not None
+        self.folder = folder
+        self.problem: str | None = None
 
     def read(self, key: str) -> dict[str, Tensor] | None:
         """The tensors that were written under the key; None where there are none, or where a bit has changed."""
@@ -95,7 +96,7 @@ class TensorCache:
 
     def write(self, key: str, tensors: Mapping[str, Tensor]) -> None:
         """Write CPU tensors. Another process sees the old file or the new one, and `read` passes over a torn one."""
-        if self.folder is None or not self.writable:
+        if self.folder is None or self.problem:
             return
         content = safetensors.torch.save(dict(tensors))
         try:
@@ -104,8 +105,8 @@ class TensorCache:
                 file = Path(temporary) / key
                 file.write_bytes(_checksum(key, content) + content)
                 os.replace(file, self.folder / key)
-        except OSError:
-            self.writable = False  # it is not tried for every file
+        except OSError as error:
+            self.problem = str(error)
 
 
 def _checksum(key: str, content: bytes) -> bytes:
@@ -113,7 +114,12 @@ def _checksum(key: str, content: bytes) -> bytes:
 
 
 class OperatorCache(TensorCache):
-    """Transfer operators, a file per mesh and view: 5 views find those that a run with 10 has built."""
+    """Transfer operators, a file per mesh and view: 5 views find those that a run with 10 has built.
+
+    views: how many were asked for; built: how many of them were computed.
+    """
+
+    views = built = 0
 
     def operators(
         self,
@@ -132,6 +138,7 @@ class OperatorCache(TensorCache):
         missing = [camera for camera, tensors in files.items() if tensors is None]
         new = build_operators(mesh, missing, settings, rasterizer, albedo_scale, basis, dtype) if missing else []
         operators = dict(zip(missing, new, strict=True))
+        self.views, self.built = self.views + len(keys), self.built + len(missing)
         for camera, operator in operators.items():
             sparse = operator.sparse._asdict() if operator.sparse else {}
             self.write(keys[camera], {name: getattr(operator, name) for name in TENSORS} | sparse)

@@ -44,11 +44,12 @@ class Camera(ABC):
 
     @property
     def near(self) -> float:
-        """Distance from the camera at which visible surface begins; it ends at `far`."""
+        """Distance from the camera at which visible surface begins."""
         return max(self.distance - self.reach, NEAREST * self.distance)
 
     @property
     def far(self) -> float:
+        """Distance from the camera at which visible surface ends."""
         return self.distance + self.reach
 
     def seeing(self, radius: float) -> Self:

@@ -45,12 +45,17 @@ class Mesh:
     textures: tuple[np.ndarray, ...] = ()
 
     def __post_init__(self) -> None:
-        count = self.faces.shape[:1]
-        _require_shape("vertices", self.vertices, (*self.vertices.shape[:1], 3))
-        _require_shape("faces", self.faces, (*count, 3), "iu")
-        _require_shape("corner_colors", self.corner_colors, (*count, 3, 3))
-        _require_shape("corner_uvs", self.corner_uvs, (*count, 3, 2))
-        _require_shape("texture_ids", self.texture_ids, count, "iu")
+        count, numbers = len(self.faces), "fiu"  # NumPy's letters for types
+        for name, shape, kinds in (
+            ("vertices", (len(self.vertices), 3), numbers),
+            ("faces", (count, 3), "iu"),
+            ("corner_colors", (count, 3, 3), numbers),
+            ("corner_uvs", (count, 3, 2), numbers),
+            ("texture_ids", (count,), "iu"),
+        ):
+            values = getattr(self, name)
+            if values.shape != shape or values.dtype.kind not in kinds:
+                raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
         _require_indices(self.faces, len(self.vertices))
 
     @staticmethod
@@ -120,12 +125,6 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def _require_shape(name: str, values: np.ndarray, shape: tuple[int, ...], kinds: str = "fiu") -> None:
-    """kinds: NumPy's letters of the types that will do."""
-    if values.shape != shape or values.dtype.kind not in kinds:
-        raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
-
-
 def _require_indices(faces: np.ndarray, vertices: int) -> None:
     if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
         raise InputError(f"faces name vertices that are not there: give indices from 0 to {vertices - 1}")
@@ -133,13 +132,11 @@ def _require_indices(faces: np.ndarray, vertices: int) -> None:
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh with the faces of all, in order; vertices are not merged."""
-    vertices_before = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])[:-1]
-    textures_before = np.cumsum([0] + [len(mesh.textures) for mesh in meshes])[:-1]
-    faces = [mesh.faces + before for mesh, before in zip(meshes, vertices_before, strict=True)]
-    texture_ids = [
-        np.where(mesh.texture_ids < 0, -1, mesh.texture_ids + before).astype(np.int32)
-        for mesh, before in zip(meshes, textures_before, strict=True)
-    ]
+    faces, texture_ids, vertices, textures = [], [], 0, 0
+    for mesh in meshes:
+        faces.append(mesh.faces + vertices)
+        texture_ids.append(np.where(mesh.texture_ids < 0, -1, mesh.texture_ids + textures).astype(np.int32))
+        vertices, textures = vertices + len(mesh.vertices), textures + len(mesh.textures)
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         faces=np.concatenate(faces),

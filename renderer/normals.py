@@ -142,17 +142,11 @@ def _difference(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """(a b rounded, its rounding error)."""
-    rounded = a * b
-    (a, a_low), (b, b_low) = _halves(a), _halves(b)
-    return rounded, ((a * b - rounded) + a * b_low + a_low * b) + a_low * b_low
-
-
-def _halves(a: Tensor) -> tuple[Tensor, Tensor]:
-    """Two numbers of half as many digits with the sum a."""
-    scaled = (2.0**27 + 1) * a
-    high = scaled - (scaled - a)
-    return high, a - high
+    """(a b rounded, its rounding error), by halves of the digits."""
+    rounded, (scaled_a, scaled_b) = a * b, ((2.0**27 + 1) * a, (2.0**27 + 1) * b)
+    a_high, b_high = scaled_a - (scaled_a - a), scaled_b - (scaled_b - b)
+    a_low, b_low = a - a_high, b - b_high
+    return rounded, ((a_high * b_high - rounded) + a_high * b_low + a_low * b_high) + a_low * b_low
 
 
 def _difference_of_products(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:

@@ -289,24 +289,16 @@ def revolve(*strokes: np.ndarray | Sequence[tuple[float, float]]) -> tuple[np.nd
     """
     corners = np.concatenate(strokes)
     stroke_of_corner = np.repeat(np.arange(len(strokes)), [len(stroke) for stroke in strokes])
-    profile, edge = _subdivide(corners)
+    edges = np.diff(corners, axis=0)
+    pieces = np.ceil(np.linalg.norm(edges, axis=1) / STEP - 1e-9).astype(int)  # none of a repeated corner
+    edge = np.repeat(np.arange(len(edges)), pieces)
+    fraction = np.concatenate([np.arange(n) / n for n in pieces if n])
+    profile = np.concatenate([corners[edge] + fraction[:, None] * edges[edge], corners[-1:]])
     azimuth = np.linspace(0, 2 * np.pi, SEGMENTS, endpoint=False)
     radius, height = profile[:, :1], profile[:, 1:]
     rings = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height + 0 * azimuth], axis=-1)
     vertices, faces, band = loft(rings)
     return vertices, faces, stroke_of_corner[edge + 1][band]
-
-
-def _subdivide(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The polyline (n, 2) with edges cut to at most STEP, and the edge of each piece.
-
-    A repeated corner leaves no piece.
-    """
-    edges = np.diff(corners, axis=0)
-    pieces = np.ceil(np.linalg.norm(edges, axis=1) / STEP - 1e-9).astype(int)
-    edge = np.repeat(np.arange(len(edges)), pieces)
-    fraction = np.concatenate([np.arange(n) / n for n in pieces if n])
-    return np.concatenate([corners[edge] + fraction[:, None] * edges[edge], corners[-1:]]), edge
 
 
 def loft(rings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -100,22 +100,17 @@ def _as_one_mesh(tree: dict[str, Any], cameras: Sequence[Camera]) -> None:
     tree["meshes"], tree["nodes"] = [{"primitives": primitives}], [{"mesh": 0}]
     if cameras:
         tree["cameras"] = [_gltf_camera(camera) for camera in cameras]
-        tree["nodes"] += [_camera_node(camera, index) for index, camera in enumerate(cameras)]
+    for index, camera in enumerate(cameras):
+        pose = Y_UP_TO_Z_UP.T @ camera.pose()  # looks along its own -z; stored by columns (glTF 2.0, 3.10)
+        tree["nodes"].append({"camera": index, "name": f"view {index}", "matrix": pose.T.ravel().tolist()})
     tree["scenes"] = [{"nodes": list(range(len(tree["nodes"])))}]
 
 
 def _gltf_camera(camera: Camera) -> dict[str, Any]:
-    planes = {"znear": camera.near, "zfar": camera.far}
+    planes, half = {"znear": camera.near, "zfar": camera.far}, camera.width / 2
     if isinstance(camera, PerspectiveCamera):
         return {"type": "perspective", "perspective": {"yfov": camera.angle, "aspectRatio": 1.0, **planes}}
-    half = camera.width / 2
     return {"type": "orthographic", "orthographic": {"xmag": half, "ymag": half, **planes}}
-
-
-def _camera_node(camera: Camera, index: int) -> dict[str, Any]:
-    """A camera's pose, y up: it looks along its own -z, and the matrix is stored by columns (glTF 2.0, 3.10)."""
-    matrix = Y_UP_TO_Z_UP.T @ camera.pose()
-    return {"camera": index, "name": f"view {index}", "matrix": matrix.T.ravel().tolist()}
 
 
 def _ply(mesh: Mesh, normals: np.ndarray) -> bytes:

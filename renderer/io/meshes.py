@@ -27,9 +27,7 @@ from renderer.io.images import eight_bits
 from renderer.mesh import Mesh
 
 ARCHIVES = {"zip", "tar.gz", "tar.bz2", "bz2"}  # not read: the names in them cannot be checked first
-LIBRARY, DEFINED, USED = (
-    re.compile(rb"^[ \t]*%b[ \t]+(.*?)[ \t\r]*$" % key, re.MULTILINE) for key in (b"mtllib", b"newmtl", b"usemtl")
-)
+DEFINED, USED = (re.compile(rb"^[ \t]*%b[ \t]+(.*?)[ \t\r]*$" % key, re.MULTILINE) for key in (b"newmtl", b"usemtl"))
 OMISSION = re.compile(r"(unable|failed) to (load|store|convert)|unsupported|index failed")  # in trimesh's log
 FLOAT = 5126  # a component type of glTF 2.0 (section 3.6.2.2)
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of a primitive (section 5.24.4); trimesh skips fans
@@ -64,26 +62,17 @@ def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
 
 
 class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyped, see pyproject.toml
-    """Files that a mesh names, also as other systems write paths. Regular files alone: a pipe would never end.
-
-    materials: the content of the .mtl files.
-    """
-
-    def __init__(self, path: Path):
-        super().__init__(str(path))
-        self.folders, self.materials = [path.parent], b""
+    materials = b""  # the content of the .mtl file
 
     def get(self, name: str) -> bytes:
-        """FileNotFoundError where no file has the name: with \\ for /, %20 for a blank, or in another's folder.
+        """A file by its name from the mesh's folder, with \\ for / and %20 for a blank, or else of its last part.
 
-        Options, as in `map_Kd -s 1 1 1 peel.png`, come before the name.
+        FileNotFoundError: there is none. Regular files alone: a pipe would never end.
         """
-        plain = name.strip('" \t').replace("\\", "/")
-        last = plain.split()[-1] if plain.startswith("-") else plain
-        for file in (folder / name for folder in self.folders for name in (unquote(plain), last, Path(last).name)):
+        plain = unquote(name.strip('" \t')).replace("\\", "/")
+        for file in (Path(self.parent, plain), Path(self.parent, Path(plain).name)):
             if file.is_file() and file.suffix.lower() == ".mtl":
-                self.materials += b"\n" + _utf8(file.read_bytes())
-                self.folders.append(file.parent)
+                self.materials = _utf8(file.read_bytes())
                 return self.materials
             if file.is_file():
                 return file.read_bytes()
@@ -106,7 +95,7 @@ def _load(content: bytes, suffix: str, files: _Files) -> trimesh.Scene:
     finally:
         log.removeFilter(note)
         log.setLevel(level)
-    if suffix == "obj" and LIBRARY.search(content):
+    if suffix == "obj" and b"mtllib" in content:
         unknown = set(USED.findall(content)) - set(DEFINED.findall(files.materials))
         omissions += [f"its first .mtl file does not have the material {name.decode()}" for name in unknown]
     if omissions:

@@ -49,11 +49,11 @@ def with_added_albedo(mesh: Mesh, added: np.ndarray, encoding: str, albedo_scale
         charts = _Charts(mesh.corner_uvs[faces], source.shape[1::-1])
         texture = np.zeros((*charts.sheet[::-1], 3), dtype=np.uint8)
         for owners in np.array_split(np.arange(len(faces)), 1 + charts.texels // BLOCK):
-            owner, texel = charts.grid(owners)
-            column, row = charts.source(owner, texel).T
+            owner, texel, center = charts.grid(owners)
+            column, row = (np.floor(center / charts.scale).astype(np.int64) % source.shape[1::-1]).T  # it repeats
             albedo = decoded[torch.from_numpy(source[row, column]).int()]
             if not mesh.one_color_per_face:
-                weights = torch.from_numpy(charts.weights(owner, texel)).float()
+                weights = torch.from_numpy(charts.weights(owner, center)).float()
                 albedo *= torch.einsum("nk,nkc->nc", weights, corner_albedo[faces[owner]])
             elif not (mesh.corner_colors[faces] == 1).all():
                 albedo *= corner_albedo[faces[owner], 0]
@@ -67,43 +67,35 @@ def with_added_albedo(mesh: Mesh, added: np.ndarray, encoding: str, albedo_scale
 class _Charts:
     """The charts of N faces in a new texture. Columns and rows, from the top left, are in this order throughout.
 
-    corner: (N, 2), the top left of each. sheet: size of the new texture. texels: of all charts. uvs: (N, 3, 2).
+    corner: (N, 2), the top left of each. sheet: size of the new texture. texels: of all charts. uvs: (N, 3, 2). scale:
+    new texels per old one.
     """
 
     def __init__(self, uvs: np.ndarray, size: tuple[int, int]):
         """uvs: (N, 3, 2) of the faces in the old texture, which has so many columns and rows."""
         positions = (uvs * [1.0, -1.0] + [0.0, 1.0]) * size
         area = (np.ptp(positions, axis=1) + 2).prod(axis=1).sum()
-        self._old, self._scale = np.array(size), min(1.0, np.sqrt(MOST_TEXELS / max(area, 1)))
-        self._positions = positions * self._scale
+        self.scale = min(1.0, np.sqrt(MOST_TEXELS / max(area, 1)))
+        self._positions = positions * self.scale
         self._first = np.floor(self._positions.min(axis=1) - 0.5).astype(np.int64)
         self._size = np.floor(self._positions.max(axis=1) - 0.5).astype(np.int64) + 2 - self._first
         self.corner, self.sheet = _on_shelves(self._size)
         self.texels = int(self._size.prod(axis=1).sum())
+        self.uvs = (self._positions + (self.corner - self._first)[:, None]) / self.sheet * [1, -1] + [0, 1]
 
-    @property
-    def uvs(self) -> np.ndarray:
-        inside = self._positions + (self.corner - self._first)[:, None]
-        return inside / self.sheet * [1, -1] + [0, 1]
-
-    def grid(self, owners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(owner (S,), column and row (S, 2) in its chart) of all texels of the charts of some owners."""
+    def grid(self, owners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(owner (S,), column and row in its chart (S, 2), position (S, 2)) of all texels of some owners' charts."""
         count = self._size[owners].prod(axis=1)
         owner = np.repeat(owners, count)
         number = np.arange(len(owner)) - np.repeat(count.cumsum() - count, count)
-        return owner, np.stack(np.divmod(number, self._size[owner, 0])[::-1], axis=1)
+        texel = np.stack(np.divmod(number, self._size[owner, 0])[::-1], axis=1)
+        return owner, texel, self._first[owner] + texel + 0.5
 
-    def source(self, owner: np.ndarray, texel: np.ndarray) -> np.ndarray:
-        """(S, 2) columns and rows in the old texture, which repeats."""
-        center = self._first[owner] + texel + 0.5
-        return np.floor(center / self._scale).astype(np.int64) % self._old
-
-    def weights(self, owner: np.ndarray, texel: np.ndarray) -> np.ndarray:
-        """(S, 3) barycentric coordinates of texels, clipped into the face."""
+    def weights(self, owner: np.ndarray, center: np.ndarray) -> np.ndarray:
+        """(S, 3) barycentric coordinates of positions (S, 2), clipped into the face."""
         edges = self._positions[:, 1:] - self._positions[:, :1]
         inverse = np.linalg.pinv(edges)  # a face without area in the texture has no other
-        within = self._first[owner] + texel + 0.5 - self._positions[owner, 0]
-        second_third = np.einsum("ni,nij->nj", within, inverse[owner])
+        second_third = np.einsum("ni,nij->nj", center - self._positions[owner, 0], inverse[owner])
         weights = np.concatenate([1 - second_third.sum(axis=1, keepdims=True), second_third], axis=1).clip(min=0)
         return weights / weights.sum(axis=1, keepdims=True)
 

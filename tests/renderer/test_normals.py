@@ -80,7 +80,7 @@ def test_face_normals_are_the_meshs_and_outward():
     np.testing.assert_array_equal(outward, np.round(box.triangles_center * 2.1))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_derivative_is_the_papers_with_its_sign_put_right(seed):
     corners = draw(3, 3, seed=seed)
     ours = jacobian(lambda vertices: face_normals(vertices, ONE)[0], corners)

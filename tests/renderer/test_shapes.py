@@ -10,13 +10,7 @@ from renderer.shapes import HARD_NEGATIVES, SOLIDS, solid
 
 ALL = SOLIDS | HARD_NEGATIVES
 SHELLS = dict.fromkeys(ALL, 1) | {"cup": 2}  # a cup's handle is a shell of its own
-SEEDS = range(4)
-
-
-@pytest.fixture(params=[(name, seed) for name in ALL for seed in SEEDS], ids=lambda p: f"{p[0]}-{p[1]}")
-def named(request):
-    name, seed = request.param
-    return name, solid(name, seed)
+SEEDS = range(2)
 
 
 def enclosed_volume(vertices, faces):
@@ -33,20 +27,22 @@ def shells(mesh):
     return [mesh.faces[of_vertex[a] == shell] for shell in range(count)]
 
 
-def test_each_directed_edge_occurs_once_and_so_does_its_reverse(named):
-    _, mesh = named
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_solid_has_closed_shells_outward_with_faces_of_some_area_about_the_unit_box(name, seed):
+    """Each directed edge occurs once, and so does its reverse; each shell is a topological sphere."""
+    mesh = solid(name, seed)
     edges = Counter((face[i], face[(i + 1) % 3]) for face in mesh.faces.tolist() for i in range(3))
-    assert set(edges.values()) == {1}
-    assert all((b, a) in edges for a, b in edges)
-
-
-def test_each_shell_is_a_topological_sphere_that_encloses_a_positive_volume(named):
-    name, mesh = named
+    assert set(edges.values()) == {1} and all((b, a) in edges for a, b in edges)
     parts = shells(mesh)
     assert len(parts) == SHELLS[name]
     for faces in parts:
         assert len(np.unique(faces)) - 3 * len(faces) / 2 + len(faces) == 2
         assert enclosed_volume(mesh.vertices, faces) > 1e-3
+    assert mesh.face_areas().min() > 1e-6
+    np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
+    assert 0.8 < np.abs(mesh.vertices).max() < 1.05
+    assert mesh.corner_colors.min() >= 0 and mesh.corner_colors.max() <= 1
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -58,36 +54,10 @@ def test_a_seed_picks_one_instance(name):
     assert not np.array_equal(one.corner_colors, other.corner_colors)
 
 
-def test_a_solid_has_faces_of_some_area_about_the_unit_box_in_display_colors(named):
-    _, mesh = named
-    assert mesh.face_areas().min() > 1e-6
-    np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
-    assert 0.8 < np.abs(mesh.vertices).max() < 1.05
-    assert mesh.corner_colors.min() >= 0 and mesh.corner_colors.max() <= 1
-
-
 def mean_hue(mesh):
     """Degrees, of the mean color."""
     mean = np.average(mesh.corner_colors.mean(axis=1), axis=0, weights=mesh.face_areas())
     return 360 * colorsys.rgb_to_hsv(*mean.tolist())[0]
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_lemons_are_yellow_and_longer_than_wide_and_peaches_between_red_and_yellow(seed):
-    lemon, peach = solid("lemon", seed), solid("peach", seed)
-    assert 42 < mean_hue(lemon) < 65 and 0 < mean_hue(peach) < 40
-    width, depth, length = np.ptp(lemon.vertices, axis=0)
-    assert 1.15 * max(width, depth) < length < 1.6 * min(width, depth)
-
-
-def test_a_ball_is_a_sphere_of_one_color_or_has_a_pale_seam_on_green():
-    balls = [solid("ball", seed) for seed in range(20)]
-    plain = [ball for ball in balls if ball.one_color]
-    assert 4 < len(plain) < 16
-    for ball in balls:
-        np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=1), 0.95)
-        seam = (ball.corner_colors[..., 2] > 0.7).mean()
-        assert ball.one_color or (0.02 < seam < 0.2 and 50 < mean_hue(ball) < 90)
 
 
 def spheroid(mesh):
@@ -123,18 +93,3 @@ def test_a_tables_volume_is_that_of_its_board_and_legs():
     box = np.ptp(mesh.vertices, axis=0).prod()
     expected = box * (board + 4 * leg) / cells
     assert enclosed_volume(mesh.vertices, mesh.faces) == pytest.approx(expected, rel=1e-12)
-
-
-def test_a_bottles_label_and_cap_end_sharply():
-    mesh = solid("bottle")
-    height = mesh.vertices[mesh.faces, 2].mean(axis=1)
-    cap, label = height > 0.8 - 1e-9, (height > -0.75) & (height < -0.15)
-    colors = [np.unique(mesh.corner_colors[part].reshape(-1, 3), axis=0) for part in (cap, label, ~(cap | label))]
-    assert [len(part) for part in colors] == [1, 1, 1]
-    assert len(np.unique(np.concatenate(colors), axis=0)) == 3
-
-
-def test_a_cup_is_hollow():
-    mesh = solid("cup")
-    height = mesh.vertices[np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]) < 1e-6, 2]
-    assert len(height) == 2 and height.max() < 0.8 * mesh.vertices[:, 2].max()

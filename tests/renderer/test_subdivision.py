@@ -4,17 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 
-from renderer.albedo import surface_albedo
-from renderer.camera import OrthographicCamera
-from renderer.fragments import Fragments, build_fragments
-from renderer.image import ImageSettings
 from renderer.mesh import Mesh, concatenate
-from renderer.rasterizer import choose
-from renderer.shading import radiance
 from renderer.shapes import solid
 from renderer.subdivision import refine, subdivide
 
@@ -37,7 +30,7 @@ def euler_number(mesh: Mesh) -> int:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).euler_number
 
 
-def height_field(cells: int = 16) -> Mesh:
+def height_field(cells: int = 3) -> Mesh:
     """A rough surface over [-1, 1]², whose corners' x and y are multiples of 2 / cells; colors and uvs with seams."""
     rng = np.random.default_rng(0)
     x, y = np.meshgrid(*[np.linspace(-1, 1, cells + 1)] * 2, indexing="ij")
@@ -54,32 +47,20 @@ def height_field(cells: int = 16) -> Mesh:
     )
 
 
-SHEET = height_field(3)
+SHEET = height_field()
 MESHES = {
     "box": plain(trimesh.creation.box()),
-    "torus": plain(trimesh.creation.torus(1, 0.3, major_sections=8, minor_sections=6)),
     "cup": solid("cup"),
     "two that touch": concatenate([plain(trimesh.creation.box()), plain(trimesh.creation.icosphere(subdivisions=1))]),
     "open": SHEET,
-    "a triangle": Mesh.plain(np.eye(3), [[0, 1, 2]]),
 }
 every_mesh = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
 
-@pytest.mark.parametrize(
-    ("asked", "found"), [(0, 12), (11, 12), (12, 42), (41, 42), (42, 162), (5000, 10242), (10_000, 10_242)]
-)
+@pytest.mark.parametrize(("asked", "found"), [(0, 12), (11, 12), (12, 42), (42, 162), (5000, 10_242)])
 def test_an_icosahedron_is_subdivided_until_it_has_more_vertices_than_asked(asked, found):
     mesh = subdivide(plain(trimesh.creation.icosahedron()), asked)
     assert (len(mesh.vertices), len(mesh.faces)) == (found, 2 * found - 4)
-
-
-@every_mesh
-def test_faces_are_cut_as_trimesh_cuts_them(mesh):
-    vertices, faces = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
-    found, expected = (np.sort(cut.reshape(-1, 9), axis=0) for cut in (corners(once(mesh)), vertices[faces]))
-    assert_array_equal(found, expected)
-    assert len(once(mesh).vertices) == len(vertices)
 
 
 @every_mesh
@@ -119,28 +100,6 @@ def test_colors_and_uvs_are_the_faces_linear_functions_at_the_new_corners():
     assert_allclose(np.concatenate([finer.corner_colors, finer.corner_uvs], -1), values(finer), rtol=0, atol=2 * EPS32)
     assert_array_equal(finer.texture_ids, SHEET.texture_ids.repeat(16))
     assert finer.textures is SHEET.textures
-
-
-def fragments_of(mesh: Mesh, camera: OrthographicCamera, size: int) -> Fragments:
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], ImageSettings(size, 4), choose("numpy"))
-    return fragments
-
-
-def test_an_image_is_unchanged_where_the_new_corners_lie_on_the_rasterizers_grid():
-    """Corners at whole samples before and after. In two rounds, uvs are off by EPS32, which is 8 of that in texels; so
-    is then the albedo, whose texels and colors differ by up to 1, and so are the radiances in their proportion."""
-    mesh, camera = height_field(), OrthographicCamera(0.0, 0.0, 2.0)
-    finer = subdivide(mesh, 2000)
-    before, after = (fragments_of(each, camera, 16) for each in (mesh, finer))
-    assert torch.equal(after.sample, before.sample)
-    assert torch.equal(after.faces[after.face] // 16, before.faces[before.face])
-    light = torch.randn(49, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    images = [
-        radiance(fragments, torch.from_numpy(each.vertices), light, surface_albedo(each, fragments, "linear"))
-        for each, fragments in ((mesh, before), (finer, after))
-    ]
-    assert images[0].std() > 0.1
-    torch.testing.assert_close(images[1], images[0], rtol=0, atol=16 * EPS32 * float(images[0].abs().max()))
 
 
 def test_refined_faces_are_no_larger_than_asked_and_cover_what_the_large_ones_did():
