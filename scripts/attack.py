@@ -19,10 +19,10 @@ from train.attacks.search import overrides
 from train.attacks.settings import AttackExperimentSettings
 from train.attacks.text import format_attack, format_reloaded
 from train.attacks.transfers import format_transfers, load_others, write_transfers
+from train.device import choose_device
 from train.errors import writable_folder
 from train.networks import load_classifier
 from train.run_folder import sole_writer, write_config
-from train.runtime import choose_device
 
 
 def main(settings: AttackExperimentSettings) -> None:

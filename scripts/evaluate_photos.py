@@ -11,11 +11,11 @@ from train import cli  # isort: skip (first, since the others take seconds to im
 from omegaconf import MISSING
 
 from renderer.errors import InputError
+from train.device import MixedPrecision, choose_device, choose_precision
 from train.errors import writable_folder
 from train.networks import load_classifier, load_run
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.run_folder import sole_writer
-from train.runtime import MixedPrecision, choose_device, choose_precision
 
 
 @dataclass

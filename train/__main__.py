@@ -1,10 +1,12 @@
 """`python -m train`: train an arm, score it, and print the table. See conf/train.yaml for every setting."""
 
+import logging
 import os
 import re
 import shlex
 import sys
-from collections.abc import Mapping
+import threading
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -19,14 +21,13 @@ from omegaconf import DictConfig
 from augment import utils
 from renderer.errors import InputError
 from train import console
-from train.data import DataSet
 from train.errors import writable_file, writable_folder
+from train.processes import Interrupted, broadcast, first_process_first, process_group
 from train.report.page import report_of
 from train.report.summary import format_table, summarize
 from train.run import load_data, prepare, write_images
 from train.run_folder import sole_writer
-from train.runtime import Interrupted, broadcast, first_process_first, process_group
-from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, quoted, read_settings
+from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, read_settings
 from train.sweep import run_in_sweep, sweep
 
 NAMED_MODEL = re.compile(r"^model=(?!\{)")  # short for model.name=
@@ -34,54 +35,10 @@ LOG = "train.log"
 SWEEP_FLAGS = {"--multirun", "-m"}
 
 
-@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="train")
-def main(config: DictConfig) -> None:
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    config.run = str(folder)
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
-        run_in_sweep(config, folder)
-        return
-    with cli.handled_errors():  # here, too, or Hydra adds a line
-        run_arms(read_settings(ExperimentSettings, config), folder)
-
-
-def run_arms(settings: ExperimentSettings, folder: Path) -> None:
-    """Train the arms to compare with and the arm itself, and print their table."""
-    arms = {}
-    for arm in settings.compare:
-        with keyed("compare"):
-            arms[folder / arm] = replace(settings, augment=replace(settings.augment, arm=arm))
-    arms[folder] = settings
-    data = load_data(settings)
-    with sole_writer("run", *arms) if utils.rank() == 0 else nullcontext():
-        with first_process_first():
-            if utils.rank() == 0:
-                write_images(settings, data.size)
-        _train_arms(arms, data, folder)
-
-
-def _train_arms(arms: Mapping[Path, ExperimentSettings], data: DataSet, folder: Path) -> None:
-    runs = {path: prepare(settings, data, path) for path, settings in arms.items()}  # all first, to meet every mistake
-    for path, train_and_score in runs.items():
-        console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")
-        try:
-            train_and_score()
-        except Interrupted as stop:
-            console.info("ended by %s; to go on: %s", stop.signal, resume_command(folder))
-            raise
-    if utils.rank() == 0:
-        console.info("\n%s", format_table([summarize(path) for path in arms]))
-        console.info("%s", report_of([folder], folder))
-
-
-def resume_command(folder: Path) -> str:
-    """The command that resumes this run."""
-    return f"{given_command()} {shlex.join([f'run={folder}', 'train.resume=true'])}"
-
-
 def start() -> None:
-    """Run `main` in this process, or in each that torchrun starts; all take the first one's folder."""
+    """Train what the command line asks for, in this process or in each that torchrun starts."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # or Hydra prints its errors itself, in several lines
+    threading.excepthook = _report_thread
     with cli.handled_errors(), process_group():
         arguments = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
         sys.argv[1:] = arguments = [as_override(argument) for argument in arguments]
@@ -93,20 +50,68 @@ def start() -> None:
             )
         if flags & SWEEP_FLAGS:
             sweep(main, overrides)
-            return
-        if not flags:
-            if utils.rank() > 0:
-                console.setLevel("WARNING")
-            folder = broadcast(_run_folder(overrides) if utils.rank() == 0 else "")
-            sys.argv.append(f"run={quoted(folder)}")
-        main()
+        elif flags:
+            main()
+        else:
+            train(compose("train", overrides), overrides)
 
 
-def _run_folder(overrides: list[str]) -> str:
-    """The folder of the run, which is still to be made; InputError where settings are wrong or it cannot be written."""
-    run = read_settings(ExperimentSettings, compose("train", overrides)).run
-    writable_file(writable_folder(run, "run") / LOG, "run")
-    return run
+def _report_thread(failure: threading.ExceptHookArgs) -> None:
+    """An error of a thread, but for a full disk in TensorBoard's, which the main thread raises, too."""
+    if not issubclass(failure.exc_type, OSError):
+        threading.__excepthook__(failure)
+
+
+@hydra.main(version_base="1.3", config_path="pkg://conf", config_name="train")
+def main(config: DictConfig) -> None:
+    """A run of a sweep, or under another of Hydra's flags."""
+    command = HydraConfig.get()
+    if command.mode == RunMode.MULTIRUN:
+        config.run = command.runtime.output_dir
+        run_in_sweep(config, Path(config.run))
+    else:
+        with cli.handled_errors():  # here, too, or Hydra adds a line
+            train(config, command.overrides.task)
+
+
+def train(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Train the arms to compare with and the arm itself in the first process's folder, and print their table."""
+    run, first, command = broadcast(str(config.run)), utils.rank() == 0, given_command(overrides)
+    folder = Path(run).absolute()
+    config.run = str(folder)
+    settings = read_settings(ExperimentSettings, config)
+    if first:
+        log_to(writable_file(writable_folder(run, "run") / LOG, "run"))
+    arms = {}
+    for arm in settings.compare:
+        with keyed("compare"):
+            arms[folder / arm] = replace(settings, augment=replace(settings.augment, arm=arm))
+    arms[folder] = settings
+    data = load_data(settings)
+    with sole_writer("run", *arms) if first else nullcontext():
+        with first_process_first():
+            if first:
+                write_images(settings, data.size)
+        runs = {path: prepare(arm, data, path, command) for path, arm in arms.items()}  # all, to meet every mistake
+        for path, train_and_score in runs.items():
+            console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")
+            try:
+                train_and_score()
+            except Interrupted as stop:
+                again = f"{command} {shlex.quote(f'run={folder}')} train.resume=true"
+                console.info("ended by %s; to go on: %s", stop.signal, again)
+                raise
+        if first:
+            console.info("\n%s", format_table([summarize(path) for path in arms]))
+            console.info("%s", report_of([folder], folder))
+
+
+def log_to(path: Path) -> None:
+    """Log to the console and to a file, whose folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+    handlers = [logging.StreamHandler(sys.stdout), file]
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=handlers, force=True)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from safetensors import safe_open
@@ -11,7 +11,7 @@ from safetensors.torch import save
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from augment.service import SHOWN_EXAMPLES, AttackExamples
+from augment.service import AttackExamples
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
 from renderer.rendering import light_sphere
@@ -22,8 +22,7 @@ SPHERE = 64  # pixels per side of the ball that shows the light
 OTHER = "other things"  # the label of hard negatives that belong to no class
 
 
-@dataclass(frozen=True)
-class Side:
+class Side(NamedTuple):
     """An example before or after the attack: its image and a white ball in its light, (3, H, W) uint8, and what the
     model predicts."""
 
@@ -35,17 +34,18 @@ class Side:
 
 def write_attack_examples(path: Path, attack_examples: AttackExamples, classes: Sequence[str]) -> None:
     """Images as bytes in the safetensors format; labels and predictions in its metadata."""
-    labels = [classes[index] if index >= 0 else OTHER for index in attack_examples.labels.tolist()]
+    shown = attack_examples
+    labels = [classes[index] if index >= 0 else OTHER for index in shown.labels.tolist()]
     tensors, predictions = {}, {"label": labels}
     for name, images, lights, probabilities in [
-        ("before", attack_examples.images_before, attack_examples.lights_before, attack_examples.predictions_before),
-        ("after", attack_examples.images, attack_examples.lights, attack_examples.predictions),
+        ("before", shown.images_before, shown.lights_before, shown.predictions_before),
+        ("after", shown.images, shown.lights, shown.predictions),
     ]:
         images = images.detach().cpu()
         if images.shape[-1] > LARGEST_SIDE:
             images = interpolate(images, LARGEST_SIDE, mode="area")
         tensors[f"images_{name}"] = to_bytes(images).contiguous()
-        spheres = [to_bytes(light_sphere(light, SPHERE, basis=attack_examples.basis)) for light in lights]
+        spheres = [to_bytes(light_sphere(light, SPHERE, basis=shown.basis)) for light in lights]
         tensors[f"spheres_{name}"] = torch.stack(spheres)
         best = probabilities.max(1)
         predictions[name] = [classes[index] for index in best.indices.tolist()]
@@ -56,33 +56,13 @@ def write_attack_examples(path: Path, attack_examples: AttackExamples, classes: 
 def read_attack_examples(path: Path) -> list[tuple[str, Side, Side]]:
     """The label of each example, and its sides before and after; InputError naming a damaged file."""
     try:
-        if not path.is_file():
-            raise ValueError("there is no such file")
         with safe_open(path, "pt") as file:
             predictions = json.loads(file.metadata()["predictions"])
-            before, after = (
-                [
-                    _side(*row)
-                    for row in zip(
-                        file.get_tensor(f"images_{name}"),
-                        file.get_tensor(f"spheres_{name}"),
-                        predictions[name],
-                        predictions[f"confidence_{name}"],
-                        strict=True,
-                    )
-                ]
-                for name in ("before", "after")
-            )
-        if len(before) > SHOWN_EXAMPLES:
-            raise ValueError(f"{len(before)} examples")
-        return list(zip(map(str, predictions["label"]), before, after, strict=True))
+            sides = []
+            for name in ("before", "after"):
+                images, spheres = file.get_tensor(f"images_{name}"), file.get_tensor(f"spheres_{name}")
+                rows = zip(images, spheres, predictions[name], predictions[f"confidence_{name}"], strict=True)
+                sides.append([Side(*row) for row in rows])
+        return list(zip(predictions["label"], *sides, strict=True))
     except Exception as error:  # safetensors raises its own type
         raise InputError(f"{path} is damaged or of another version ({in_one_line(error)})") from error
-
-
-def _side(image: Tensor, sphere: Tensor, predicted: object, confidence: object) -> Side:
-    for pixels in (image, sphere):
-        channels, height, width = pixels.shape
-        if pixels.dtype != torch.uint8 or channels != 3 or height != width or width > LARGEST_SIDE:
-            raise ValueError(f"an image of {pixels.dtype} {tuple(pixels.shape)}")
-    return Side(image, sphere, str(predicted), float(confidence))  # type: ignore[arg-type]

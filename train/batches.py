@@ -58,10 +58,8 @@ def batch_count(images: int, batch_size: int) -> int:
 
 def with_room(split: Split, count: int) -> Split:
     """The split's images and, behind them, room for a round's renders."""
-    images, labels = split.images, split.labels
-    return Split(
-        torch.cat([images, images.new_zeros(count, *images.shape[1:])]), torch.cat([labels, labels.new_zeros(count)])
-    )
+    room = split.images.new_zeros(count, *split.images.shape[1:]), split.labels.new_zeros(count)
+    return Split(torch.cat([split.images, room[0]]), torch.cat([split.labels, room[1]]))
 
 
 def put_last(split: Split, renders: Renders) -> None:
@@ -82,34 +80,25 @@ def training_batches(
     first images. All draws are made on the CPU and moved over once, so that they are the same on every device and for
     any number of processes. first: the batch to begin with.
     """
-    images = split.images
-    order = _order(now.rows, batch_size, generator(seed, now.number, "batches"))
+    images, rows = split.images, now.rows
+    order = rows[torch.randperm(len(rows), generator=generator(seed, now.number, "batches"))]
+    order = order[torch.arange(batch_count(len(rows), batch_size) * batch_size) % len(rows)].view(-1, batch_size)
     shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, now.number, "shifts"))
-    flipped = _flipped(order, len(images), seed, now, flips)
+    if flips == "random":
+        flipped = torch.randint(0, 2, order.shape, generator=generator(seed, now.number, "flips"), dtype=torch.bool)
+    else:
+        in_even_epochs = torch.randint(0, 2, (len(images),), generator=generator(seed, "flips"), dtype=torch.bool)
+        flipped = in_even_epochs[order] ^ bool(now.epoch % 2)
     shard = batch_size // utils.world_size()
     columns = slice(utils.rank() * shard, (utils.rank() + 1) * shard)
     order, shifts, flipped = (draws[..., first:, columns].to(images.device) for draws in (order, shifts, flipped))
     batches_at_once = max(1, CHUNK_BYTES // (shard * images[0].numel()))
     for begin in range(0, len(order), batches_at_once):
-        rows = slice(begin, begin + batches_at_once)
-        chosen = order[rows].flatten()
-        cropped = crop_and_flip(images, chosen, shifts[:, rows].flatten(1), flipped[rows].flatten())
+        chunk = slice(begin, begin + batches_at_once)
+        chosen = order[chunk].flatten()
+        cropped = crop_and_flip(images, chosen, shifts[:, chunk].flatten(1), flipped[chunk].flatten())
         rendered = chosen >= len(images) - now.renders
         yield from zip(*(part.split(shard) for part in (cropped, split.labels[chosen], rendered)), strict=True)
-
-
-def _order(rows: Tensor, batch_size: int, draws: torch.Generator) -> Tensor:
-    """Rows in random order, (batches, batch_size), beginning again where they run out."""
-    order = rows[torch.randperm(len(rows), generator=draws)]
-    indices = torch.arange(batch_count(len(rows), batch_size) * batch_size) % len(rows)
-    return order[indices].view(-1, batch_size)
-
-
-def _flipped(order: Tensor, images: int, seed: int, now: Round, flips: str) -> Tensor:
-    if flips == "random":
-        return torch.randint(0, 2, order.shape, generator=generator(seed, now.number, "flips"), dtype=torch.bool)
-    in_even_epochs = torch.randint(0, 2, (images,), generator=generator(seed, "flips"), dtype=torch.bool)
-    return in_even_epochs[order] ^ bool(now.epoch % 2)
 
 
 def crop_and_flip(images: Tensor, chosen: Tensor, shifts: Tensor, flips: Tensor) -> Tensor:

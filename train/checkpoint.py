@@ -7,12 +7,12 @@ it, with its VERSION), in best.pt; and in last.pt what `train.loop.Trainer.state
 import hashlib
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, cuda, get_rng_state, set_rng_state
+from torch import Tensor, cuda
 
 from renderer.errors import InputError
 
@@ -36,11 +36,9 @@ def write_whole(path: Path, content: bytes | memoryview, previous: Path | None =
             os.replace(path, previous)
         os.replace(temporary, path)
         if os.name == "posix":  # make the renaming last
-            descriptor = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            folder = os.open(path.parent, os.O_RDONLY)
+            os.fsync(folder)
+            os.close(folder)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(path)) from error
@@ -68,16 +66,15 @@ def load(path: Path) -> dict[str, Any]:
 
 def checked(state: dict[str, Any], path: Path) -> dict[str, Any]:
     """The state; InputError where it lacks finite weights or an architecture, or comes from a later version."""
-    weights, architecture = state.get("model"), state.get("architecture")
-    if not isinstance(architecture, dict):
-        raise InputError(f"checkpoint {path} has no architecture: give one that `python -m train` wrote")
-    version = architecture.get("version", 1)
-    if not isinstance(version, int) or version > VERSION:
+    try:
+        version = state["architecture"].get("version", 1)
+        finite = all(value.isfinite().all() for value in state["model"].values())
+    except (LookupError, AttributeError) as error:
+        raise InputError(f"checkpoint {path} has no architecture or weights: use another one") from error
+    if version not in range(VERSION + 1):
         raise InputError(f"checkpoint {path} was written by a later version ({version!r}): install that version")
-    if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise InputError(f"checkpoint {path} has no weights under model: use another one")
-    if not_finite := [name for name, value in weights.items() if not value.isfinite().all()]:
-        raise InputError(f"checkpoint {path} has NaN or infinity in {not_finite[0]}: use another one")
+    if not finite:
+        raise InputError(f"checkpoint {path} has NaN or infinity in its weights: use another one")
     return state
 
 
@@ -99,35 +96,35 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
 def content_hash(state: Any) -> str:
     """SHA-256 over keys, types, shapes and values of nested mappings and sequences of tensors and plain values."""
     digest = hashlib.sha256()
-    for part in _parts(state):
-        digest.update(part)
+    _update(digest, state)
     return digest.hexdigest()
 
 
-def _parts(value: Any) -> Iterator[bytes | memoryview]:
-    if isinstance(value, Tensor):
-        plain = value.detach().cpu().contiguous()
-        yield f"{plain.dtype}{tuple(plain.shape)}".encode()
-        yield memoryview(plain.flatten().view(torch.uint8).numpy().data)
-    elif isinstance(value, Mapping):
-        for key, item in value.items():
-            yield f"{key!r}:".encode()
-            yield from _parts(item)
-    elif isinstance(value, list | tuple):
-        yield f"[{len(value)}]".encode()
-        for item in value:
-            yield from _parts(item)
-    else:
-        yield f"{value!r};".encode()
+def _update(digest: Any, value: Any) -> None:
+    match value:
+        case Tensor():
+            plain = value.detach().cpu().contiguous()
+            digest.update(f"{plain.dtype}{tuple(plain.shape)}".encode())
+            digest.update(plain.flatten().view(torch.uint8).numpy().data)
+        case Mapping():
+            for key, item in value.items():
+                digest.update(f"{key!r}:".encode())
+                _update(digest, item)
+        case list() | tuple():
+            digest.update(f"[{len(value)}]".encode())
+            for item in value:
+                _update(digest, item)
+        case _:
+            digest.update(f"{value!r};".encode())
 
 
 def random_state() -> dict[str, Tensor | list[Tensor]]:
     """The state of the CPU's random generator and of each GPU's."""
-    return {"cpu": get_rng_state(), "cuda": cuda.get_rng_state_all() if cuda.is_available() else []}
+    return {"cpu": torch.get_rng_state(), "cuda": cuda.get_rng_state_all() if cuda.is_available() else []}
 
 
 def restore_random_state(state: Mapping[str, Any]) -> None:
     """Restore a `random_state`, on as many GPUs as both machines have."""
-    set_rng_state(state["cpu"])
+    torch.set_rng_state(state["cpu"])
     for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
         cuda.set_rng_state(values, device)

@@ -8,7 +8,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from renderer.errors import InputError, is_out_of_memory
-from train.runtime import is_process_lost
+from train.processes import is_process_lost
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LONGEST_NAME = 200  # characters
@@ -25,10 +25,10 @@ def one_sentence(error: BaseException) -> str | None:
         case UnicodeEncodeError():
             name = ascii(error.object[:LONGEST_NAME])
             return f"{name} has characters that this system or library cannot write: rename it, or set PYTHONUTF8=1"
+        case OSError() if error.errno in NO_ROOM:
+            return f"{error.filename or 'the output'} cannot be written ({error.strerror}): make room and start again"
         case OSError() if error.filename is not None:
             return f"{error.filename} cannot be read or written: {error.strerror}"
-        case OSError() if error.errno in NO_ROOM:
-            return f"there is no room for the output: {error.strerror}"
         case RuntimeError() if is_process_lost(error):
             return "another process of this run has ended: fix what ended it, and go on with train.resume=true"
         case RuntimeError() | MemoryError() if is_out_of_memory(error):

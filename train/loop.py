@@ -1,5 +1,6 @@
 """The training loop: an epoch has one or more rounds, each with fresh renders; validation and a checkpoint end it."""
 
+import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -10,28 +11,21 @@ from typing import Any, cast
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_swa_avg_fn
 
 from augment import utils
 from augment.service import AugmentationService, Renders
-from augment.utils import Phases, eval_mode, progress, stream_seed
-from renderer.errors import InputError, in_one_line, is_out_of_memory
+from augment.utils import eval_mode, progress, stream_seed
+from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoint, console
 from train.batches import Round, batch_count, put_last, rounds_of_epoch, training_batches, with_room
 from train.checkpoint import random_state, restore_random_state
 from train.data import Split
-from train.recipe import SCHEDULES, MovingAverage, TrainSettings, augmentation, soup, training_loss
-from train.run_folder import PHASES, Log
-from train.runtime import (
-    PRECISIONS,
-    GraphedModel,
-    Interruption,
-    MixedPrecision,
-    compiled_pass,
-    compiles,
-    replicated,
-    summed,
-)
+from train.device import GraphedModel, MixedPrecision, compiled_pass, compiles
+from train.processes import Interruption, replicated, summed
+from train.recipe import SCHEDULES, MovingAverage, TrainSettings, augmentation, training_loss
+from train.run_folder import PHASES, RunLog
 
 EVALUATION_BATCH = 512  # images at a time
 
@@ -80,9 +74,7 @@ class Trainer:
         model: MixedPrecision,
         architecture: dict[str, Any],
         service: AugmentationService,
-        phases: Phases,
         folder: Path,
-        seed: int,
     ):
         """model: as the run begins; it is the teacher of a distillation, and each epoch of a soup begins with it.
         architecture: what rebuilds the network from a checkpoint, classes included.
@@ -97,9 +89,8 @@ class Trainer:
             raise InputError(
                 f"train.ranking={settings.ranking} ranks hard negatives: name some in scene.hard_negatives"
             )
-        self.settings, self.architecture, self.service = settings, architecture, service
-        self.phases, self.folder, self.seed = phases, folder, seed
-        self.epoch, self.best_accuracy, self.best_epoch = 0, -1.0, 0
+        self.settings, self.architecture, self.service, self.folder = settings, architecture, service, folder
+        self.phases, self.seed, self.epoch = service.phases, service.seed, 0
         self.history: list[dict[str, float]] = []  # the metrics of each epoch
         self._under_way: EpochState | None = None  # of the epoch that has begun
         self._random_state: dict[str, Any] = {}  # where a checkpoint within an epoch left it
@@ -107,22 +98,17 @@ class Trainer:
 
         self.model, self.device = model, next(model.parameters()).device
         self.ema = MovingAverage(model, settings.ema_decay) if settings.ema_decay else None
-        self.soup = soup(model) if settings.soup else None
+        mean = {"avg_fn": get_swa_avg_fn(), "use_buffers": True}  # Wortsman et al. 2022, "Model soups"
+        self.soup = AveragedModel(model, **mean) if settings.soup else None
         self._initial = deepcopy(model.state_dict()) if settings.soup else None
         teacher = deepcopy(model).eval().requires_grad_(False) if settings.distillation else None
         replica = replicated(model)  # may replace layers, so the optimizer comes after it
-        self.optimizer = torch.optim.SGD(
-            model.parameters(),
-            lr=settings.learning_rate,
-            momentum=settings.momentum,
-            weight_decay=settings.weight_decay,
-            nesterov=settings.momentum > 0,
-            fused=True,
-        )
+        options = {"weight_decay": settings.weight_decay, "nesterov": settings.momentum > 0, "fused": True}
+        self.optimizer = torch.optim.SGD(model.parameters(), settings.learning_rate, settings.momentum, **options)
         compiled = compiles(settings.compile, self.device)
         loss = training_loss(replica, settings, service.label, teacher)
         self._loss = compiled_pass(loss) if compiled else loss
-        self._augment = augmentation(settings.augmentation, model, seed)
+        self._augment = augmentation(settings.augmentation, model, self.seed)
         self.attacked: nn.Module = GraphedModel(model) if compiled else model
         self.validated: nn.Module = GraphedModel(self.selected) if compiled else self.selected
 
@@ -137,10 +123,11 @@ class Trainer:
 
     # --------------------------------------------------------------------------------- epochs and rounds
 
-    def fit(self, train: Split, validation: Split, log: Log) -> None:
+    def fit(self, train: Split, validation: Split, log: RunLog | None) -> None:
         """Train to the last epoch; best.pt holds the network of the best validation, or a soup's last.
 
-        InputError where training diverges. `Interrupted`, after a checkpoint, where a signal asked for it.
+        log: of the process that writes. InputError where training diverges. `Interrupted`, after a checkpoint, where a
+        signal asked for it.
         """
         mixed = with_room(train, len(self.service))
         with Interruption() as interruption:
@@ -154,7 +141,7 @@ class Trainer:
                 if stopping:
                     interruption.stop()
 
-    def _train_epoch(self, mixed: Split, images: int, interruption: Interruption, log: Log) -> bool:
+    def _train_epoch(self, mixed: Split, images: int, interruption: Interruption, log: RunLog | None) -> bool:
         """Take the epoch's remaining steps; whether all were taken, since a signal ends them early.
 
         mixed: the training images, and behind them room for the renders.
@@ -164,7 +151,11 @@ class Trainer:
         steps = [batch_count(len(part.rows), settings.batch_size) for part in rounds]
         total = sum(steps)
         if self._under_way is None:
-            self._reset_to_initial()
+            if self._initial:  # a soup's epochs all begin with it
+                self.model.load_state_dict(self._initial)
+                self.optimizer.state.clear()
+                if self.ema:
+                    self.ema.n_averaged.zero_()
             renders = self._regenerate(rounds[0], log)
             self._under_way = EpochState(renders, torch.zeros(2, device=self.device), [renders.diagnostics])
         else:
@@ -186,29 +177,21 @@ class Trainer:
                         return state.step == total
         return True
 
-    def _regenerate(self, now: Round, log: Log) -> Renders:
+    def _regenerate(self, now: Round, log: RunLog | None) -> Renders:
         """Renders made against the current weights."""
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
             renders = self.service.regenerate(self.attacked, now.number)
-        if renders.attack_examples:
+        if log and renders.attack_examples:
             with self.phases("input_output"):  # now, since a run that is resumed within the epoch makes no others
                 log.attack_examples(renders.attack_examples, self.architecture["classes"], self.epoch + 1)
         return renders
-
-    def _reset_to_initial(self) -> None:
-        """Begin a soup's epoch with the weights that the run began with."""
-        if self._initial:
-            self.model.load_state_dict(self._initial)
-            self.optimizer.state.clear()
-            if self.ema:
-                self.ema.n_averaged.zero_()
 
     def _step(self, images: Tensor, labels: Tensor, rendered: Tensor, progress: float, number: int) -> Tensor:
         """Learn from uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool; returns (2,) the sum of
         their losses, and how many predictions were correct.
 
-        progress: the fraction of the epoch that is over. number: the run's step. InputError where memory runs out.
+        progress: the fraction of the epoch that is over. number: the run's step.
         """
         settings = self.settings
         if not settings.soup:
@@ -217,20 +200,14 @@ class Trainer:
             group["lr"] = settings.learning_rate * SCHEDULES[settings.schedule](progress)
         images = self._augment(images, labels, number)
         self.optimizer.zero_grad(set_to_none=True)
-        try:
-            loss, hits = self._loss(images, labels, rendered)
-            loss.backward()
-        except (RuntimeError, MemoryError) as error:
-            if not is_out_of_memory(error):
-                raise
-            setting = f"train.batch_size={settings.batch_size}"
-            raise InputError(f"{setting} needs more memory than there is: set a lower one") from error
+        loss, hits = self._loss(images, labels, rendered)
+        loss.backward()
         self.optimizer.step()
         if self.ema:
             self.ema.update_parameters(self.model)
         return torch.stack([loss.detach() * len(labels), hits])
 
-    def _end_epoch(self, validation: Split, log: Log) -> None:
+    def _end_epoch(self, validation: Split, log: RunLog | None) -> None:
         """Validate, remember the best network, and log the epoch's metrics."""
         state, self._under_way = cast(EpochState, self._under_way), None
         images = state.step * self.settings.batch_size
@@ -240,17 +217,16 @@ class Trainer:
         with self.phases("evaluation"):
             validated = evaluate(self.validated, validation)
         self.epoch += 1
-        self._require_finite(loss_sum / images + validated["loss"], self.epoch)
-        if validated["accuracy"] > self.best_accuracy or self.soup:  # a soup has all epochs in it
-            self.best_accuracy, self.best_epoch = validated["accuracy"], self.epoch
-            weights = self.selected.network.state_dict()
-            weights = {name: value.to("cpu", copy=True) for name, value in weights.items()}
+        self._require_finite(loss_sum + validated["loss"], self.epoch)
+        before = [line["validation/accuracy"] for line in self.history]
+        if validated["accuracy"] > max(before, default=-1) or self.soup:  # a soup has all epochs in it
+            weights = {name: value.to("cpu", copy=True) for name, value in self.selected.network.state_dict().items()}
             self._best = {"model": weights, **self._description(), "validation_accuracy": validated["accuracy"]}
-        if len(state.renders.labels):
+        if log and len(state.renders.labels):
             with self.phases("input_output"):
                 log.renders(state.renders.images, self.epoch)
-        names = state.renders.diagnostics
-        diagnostics = {name: fmean(part[name] for part in state.diagnostics) for name in names}
+        rounds = state.diagnostics
+        diagnostics = {name: fmean(part[name] for part in rounds) for name in rounds[0]}
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()  # one resumed after its last attack has no more
         metrics = {
             "train/loss": loss_sum / images,
@@ -261,7 +237,8 @@ class Trainer:
             **{f"seconds/{name}": value for name, value in seconds.items()},
         }
         self.history.append({"epoch": self.epoch, **metrics})
-        log.scalars(metrics, self.epoch)
+        if log:
+            log.scalars(metrics, self.epoch)
         success = diagnostics.get("attack_success")
         console.info(
             f"epoch {self.epoch}/{self.settings.epochs}  train loss {metrics['train/loss']:.3f} accuracy "
@@ -271,17 +248,13 @@ class Trainer:
         )
 
     def _require_finite(self, loss: float, epoch: int) -> None:
-        """InputError naming what is NaN or infinite, before any of it is kept."""
-        network, settings = self.model.network, self.settings
-        tensors = {f"weight {name}": value for name, value in network.state_dict().items()}
-        tensors |= {f"gradient of {name}": p.grad for name, p in network.named_parameters() if p.grad is not None}
-        tensors["loss"] = torch.tensor(loss, device=self.device)
-        finite = torch.stack([value.isfinite().all() for value in tensors.values()]).tolist()
-        if not all(finite):
-            name = list(tensors)[finite.index(False)]
+        """InputError where the loss or a weight is NaN or infinite, before either is kept."""
+        settings, weights = self.settings, self.model.network.state_dict().values()
+        if not (math.isfinite(loss) and torch.stack([value.isfinite().all() for value in weights]).all()):
             raise InputError(
                 f"train.learning_rate={settings.learning_rate} with train.weight_decay={settings.weight_decay} made "
-                f"the {name} NaN or infinite in epoch {epoch}: set lower ones; the checkpoint before, if any, is kept"
+                f"the loss or weights NaN or infinite in epoch {epoch}: set lower ones; the checkpoint before, if any, "
+                "is kept"
             )
 
     # --------------------------------------------------------------------------------- checkpoints
@@ -316,48 +289,34 @@ class Trainer:
             "random_state": random_state(),
             "under_way": self._under_way.state_dict() if self._under_way else None,
             "history": self.history,
-            "validation_accuracy_best": self.best_accuracy,
-            "epoch_best": self.best_epoch,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """What `state_dict` gave; many kinds of error for anything else."""
-        epoch, history, precision = state["epoch"], state["history"], state["precision"]
-        if not isinstance(epoch, int) or not isinstance(history, list) or len(history) != epoch:
-            raise ValueError(f"metrics of other epochs than the {epoch!r} that it has")
-        if precision not in PRECISIONS:
-            raise ValueError(f"precision {precision!r}")
         self.model.network.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         if self.ema:
             self.ema.load_state_dict(state["ema"])
         if self.soup:
             self.soup.load_state_dict(state["soup"])
-        self.model.precision = self._trained.precision = self.selected.precision = precision
+        self.model.precision = self._trained.precision = self.selected.precision = state["precision"]
         self.service.load_state_dict(state["service"])
         self._random_state = dict(state["random_state"])
         if state["under_way"]:
             self._under_way = EpochState.from_state_dict(state["under_way"], self.device)
-        self.epoch, self.history = epoch, history
-        self.best_accuracy, self.best_epoch = state["validation_accuracy_best"], state["epoch_best"]
+        self.epoch, self.history = state["epoch"], state["history"]
 
     def resume(self) -> None:
         """Go on from the folder's newest whole checkpoint; InputError where it does not belong to this run."""
         state, problem = checkpoint.load_newest(self.folder)
-        stored, place = state["architecture"], f"the checkpoint in {self.folder}"
-        if any(stored.get(key, value) != value for key, value in self.architecture.items() if key != "version"):
-            raise InputError(
-                f"{place} is from another architecture or other classes: resume with the settings of "
-                f"{self.folder / 'config.yaml'}, or start in another folder with run="
-            )
         try:
+            if state["architecture"] != self.architecture:
+                raise ValueError("it has another architecture or other classes")
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            if isinstance(error, InputError):
-                raise
             raise InputError(
-                f"{place} is not one that this run can go on from ({in_one_line(error)}): restore {checkpoint.LAST}, "
-                "or start in another folder with run="
+                f"the checkpoint in {self.folder} is not one that this run can go on from ({in_one_line(error)}): "
+                f"restore {checkpoint.LAST}, or start in another folder with run="
             ) from error
         if problem:
             console.warning("%s: going on from the one before", problem)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from augment import utils
 from augment.losses import divergence, is_right, label_loss, ranking_loss
@@ -14,7 +14,7 @@ from augment.utils import as_found, generator, stream_seed
 from renderer.errors import FACTOR, InputError, require_choice, require_range
 from renderer.image import to_bytes, to_unit
 from train.batches import FLIPS
-from train.runtime import COMPILE
+from train.device import COMPILE
 
 Augment = Callable[[Tensor, Tensor, int], Tensor]  # uint8 images (B, 3, H, W), labels (B,) and the step to images
 Loss = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -134,11 +134,6 @@ class MovingAverage(AveragedModel):
             if group := [pair for pair in pairs if pair[0].is_floating_point() == floating]:
                 self._average([average for average, _ in group], [latest for _, latest in group], None)
         self.n_averaged += 1
-
-
-def soup(model: nn.Module) -> AveragedModel:
-    """A copy of a model for the mean of its weights and statistics over updates (Wortsman et al. 2022)."""
-    return AveragedModel(model, avg_fn=get_swa_avg_fn(), use_buffers=True)
 
 
 # ------------------------------------------------------------------------------------- baseline augmentations

@@ -88,12 +88,11 @@ def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
 
 def _render_split(part: str, per_class: int, seed: int, settings: ImageSettings, cache: TensorCache) -> Split:
     key = content_key(CODE, CLASSES, per_class, seed, part, settings)
-    cached, source = cache.read(key), "from the cache"
+    cached = cache.read(key)
     if cached is None:
         cached = {"images": _render(part, per_class, seed, settings)}
         cache.write(key, cached)
-        source = f"rendered; not cached: {cache.problem}" if cache.problem else "rendered"
-    console.info("%s images: %d %s", part, len(cached["images"]), source)
+    console.info("%s images: %d", part, len(cached["images"]))
     return Split(cached["images"], torch.arange(len(CLASSES)).repeat_interleave(per_class))
 
 

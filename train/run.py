@@ -1,8 +1,7 @@
 """One run from its settings: data, network, augmentation service, training, scores on the test set and photographs."""
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -17,35 +16,31 @@ from augment.utils import Phases, stream_seed
 from renderer.cache import TensorCache, cache_folder
 from renderer.errors import InputError, require_choice
 from renderer.image import LARGEST_SIZE
-from renderer.light.harmonics import nonzero_coefficients
-from renderer.transfer import COEFFICIENTS, DEGREE
 from train import checkpoint, console
 from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
-from train.errors import NO_ROOM
+from train.device import MixedPrecision, choose_device, choose_precision, set_deterministic, set_threads
 from train.loop import Trainer, evaluate
 from train.networks import build_network, describe, start_from
 from train.photographs.folder import find_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
 from train.photographs.scoring import evaluate_photographs, format_summary
+from train.processes import first_process_first
 from train.rendered_shapes import load_shapes, write_held_out
-from train.run_folder import NoLog, RunLog, require_same_inputs, require_same_settings, write_config
-from train.runtime import (
-    MixedPrecision,
-    choose_device,
-    choose_precision,
-    first_process_first,
-    set_deterministic,
-    set_threads,
-)
-from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, given_command, keyed
+from train.run_folder import RunLog, require_same_run, write_config
+from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, keyed
+
+Scores = dict[str, float]
 
 
-def run(settings: ExperimentSettings, data: DataSet, folder: Path) -> dict[str, float]:
-    """Train one arm into `folder` and score it; the scores, which are in the folder's files, too."""
-    return prepare(settings, data, folder)()
+def run(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Scores:
+    """Train one arm into `folder` and score it; the scores, which are in the folder's files, too.
+
+    command: the one that was given, to be recorded.
+    """
+    return prepare(settings, data, folder, command)()
 
 
-def prepare(settings: ExperimentSettings, data: DataSet, folder: Path) -> Callable[[], dict[str, float]]:
+def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Callable[[], Scores]:
     """All of `run` that comes before the first epoch, where wrong input shows; returns a function for the rest."""
     for name, photographs in settings.evaluate.folders.items():
         require_outside(folder / name, photographs)
@@ -55,19 +50,19 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path) -> Callab
     set_deterministic(settings.train.deterministic)
     train, validation = stratified_split(data.train, settings.data.validation, seed=0)
     trainer = build_trainer(settings, data, folder, device)
-    with _one_error_without_room(folder):
-        _open_folder(trainer, settings)
+    _open_folder(trainer, settings, command)
 
-    @_one_error_without_room(folder)
-    def train_and_score() -> dict[str, float]:
+    def train_and_score() -> Scores:
         console.info(
             f"{len(train)} images, {len(data.classes)} classes; {device}, {trainer.model.precision}, "
             f"{torch.get_num_threads()} threads, {utils.world_size()} processes"
         )
-        log = NoLog() if utils.rank() else RunLog(folder, trainer.history)
+        log = None if utils.rank() else RunLog(folder, trainer.history)
         trainer.fit(train.to(device), validation.to(device), log)
         scores = _test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device)
-        log.scalars(scores)
+        if log:
+            log.scalars(scores)
+            log.close()
         return scores
 
     return train_and_score
@@ -101,8 +96,7 @@ def write_images(settings: ExperimentSettings, size: int) -> None:
     data = settings.data
     if data.name == "shapes" and data.images:
         console.info("writing held-out renders in hard light (not photographs) to %s", data.images)
-        with _one_error_without_room(data.images):
-            write_held_out(Path(data.images), size, data.seed, TensorCache(cache_folder(settings.renderer.cache)))
+        write_held_out(Path(data.images), size, data.seed, TensorCache(cache_folder(settings.renderer.cache)))
 
 
 # ------------------------------------------------------------------------------------- network and renders
@@ -121,7 +115,7 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
         start_from(network, facts, Path(settings.train.init_from))
     service = build_service(settings, data, device, phases)
     model = MixedPrecision(network.to(device), precision)
-    return Trainer(settings.train, model, describe(network, **facts), service, phases, folder, settings.seed)
+    return Trainer(settings.train, model, describe(network, **facts), service, folder)
 
 
 def build_service(
@@ -141,7 +135,7 @@ def build_service(
 
 
 def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
-    """The scene; logs what its examples share and what is left out of them."""
+    """The scene; logs its rasterizer and how long it took."""
     for key, item in settings.objects.items():
         if item.label != OTHER:
             class_index(data.classes, item.label, f"label of {key}")
@@ -150,57 +144,27 @@ def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.devi
         scene = build_scene(
             objects, data.size, settings.views, scene=settings.scene, renderer=settings.renderer, device=device
         )
-    console.info("rasterizer: %s", scene.rasterizer.description)
-    if not settings.augment.relights:
-        console.info("operators: none are kept, since views are rasterized in every epoch")
-        return scene
-    cache = scene.operators
-    covered = sum(len(stack.pixels) for stack in scene.stacks) / len(scene.stacks)
-    console.info(
-        f"operators: {cache.views} views for {len(scene)} examples, {cache.views - cache.built} from the cache, "
-        f"{cache.built} built ({time.perf_counter() - start:.2f} s)"
-        f"{f'; not cached: {cache.problem}' if cache.problem else ''}"
-    )
-    console.info(
-        f"skipped: rasterization in every epoch, {COEFFICIENTS - len(nonzero_coefficients(DEGREE))} of {COEFFICIENTS} "
-        f"light coefficients, {100 * (1 - covered / scene.settings.size**2):.0f} % of the pixels (background)"
-    )
+    seconds = time.perf_counter() - start
+    console.info("scene: %d examples in %.2f s; rasterizer: %s", len(scene), seconds, scene.rasterizer.description)
     return scene
 
 
 # ------------------------------------------------------------------------------------- the folder
 
 
-def _open_folder(trainer: Trainer, settings: ExperimentSettings) -> None:
+def _open_folder(trainer: Trainer, settings: ExperimentSettings, command: str) -> None:
     """Resume from the folder, or start in it; InputError rather than writing over another run."""
     folder = trainer.folder
     if checkpoint.exists(folder):
         if not settings.train.resume:
-            raise InputError(
-                f"run={folder} holds a run already: set train.resume=true to go on, or choose another run="
-            )
-        require_same_settings(folder, settings)
-        require_same_inputs(folder, settings)
+            raise InputError(f"run={folder} holds a run already: set train.resume=true to go on, or choose another run")
+        require_same_run(folder, settings)
         trainer.resume()
     elif settings.train.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
     if utils.rank() == 0:
         hardware = {"device": str(trainer.device), "precision": trainer.model.precision}
-        write_config(folder, settings, hardware=hardware, command=given_command())
-
-
-@contextmanager
-def _one_error_without_room(folder: Path | str) -> Iterator[None]:
-    """InputError where the disk is full, whatever was being written."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in NO_ROOM:
-            raise
-        path = error.filename or folder
-        raise InputError(
-            f"{path} cannot be written ({error.strerror}): make room and go on with train.resume=true"
-        ) from error
+        write_config(folder, settings, hardware=hardware, command=command)
 
 
 # ------------------------------------------------------------------------------------- scores
@@ -224,16 +188,9 @@ def _photograph_scores(
     """The network's metrics on each folder of photographs, as NAME/METRIC; empty without one."""
     scores: dict[str, float | None] = {}
     for name, photographs in settings.evaluate.folders.items() if utils.rank() == 0 else ():
-        summary = evaluate_photographs(
-            trainer.selected,
-            data.classes,
-            photographs,
-            settings.label,
-            trainer.folder / name,
-            size=data.size,
-            skip_unreadable=settings.evaluate.skip_unreadable,
-            device=device,
-        )
+        inputs = trainer.selected, data.classes, photographs, settings.label
+        options = {"size": data.size, "skip_unreadable": settings.evaluate.skip_unreadable, "device": device}
+        summary = evaluate_photographs(*inputs, trainer.folder / name, **options)
         console.info("%s: %s", name, format_summary(summary))
         scores |= {f"{name}/{metric}": find_metric(summary, metric)["value"] for metric in ("top5", *METRICS)}
     return {name: value for name, value in scores.items() if value is not None}

@@ -1,19 +1,16 @@
 """A run's folder: its one writer, its configuration and input files, its metrics and logs."""
 
 import hashlib
-import io
 import json
 import logging
 import os
 import platform
-import socket
-import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 import yaml
@@ -30,7 +27,7 @@ from train.checkpoint import write_whole
 from train.settings import ExperimentSettings, dotted, is_within
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
-LARGEST_CONFIG, LARGEST_FILE = 2**20, 2**28  # bytes; a run writes about 300 per epoch
+LARGEST_FILE = 2**26  # bytes; a run writes about 300 per epoch
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; other phases are parts of these
 logging.raiseExceptions = False  # on a full disk train.log lacks lines, and only the run's own error is shown
 
@@ -40,12 +37,8 @@ CIRCUMSTANCES = (
     *("renderer.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (
-    "data.path",
-    "scene.meshes",
-    "scene.hard_negatives",
-    "scene.backgrounds",
-    "scene.light",
-    "augment.vary.environments",
+    *("data.path", "augment.vary.environments"),
+    *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
 )
 
 # ------------------------------------------------------------------------------------ one writer
@@ -56,13 +49,10 @@ def locked(folder: Path) -> Iterator[bool]:
     """Whether this process alone holds the folder, among all machines that share it, until the block ends."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK)
-    try:
+    with suppress(Timeout):
         lock.acquire(blocking=False)
-    except Timeout:
-        yield False
-        return
     try:
-        yield True
+        yield lock.is_locked
     finally:
         lock.release()
 
@@ -102,23 +92,19 @@ def state(folder: Path) -> str:
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """InputError naming the file for whatever reading it raises."""
+def _text_of(path: Path) -> Iterator[str]:
+    """A file's text; InputError naming the file for whatever reading it, or using its text inside, raises."""
     try:
-        yield
+        if not path.is_file():
+            raise ValueError("there is no such file")
+        if path.stat().st_size > LARGEST_FILE:
+            raise ValueError(f"it is larger than {LARGEST_FILE} bytes")
+        yield path.read_text(encoding="utf-8")
     except Exception as error:
         reason = in_one_line(error)
         raise InputError(
             f"{path} is damaged or not as `python -m train` wrote it ({reason}): use another run"
         ) from error
-
-
-def _read(path: Path, largest: int = LARGEST_FILE) -> str:
-    if not path.is_file():
-        raise ValueError("there is no such file")
-    if path.stat().st_size > largest:
-        raise ValueError(f"it is larger than {largest} bytes")
-    return path.read_text(encoding="utf-8")
 
 
 def read_config(path: Path) -> DictConfig:
@@ -127,8 +113,7 @@ def read_config(path: Path) -> DictConfig:
     Files with aliases or interpolations are refused: a short alias can stand for more than memory holds, and an
     interpolation would show the reader's environment.
     """
-    with _named(path):
-        text = _read(path, LARGEST_CONFIG)
+    with _text_of(path) as text:
         if "${" in text or any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
             raise ValueError("it holds an alias or an interpolation")
         plain = yaml.safe_load(text)
@@ -152,17 +137,20 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
 
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON file that holds an object; InputError naming a damaged file."""
-    with _named(path):
-        return _object(_read(path))
+    with _text_of(path) as text:
+        return _object(text)
 
 
-def read_numbers(path: Path) -> list[dict[str, float]]:
-    """JSON lines, each an object of numbers; a last line that a crash cut short is skipped.
+def read_metrics(folder: Path) -> list[dict[str, float]]:
+    """The lines of a run's metrics.jsonl, one per epoch, then the final scores; [] without the file.
 
-    InputError naming a damaged file.
+    A last line that a crash cut short is skipped. InputError naming a damaged file.
     """
-    with _named(path):
-        lines = [_object(line) for line in _read(path).split("\n")[:-1]]
+    path = folder / METRICS
+    if not path.is_file():
+        return []
+    with _text_of(path) as text:
+        lines = [_object(line) for line in text.split("\n")[:-1]]
         if any(not isinstance(value, int | float) for line in lines for value in line.values()):
             raise ValueError("a value is not a number")
         return lines
@@ -175,21 +163,12 @@ def _object(text: str) -> dict[str, Any]:
     return parsed
 
 
-def read_metrics(folder: Path) -> list[dict[str, float]]:
-    """The lines of a run's metrics.jsonl: one per epoch, then the final scores; [] without the file."""
-    path = folder / METRICS
-    return read_numbers(path) if path.is_file() else []
-
-
 # ------------------------------------------------------------------------------------ resuming
 
 
 def decisive_settings(settings: ExperimentSettings | DictConfig) -> dict[str, object]:
     """The settings that decide a run's result, by dotted key; paths inside the run's own folder begin with `<run>`."""
-    if isinstance(settings, DictConfig):
-        plain = cast(dict[str, Any], OmegaConf.to_container(settings))
-    else:
-        plain = asdict(settings)
+    plain: Any = OmegaConf.to_container(settings) if isinstance(settings, DictConfig) else asdict(settings)
     run = str(plain.get("run"))
 
     def relative(value: object) -> object:
@@ -199,38 +178,32 @@ def decisive_settings(settings: ExperimentSettings | DictConfig) -> dict[str, ob
     return {key: relative(value) for key, value in dotted(plain) if not is_within(key, CIRCUMSTANCES)}
 
 
-def require_same_settings(folder: Path, settings: ExperimentSettings, finished: bool = False) -> None:
-    """InputError where the run in the folder has other decisive settings than those asked for.
+def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool = False) -> None:
+    """InputError where the run in the folder has other decisive settings or input files than those asked for.
 
     A run that goes on may get more epochs and another evaluation, unless it is finished.
     """
-    defaults = decisive_settings(ExperimentSettings())
-    before, asked = defaults | decisive_settings(read_config(folder / CONFIG)), decisive_settings(settings)
+    config, elsewhere = read_config(folder / CONFIG), "another folder with run= (sweep=)"
+    before, asked = decisive_settings(ExperimentSettings()) | decisive_settings(config), decisive_settings(settings)
     for key in sorted(before.keys() | asked.keys()):
         old, new = before.get(key), asked.get(key)
-        longer = key == "train.epochs" and isinstance(old, int) and isinstance(new, int) and new > old
+        longer = key == "train.epochs" and isinstance(old, int) and settings.train.epochs > old
         if old != new and (finished or not (longer or key.startswith("evaluate."))):
             raise InputError(
-                f"{folder} was trained with {key}={old}, not {new}: give the settings of {folder / CONFIG}, or another "
-                "folder with run= (sweep=)"
+                f"{folder} was trained with {key}={old}, not {new}: give the settings of {folder / CONFIG}, or "
+                f"{elsewhere}"
             )
+    hashes = config.get("inputs") or {}
+    for path, fingerprint in fingerprints(settings).items():
+        if hashes.get(path, fingerprint) != fingerprint:
+            raise InputError(f"{path} has changed since {folder} began: put it back, or start in {elsewhere}")
 
 
 def fingerprints(settings: Any) -> dict[str, str]:
     """SHA-256 of every file, and of the names and sizes in every folder, that INPUTS name, by path."""
     by_key = dict(dotted(asdict(settings)))
     paths = {path for key in INPUTS for path in _paths(by_key.get(key)) if os.path.exists(path)}
-    return {path: _folder_hash(path) if os.path.isdir(path) else _file_hash(path) for path in sorted(paths)}
-
-
-def require_same_inputs(folder: Path, settings: ExperimentSettings) -> None:
-    """InputError naming an input file whose content has changed since the run in the folder began."""
-    before = read_config(folder / CONFIG).get("inputs") or {}
-    for path, fingerprint in fingerprints(settings).items():
-        if before.get(path, fingerprint) != fingerprint:
-            raise InputError(
-                f"{path} has changed since {folder} began: put it back, or start in another folder with run= (sweep=)"
-            )
+    return {path: _fingerprint(Path(path)) for path in sorted(paths)}
 
 
 def _paths(value: Any) -> Iterator[str]:
@@ -245,15 +218,13 @@ def _paths(value: Any) -> Iterator[str]:
             yield from _paths([value.get("mesh"), value.get("props")])
 
 
-def _folder_hash(path: str) -> str:
-    files = [file for file in Path(path).rglob("*") if file.is_file()]
-    sizes = sorted((str(file.relative_to(path)), file.stat().st_size) for file in files)
-    return hashlib.sha256(repr(sizes).encode(errors="surrogateescape")).hexdigest()
-
-
-def _file_hash(path: str) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _fingerprint(path: Path) -> str:
+    if path.is_dir():
+        files = [file for file in path.rglob("*") if file.is_file()]
+        sizes = sorted((str(file.relative_to(path)), file.stat().st_size) for file in files)
+        return hashlib.sha256(repr(sizes).encode(errors="surrogateescape")).hexdigest()
+    with open(path, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 # ------------------------------------------------------------------------------------ logs
@@ -267,66 +238,40 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, history: Sequence[Mapping[str, float]] = ()):
-        from tensorboard.compat.proto.event_pb2 import SessionLog  # half a second, which readers of metrics are spared
+        from torch.utils.tensorboard import SummaryWriter  # half a second, which readers of metrics are spared
 
-        self._metrics = folder / METRICS
-        self._renders = folder / "renders"
-        self._board = folder / f"events.out.tfevents.{time.time():010.0f}.{socket.gethostname()}.{os.getpid()}"
-        self._epochs = len(history)
-        self._metrics.unlink(missing_ok=True)  # opening a pipe of that name would block
+        self._metrics, self._renders, self._epochs = folder / METRICS, folder / "renders", len(history)
         self._metrics.write_text("".join(json.dumps(line) + "\n" for line in history))
-        self._show(0, file_version="brain.Event:2")
-        self._show(self._epochs + 1, session_log=SessionLog(status=SessionLog.START))
+        self._board = SummaryWriter(str(folder), purge_step=self._epochs + 1)
 
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
         """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores.
 
         TensorBoard shows the final scores one step after the last epoch, where a resumed run replaces them.
         """
-        from tensorboard.compat.proto.summary_pb2 import Summary
-
         line = values if epoch is None else {"epoch": epoch, **values}
         with open(self._metrics, "a") as file:
             file.write(json.dumps(line) + "\n")
         self._epochs = self._epochs if epoch is None else epoch
-        points = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
-        self._show(epoch or self._epochs + 1, summary=Summary(value=points))
+        for name, value in values.items():
+            self._board.add_scalar(name, value, epoch or self._epochs + 1)
+        self._board.flush()
 
     def renders(self, images: Tensor, epoch: int) -> None:
         """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
-        from tensorboard.compat.proto.summary_pb2 import Summary
         from torchvision.utils import make_grid
 
         grid = to_bytes(make_grid(images.cpu(), nrow=20, padding=1, pad_value=1.0))
-        png = io.BytesIO()
-        Image.fromarray(grid.permute(1, 2, 0).numpy()).save(png, "PNG", compress_level=1)
         self._renders.mkdir(exist_ok=True)
-        (self._renders / f"epoch_{epoch:03d}.png").write_bytes(png.getvalue())
-        channels, height, width = grid.shape
-        image = Summary.Image(height=height, width=width, colorspace=channels, encoded_image_string=png.getvalue())
-        self._show(epoch, summary=Summary(value=[Summary.Value(tag="renders", image=image)]))
+        path = self._renders / f"epoch_{epoch:03d}.png"
+        Image.fromarray(grid.permute(1, 2, 0).numpy()).save(path, compress_level=1)
+        self._board.add_image("renders", grid, epoch)
 
     def attack_examples(self, attack_examples: AttackExamples, classes: Sequence[str], epoch: int) -> None:
         """A few successful attacks of the epoch, before and after, in renders/."""
         self._renders.mkdir(exist_ok=True)
         write_attack_examples(self._renders / f"epoch_{epoch:03d}{SUFFIX}", attack_examples, classes)
 
-    def _show(self, step: int, **content: object) -> None:
-        """Append a TensorBoard event at once; torch's SummaryWriter writes in a thread, whose errors are lost."""
-        from tensorboard.compat.proto.event_pb2 import Event
-        from tensorboard.summary.writer.record_writer import RecordWriter
-
-        with open(self._board, "ab") as file:
-            RecordWriter(file).write(Event(wall_time=time.time(), step=step, **content).SerializeToString())
-
-
-class NoLog:
-    """Stands in for a `RunLog` in processes of a run that write nothing."""
-
-    def _nothing(self, *_: object, **__: object) -> None:
-        pass
-
-    scalars = renders = attack_examples = _nothing
-
-
-Log = RunLog | NoLog
+    def close(self) -> None:
+        """End TensorBoard's thread."""
+        self._board.close()

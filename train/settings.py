@@ -11,7 +11,6 @@ from typing import Any, TypeVar, cast, get_type_hints
 import hydra
 from hydra import initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -207,13 +206,10 @@ def as_override(argument: str) -> str:
     return argument if as_given else f"{key}={quoted(value)}"
 
 
-def given_command() -> str:
-    """The command of this process's run as it was given, without the run's folder; "" outside `python -m train`."""
-    if not HydraConfig.initialized():
-        return ""
+def given_command(overrides: Sequence[str]) -> str:
+    """`python -m train`, or torchrun's, with these overrides but without the run's folder."""
     count = world_size()
     command = ["torchrun", f"--nproc_per_node={count}", "-m", "train"] if count > 1 else ["python", "-m", "train"]
-    overrides = HydraConfig.get().overrides.task
     return shlex.join([*command, *(text for text in overrides if not text.startswith(("run=", "train.resume=")))])
 
 

@@ -14,6 +14,7 @@ from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
@@ -23,8 +24,8 @@ from train.errors import one_sentence, writable_folder
 from train.report.page import report_of
 from train.report.summary import format_spread, format_table, is_finished, summarize
 from train.run import load_data, run, write_images
-from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_inputs, require_same_settings, state
-from train.settings import ExperimentSettings, compose, read_settings
+from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
+from train.settings import ExperimentSettings, compose, given_command, read_settings
 
 LONGEST_VALUE, LONGEST_NAME = 24, 200  # characters in a folder's name; file systems take 255
 HYDRAS_OWN = re.compile(r"\+*hydra[./]")  # overrides that do not concern the run
@@ -68,8 +69,7 @@ def sweep(start: Callable[[], None], overrides: Sequence[str]) -> None:
     for folder, words in zip(folders, runs, strict=True):
         if is_finished(folder) or checkpoint.exists(folder):
             settings = read_settings(ExperimentSettings, compose("train", words))
-            require_same_settings(folder, settings, finished=True)
-            require_same_inputs(folder, settings)
+            require_same_run(folder, settings, finished=True)
     handler = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # so that launchers end theirs
     try:
         start()
@@ -111,7 +111,7 @@ def run_in_sweep(config: DictConfig, folder: Path) -> None:
             settings.train.resume = checkpoint.exists(folder)
             data = load_data(settings)
             write_images(settings, data.size)
-            run(settings, data, folder)
+            run(settings, data, folder, given_command(HydraConfig.get().overrides.task))
         except Exception as error:
             sentence = one_sentence(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()

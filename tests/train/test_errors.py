@@ -13,7 +13,8 @@ from train.errors import one_sentence, writable_file, writable_folder
     [
         (InputError("light=x is not known"), "light=x is not known"),
         (PermissionError(13, "Permission denied", "/a/b"), "/a/b cannot be read or written: Permission denied"),
-        (OSError(28, "No space left on device"), "there is no room for the output: No space left on device"),
+        (OSError(28, "No space left on device"), "the output cannot be written (No space left on device): make room"),
+        (OSError(28, "No space left", "/a/b"), "/a/b cannot be written (No space left): make room and start again"),
         (RuntimeError("[/gloo/x.cc:1] Connection closed by peer"), "another process of this run has ended: "),
         (torch.distributed.DistBackendError("NCCL error"), "another process of this run has ended: "),
         (UnicodeEncodeError("utf-8", "a\udcffb", 1, 2, "no"), r"'a\udcffb' has characters that this system"),

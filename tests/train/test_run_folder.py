@@ -1,8 +1,9 @@
 """A run's folder, also where others write to it or have damaged its files."""
 
-import os
+import itertools
 import shutil
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,7 @@ from train.run_folder import (
     fingerprints,
     read_config,
     read_metrics,
-    read_numbers,
-    require_same_inputs,
+    require_same_run,
     sole_writer,
     write_config,
 )
@@ -61,7 +61,6 @@ BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{
     "file, content",
     [
         (CONFIG, b"- 1"),
-        (CONFIG, b"[" * 5000),
         (CONFIG, BOMB.encode()),
         (CONFIG, b"!!python/object/apply:os.system [touch hacked]"),
         (CONFIG, b"a: ${oc.env:HOME}"),
@@ -69,7 +68,7 @@ BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join(9 * [f'*a{
         (METRICS, b'{"test/accuracy": "high"}\n'),
         ("photographs/summary.json", b'{"recall": {"value": 0.5}}'),
     ],
-    ids=["list", "deep", "bomb", "code", "variable", "cut", "text", "few"],
+    ids=["list", "bomb", "code", "variable", "cut", "text", "few"],
 )
 def test_a_damaged_file_is_one_sentence_that_names_it(finished, tmp_path, file, content):
     run = shutil.copytree(finished, tmp_path / "run")
@@ -109,10 +108,10 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
     file.write_bytes(b"one")
     settings = tiny(override.format(file), "augment.examples=null", "scene.views=1")
     write_config(folder, settings)
-    require_same_inputs(folder, settings)
+    require_same_run(folder, settings)
     file.write_bytes(b"two")
     with pytest.raises(InputError, match=rf"{file} has changed since {folder} began: put it back"):
-        require_same_inputs(folder, settings)
+        require_same_run(folder, settings)
 
 
 def test_a_folder_that_changed_has_another_fingerprint(tiny, tmp_path):
@@ -128,9 +127,9 @@ def test_a_folder_that_changed_has_another_fingerprint(tiny, tmp_path):
 
 
 def test_a_last_line_that_was_cut_short_is_skipped(tmp_path):
-    (tmp_path / "lines").write_text('{"epoch": 1}\n{"epo')
-    assert read_numbers(tmp_path / "lines") == [{"epoch": 1}]
     assert read_metrics(tmp_path) == []  # without a file
+    (tmp_path / METRICS).write_text('{"epoch": 1}\n{"epo')
+    assert read_metrics(tmp_path) == [{"epoch": 1}]
 
 
 def write_epochs(folder: Path, epochs: range, history=()) -> None:
@@ -140,8 +139,9 @@ def write_epochs(folder: Path, epochs: range, history=()) -> None:
 
 
 @pytest.mark.parametrize("done", [0, 2, 3])
-def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(tmp_path, done):
+def test_resuming_continues_the_metrics_from_the_epoch_of_the_checkpoint(tmp_path, done, monkeypatch):
     """Later lines are written again, final scores too; a line cut short and lines that were lost come back."""
+    monkeypatch.setattr(time, "time", itertools.count(1e9).__next__)  # TensorBoard orders the files by their seconds
     write_epochs(tmp_path, range(1, 4))
     epochs = read_metrics(tmp_path)
     RunLog(tmp_path, epochs).scalars({"test/accuracy": 0.5})
@@ -174,11 +174,3 @@ def test_tensorboard_reads_the_scalars_and_the_renders(tmp_path):
     for number, render in enumerate(renders):
         tile = pixels[1:17, 17 * number + 1 : 17 * number + 17]
         np.testing.assert_allclose(tile / 255, render.permute(1, 2, 0), atol=0.5 / 255 + 1e-6)
-
-
-def test_a_pipe_in_place_of_the_metrics_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / METRICS)
-    reader = os.open(tmp_path / METRICS, os.O_RDWR)  # so that this test fails rather than hangs
-    RunLog(tmp_path, [{"epoch": 1}])
-    os.close(reader)
-    assert read_metrics(tmp_path) == [{"epoch": 1}]

@@ -1,0 +1,179 @@
+import os
+from copy import deepcopy
+
+import pytest
+import torch
+
+from renderer.errors import InputError
+from train import device
+from train.device import (
+    SIZES,
+    GraphedModel,
+    MixedPrecision,
+    choose_device,
+    choose_precision,
+    compiled_pass,
+    compiles,
+    set_threads,
+)
+from train.networks import WideResNet
+from train.recipe import TrainSettings, training_loss
+
+CPU, GPU = torch.device("cpu"), torch.device("cuda")
+
+
+@pytest.fixture
+def network() -> WideResNet:
+    torch.manual_seed(0)
+    return WideResNet(3, 10, 1, dropout=0.0).eval()
+
+
+@pytest.mark.parametrize("name", ["abacus", "cuda:99"])
+def test_a_device_that_is_not_there_is_one_error(name):
+    with pytest.raises(InputError, match=f"device={name} is not available here: use cpu"):
+        choose_device(name)
+
+
+@pytest.mark.parametrize("quota, cores", [("300000 100000", 3), ("20000 100000", 1), ("max 100000", 8), (None, 8)])
+def test_threads_are_no_more_than_the_containers_quota_of_cores(tmp_path, monkeypatch, quota, cores):
+    if quota:
+        (tmp_path / "cpu.max").write_text(quota)
+    monkeypatch.setattr(device, "QUOTA", tmp_path / "cpu.max")
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    before = torch.get_num_threads()
+    try:
+        for present, asked, expected in [(8, None, cores), (8, 5, 5), (1, None, 1)]:
+            torch.set_num_threads(present)
+            set_threads(asked)
+            assert torch.get_num_threads() == expected
+    finally:
+        torch.set_num_threads(before)
+
+
+# ------------------------------------------------------------------------------------- precision
+
+
+@pytest.mark.parametrize("supported, expected", [(True, "bfloat16"), (False, "float32")])
+@pytest.mark.parametrize(
+    "where, machine, rule",
+    [
+        (GPU, "x86_64", "torch.cuda.is_bf16_supported"),
+        (CPU, "x86_64", "torch.cpu._is_avx512_bf16_supported"),
+        (CPU, "aarch64", "torch.ops.mkldnn._is_mkldnn_bf16_supported"),
+    ],
+)
+def test_auto_is_bfloat16_where_the_hardware_computes_in_it(monkeypatch, where, machine, rule, supported, expected):
+    monkeypatch.setattr(device.platform, "machine", lambda: machine)
+    monkeypatch.setattr(rule, lambda **options: supported)
+    assert choose_precision("auto", where) == expected
+    assert choose_precision("float32", where) == "float32"
+
+
+def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
+    images = torch.rand(4, 3, 16, 16, requires_grad=True)
+    exact = network(images)
+    inside = []
+    network.stem.register_forward_hook(lambda module, arguments, result: inside.append(result.dtype))
+    logits = MixedPrecision(network, "bfloat16")(images)
+    logits.sum().backward()
+    assert inside == [torch.bfloat16]
+    assert logits.dtype == images.grad.dtype == torch.float32
+    assert {parameter.dtype for parameter in network.parameters()} == {torch.float32}
+    assert not torch.equal(logits, exact)
+    assert (logits - exact).norm() / exact.norm() < 0.05  # bfloat16 has 8 bits, over a dozen layers
+    assert (torch.rand(8, 8) @ torch.rand(8, 8)).dtype == torch.float32  # autocast ends with the forward pass
+
+
+def test_float32_is_the_network_to_rounding(network):
+    images, expected = torch.rand(4, 3, 16, 16), deepcopy(network)
+    torch.testing.assert_close(MixedPrecision(network, "float32")(images), expected(images))
+
+
+# ------------------------------------------------------------------------------------- compiled passes
+
+
+class Recorded:
+    """A compiler for torch.compile that notes the number of images of each graph and runs it as it is."""
+
+    def __init__(self):
+        self.sizes = []
+
+    def __call__(self, module, inputs):
+        self.sizes.append(next(len(x) for x in inputs if x.shape[1:] == (3, 8, 8)))
+        return module.forward
+
+
+@pytest.fixture
+def linear() -> torch.nn.Module:
+    torch.manual_seed(0)
+    return torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(192, 3)).double().requires_grad_(False)
+
+
+@pytest.mark.parametrize("works", [True, False])
+@pytest.mark.parametrize(
+    "choice, where, processes, expected",
+    [
+        ("auto", GPU, 1, True), ("auto", CPU, 1, False), ("always", GPU, 1, True),
+        ("never", GPU, 1, False), ("auto", GPU, 2, False), ("always", GPU, 2, True),
+    ],
+)  # fmt: skip
+def test_one_gpu_compiles_where_it_can_unless_told(monkeypatch, caplog, works, choice, where, processes, expected):
+    def no_compiler(images):
+        raise RuntimeError("Failed to find C compiler.")
+
+    monkeypatch.setattr(device.torch, "compile", lambda function: (lambda images: images) if works else no_compiler)
+    monkeypatch.setattr(device.torch, "zeros", lambda size, device: None)
+    monkeypatch.setattr(device.utils, "world_size", lambda: processes)
+    compiles.cache_clear()
+    tried = choice == "auto" and expected
+    for _ in range(2):
+        assert compiles(choice, where) == (works if tried else expected)
+    assert len(caplog.messages) == (tried and not works)  # once
+    compiles.cache_clear()
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # the compiler looks at it
+def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_and_gradient(linear):
+    recorded = Recorded()
+    graphed = GraphedModel(linear, recorded).eval()
+    for count in (1, 7, 16, 17, 30, 32, 33):
+        images = torch.rand(count, 3, 8, 8, dtype=torch.float64, requires_grad=True)
+        logits, expected = graphed(images), linear(images)
+        torch.testing.assert_close(logits, expected)
+        weights = torch.rand_like(logits)
+        gradient, exact = (torch.autograd.grad((x * weights).sum(), images)[0] for x in (logits, expected))
+        torch.testing.assert_close(gradient, exact)
+    graphed.train()(images)
+    graphed.eval()(images[:1].expand(SIZES[-1] + 1, -1, -1, -1))
+    assert recorded.sizes == [16, 32, 64]  # in training mode, and for larger batches, the model is used as it is
+
+
+@pytest.mark.slow
+def test_no_run_of_a_sweep_is_compiled_less_than_the_first(linear, monkeypatch):
+    """Torch would stop at a number of graphs, of all the runs of a process together."""
+    monkeypatch.setattr(device, "RECOMPILE_LIMIT", 2)
+    recorded = Recorded()
+    for _ in range(3):
+        compiled_pass(linear)  # as each run begins
+        graphed = GraphedModel(linear, recorded).eval()
+        for size in (16, 32):
+            graphed(torch.zeros(size, 3, 8, 8, dtype=torch.float64))
+    assert recorded.sizes == 3 * [16, 32]
+
+
+@pytest.mark.slow
+def test_compiled_passes_give_the_same_gradients_and_logits(network):
+    """Through the compiler of the CPU; there are no graphs to record there."""
+    images, labels = torch.randint(0, 256, (9, 3, 8, 8), dtype=torch.uint8), torch.arange(9) % 3
+    teacher = WideResNet(3, 10, 1, dropout=0.0).eval().requires_grad_(False)
+    settings = TrainSettings(init_from="base", label_smoothing=0.1, ranking=1.0, distillation=1.0)
+    loss, gradients = training_loss(network, settings, 1, teacher), []
+    for step in (loss, compiled_pass(loss)):
+        network.zero_grad()
+        network.train()
+        step(images, labels, labels == 0)[0].backward()
+        gradients.append({name: parameter.grad.clone() for name, parameter in network.named_parameters()})
+    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-5)
+    network.eval()
+    with torch.no_grad():
+        torch.testing.assert_close(GraphedModel(network).eval()(images / 255), network(images / 255))

@@ -1,0 +1,207 @@
+"""Two processes against one, over gloo on a CPU; and the signals that end a run."""
+
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.multiprocessing as multiprocessing
+import torch.nn.functional as F
+from omegaconf import OmegaConf
+from PIL import Image
+
+from augment import utils
+from train import checkpoint, loop
+from train.networks import WideResNet
+from train.processes import Interrupted, Interruption, any_process, process_group, replicated, summed
+from train.run import load_data, run
+from train.run_folder import read_metrics
+from train.settings import ExperimentSettings, read_settings
+
+ROOT = Path(__file__).parents[2]
+BATCH = torch.rand(12, 3, 8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+LABELS = torch.arange(12) % 3
+EPOCHS = 2
+
+
+def group_norms(patch: pytest.MonkeyPatch) -> None:
+    """In place of batch norms, whose statistics on a CPU are those of a process's own part."""
+    patch.setattr(torch.nn, "BatchNorm2d", lambda channels: torch.nn.GroupNorm(1, channels))
+
+
+def one_of_two(index: int, port: int, folder: Path) -> None:
+    """All that the tests ask of two processes, in one of them."""
+    os.environ |= {"WORLD_SIZE": "2", "RANK": str(index), "LOCAL_RANK": str(index)}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    with pytest.MonkeyPatch.context() as patch, process_group():
+        group_norms(patch)
+        train_two_steps(folder)
+        run_from_file(folder / "config.yaml", folder / "two")
+        run_until_a_signal(folder / "config.yaml", folder / "mixed")
+
+
+def train_two_steps(folder: Path) -> None:
+    """Writes the losses, the gradients of the second step, and what the processes agree on."""
+    torch.manual_seed(0)
+    model = WideResNet(3, 10, 1, dropout=0.4).double()
+    replica, losses = replicated(model), []
+    shard = torch.arange(12).view(utils.world_size(), -1)[utils.rank()]
+    for step in range(2):
+        torch.manual_seed(step)
+        loss = F.cross_entropy(replica(BATCH[shard]), LABELS[shard])
+        model.zero_grad()
+        loss.backward()
+        losses.append(float(summed(loss.detach().clone())) / utils.world_size())
+    five, one = (utils.shard(total, utils.rank(), utils.world_size()) for total in (5, 1))
+    state = {
+        "losses": losses,
+        "gradients": {name: parameter.grad for name, parameter in model.named_parameters()},
+        "any": [any_process(utils.rank() == 1), any_process(False)],
+        "merged": utils.merged(10 * five, five, 5, utils.world_size()),
+        "few": utils.merged(one + 7, one, 1, utils.world_size()),
+    }
+    torch.save(state, folder / f"{utils.rank()}_of_{utils.world_size()}.pt")
+
+
+def run_from_file(config: Path, folder: Path) -> None:
+    settings = read_settings(ExperimentSettings, OmegaConf.load(config))
+    run(settings, load_data(settings), folder)
+
+
+def run_until_a_signal(config: Path, folder: Path) -> None:
+    """The second process alone gets it, in the second step of the second epoch."""
+    training_batches = loop.training_batches
+
+    def signalled(split, batch_size, seed, now, *rest):
+        for count, batch in enumerate(training_batches(split, batch_size, seed, now, *rest), 1):
+            if (now.epoch, count, utils.rank()) == (1, 2, 1):
+                signal.raise_signal(signal.SIGTERM)
+            yield batch
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "training_batches", signalled)
+        with pytest.raises(Interrupted):
+            run_from_file(config, folder)
+
+
+@pytest.fixture(scope="module")
+def runs(tiny, tmp_path_factory) -> Path:
+    """Two steps and an adversarial run by one process and by two, and a run by two until a signal and then by one; at a
+    learning rate so low that rounding does not grow."""
+    folder = tmp_path_factory.mktemp("distributed")
+    for name, overrides in [("config", ()), ("resume", ("train.resume=true",))]:
+        settings = tiny("train.learning_rate=0.001", f"train.epochs={EPOCHS}", *overrides)
+        OmegaConf.save(OmegaConf.structured(settings), folder / f"{name}.yaml")
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    multiprocessing.set_forkserver_preload([__name__, "torch.utils.tensorboard", "torchvision.utils"])  # once for both
+    multiprocessing.start_processes(one_of_two, (port, folder), nprocs=2, start_method="forkserver")
+    state = checkpoint.load(folder / "mixed" / checkpoint.LAST)
+    assert (state["epoch"], state["under_way"]["step"]) == (1, 2)
+    with pytest.MonkeyPatch.context() as patch:
+        group_norms(patch)
+        train_two_steps(folder)
+        run_from_file(folder / "config.yaml", folder / "one")
+        run_from_file(folder / "resume.yaml", folder / "mixed")
+    return folder
+
+
+def test_two_processes_agree_on_the_losses_and_gradients_of_one(runs):
+    """In float64, with dropout over the whole batch; and shards become whole."""
+    names = ("0_of_1.pt", "0_of_2.pt", "1_of_2.pt")
+    one, *two = (torch.load(runs / name, weights_only=True) for name in names)
+    assert one["any"] == [False, False] and one["merged"].tolist() == [0, 10, 20, 30, 40]
+    for result in two:
+        torch.testing.assert_close(result["losses"], one["losses"], rtol=1e-12, atol=0)
+        torch.testing.assert_close(result["gradients"], one["gradients"], rtol=1e-9, atol=1e-13)
+        assert result["any"] == [True, False]
+        assert result["merged"].tolist() == [0, 10, 20, 30, 40] and result["few"].tolist() == [7]
+    assert max(gradient.abs().max() for gradient in one["gradients"].values()) > 0.1
+    assert all(torch.equal(value, two[1]["gradients"][name]) for name, value in two[0]["gradients"].items())
+
+
+@pytest.mark.parametrize("name", ["two", "mixed"])
+def test_a_run_does_not_depend_on_the_number_of_its_processes(runs, name):
+    first, other = (checkpoint.load(runs / folder / checkpoint.LAST) for folder in ("one", name))
+    torch.testing.assert_close(other["model"], first["model"], rtol=1e-3, atol=1e-5)  # float32
+    torch.testing.assert_close(other["service"], first["service"], rtol=0, atol=1e-3)
+    for epoch in range(1, EPOCHS + 1):
+        grids = [np.asarray(Image.open(runs / folder / "renders" / f"epoch_00{epoch}.png")) for folder in ("one", name)]
+        np.testing.assert_allclose(*(grid.astype(int) for grid in grids), atol=1)  # of 255, where rounding decides
+    expected, lines = (read_metrics(runs / folder) for folder in ("one", name))
+    assert [line.get("epoch") for line in lines] == [*range(1, EPOCHS + 1), None]
+    for one, line in zip(expected, lines, strict=True):
+        for key in (key for key in one if not key.startswith("seconds/")):
+            assert line[key] == pytest.approx(one[key], rel=1e-3), key
+    assert all(line["augment/light_change"] > 0 for line in expected[:-1])
+    files = [
+        {path.name for path in (runs / folder).iterdir() if "tfevents" not in path.name} for folder in ("one", name)
+    ]
+    assert files[0] == files[1]
+    assert len(list((runs / "two").glob("events.out.tfevents.*"))) == 1  # one process writes
+
+
+@pytest.mark.slow
+def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_path):
+    """The command of the README; the second call goes on where SIGTERM stopped the first."""
+    small = ["model.depth=10", "model.width=1", "train.batch_size=16", "renderer.samples=2", "augment.examples=10"]
+    data = ["data=npz", f"data.path={tiny_npz}", "evaluate.photos=null", "compare=[]"]
+    overrides = [*small, *data, "train.device=cpu", "train.epochs=20", "train.checkpoint_every=1000"]
+    start = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "-m", "train"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    with subprocess.Popen([*start, *overrides], cwd=tmp_path, env=environment, **pipes) as first:
+        for line in first.stdout:
+            if line.startswith("epoch 1/"):
+                first.terminate()
+                break
+        (advice,) = [line for line in first.stdout if line.startswith("ended by SIGTERM")]
+    assert first.returncode != 0
+    command = shlex.split(advice.partition("to go on: ")[2])
+    assert command[:4] == ["torchrun", "--nproc_per_node=2", "-m", "train"]
+    (folder,) = (tmp_path / "runs").glob("*/*")
+    epochs = checkpoint.load(folder / checkpoint.LAST)["epoch"]
+    assert 1 <= epochs < 20
+    done = subprocess.run([*start, *command[4:]], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"after epoch {epochs}" in done.stdout and done.stdout.count("| adversarial") == 1
+    assert [line.get("epoch") for line in read_metrics(folder)] == [*range(1, 21), None]
+
+
+# ---------------------------------------------------------------------------------------- signals
+
+
+@pytest.mark.parametrize(
+    "ended, expected", [("asked", Interrupted), ("unasked", KeyboardInterrupt), ("by an error", ZeroDivisionError)]
+)
+def test_a_signal_is_noted_never_swallowed_and_hides_no_error(ended, expected):
+    """It ends the run where it is asked for, or else where the block ends; the handlers are those of before."""
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+    with pytest.raises(expected) as stopped, Interruption() as interruption:
+        assert not interruption.requested()
+        signal.raise_signal(signal.SIGINT)
+        if ended == "by an error":
+            raise ZeroDivisionError
+        if ended == "asked":
+            assert interruption.requested()
+            interruption.stop()
+    assert ended != "asked" or stopped.value.code == 128 + signal.SIGINT
+    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)] == before
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    """As nohup ignores SIGHUP, a shell ignores SIGINT for what it starts in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Interruption() as interruption:
+            signal.raise_signal(signal.SIGINT)
+            assert not interruption.requested()
+    finally:
+        signal.signal(signal.SIGINT, before)

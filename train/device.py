@@ -1,0 +1,137 @@
+"""Where and how to compute: device, threads, precision, and CUDA graphs."""
+
+import functools
+import os
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from augment import utils
+from renderer.errors import InputError, as_device, require_choice
+from train import console
+
+QUOTA = Path("/sys/fs/cgroup/cpu.max")
+PRECISIONS = ("auto", "bfloat16", "float32")
+COMPILE = ("auto", "always", "never")
+SIZES = (16, 32, 64, 128, 512)  # of a batch in eval mode: attacks, whose examples leave on success, and validation
+RECOMPILE_LIMIT = 4 * len(SIZES)  # each with and without gradients, which torch's 8 are too few for
+
+
+def choose_device(name: str) -> torch.device:
+    """auto (CUDA where there is a GPU, else the CPU) or any name torch knows; InputError where it is not available.
+
+    Each process that torchrun starts takes a GPU of its own for "auto" and "cuda".
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and "LOCAL_RANK" in os.environ:
+        name = f"cuda:{os.environ['LOCAL_RANK']}"
+    return as_device(name)
+
+
+def set_threads(threads: int | None) -> None:
+    """Threads of an operation on the CPU; None leaves torch's choice, but no more than a container's quota of cores.
+
+    torch counts the machine's cores, and threads above the quota wait for each other.
+    """
+    try:
+        quota, period = QUOTA.read_text().split()
+        cores = max(1, int(quota) // int(period))
+    except (OSError, ValueError):  # no such file (it is Linux's, cgroup v2), or "max 100000"
+        cores = os.cpu_count() or 1
+    torch.set_num_threads(threads or min(torch.get_num_threads(), cores))
+
+
+def set_deterministic(deterministic: bool) -> None:
+    """Whether a GPU's results repeat bit for bit, at some cost in time; a CPU's always do."""
+    if deterministic:
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS asks for it
+    torch.use_deterministic_algorithms(deterministic)
+    torch.backends.cudnn.benchmark = not deterministic
+
+
+def choose_precision(precision: str, device: torch.device) -> str:
+    """ "bfloat16" or "float32"; "auto" takes bfloat16 where the device computes in it rather than emulate it."""
+    require_choice("train.precision", precision, PRECISIONS)
+    if precision != "auto":
+        return precision
+    match device.type:
+        case "cuda":
+            supported = torch.cuda.is_bf16_supported(including_emulation=False)
+        case "cpu" if platform.machine() in ("x86_64", "AMD64"):
+            supported = torch.cpu._is_avx512_bf16_supported()
+        case "cpu":
+            supported = torch.ops.mkldnn._is_mkldnn_bf16_supported()
+        case _:
+            supported = False
+    return "bfloat16" if supported else "float32"
+
+
+class MixedPrecision(nn.Module):
+    """A network run in channels-last layout under autocast: float32 images in, float32 logits out.
+
+    Only the network computes in the precision; the renderer's products and the loss stay in float32.
+    """
+
+    def __init__(self, network: nn.Module, precision: str):
+        super().__init__()
+        self.network = network.to(memory_format=torch.channels_last)
+        self.precision = precision
+
+    def forward(self, images: Tensor) -> Tensor:
+        images = images.contiguous(memory_format=torch.channels_last)
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            return self.network(images).float()
+
+
+# ------------------------------------------------------------------------------------- compiled passes on a GPU
+
+
+@functools.cache
+def compiles(choice: str, device: torch.device) -> bool:
+    """Whether to compile.
+
+    "auto" does on one GPU where torch.compile works, which needs a C compiler and Python's headers; several processes
+    wait for each other inside a pass. InputError for "always" on a CPU, which has no graphs to replay.
+    """
+    if choice == "always" and device.type == "cpu":
+        raise InputError("train.compile=always is for a GPU, whose graphs it replays: use auto or never")
+    if choice != "auto" or device.type != "cuda" or utils.world_size() > 1:
+        return choice == "always"
+    try:
+        torch.compile(torch.exp)(torch.zeros(2, device=device))
+    except Exception as error:  # of torch, Triton or the compiler
+        reason = " ".join(str(error).splitlines()[:2])
+        console.warning("compile: torch.compile fails here, so training is slower: %s", reason)
+        return False
+    return True
+
+
+def compiled_pass(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A training pass as CUDA graphs. Forgets earlier graphs, since torch limits those of all runs of a process."""
+    torch.compiler.reset()
+    return torch.compile(function, mode="reduce-overhead", dynamic=False)
+
+
+class GraphedModel(nn.Module):
+    """A model in eval mode as CUDA graphs, one for each of a few batch sizes; smaller batches are filled up with zeros.
+
+    Rows do not influence each other in eval mode. In training mode, and for larger batches, the model as it is.
+    """
+
+    def __init__(self, model: nn.Module, compiler: Any = "cudagraphs"):
+        super().__init__()
+        self.model = model
+        self._graphs = torch.compile(model.forward, backend=compiler, dynamic=False)
+        torch._dynamo.config.recompile_limit = RECOMPILE_LIMIT
+
+    def forward(self, images: Tensor) -> Tensor:
+        if self.training or len(images) > SIZES[-1]:
+            return self.model(images)
+        size = next(size for size in SIZES if len(images) <= size)
+        filled = torch.cat([images, images.new_zeros(size - len(images), *images.shape[1:])])
+        return self._graphs(filled)[: len(images)].clone()  # the next replay writes over a graph's result

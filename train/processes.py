@@ -1,0 +1,138 @@
+"""The processes that torchrun starts for one run, and the signals that end it."""
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from augment import utils
+
+BATCH_SYSTEM = getattr(signal, "SIGUSR2", None)  # submitit's, before a job's time is over; Windows has none
+SIGNALS = tuple(filter(None, (signal.SIGTERM, signal.SIGINT, BATCH_SYSTEM)))
+
+# ------------------------------------------------------------------------------------- processes
+
+
+@contextmanager
+def process_group() -> Iterator[None]:
+    """Join the processes that torchrun started; a run by itself has none to join."""
+    if int(os.environ.get("WORLD_SIZE", 1)) == 1:
+        yield
+        return
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+    try:
+        yield
+    finally:
+        dist.destroy_process_group()
+
+
+def is_process_lost(error: Exception) -> bool:
+    """Whether another process, which this one waited for, has ended: NCCL's error, or gloo's, known by its file."""
+    return isinstance(error, dist.DistError) or "/gloo/" in str(error)
+
+
+@contextmanager
+def first_process_first() -> Iterator[None]:
+    """Let the first process do alone what the others then find done, such as a download."""
+    if utils.rank() > 0:
+        dist.barrier()
+    yield
+    if utils.rank() == 0 and utils.world_size() > 1:
+        dist.barrier()
+
+
+def broadcast(value: str) -> str:
+    """The first process's value, which the others wait for."""
+    values = [value]
+    if utils.world_size() > 1:
+        dist.broadcast_object_list(values, src=0)
+    return values[0]
+
+
+def any_process(flag: bool) -> bool:
+    """Whether the flag is set in any process."""
+    return bool(summed(torch.tensor(float(flag))))  # on the CPU, so that no device has to catch up
+
+
+def summed(values: Tensor) -> Tensor:
+    """The sum over all processes, in place."""
+    if utils.world_size() > 1:
+        dist.all_reduce(values)
+    return values
+
+
+def replicated(model: nn.Module) -> nn.Module:
+    """The model whose gradients are averaged over all processes; itself where there is but one.
+
+    On GPUs, batch normalization takes its statistics over the global batch (`nn.SyncBatchNorm`), so that the result
+    does not depend on the number of processes; on CPUs, over each process's part.
+    """
+    if utils.world_size() == 1:
+        return model
+    if next(model.parameters()).is_cuda:
+        nn.SyncBatchNorm.convert_sync_batchnorm(model)  # replaces the norms inside
+    return DistributedDataParallel(model)
+
+
+# ------------------------------------------------------------------------------------- signals
+
+
+class Interrupted(SystemExit):
+    """A run ended early by a signal, with its checkpoint written; its exit status is the shell's: 128 + number."""
+
+    def __init__(self, number: int):
+        super().__init__(128 + number)
+        self.signal = signal.Signals(number).name
+
+
+class Interruption:
+    """Notes the first of `SIGNALS` while it is entered; a second one acts as it would without.
+
+    So does the first where nobody asks for it until it is left. Signals that the process was started to ignore stay
+    ignored, and they reach its main thread alone: in another one, none is noted.
+    """
+
+    def __init__(self) -> None:
+        self._number: int | None = None
+        self._handlers: dict[int, Any] = {}  # before it was entered
+
+    def __enter__(self) -> "Interruption":
+        if threading.current_thread() is threading.main_thread():
+            heeded = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+            self._handlers = {number: signal.signal(number, self._note) for number in heeded}
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
+        self._restore()
+        if error is None and self._number is not None:
+            signal.raise_signal(self._number)
+
+    def requested(self) -> bool:
+        """Whether to stop now; the same in all processes of a run."""
+        return any_process(self._number is not None)
+
+    def stop(self) -> None:
+        """Raise `Interrupted`, after a batch system's own handler, which may queue the job again and exit."""
+        number = self._number or signal.SIGTERM  # the signal may have reached another process alone
+        if number == BATCH_SYSTEM and callable(signal.getsignal(number)):
+            signal.raise_signal(number)
+        raise Interrupted(number)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._number = number
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers = {}
