@@ -221,19 +221,6 @@ def test_weights_that_are_not_finite_are_named_even_where_a_signal_came_before(t
     assert state_of(tmp_path)["epoch"] == 1
 
 
-@pytest.mark.parametrize(
-    "error", [torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("can't allocate memory: you ")]
-)
-def test_where_memory_runs_out_in_training_the_setting_is_named(tmp_path, monkeypatch, error):
-    def too_large(*batch):
-        raise error
-
-    trainer = make_trainer(tmp_path)
-    monkeypatch.setattr(trainer, "_loss", too_large)
-    with pytest.raises(InputError, match=r"train.batch_size=16 needs more memory than there is: set a lower one"):
-        fit_noise(trainer)
-
-
 def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tmp_path):
     """So a second accident, while the next one is written, is not the end of the run."""
     fit_noise(make_trainer(tmp_path, epochs=2))
@@ -248,7 +235,6 @@ def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tm
 @pytest.mark.parametrize(
     "changes",
     [
-        {"history": []},
         {"optimizer": [1]},
         {"under_way": {"step": 1}},
         {"architecture": {**ARCHITECTURE, "classes": ["fig", "lime", "plum"]}},

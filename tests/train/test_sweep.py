@@ -158,10 +158,10 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
 ):
     train = sweep.run
 
-    def broken(settings, data, folder):
+    def broken(settings, *rest):
         if settings.train.learning_rate == 0.5:
             raise ZeroDivisionError("a mistake of the program")
-        train(settings, data, folder)
+        train(settings, *rest)
 
     rates = ("-1", "0.05", "0.5")
     overrides = ["train.epochs=1", f"train.learning_rate={','.join(rates)}"]
