@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,8 +15,8 @@ from augment.attacks.attack import AttackResult, predictions
 from augment.attacks.evaluate import Checks, RerenderCheck, require_renderers, rerender
 from augment.attacks.figure import Panel, prediction_caption, save_figure
 from augment.scene import Conditions
-from renderer.io.mesh_damage import mesh_damage
 from renderer.light.basis import Basis
+from renderer.mesh import doubled_area_vectors
 from renderer.rendering import light_sphere
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
@@ -103,9 +104,11 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
 
 
 def _damage(result: AttackResult, after: Conditions, example: int) -> dict[str, dict[str, Any]]:
-    """The damage to an attacked shape; see `renderer.io.mesh_damage`."""
+    """Of an attacked shape: faces turned by more than 90°, and the largest displacements along x, y and z."""
     mesh = result.problem.scene.mesh(example)
     if after.vertices is None:
         return {}
     vertices = after.vertices[example, : len(mesh.vertices)].detach().cpu().double().numpy()
-    return {"shape": mesh_damage(mesh.vertices, vertices, mesh.faces)}
+    before, now = (doubled_area_vectors(corners, mesh.faces) for corners in (mesh.vertices, vertices))
+    displacement = np.abs(vertices - mesh.vertices).max(axis=0).tolist()
+    return {"shape": {"flipped": int(((before * now).sum(axis=1) < 0).sum()), "displacement": displacement}}

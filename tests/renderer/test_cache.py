@@ -45,7 +45,6 @@ def textured(texels: np.ndarray) -> Mesh:
 TEXELS = np.random.default_rng(0).integers(0, 256, (4, 4, 3), dtype=np.uint8)
 TEXTURED = textured(TEXELS)
 MESHES = {
-    "open, one color": Mesh.plain([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], [[0, 1, 2]], color=(0.2, 0.5, 0.7)),
     "closed, many colors": PLATE,
     "textured": TEXTURED,
     "out of the image": replace(TEXTURED, vertices=TEXTURED.vertices + np.array([0, 0, 9])),
@@ -101,19 +100,13 @@ def changed(array: np.ndarray, index: tuple, by: float) -> np.ndarray:
 
 CHANGES = {
     "a texel": {"mesh": textured(changed(TEXELS, (3, 1, 2), 1))},
-    "a texture's shape": {"mesh": textured(TEXELS.reshape(2, 8, 3))},
     "a vertex, by one rounding": {"mesh": replace(TEXTURED, vertices=changed(TEXTURED.vertices, (2, 1), 2.0**-52))},
     "a face": {"mesh": replace(TEXTURED, faces=TEXTURED.faces[:, [1, 2, 0]])},
     "a corner's color": {"mesh": replace(TEXTURED, corner_colors=changed(TEXTURED.corner_colors, (0, 0, 0), -0.1))},
     "a corner's texel": {"mesh": replace(TEXTURED, corner_uvs=changed(TEXTURED.corner_uvs, (0, 0, 0), 0.1))},
-    "no texture": {"mesh": replace(TEXTURED, texture_ids=np.full(1, -1, np.int32))},
-    "another texture beside": {"mesh": replace(TEXTURED, textures=(TEXELS, TEXELS))},
     "the polar angle": {"camera": replace(CAMERA, polar=np.nextafter(CAMERA.polar, 2))},
-    "the azimuth": {"camera": replace(CAMERA, azimuth=np.nextafter(CAMERA.azimuth, 1))},
     "the field of view": {"camera": replace(CAMERA, width=2.1)},
     "the size": {"settings": replace(SETTINGS, size=9)},
-    "the samples": {"settings": replace(SETTINGS, samples=3)},
-    "the encoding": {"settings": replace(SETTINGS, encoding="srgb")},
     "the shadows": {"settings": replace(SETTINGS, shadows=True)},
     "the albedo scale": {"albedo_scale": 1.1},
     "the basis": {"basis": Harmonics(2)},

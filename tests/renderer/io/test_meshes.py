@@ -190,18 +190,6 @@ def test_a_glb_scene_has_its_parts_placed_z_up_with_their_materials(tmp_path):
     assert has_texture(mesh)
 
 
-def test_a_part_that_two_nodes_share_appears_twice_and_shares_its_texture(tmp_path):
-    scene, _, _ = leaf_and_fruit()
-    second_place = np.eye(4)
-    second_place[:3, 3] = [0, 0, 9]
-    scene.graph.update(frame_to="second", geometry="fruit", matrix=second_place)
-    scene.export(tmp_path / "scene.glb")
-    mesh = load_mesh(tmp_path / "scene.glb")
-    assert len(mesh.faces) == 36
-    first, second = mesh.textures
-    assert first is second
-
-
 def test_glb_vertex_colors_are_linear_and_multiply_the_material(tmp_path):
     box = trimesh.creation.box()
     box.visual.vertex_colors = np.tile([51, 102, 255, 255], (8, 1))
@@ -272,12 +260,6 @@ def test_names_and_comments_may_be_latin_1(tmp_path):
     write(tmp_path / "peel.png", png())
     content = "# by Müller\nmtllib peel.mtl\n" + OBJ.replace("peel", "schäl")
     assert has_texture(load_mesh(write(tmp_path / "mesh.obj", content.encode("latin-1"))))
-
-
-def test_a_texture_of_16_bits_is_scaled_and_not_clipped(tmp_path):
-    Image.fromarray(TEXTURE[..., 0].astype(np.uint16) * 256).save(tmp_path / "peel.png")
-    (texture,) = load_mesh(obj(tmp_path)).textures
-    assert_array_equal(texture, np.repeat(TEXTURE[..., :1], 3, axis=2))
 
 
 # Refused rather than read wrongly

@@ -1,6 +1,5 @@
 """All rasterizers against one contract, a brute-force oracle and each other."""
 
-import math
 import subprocess
 import sys
 import threading
@@ -19,7 +18,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from renderer import rasterizer as rasterizers
-from renderer.camera import OrthographicCamera
 from renderer.errors import InputError
 from renderer.rasterizer import NAMES, SPAN, Rasterizer, choose, opengl
 from renderer.rasterizer import numpy as numpy_rasterizer
@@ -175,32 +173,6 @@ def test_points_that_are_not_finite_are_refused(rasterizer, value):
     points, faces = triangle([0, 0, 0], [1, 0, 0], [0, value, 0])
     with pytest.raises(ValueError, match="NaN or infinity"):
         rasterizer.rasterize(points, faces, 4)
-
-
-BOX = trimesh.creation.box(bounds=[[-0.6, -0.4, -0.2], [0.4, 0.6, 0.2]])
-BUMP = trimesh.creation.box(bounds=[[0.4, 0.0, 0.0], [0.8, 0.4, 0.4]])  # on the +x side, higher than the box
-# Rows of 10×10 samples, 0.2 apart from -0.9 to 0.9. X is the side towards +x, x the one towards -x, B the bump.
-IMAGES = {
-    "+x, right +y, up +z": (90, 0, {3: ".....BB...", 4: "...XXBBX..", 5: "...XXXXX.."}),
-    "+y, right -x, up +z": (90, 90, {3: ".BB.......", 4: ".BBYYYYY..", 5: "...YYYYY.."}),
-    "+z, right +y, up -x": (0, 0, dict.fromkeys(range(2, 7), "...ZZZZZ..") | dict.fromkeys((7, 8), ".....BB...")),
-    "-z, right +y, up +x": (180, 0, dict.fromkeys((1, 2), ".....BB...") | dict.fromkeys(range(3, 8), "...zzzzz..")),
-    "+x above, right +y, up (-1/2, 0, √3/2)": (
-        60, 0, {3: "...ZZZZZ..", 4: "...ZZBBZ..", 5: "...XXBBX..", 6: "...XXBBX.."},
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
-@pytest.mark.parametrize(("polar", "azimuth", "rows"), IMAGES.values(), ids=IMAGES)
-def test_a_labeled_box_with_a_bump_looks_as_sketched_from_each_side(rasterizer, closed, polar, azimuth, rows):
-    labels = ["xyzXYZ"[axis] for axis in np.argmax(np.hstack([-BOX.face_normals, BOX.face_normals]), axis=1)]
-    labels = np.array([*labels, *"B" * len(BUMP.faces), "."])  # an id of -1 takes the last
-    mesh = trimesh.util.concatenate([BOX, BUMP])
-    camera = OrthographicCamera(math.radians(polar), math.radians(azimuth), width=2.0)
-    ids = rasterizer.rasterize(camera.project(mesh.vertices)[None], mesh.faces, 10, closed)[0]
-    image = ["".join(row) for row in labels[ids]]
-    assert image == [rows.get(row, "." * 10) for row in range(10)]
 
 
 on_the_cpu = pytest.mark.parametrize("name", ["numpy", COMPILED])
