@@ -1,6 +1,5 @@
 """Labeled images as uint8 arrays: CIFAR-100, an .npz file, or a folder of class folders."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,12 +9,11 @@ from torch import Tensor
 
 from augment.classifiers.adapter import class_index
 from augment.utils import generator
-from renderer.errors import InputError
+from renderer.errors import InputError, in_one_line
 from train import console
 from train.photographs.folder import find_photographs, is_hidden, left_out, load_photographs
 
 PARTS = ("train", "training", "val", "valid", "validation", "dev", "test", "testing")  # not names of classes
-ARRAYS = ("train_images", "train_labels", "test_images", "test_labels", "classes")
 
 
 @dataclass(frozen=True)
@@ -97,38 +95,35 @@ def load_cifar100(path: str) -> DataSet:
 
 
 def load_npz(path: str) -> DataSet:
-    """Arrays train_images and test_images (N, 3, S, S) uint8, train_labels and test_labels (N,), classes (C,) str."""
+    """Arrays train_images and test_images (N, 3, S, S) uint8, train_labels and test_labels (N,), classes (C,) str.
+
+    InputError naming the file where it is not such an archive, or would need pickle, which runs code.
+    """
     if not Path(path).is_file():
         raise InputError(f"data.path={path} does not exist: give the path of an .npz file")
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in ARRAYS if name in archive}
-    except Exception as error:  # zipfile, zlib and NumPy raise many kinds for a damaged or foreign file
-        raise InputError(f"data.path={path} is not an .npz file that loads without pickle: {error}") from error
-    try:
-        if missing := [name for name in ARRAYS if name not in arrays]:
-            raise ValueError(f"the array {missing[0]} is missing; it needs {', '.join(ARRAYS)}")
-        classes = arrays["classes"]
+            classes = archive["classes"]
+            splits = [
+                _npz_split(archive[f"{part}_images"], archive[f"{part}_labels"], classes.size)
+                for part in ("train", "test")
+            ]
         if classes.ndim != 1 or classes.dtype.kind != "U" or len(set(classes.tolist())) != len(classes):
             raise ValueError("classes must be distinct strings, one per class")
-        splits = [_npz_split(arrays, part, len(classes)) for part in ("train", "test")]
         if splits[0].images.shape[1:] != splits[1].images.shape[1:]:
-            raise ValueError("train_images and test_images differ in size; make them alike")
-    except ValueError as error:
-        raise InputError(f"data.path={path}: {error}") from error
+            raise ValueError("train_images and test_images differ in size")
+    except Exception as error:  # zipfile, zlib and NumPy raise many kinds for a damaged or foreign file
+        raise InputError(f"data.path={path} is not an .npz file of labeled images: {in_one_line(error)}") from error
     return DataSet(tuple(classes.tolist()), *splits)
 
 
-def _npz_split(arrays: Mapping[str, np.ndarray], part: str, classes: int) -> Split:
-    images, labels = arrays[f"{part}_images"], arrays[f"{part}_labels"]
+def _npz_split(images: np.ndarray, labels: np.ndarray, classes: int) -> Split:
     if images.ndim != 4 or images.shape[1] != 3 or images.shape[2] != images.shape[3] or images.dtype != np.uint8:
-        raise ValueError(f"{part}_images is {images.dtype} of shape {images.shape}; it must be uint8 (N, 3, S, S)")
+        raise ValueError(f"images are {images.dtype} of shape {images.shape}; they must be uint8 (N, 3, S, S)")
     if labels.shape != images.shape[:1] or labels.dtype.kind not in "iu":
-        raise ValueError(
-            f"{part}_labels is {labels.dtype} of shape {labels.shape}; it must be integers ({len(images)},)"
-        )
+        raise ValueError(f"labels are {labels.dtype} of shape {labels.shape}; they must be integers ({len(images)},)")
     if not len(labels) or labels.min() < 0 or labels.max() >= classes:
-        raise ValueError(f"{part}_labels must hold labels 0 to {classes - 1}, one at least")
+        raise ValueError(f"labels must be 0 to {classes - 1}, one at least")
     return Split(torch.from_numpy(images), torch.from_numpy(labels.astype(np.int64)))
 
 

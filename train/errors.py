@@ -52,33 +52,27 @@ def _configuration_error(error: Exception) -> str:
 
 def writable_folder(folder: str | Path, key: str) -> Path:
     """The folder, which may be missing yet. InputError naming the key where no file can be written into it."""
-    try:
-        _try_folder(Path(folder))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{key}={folder} cannot be written to ({_reason(error)}): choose another folder") from error
-    return Path(folder)
+    return _writable(Path(folder), key, is_folder=True)
 
 
 def writable_file(file: str | Path, key: str) -> Path:
     """The file, which may be missing yet, as may its folder. InputError naming the key where it cannot be written."""
-    path = Path(file)
+    return _writable(Path(file), key, is_folder=False)
+
+
+def _writable(path: Path, key: str, is_folder: bool) -> Path:
+    """Open the file, if it exists, and write a temporary one to its folder, or the nearest folder above that exists."""
     try:
-        if path.exists() and not path.is_file():
-            raise ValueError("it is not a regular file")
-        _try_folder(path.parent)
-        if path.exists():
+        if not is_folder and path.exists():
+            if not path.is_file():
+                raise ValueError("it is not a regular file")
             path.open("ab").close()
+        folder = path if is_folder else path.parent
+        existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+        with tempfile.TemporaryFile(dir=existing) as file:
+            file.write(bytes(2**16))
     except (OSError, ValueError) as error:
-        raise InputError(f"{key}={file} cannot be written ({_reason(error)}): choose another file") from error
+        reason = getattr(error, "strerror", None) or error
+        written, kind = ("written to", "folder") if is_folder else ("written", "file")
+        raise InputError(f"{key}={path} cannot be {written} ({reason}): choose another {kind}") from error
     return path
-
-
-def _try_folder(folder: Path) -> None:
-    """Write a temporary file there, or to the nearest folder above that exists."""
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    with tempfile.TemporaryFile(dir=existing) as file:
-        file.write(bytes(2**16))
-
-
-def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error)

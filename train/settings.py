@@ -4,7 +4,7 @@ import re
 import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast, get_type_hints
 
@@ -13,11 +13,11 @@ from hydra import initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from augment.build import RendererSettings, SceneSettings, count_views
-from augment.objects import ObjectSettings, PropSettings
+from augment.objects import ObjectSettings
 from augment.service import AugmentationSettings
 from augment.utils import world_size
 from renderer.errors import InputError, in_one_line, require_range
@@ -164,15 +164,8 @@ class ExperimentSettings:
 
 def read_object(item: str | dict[str, Any], label: str, index: int, key: str = "scene.meshes") -> ObjectSettings:
     """An entry of `key`: a file or solid of the class `label`, or a mapping that may name its own class."""
-    entry, keys = f"{key}[{index}]", dict(item) if isinstance(item, dict) else {"mesh": item}
-    props: Any = keys.pop("props", [])
-    if not (isinstance(props, list) and all(isinstance(prop, dict) for prop in props)):
-        raise InputError(f"{entry}.props: give a list of mappings, as in [{{mesh: solid:cup, at: [0.9, 0]}}]")
-    props = [
-        read_settings(PropSettings, OmegaConf.create(prop), f"{entry}.props[{number}]")
-        for number, prop in enumerate(props)
-    ]
-    return replace(read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), entry), props=props)
+    keys = item if isinstance(item, dict) else {"mesh": item}
+    return read_settings(ObjectSettings, OmegaConf.create({"label": label, **keys}), f"{key}[{index}]")
 
 
 # ------------------------------------------------------------------------------------- reading configurations
@@ -242,14 +235,17 @@ def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Se
 
 
 def _check(node: DictConfig, key: str) -> None:
-    """InputError with the key of the innermost dataclass that refuses its values, or of a list of other things."""
+    """InputError with the key of the innermost dataclass that refuses its values, or of a list's wrong item."""
     types: dict[Any, Any] = get_type_hints(OmegaConf.get_type(node))
     for name, child in node.items():
-        inner = _join(key, str(name))
-        if isinstance(child, DictConfig) and OmegaConf.get_type(child) is not dict:
-            _check(child, inner)
-        elif types[name] in (list[str], list[float]) and any(map(OmegaConf.is_config, child)):  # OmegaConf lets it pass
-            raise InputError(f"{inner}: give a list of plain values, without lists or mappings in it")
+        items = {_join(key, str(name)): child}
+        if isinstance(child, ListConfig):
+            items = {f"{_join(key, str(name))}[{index}]": item for index, item in enumerate(child)}
+        for inner, item in items.items():
+            if isinstance(item, DictConfig) and OmegaConf.get_type(item) is not dict:
+                _check(item, inner)
+            elif types[name] in (list[str], list[float]) and OmegaConf.is_config(item):  # OmegaConf lets it pass
+                raise InputError(f"{inner}: give a plain value, not a list or mapping")
     with keyed(key, types):
         OmegaConf.to_object(node)
 

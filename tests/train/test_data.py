@@ -60,15 +60,14 @@ def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
 @pytest.mark.parametrize(
     "changes, fault",
     [
-        ({"test_labels": None}, "the array test_labels is missing"),
-        ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"train_images is uint8 of shape \(5, 8, 8, 3\)"),
-        ({"test_images": np.zeros((2, 3, 8, 8), np.float32)}, "test_images is float32"),
+        ({"test_labels": None}, "test_labels is not a file in the archive"),
+        ({"train_images": np.zeros((5, 8, 8, 3), np.uint8)}, r"images are uint8 of shape \(5, 8, 8, 3\)"),
         ({"test_images": np.zeros((2, 3, 9, 9), np.uint8)}, "differ in size"),
-        ({"train_labels": np.zeros(4, int)}, r"train_labels is int64 of shape \(4,\); it must be integers \(5,\)"),
-        ({"test_labels": np.array([0, -1])}, "test_labels must hold labels 0 to 1"),
-        ({"test_images": np.zeros((0, 3, 8, 8), np.uint8), "test_labels": np.zeros(0, int)}, "one at least"),
+        ({"train_labels": np.zeros(4, int)}, r"labels are int64 of shape \(4,\); they must be integers \(5,\)"),
+        ({"test_labels": np.array([0, 2])}, "labels must be 0 to 1"),
+        ({"test_labels": np.array([0, 2**64 - 1], np.uint64)}, "labels must be 0 to 1"),
         ({"classes": np.array(["fig", "fig"])}, "classes must be distinct strings"),
-        ({"classes": np.array(["lime", "fig"], dtype=object)}, "loads without pickle"),
+        ({"classes": np.array(["lime", "fig"], dtype=object)}, "allow_pickle=False"),
     ],
 )
 def test_a_fault_in_an_npz_file_is_named(tmp_path, changes, fault):

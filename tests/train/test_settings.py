@@ -65,7 +65,7 @@ def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by
         (["train=3"], "train: Merge error: int is not a subclass of TrainSettings. value: 3"),
         (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
         (["scene.meshes=solid:orange"], "scene.meshes: Invalid value assigned"),
-        (["compare=[[none]]"], "compare: give a list of plain values"),
+        (["compare=[[none]]"], "compare[0]: give a plain value, not a list"),
         ([f"scene.exposure={10**400}"], "scene.exposure: int too large to convert to float"),
         (["seed=-1"], "seed=-1 must be at least 0"),
         (["train.epochs=0"], "train.epochs: epochs=0 must be at least 1"),

@@ -255,13 +255,9 @@ BESIDE = [
     ([{"mesh": "solid:cup", "at": [1]}], r"meshes\[3\].props\[0\].at: at=\[1.0\] must be x and y"),
     ([{"mesh": "solid:cup", "at": [0, float("nan")]}], r"at=\[0.0, nan\] must be x and y from -10 to 10"),
     ([{"mesh": "solid:cup", "at": [0, 1], "scale": 0}], "scale=0.0 must be at least 0.1"),
-    (
-        [{"mesh": "solid:cup", "at": [0, 1], "albedo_scale": 2}],
-        r"meshes\[3\].props\[0\].albedo_scale: Key 'albedo_scale' not in",
-    ),
-    (["solid:cup"], r"meshes\[3\].props: give a list of mappings"),
-    ("solid:cup", r"meshes\[3\].props: give a list of mappings"),
-    (None, r"meshes\[3\].props: give a list of mappings"),
+    ([{"mesh": "solid:cup", "at": [0, 1], "albedo_scale": 2}], r"meshes\[3\].props: Key 'albedo_scale' not in"),
+    (["solid:cup"], r"meshes\[3\].props: Invalid type"),
+    (None, r"meshes\[3\].props: field 'props' is not Optional"),
 ]
 
 
