@@ -231,7 +231,9 @@ def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Se
         _check(merged, key)
         return cast(Settings, OmegaConf.to_object(merged))
     except (OmegaConfBaseException, OverflowError) as error:  # the latter for a whole number that no float holds
-        raise InputError(_fault(kind, config, key) or _join(key, one_sentence(error) or in_one_line(error))) from error
+        name = _wrong_key(kind, config) or getattr(error, "full_key", None) or ""
+        reason = str(getattr(error, "msg", error)).splitlines()[0]
+        raise InputError(f"{_join(key, name)}: {reason}".removeprefix(": ")) from error
 
 
 def _check(node: DictConfig, key: str) -> None:
@@ -250,17 +252,17 @@ def _check(node: DictConfig, key: str) -> None:
         OmegaConf.to_object(node)
 
 
-def _fault(kind: type, config: DictConfig, key: str) -> str | None:
-    """The key of the first value that is wrong by itself, with the reason; OmegaConf may name only its group."""
-    plain: Any = OmegaConf.to_container(config)
+def _wrong_key(kind: type, config: DictConfig) -> str:
+    """The key of the first value that is wrong by itself, which OmegaConf names for most values alone; "" for none."""
+    settings, plain = OmegaConf.structured(kind), cast(dict[str, Any], OmegaConf.to_container(config))
     for name, value in dotted(plain):
-        alone = OmegaConf.create()
-        OmegaConf.update(alone, name, value, force_add=True)
         try:
-            OmegaConf.merge(OmegaConf.structured(kind), alone)
-        except (OmegaConfBaseException, OverflowError) as error:
-            return f"{_join(key, name)}: {str(getattr(error, 'msg', error)).splitlines()[0]}"
-    return None
+            OmegaConf.update(settings, name, value)
+        except AssertionError:  # OmegaConf's, within a group that is null by default
+            continue
+        except (OmegaConfBaseException, OverflowError):
+            return name
+    return ""
 
 
 def _join(key: str, name: str) -> str:

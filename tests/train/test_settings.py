@@ -1,7 +1,6 @@
 """Configurations: what Hydra or a dataclass refuses is one sentence with the key, and every default has one owner."""
 
 import re
-from dataclasses import dataclass, field
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -9,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError
 from train.attacks.settings import AttackExperimentSettings
 from train.run import load_data, prepare
 from train.settings import ExperimentSettings, as_override, compose, dotted, quoted, read_settings
@@ -65,11 +64,15 @@ def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by
         (["train=3"], "train: Merge error: int is not a subclass of TrainSettings. value: 3"),
         (["train.epochs=abc"], "train.epochs: Value 'abc' of type 'str' could not be converted to Integer"),
         (["scene.meshes=solid:orange"], "scene.meshes: Invalid value assigned"),
-        (["compare=[[none]]"], "compare[0]: give a plain value, not a list"),
+        (["compare=[[none]]"], "compare[0]: give a plain value, not a list or mapping"),
         ([f"scene.exposure={10**400}"], "scene.exposure: int too large to convert to float"),
         (["seed=-1"], "seed=-1 must be at least 0"),
         (["train.epochs=0"], "train.epochs: epochs=0 must be at least 1"),
-        (["scene.exposure=1e30"], "scene.exposure: exposure=1e+30 must be at least 0 and at most 100000"),
+        (
+            ["attack@augment.attack=[geometry]", "augment.attack.geometry.radius=-1"],
+            "augment.attack.geometry.radius: radius=-1.0 must be at least 0",
+        ),
+        (["+scene.projector.pixels=abc"], "scene.projector.pixels: Value 'abc' of type"),
         (["evaluate.photos={renders: /x}"], "evaluate.photos: renders must be a name of letters"),
         (["evaluate.photos=[/x]"], "evaluate.photos: photos=['/x'] must be a folder, or a mapping"),
     ],
@@ -81,49 +84,20 @@ def test_a_wrong_setting_is_one_sentence_that_names_it(overrides, sentence):
     assert str(refusal.value).startswith(sentence) and "\n" not in str(refusal.value)
 
 
-@dataclass
-class Inner:
-    size: int = 1
-
-    def __post_init__(self) -> None:
-        require_range("size", self.size, 1, 9)
-        if self.size == 5:
-            raise InputError("five of them are refused")
-
-
-@dataclass
-class Outer:
-    inner: Inner = field(default_factory=Inner)
-    optional: Inner | None = None
-
-
-@pytest.mark.parametrize("group", ["inner", "optional"])
-def test_the_check_of_a_nested_dataclass_gets_its_key(group):
-    for size, message in [(0, rf"a\.{group}\.size: size=0 must be"), (5, rf"a\.{group}: five of them")]:
-        with pytest.raises(InputError, match=f"^{message}"):
-            read_settings(Outer, OmegaConf.create({group: {"size": size}}), "a")
-    assert getattr(read_settings(Outer, OmegaConf.create({group: {"size": 3}})), group) == Inner(3)
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         (["data.validation=1.5"], "data.validation=1.5 must lie between 0 and 1"),
         (["data.name=mnist"], "data.name=mnist: choose one of cifar100, npz, folder, shapes"),
-        (["augment.arm=adverserial"], "arm=adverserial: choose one of"),
-        (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds = 12"),
+        (["scene.views=3"], "augment.examples=4 is not 2 meshes × 3 views × 2 backgrounds"),
         (["scene.meshes=[{mesh: 'solid:orange', lable: orange}]"], "scene.meshes[0].lable: Key 'lable'"),
-        (["scene.meshes=['solid:ornage']", "augment.examples=2"], "choose one of orange"),
         (
             ["scene.hard_negatives=[{mesh: 'solid:orange', label: orange}]", "augment.examples=6"],
             "scene.hard_negatives[0] is of the class orange: name it in scene.meshes",
         ),
-        (["train.compile=always"], "compile=always is for a GPU"),
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
-        (["model.width=100000"], "model.width=100000: 1e+15 parameters are too many"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
-        (["renderer.rasterizer=opengll"], "opengll"),
         (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab does not exist"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
