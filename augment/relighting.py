@@ -71,27 +71,41 @@ class OperatorStack:
     def __init__(self, operators: Sequence[TransferOperator], shown: Tensor, device: torch.device | str = "cpu"):
         """shown: (N,) int64, the operator of each image. The operators are of one dtype and basis, on the CPU."""
         pixels = torch.cat([operator.pixels for operator in operators]).unique()
-        slots, self._slots = _rank_among_equals(shown)
-        kept = torch.cat([operator.nonzero for operator in operators]).unique()
-        padded = F.pad(kept, (0, len(kept) % 2))  # with any coefficient
-        parts = (pixels, *_stack(operators, pixels, kept), shown, slots, padded)
-        self._sparse, self._first = _joined(operators, pixels, device)
-        self.pixels, self.transfer, self.albedo, self.coverage, self.shown, self._slot, self._coefficients = (
-            part.to(device) for part in parts
+        nonzero = torch.cat([operator.nonzero for operator in operators]).unique()
+        coefficients = F.pad(nonzero, (0, len(nonzero) % 2))  # with any coefficient
+        channels, like = max(len(operator.transfer) for operator in operators), operators[0].transfer
+        transfer = like.new_zeros(len(operators), channels, len(coefficients), len(pixels))
+        albedo = like.new_ones(len(operators), 3, len(pixels))
+        coverage = like.new_zeros(len(operators), 1, len(pixels))
+        first, parts = [0], list[SparseTransfer]()
+        for index, operator in enumerate(operators):
+            rows, columns = torch.searchsorted(nonzero, operator.nonzero), torch.searchsorted(pixels, operator.pixels)
+            if channels == 1:
+                transfer[index][:, rows[:, None], columns] = operator.transfer
+                albedo[index][:, columns] = operator.albedo
+            else:
+                transfer[index][:, rows[:, None], columns] = operator.transfer * operator.albedo[:, None]
+            coverage[index, 0, columns] = operator.coverage
+            if operator.sparse is not None:
+                parts.append(operator.sparse._replace(pixel=columns[operator.sparse.pixel]))
+            first.append(sum(len(part.function) for part in parts))
+        sparse = joined(parts)
+        self._sparse = sparse and sparse.to(device)
+        tensors = pixels, transfer, albedo, coverage, shown, coefficients, torch.tensor(first)
+        self.pixels, self.transfer, self.albedo, self.coverage, self.shown, self._coefficients, self._first = (
+            tensor.to(device) for tensor in tensors
         )
 
     def radiance(self, lights: Tensor, images: Tensor) -> Tensor:
         """Linear radiance (A, 3, P) of images (A,), each in its light (A, size, 3); differentiable in the lights.
 
-        Lights are laid out on a grid of operators × their images, with gaps for images that are not asked for.
+        Lights are laid out on a grid of operators × their images, with gaps where an operator has fewer than another.
         Operators that none of the images shows are left out.
         """
-        used, row = torch.unique(self.shown[images], return_inverse=True)
-        if (images.diff() > 0).all():
-            slot, slots = self._slot[images], self._slots
-        else:  # an image may occur more than once
-            slot, slots = _rank_among_equals(row)
-        cell = row * slots + slot
+        used, row, counts = torch.unique(self.shown[images], return_inverse=True, return_counts=True)
+        slots, order = max(counts.tolist(), default=0), row.argsort(stable=True)
+        rank = torch.arange(len(row), device=row.device) - (counts.cumsum(0) - counts)[row[order]]
+        cell = row * slots + torch.empty_like(row).index_copy_(0, order, rank)
         kept = lights.index_select(1, self._coefficients)
         grid = kept.new_zeros(len(used) * slots, *kept.shape[1:]).index_copy(0, cell, kept)
         everything = len(used) == len(self.transfer)
@@ -110,44 +124,6 @@ class OperatorStack:
         image = torch.arange(len(shown), device=shown.device).repeat_interleave(count)
         entry = torch.arange(len(image), device=shown.device) + (first - count.cumsum(0) + count)[image]
         return sparse.taken(entry), image
-
-
-def _rank_among_equals(values: Tensor) -> tuple[Tensor, int]:
-    """((N,) how many equal values come before each value; how often the most frequent value occurs)."""
-    order, counts = values.argsort(stable=True), values.bincount()
-    first = (counts.cumsum(0) - counts)[values[order]]
-    ranks = torch.empty_like(values).index_copy_(0, order, torch.arange(len(values), device=values.device) - first)
-    return ranks, int(counts.max())
-
-
-def _joined(
-    operators: Sequence[TransferOperator], pixels: Tensor, device: torch.device | str
-) -> tuple[SparseTransfer | None, Tensor]:
-    """(the sparse entries of all operators, over common pixels; (O + 1,) the first entry of each operator)."""
-    counts = [0 if operator.sparse is None else len(operator.sparse.function) for operator in operators]
-    parts = [
-        operator.sparse._replace(pixel=torch.searchsorted(pixels, operator.pixels)[operator.sparse.pixel])
-        for operator in operators
-        if operator.sparse is not None
-    ]
-    entries = joined(parts)
-    return entries and entries.to(device), torch.tensor([0, *counts], device=device).cumsum(0)
-
-
-def _stack(operators: Sequence[TransferOperator], pixels: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Operators over common pixels and coefficients: transfer (O, C, K, P), albedo (O, 3, P), coverage (O, 1, P)."""
-    channels, like = max(len(operator.transfer) for operator in operators), operators[0].transfer
-    transfer = like.new_zeros(len(operators), channels, len(kept) + len(kept) % 2, len(pixels))
-    albedo = like.new_ones(len(operators), 3, len(pixels))
-    coverage = like.new_zeros(len(operators), 1, len(pixels))
-    for row, operator in enumerate(operators):
-        rows, columns = torch.searchsorted(kept, operator.nonzero)[:, None], torch.searchsorted(pixels, operator.pixels)
-        if channels == 1:
-            transfer[row][:, rows, columns], albedo[row][:, columns] = operator.transfer, operator.albedo
-        else:
-            transfer[row][:, rows, columns] = operator.transfer * operator.albedo[:, None]
-        coverage[row, 0, columns] = operator.coverage
-    return transfer, albedo, coverage
 
 
 STACKED = 2**16  # pixels of the images in one stack; larger stacks are no faster
