@@ -70,7 +70,7 @@ class LampsSettings:
             start = torch.tensor(self.start, dtype=torch.float32).expand(len(positions), 3)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise InputError(
-                f"lamps: give positions [x, y, z] and, as start, a number or [r, g, b]s ({error})"
+                f"lamps: give positions [x, y, z], and a number or [r, g, b]s as start ({error})"
             ) from error
         basis = Lamps(positions, self.power, self.radius)
         if not ((start >= 0) & (start <= self.power)).all():  # NaN is not

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -190,16 +189,14 @@ class AugmentationService:
         size: int,
         settings: AugmentationSettings | None = None,
         *,
-        views: int = 10,
-        backgrounds: Sequence[float | str | Path] = (0.0, 0.25, 0.5, 0.75, 1.0),
         seed: int = 0,
-        device: torch.device | str = "cpu",
         **of_scene: Any,
     ) -> AugmentationService:
         """A service for any training loop: meshes × views × backgrounds renders, as in the paper by default.
 
         meshes: pairs of a file, solid:NAME or `Mesh`, and the index of its class. size: pixels per side. of_scene:
-        further arguments of `build_scene`; 8 × 8 samples per pixel and flat shading, as in the paper, by default.
+        further arguments of `build_scene`, by default the paper's: 10 views before 5 grays, 8 × 8 samples per pixel and
+        flat shading.
 
         >>> service = AugmentationService.from_meshes([("solid:orange", 0), ("solid:apple", 1)], 8, views=1, samples=1)
         >>> model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 8 * 8, 2))
@@ -207,11 +204,12 @@ class AugmentationService:
         torch.Size([10, 3, 8, 8])
         """
         named = [(mesh, str(label)) for mesh, label in meshes]
-        options = {"samples": 8, "normals": "flat", "backgrounds": backgrounds, "device": device, **of_scene}
-        scene = build_scene(named, size, views, **options)
-        labels = torch.tensor([int(label) for label in scene.labels], device=device)
+        paper: dict[str, Any] = {"views": 10, "samples": 8, "normals": "flat"}
+        paper["backgrounds"] = [0.0, 0.25, 0.5, 0.75, 1.0]
+        scene = build_scene(named, size, **paper | of_scene)
+        labels = torch.tensor([int(label) for label in scene.labels], device=scene.lights.device)
         settings = replace(settings or AugmentationSettings(), examples=len(scene))
-        return cls(settings, scene, labels, seed, Phases(device))
+        return cls(settings, scene, labels, seed, Phases(labels.device))
 
     def __len__(self) -> int:
         """Examples per regeneration."""
@@ -298,10 +296,8 @@ class AugmentationService:
         random, parts = self.settings.random_light, []
         for parameter, start in zip(problem.parameters, problem.split(problem.start), strict=True):
             if isinstance(parameter, Lighting):
-                zero, draws = (
-                    torch.zeros(start.shape[1] // 3, 3).to(start.dtype),
-                    generator(self.seed, number, "lights"),
-                )
+                zero = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
+                draws = generator(self.seed, number, "lights")
                 offsets = perturb(zero, len(start), random.amplitude, random.radius, draws)
                 parts.append(start + offsets.flatten(1).to(start))
             else:
