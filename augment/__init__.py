@@ -5,7 +5,6 @@ from renderer.lazy import attach
 __getattr__, __dir__, __all__ = attach(
     __name__,
     {
-        "attacks.criteria": ["LeastLikely", "Misclassification", "Targeted"],
         "attacks.adversary": ["Adversary", "reload"],
         "attacks.attack": ["AttackResult", "AttackSettings", "attack"],
         "attacks.evaluate": ["check", "random_search", "success_by_radius", "transfer"],

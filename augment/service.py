@@ -12,10 +12,9 @@ from torch.utils.data import Dataset
 
 from augment import utils
 from augment.attacks.attack import AttackSettings, logits_of
-from augment.attacks.criteria import Goal
-from augment.attacks.descent import DescentResult, Part, descend
+from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting
+from augment.attacks.parameters import AttackProblem
 from augment.build import Shown, build_scene
 from augment.losses import NO_CLASS, is_right, label_loss, require_known
 from augment.scene import Conditions, Scene
@@ -69,7 +68,7 @@ class TrainingAttackSettings(AttackSettings):
 
     @property
     def parameters(self) -> dict[str, StepSettings]:
-        return super().parameters or {Lighting.name: self._light}
+        return super().parameters or {"lighting": self._light}
 
 
 @dataclass
@@ -101,7 +100,7 @@ class AugmentationSettings:
         require_range("every", self.every, 1, MOST_EVERY)
         random = "random" in (self.arm, self.init)
         for name, settings in self.attack.parameters.items():
-            if random and name != Lighting.name and settings.radius is None:
+            if random and name != "lighting" and settings.radius is None:
                 raise InputError(f"attack.{name}.radius is None, which has no random draw: set a radius")
         if self.warm_start and self.vary.instances:
             raise InputError("warm_start=True keeps the last attack's shapes: set vary.instances=False")
@@ -114,7 +113,7 @@ class AugmentationSettings:
     @property
     def relights(self) -> bool:
         """Whether nothing but the light changes, so that precomputed transfer lasts from epoch to epoch."""
-        return not (self.vary.moves or {Geometry.name, Albedo.name} & self.attack.parameters.keys())
+        return not (self.vary.moves or {"geometry", "albedo"} & self.attack.parameters.keys())
 
 
 @dataclass(frozen=True)
@@ -266,11 +265,13 @@ class AugmentationService:
         restarts = (problem.sample(draws)[shard] for _ in range(attack.restarts))
         result = descend(
             attack.preprocessed_model(model),
-            Part(problem, shard, start[shard]),
+            problem,
             goal.of(shard),
             attack,
             self.phases,
-            starts=restarts,
+            examples=shard,
+            start=start[shard],
+            restarts=restarts,
             at_once=problem.scene.at_once,
             seed=stream_seed(self.seed, number),
         )
@@ -295,7 +296,7 @@ class AugmentationService:
         """Random values (E, D) within the norm-balls."""
         random, parts = self.settings.random_light, []
         for parameter, start in zip(problem.parameters, problem.split(problem.start), strict=True):
-            if isinstance(parameter, Lighting):
+            if parameter.name == "lighting":
                 zero = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
                 draws = generator(self.seed, number, "lights")
                 offsets = perturb(zero, len(start), random.amplitude, random.radius, draws)

@@ -92,7 +92,7 @@ Step, Sky = augment.StepSettings, augment.SkylightSettings
 BOTH = {"lighting": Step(step_size=0.2), "geometry": Step(radius=0.01, step="sign", step_size=0.005)}
 SHAPE, COLOR = {"geometry": Step("linf", 0.02, "sign", 0.01)}, {"albedo": Step("linf", 0.2, "sign", 0.03)}
 DRAWS = {"restarts": 2, "eot": EOTSettings(draws=2)}
-# name: (what is attacked, keywords of `build_scene`, other keywords of `AttackSettings`, criterion)
+# name: (what is attacked, keywords of `build_scene`, other keywords of `AttackSettings`, target)
 ATTACKS = {
     "lighting_l2": ({"lighting": Step("l2", 0.8, step_size=0.3)}, {}, {"rounded": True}, None),
     "lighting_signed": ({"lighting": Step(step_size=0.3)}, {}, {"allow_negative": True, "margin": 0.0}, None),
@@ -102,9 +102,9 @@ ATTACKS = {
     "places": ({"positions": Step("l2", 1.0, step_size=0.3)}, {"lamps": DISCS}, {}, None),
     "geometry": (SHAPE, {"normals": "smooth", "shadows": True}, {"shorten": True}, None),
     "albedo": (COLOR, {"shadows": True, "ground": [0.5, 0.4, 0.3]}, {}, None),
-    "pixels": ({"pixels": Step("linf", 0.03, "sign", 0.01)}, {}, {}, augment.LeastLikely()),
+    "pixels": ({"pixels": Step("linf", 0.03, "sign", 0.01)}, {}, {}, "least_likely"),
     "shared_views": (BOTH, {"views": 3, "shared": True, "fov": 35.0}, {"shorten": True}, None),
-    "targeted": ({"lighting": Step(step="raw", step_size=0.5)}, {"views": 2}, {}, augment.Targeted("pear")),
+    "targeted": ({"lighting": Step(step="raw", step_size=0.5)}, {"views": 2}, {}, "pear"),
     "expectation": ({"lighting": Step("linf", 0.1, "sign", 0.04)}, {"backgrounds": [0.1, 0.9]}, DRAWS, None),
 }
 
@@ -166,10 +166,10 @@ def test_render_of_a_scene(name, verify):
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack(name, verify):
-    changed, shown, others, criterion = ATTACKS[name]
+    changed, shown, others, target = ATTACKS[name]
     scene = augment.build_scene(ORANGES, SIZE, **SCENE | shown)
     settings = augment.AttackSettings(**changed, **SETTINGS | others)
-    found = augment.attack(classifier(), scene, criterion, settings, seed=5, force=True)
+    found = augment.attack(classifier(), scene, target, settings, seed=5, force=True)
     assert (found.images - found.images_before).abs().max() > 1e-3
     verify(found.images_before, found.images, found.logits, found.descent.values, found.descent.cost, found.steps)
 

@@ -56,8 +56,8 @@ class Adversary:
     ) -> Adversary:
         """An example of a scene under a row of conditions, by default its own among those of all examples, with its
         images (V, 3, size, size)."""
-        placed, row = scene.examples[example], example if row is None else row
-        shown = scene.objects[placed.object]
+        of_example, row = scene.examples[example], example if row is None else row
+        shown = scene.objects[of_example.object]
         mesh, albedo_scale = shown.mesh, shown.albedo_scale
         if after.albedo is not None:
             added = after.albedo[row, : len(mesh.faces)].detach().cpu().double().numpy()
@@ -67,10 +67,10 @@ class Adversary:
             mesh = replace(mesh, vertices=vertices)
         return Adversary(
             shown=replace(shown, mesh=mesh, albedo_scale=albedo_scale),
-            cameras=placed.cameras,
-            light=after.light[row].detach().cpu() * placed.exposure,
+            cameras=of_example.cameras,
+            light=after.light[row].detach().cpu() * of_example.exposure,
             basis=scene.basis_under(after, row),
-            background=scene.backgrounds[placed.background].cpu(),
+            background=scene.backgrounds[of_example.background].cpu(),
             settings=scene.settings,
             images_before=before.cpu(),
             images=images.cpu(),
@@ -79,10 +79,8 @@ class Adversary:
 
     def scene(self, rasterizer: Rasterizer, device: torch.device | str = "cpu") -> Scene:
         """A scene of this one example."""
-        background, light = self.background[None], self.light.to(device)
-        return Scene(
-            [self.shown], [Example(0, self.cameras, 0)], background, light, self.settings, rasterizer, basis=self.basis
-        )
+        rows, background, light = [Example(0, self.cameras, 0)], self.background[None], self.light.to(device)
+        return Scene([self.shown], rows, background, light, self.settings, rasterizer, basis=self.basis)
 
     @torch.no_grad()
     def render(self, rasterizer: Rasterizer | None = None) -> Tensor:
@@ -100,20 +98,24 @@ NOWHERE = 2.0**-8  # of the brightest radiance: what an .hdr file rounds off
 
 
 def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
-    """Write the folder; returns {"negative_light": the fraction of the light's energy that is negative}."""
+    """Write the folder; returns {"negative_light": the fraction of the light's energy that is negative}.
+
+    Mitsuba's scene leaves out negative light, and maps are written only of light that is positive all round.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     shown, settings = adversary.shown, adversary.settings
     export_mesh(shown.mesh, folder / MESH, settings.normals, adversary.cameras, shown.own)
-    (where, sky), *local = parts_of(adversary.basis)
-    save_light(folder / LIGHT, adversary.light[where], sky)
-    for rows, basis in local:
-        save_light(folder / f"{basis.name}.json", adversary.light[rows], basis)
+    (where, sky), *others = parts_of(adversary.basis)
+    light, local = adversary.light[where], [(basis, adversary.light[rows]) for rows, basis in others]
+    save_light(folder / LIGHT, light, sky)
+    for basis, coefficients in local:
+        save_light(folder / f"{basis.name}.json", coefficients, basis)
     description = {
         "label": shown.label,
         "name": Path(shown.name).name,
         "own_faces": shown.own,
         "albedo_scale": shown.albedo_scale,
-        "local_lights": [basis.name for _, basis in local],
+        "local_lights": [basis.name for basis, _ in local],
         "background": _write_background(adversary.background, folder),
         "cameras": [asdict(camera) for camera in adversary.cameras],
         "image": asdict(settings),
@@ -126,27 +128,20 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
         for view, image in enumerate(to_bytes(images)):
             Image.fromarray(image.permute(1, 2, 0).numpy()).save(folder / f"{name}_{view}.png")
     (folder / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
-    return _write_radiance(adversary, folder)
-
-
-def _write_radiance(adversary: Adversary, folder: Path) -> dict[str, float]:
-    """The light's maps, and the Mitsuba scene, which leaves out negative light."""
-    (where, _), *local = parts_of(adversary.basis)
-    radiance = to_map(adversary.light[where], MAP_HEIGHT)
+    radiance = to_map(light, MAP_HEIGHT)
     if radiance.min() >= -NOWHERE * radiance.max():
         for suffix in (".hdr", ".exr"):
             write_map(folder / f"light{suffix}", radiance)
-    shown, local_lights = adversary.shown, [(basis, adversary.light[rows]) for rows, basis in local]
-    cameras, settings = adversary.cameras, adversary.settings
-    write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.albedo_scale, cameras, settings, "light.exr", local_lights)
-    write_map(folder / MITSUBA / "light.exr", mitsuba_map(adversary.light[where], MAP_HEIGHT).clamp(min=0))
+    cameras = adversary.cameras
+    write_mitsuba_scene(folder / MITSUBA, shown.mesh, shown.albedo_scale, cameras, settings, "light.exr", local)
+    write_map(folder / MITSUBA / "light.exr", mitsuba_map(light, MAP_HEIGHT).clamp(min=0))
     return {"negative_light": negative_fraction(radiance)}
 
 
 def reload(folder: str | Path) -> Adversary:
     """Read the folder of an example that `augment.save` wrote. InputError where a file is missing or damaged.
 
-    >>> checks = augment.save(result, "adversaries")
+    >>> lines = augment.save(result, "adversaries")
     >>> adversary = augment.reload("adversaries/example_000")
     >>> bool((adversary.render() - result.images[0]).abs().max() < 1e-5)
     True
@@ -165,9 +160,10 @@ def reload(folder: str | Path) -> Adversary:
 
 def _described(folder: Path, description: dict[str, Any]) -> Adversary:
     settings = ImageSettings(**description["image"])
-    cameras = tuple(_camera(**camera) for camera in description["cameras"])
-    if not cameras:
-        raise InputError("cameras: there are none, write it again")
+    cameras = tuple(
+        (PerspectiveCamera if "distance" in camera else OrthographicCamera)(**camera)
+        for camera in description["cameras"]
+    )
     mesh, own = load_mesh(folder / MESH), description["own_faces"]
     for camera in cameras:
         camera.depths(mesh.vertices)  # which refuses a mesh around the camera
@@ -177,24 +173,18 @@ def _described(folder: Path, description: dict[str, Any]) -> Adversary:
     local = [read_light(folder / f"{Path(name).name}.json", Projector, Lamps) for name in description["local_lights"]]
     basis, light = with_local_lights(load_light(str(folder / LIGHT)), local)
     background, shape = description["background"], (len(cameras), 3, settings.size, settings.size)
-    before, after = (_read_images(folder / f"{name}.npy", shape) for name in (BEFORE, AFTER))
+    background = folder / BACKGROUND if isinstance(background, str) else background
     return Adversary(
         shown=SceneObject(str(description["label"]), mesh, albedo_scale, str(description["name"]), own),
         cameras=cameras,
         light=light,
         basis=basis,
-        background=load_background(
-            folder / BACKGROUND if isinstance(background, str) else background, settings.size, "background"
-        ),
+        background=load_background(background, settings.size, "background"),
         settings=settings,
-        images_before=before,
-        images=after,
+        images_before=_read_images(folder / f"{BEFORE}.npy", shape),
+        images=_read_images(folder / f"{AFTER}.npy", shape),
         pixels=_read_images(folder / PIXELS, shape) if description["pixels"] else None,
     )
-
-
-def _camera(**described: float) -> Camera:
-    return PerspectiveCamera(**described) if "distance" in described else OrthographicCamera(**described)
 
 
 def _write_background(background: Tensor, folder: Path) -> float | str:

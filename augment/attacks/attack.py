@@ -7,19 +7,21 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from augment.attacks.adversary import Adversary
-from augment.attacks.criteria import Criterion, Goal, Misclassification, Targeted
-from augment.attacks.descent import DescentResult, descend
+from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.eot import EOTSettings, Rounded
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import PARAMETERS, AttackProblem, Lighting, SkylightSettings
+from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings, lighting
 from augment.classifiers.adapter import Classifier
 from augment.scene import Conditions, Scene
 from augment.utils import BatchSize, Phases, generator
 from renderer.errors import FACTOR, InputError, require_range
+
+LEAST_LIKELY = "least_likely"  # in place of a target class
 
 
 @dataclass
@@ -83,8 +85,8 @@ class AttackSettings:
         """The parameters to change of a scene, whose light is made physically possible unless it may be negative."""
         if not self.allow_negative:
             scene = replace(scene, lights=scene.basis.project_nonnegative(scene.lights))
-        parameters = PARAMETERS | {Lighting.name: partial(Lighting, nonnegative=not self.allow_negative)}
-        return AttackProblem(scene, [parameters[name](scene, settings) for name, settings in self.parameters.items()])
+        make = PARAMETERS | {"lighting": partial(lighting, nonnegative=not self.allow_negative)}
+        return AttackProblem(scene, [make[name](scene, settings) for name, settings in self.parameters.items()])
 
 
 class NotCleanCorrectError(InputError):
@@ -153,7 +155,7 @@ class AttackResult:
 def attack(
     classifier: Classifier,
     scene: Scene,
-    criterion: Criterion | None = None,
+    target: str | Sequence[str] | None = None,
     settings: AttackSettings | None = None,
     *,
     seed: int = 0,
@@ -161,9 +163,10 @@ def attack(
 ) -> AttackResult:
     """Change a scene until a classifier errs, example by example; the classifier is left as it was found.
 
-    criterion: `Misclassification` (the default), `Targeted`, `LeastLikely`. settings: what is changed, within which
-    norm-balls; by default the light, without a limit. seed: of the restarts. force: also attack what the classifier
-    gets wrong before. The scene lies on the classifier's device.
+    target: None for any error, a class, a class for each of the views that share what is attacked, or "least_likely",
+    the class of each image's lowest confidence. settings: what is changed, within which norm-balls; by default the
+    light, without a limit. seed: of the restarts. force: also attack what the classifier gets wrong before. The scene
+    lies on the classifier's device.
     NotCleanCorrectError where an example is not classified correctly before; InputError where the classifier lacks a
     class, or a target is the right one.
 
@@ -186,20 +189,39 @@ def attack(
     labels = torch.tensor([classifier.label(label) for label in scene.labels], device=before.device)
     if not force:
         require_clean_correct(scene, before, labels, classifier)
-    criterion = criterion or Misclassification()
-    targets = criterion.targets(before, classifier)
-    if isinstance(criterion, Targeted) and targets is not None and torch.eq(targets, labels[:, None]).any():
-        raise InputError(f"target={criterion.classes} is the right class of an example: name another class")
-    goal = Goal(labels[:, None].expand(-1, scene.views), targets)
+    source = labels[:, None].expand(-1, scene.views)
+    goal = Goal(source, target_labels(target, source, before, classifier))
     phases = Phases(problem.start.device)
-    starts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))
+    restarts = (problem.sample(generator(seed, restart + 1, "restart")) for restart in range(settings.restarts))
     with phases("attack"):
-        descent = descend(model, problem, goal, settings, phases, starts=starts, at_once=scene.at_once, seed=seed)
+        descent = descend(model, problem, goal, settings, phases, restarts=restarts, at_once=scene.at_once, seed=seed)
         images = final_images(problem, descent.values, problem.everything, descent.images)
     after = logits_of(model, images, settings.batch_size)
     return AttackResult(
         problem, classifier, goal, settings, seed, images_before, images, before, after, descent, phases.take()
     )
+
+
+def target_labels(
+    target: str | Sequence[str] | None, source: Tensor, logits: Tensor, classifier: Classifier
+) -> Tensor | None:
+    """The target classes (E, V) of `attack`'s target, given the right classes (E, V) and the logits (E, V, C) before.
+    None where any error will do."""
+    if target is None:
+        return None
+    if target == LEAST_LIKELY:
+        return logits.argmin(2)
+    views = logits.shape[1]
+    names = [target] * views if isinstance(target, str) else [str(name) for name in target]
+    if len(names) != views:
+        raise InputError(
+            f"target={names} names {len(names)} classes for {views} views that share what is attacked: give one class "
+            "per view, and shared=true"
+        )
+    labels = torch.tensor([classifier.label(name) for name in names], device=logits.device).expand(len(logits), views)
+    if torch.eq(labels, source).any():
+        raise InputError(f"target={target} is the right class of an example: name another class")
+    return labels
 
 
 def final_images(problem: AttackProblem, values: Tensor, examples: Tensor, images: Tensor) -> Tensor:
@@ -222,9 +244,9 @@ def logits_of(model: nn.Module, images: Tensor, batch_size: int) -> Tensor:
 
 
 def predictions(logits: Tensor, classes: Sequence[str]) -> dict[str, Any]:
-    """The predicted classes of logits (V, C) by name and their probabilities, as lists for JSON."""
-    best = logits.softmax(1).max(1)
-    return {"predicted": [classes[index] for index in best.indices.tolist()], "confidence": best.values.tolist()}
+    """The predicted classes of logits (..., C) by name and their probabilities, as nested lists for JSON."""
+    best = logits.softmax(-1).max(-1)
+    return {"predicted": np.asarray(classes)[best.indices.cpu().numpy()].tolist(), "confidence": best.values.tolist()}
 
 
 def require_clean_correct(scene: Scene, logits: Tensor, labels: Tensor, classifier: Classifier) -> None:

@@ -16,20 +16,44 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from augment.attacks.criteria import Goal
 from augment.attacks.eot import ExpectationOverTransformations
-from augment.losses import adversarial_cost, logit_gap
+from augment.losses import NO_CLASS, adversarial_cost, logit_gap
 from augment.utils import BatchSize, Phases, as_found, generator, progress
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
     from augment.attacks.attack import AttackSettings
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Source and target class of each view: an attack lowers the confidence in one and raises it in the other.
+
+    source: NO_CLASS where only the target counts. target: NO_CLASS, or None for all views, where any error will do. A
+    goal is reached where every view is classified as its target or, without a target, as anything but its source.
+    """
+
+    source: Int[Tensor, "E V"]
+    target: Int[Tensor, "E V"] | None = None
+
+    def of(self, examples: Tensor) -> Goal:
+        """The goal of some of the examples."""
+        return Goal(self.source[examples], None if self.target is None else self.target[examples])
+
+    def reached(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, " E"]:
+        """Whether the predicted classes reach the goal in all views of an example."""
+        return self.reached_in_views(predicted).all(1)
+
+    def reached_in_views(self, predicted: Int[Tensor, "E V"]) -> Bool[Tensor, "E V"]:
+        """Whether the predicted classes reach the goal, view by view."""
+        erred = predicted != self.source
+        return erred if self.target is None else torch.where(self.target == NO_CLASS, erred, predicted == self.target)
 
 
 class Problem(Protocol):
@@ -47,24 +71,6 @@ class Problem(Protocol):
 
     def project(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
         """The nearest permitted values."""
-
-
-@dataclass(frozen=True)
-class Part:
-    """Some examples (A,) of a problem, with other starts (A, D)."""
-
-    problem: Problem
-    examples: Tensor
-    start: Tensor
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self.problem.render(values, self.examples[examples])
-
-    def step(self, gradient: Tensor) -> Tensor:
-        return self.problem.step(gradient)
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self.problem.project(values, self.examples[examples])
 
 
 @dataclass(frozen=True)
@@ -95,30 +101,37 @@ def descend(
     settings: AttackSettings,
     phases: Phases | None = None,
     *,
-    starts: Iterable[Tensor] = (),
+    examples: Tensor | None = None,
+    start: Tensor | None = None,
+    restarts: Iterable[Tensor] = (),
     at_once: int | None = None,
     seed: int = 0,
 ) -> DescentResult:
-    """Descend from the problem's start and, for examples without success, from further starts (E, D).
+    """Descend from the problem's start and, for examples without success, from further starts.
 
-    model: (N, 3, H, W) in [0, 1] → logits, with its preprocessing; used in eval mode and left as it was found. A later
-    start replaces an example's result only if it succeeds; steps add up. at_once: examples per round, so that memory
-    holds no more than theirs; None: all. seed: of the transformations that `settings.eot` asks for.
+    model: (N, 3, H, W) in [0, 1] → logits, with its preprocessing; used in eval mode and left as it was found. goal: of
+    the examples. examples: (A,), some of the problem's. start: (A, D) instead of the problem's. restarts: further
+    starts (A, D); one replaces an example's result only if it succeeds; steps add up. at_once: examples per round, so
+    that memory holds no more than theirs; None: all. seed: of the transformations that `settings.eot` asks for.
     """
-    phases, begin = phases or Phases(), problem.start
+    phases = phases or Phases()
+    examples = torch.arange(len(problem.start), device=problem.start.device) if examples is None else examples
+    start = problem.start[examples] if start is None else start
     expectation = ExpectationOverTransformations(settings.eot, generator(seed, "expectation"))
-    rounds = torch.arange(len(begin), device=begin.device).split(at_once or max(len(begin), 1))
-    starts = starts if len(rounds) <= 1 else list(starts)
+    rounds = torch.arange(len(start), device=start.device).split(at_once or max(len(start), 1))
+    restarts = restarts if len(rounds) <= 1 else list(restarts)
     whole: dict[str, Tensor] = {}
+
+    def run(rows: Tensor, begin: Tensor) -> DescentResult:
+        return _descend_once(model, problem, examples[rows], begin[rows], goal.of(rows), settings, expectation, phases)
+
     for rows in progress(rounds, "attack") if len(rounds) > 1 else rounds:
-        part = problem if len(rounds) == 1 else Part(problem, rows, begin[rows])
-        best = _descend_once(model, part, goal.of(rows), settings, expectation, phases)
-        for start in starts:
+        best = run(rows, start)
+        for restart in restarts:
             left = torch.nonzero(~best.success).squeeze(1)
             if not len(left):
                 break
-            rest = Part(problem, rows[left], start[rows[left]])
-            again = _descend_once(model, rest, goal.of(rows[left]), settings, expectation, phases)
+            again = run(rows[left], restart)
             better = left[again.success]
             best.success_at[better] = (best.steps[left] + again.success_at)[again.success]
             best.steps[left] += again.steps
@@ -128,7 +141,7 @@ def descend(
             return best
         for item in fields(best):
             result = getattr(best, item.name)
-            whole.setdefault(item.name, result.new_empty(len(begin), *result.shape[1:]))[rows] = result
+            whole.setdefault(item.name, result.new_empty(len(start), *result.shape[1:]))[rows] = result
     return DescentResult(**whole)
 
 
@@ -136,65 +149,60 @@ def descend(
 def _descend_once(
     model: nn.Module,
     problem: Problem,
+    examples: Tensor,
+    start: Tensor,
     goal: Goal,
     settings: AttackSettings,
     expectation: ExpectationOverTransformations,
     phases: Phases,
 ) -> DescentResult:
-    """Only examples that go on are rendered."""
-    values = problem.start.detach().clone()
+    """Of examples (A,) from a start (A, D). Only examples that go on are rendered."""
+    values = start.detach().clone()
     active = torch.arange(len(values), device=values.device)
     steps, success_at, success = torch.zeros_like(active), torch.zeros_like(active), torch.zeros_like(active).bool()
-    cost, length = values.new_full((len(values),), torch.inf), values.new_ones(len(values), 1)
-    candidate, place, slope = values.clone(), values.clone(), torch.zeros_like(values)
+    lowest, length = values.new_full((len(values),), torch.inf), values.new_ones(len(values), 1)
+    candidate, position, slope = values.clone(), values.clone(), torch.zeros_like(values)
     predicted, batch_size = torch.zeros_like(goal.source), BatchSize(settings.batch_size)
     with as_found(model):
         for step in range(settings.max_steps + 1):
-            chosen = candidate[active].requires_grad_(True)
-            rendered = problem.render(chosen, active)
-            aim = goal.of(active)
+            chosen, active_goal = candidate[active].requires_grad_(True), goal.of(active)
+            rendered = problem.render(chosen, examples[active])
             with phases("attack_classifier"):
-                now = _classifier_pass(model, rendered.detach(), aim, batch_size, expectation)
-            (gradient,) = torch.autograd.grad(rendered, chosen, now.gradient)
-            reached = aim.reached(now.predicted)
+                cost, gap, classes, by_image = _classifier_pass(
+                    model, rendered.detach(), active_goal, batch_size, expectation
+                )
+            (gradient,) = torch.autograd.grad(rendered, chosen, by_image)
+            reached = active_goal.reached(classes)
             if step == 0:
-                images, cost_before, success_before = rendered.detach().clone(), now.cost, reached
+                images, cost_before, success_before = rendered.detach().clone(), cost, reached
                 zero_gradient = gradient.abs().amax(1) == 0
-            done = reached & (now.gap >= settings.margin)
+            done = reached & (gap >= settings.margin)
             success_at[active[reached & ~success[active]]] = step
-            fell = now.cost < cost[active]
+            fell = cost < lowest[active]
             taken = done | fell if settings.shorten else torch.ones_like(done)
             best = done | torch.where(success[active], reached & fell, reached | taken)
             rows = torch.nonzero(best).squeeze(1)
-            kept = active[rows]
-            values[kept], images[kept] = candidate[kept], rendered.detach()[rows]
-            cost[kept], predicted[kept], success[kept] = now.cost[rows], now.predicted[rows], reached[rows]
-            place[active[taken]], slope[active[taken]] = candidate[active[taken]], gradient[taken]
+            improved = active[rows]
+            values[improved], images[improved] = candidate[improved], rendered.detach()[rows]
+            lowest[improved], predicted[improved], success[improved] = cost[rows], classes[rows], reached[rows]
+            position[active[taken]], slope[active[taken]] = candidate[active[taken]], gradient[taken]
             length[active[~taken]] /= 2
             active = active[~done]
             if step == settings.max_steps or not len(active):
                 break
-            moved = place[active] - length[active] * problem.step(slope[active])
-            candidate[active] = problem.project(moved, active)
+            moved = position[active] - length[active] * problem.step(slope[active])
+            candidate[active] = problem.project(moved, examples[active])
             steps[active] += 1
     return DescentResult(
-        values, images, steps, success_before, success, success_at, cost_before, cost, predicted, zero_gradient
+        values, images, steps, success_before, success, success_at, cost_before, lowest, predicted, zero_gradient
     )
-
-
-class _Pass(NamedTuple):
-    """A classifier's pass over A examples. cost, gap: (A,), the sum and the least over views. predicted: (A, V), of the
-    images as they are. gradient: of the cost by the images (A, V, 3, H, W)."""
-
-    cost: Tensor
-    gap: Tensor
-    predicted: Tensor
-    gradient: Tensor
 
 
 def _classifier_pass(
     model: nn.Module, images: Tensor, goal: Goal, batch_size: BatchSize, expectation: ExpectationOverTransformations
-) -> _Pass:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of images (A, V, 3, H, W): the sum of the cost (A,) and the least logit gap (A,) over views, the predicted
+    classes (A, V) of the images as they are, and the gradient of the cost by the images."""
     views, flat = images.shape[1], images.flatten(0, 1)
     source, target = goal.source.flatten(), None if goal.target is None else goal.target.flatten()
     gradient = torch.empty_like(flat)
@@ -203,12 +211,12 @@ def _classifier_pass(
         batch = flat[part].detach().requires_grad_(True)
         logits = model(batch)
         expected = expectation(model, batch, logits)
-        aim = source[part], None if target is None else target[part]
-        cost = adversarial_cost(expected, *aim)
+        classes = source[part], None if target is None else target[part]
+        cost = adversarial_cost(expected, *classes)
         (by_image,) = torch.autograd.grad(cost.sum(), batch)
         gradient[part] = by_image  # laid out as the images are, not as the network's channels
-        return cost.detach(), logit_gap(expected.detach(), *aim), logits.detach().argmax(1)
+        return cost.detach(), logit_gap(expected.detach(), *classes), logits.detach().argmax(1)
 
     parts = zip(*batch_size.map(compute, len(flat)), strict=True)
-    costs, gaps, predicted = (torch.cat(part).unflatten(0, (-1, views)) for part in parts)
-    return _Pass(costs.sum(1), gaps.amin(1), predicted, gradient.unflatten(0, (-1, views)))
+    cost, gap, predicted = (torch.cat(part).unflatten(0, (-1, views)) for part in parts)
+    return cost.sum(1), gap.amin(1), predicted, gradient.unflatten(0, (-1, views))

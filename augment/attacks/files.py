@@ -1,90 +1,87 @@
-"""The files of an attack: an image and a folder for each example, and all numbers as JSON lines."""
+"""The files of an attack: a figure and a folder for each example, and all numbers as JSON lines."""
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
-from augment.attacks.adversary import Adversary, write_adversary
-from augment.attacks.attack import AttackResult, predictions
-from augment.attacks.evaluate import Checks, RerenderCheck, require_renderers, rerender
-from augment.attacks.figure import Panel, prediction_caption, save_figure
+from augment.attacks.adversary import MITSUBA, Adversary, reload, write_adversary
+from augment.attacks.attack import AttackResult, logits_of, predictions
+from augment.attacks.eot import as_jpeg
+from augment.attacks.evaluate import warnings
 from augment.scene import Conditions
-from renderer.light.basis import Basis
+from renderer.errors import require_choice
+from renderer.image import background_term, clamp, to_bytes, to_unit, tonemap_composite
+from renderer.io.mitsuba import SCENE, mitsuba, render_mitsuba_scene
+from renderer.io.tiles import Tile, draw_grid
 from renderer.mesh import doubled_area_vectors
+from renderer.rasterizer import Rasterizer
 from renderer.rendering import light_sphere
 
 LINES = "attack.jsonl"  # a line per example, and a last one with the checks
-SPHERE = 192
+JPEG_QUALITY = 90
+RENDERERS = ("reload", MITSUBA)
+SIDE = 192  # px: smaller images of a figure are enlarged by a whole factor to at least this width
 
 
 def save(
-    result: AttackResult, folder: str | Path, checks: Checks | None = None, verify: Sequence[str] = ("reload",)
-) -> list[RerenderCheck]:
-    """Write attack.jsonl and, for each example, an image of before and after and a folder with its whole adversary.
+    result: AttackResult,
+    folder: str | Path,
+    checks: dict[str, Any] | None = None,
+    verify: Sequence[str] = ("reload",),
+) -> list[dict[str, Any]]:
+    """Write attack.jsonl and, for each example, a figure of before and after and a folder with its whole adversary.
 
-    verify: "reload", "mitsuba" or both render the adversaries again from these folders; returned are the checks of
-    these images and of the attack's own ones, which are in attack.jsonl, too. See `augment.reload`.
+    checks: as `augment.check` returns them, for the last line. verify: "reload", "mitsuba" or both render the
+    adversaries again from these folders; Mitsuba's illumination is direct, and concave meshes shade themselves in it.
+    Returns the examples' lines. Their `versions` are the predictions of the images as floats, with 8 bits, as JPEG and
+    as rendered again, and the differences of pixel values. See `augment.reload`.
 
-    >>> rerender_checks = augment.save(result, "adversaries")
+    >>> [line] = augment.save(result, "adversaries")
     >>> sorted(path.name for path in Path("adversaries").iterdir())
     ['attack.jsonl', 'example_000', 'example_000.png']
-    >>> [check.version for check in rerender_checks]
+    >>> [*line["versions"]]
     ['float', '8 bits', 'JPEG 90', 'reload']
     """
     require_renderers(verify)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    after = result.conditions
+    after, lines = result.conditions, []
     stems = [folder / f"example_{example:03d}" for example in range(len(result.images))]
-    lines = []
     for example, stem in enumerate(stems):
-        save_figure(*panels(result, example), stem.with_suffix(".png"))
+        figure(result, example).save(stem.with_suffix(".png"))
         images = result.images_before[example], result.images[example]
         light = write_adversary(Adversary.of(result.problem.scene, example, after, *images), stem)
         lines.append({"example": example, **_numbers(result, example), **light, **_damage(result, after, example)})
-    rerender_checks = rerender(result, stems, verify)
-    with open(folder / LINES, "w", encoding="utf-8") as file:
-        for example, line in enumerate(lines):
-            versions = {check.version: check.of(example, result.classifier.classes) for check in rerender_checks}
-            file.write(json.dumps({**line, "versions": versions}) + "\n")
-        if checks is not None:
-            file.write(json.dumps({"checks": asdict(checks), "warnings": checks.warnings}) + "\n")
-    return rerender_checks
+    versions = _versions(result, stems, verify)
+    for example, line in enumerate(lines):
+        line["versions"] = {name: numbers[example] for name, numbers in versions.items()}
+    last = [] if checks is None else [{"checks": checks, "warnings": warnings(checks)}]
+    (folder / LINES).write_text("".join(json.dumps(line) + "\n" for line in [*lines, *last]), encoding="utf-8")
+    return lines
 
 
-def panels(result: AttackResult, example: int) -> tuple[Panel, Panel]:
-    """An example's sides before and after, with their light only where the attack has changed it."""
-    problem, classes = result.problem, result.classifier.classes
-    one = problem.everything[example : example + 1]
-    sides = [problem.conditions(values[one], one) for values in (problem.start, result.descent.values)]
-    lights = [(side.light[0], problem.scene.basis_under(side, 0)) for side in sides]
-    changed = not torch.equal(lights[0][0], lights[1][0]) or lights[0][1] != lights[1][1]
-    labels = [classes[label] for label in result.goal.source[example].tolist()]
+def require_renderers(names: Sequence[str]) -> None:
+    """InputError unless each is known and installed."""
+    for name in names:
+        require_choice("verify", name, RENDERERS)
+    if MITSUBA in names:
+        with mitsuba():
+            pass
 
-    def panel(images: Tensor, logits: Tensor, light: Tensor, basis: Basis) -> Panel:
-        views = zip(logits[example].softmax(1), labels, strict=True)
-        captions = [prediction_caption(probabilities, classes, label) for probabilities, label in views]
-        cameras = problem.scene.cameras[example]
-        spheres = torch.stack([light_sphere(light, SPHERE, each, basis) for each in cameras]) if changed else None
-        return Panel(images[example], captions, spheres)
 
-    return (
-        panel(result.images_before, result.logits_before, *lights[0]),
-        panel(result.images, result.logits, *lights[1]),
-    )
+# ------------------------------------------------------------------------------------- numbers
 
 
 def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     descent, classes = result.descent, result.classifier.classes
     before = predictions(result.logits_before[example], classes)
-    one = slice(example, example + 1)
-    ends = (result.problem.split(values[one]) for values in (descent.values, result.problem.start))
+    ends = [result.problem.split(values[[example]]) for values in (descent.values, result.problem.start)]
     return {
         "clean_correct": bool(result.clean_correct[example]),
         "success_before": bool(result.success_before[example]),
@@ -112,3 +109,92 @@ def _damage(result: AttackResult, after: Conditions, example: int) -> dict[str, 
     before, now = (doubled_area_vectors(corners, mesh.faces) for corners in (mesh.vertices, vertices))
     displacement = np.abs(vertices - mesh.vertices).max(axis=0).tolist()
     return {"shape": {"flipped": int(((before * now).sum(axis=1) < 0).sum()), "displacement": displacement}}
+
+
+def _versions(result: AttackResult, folders: Sequence[Path], verify: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
+    """By version of the images after the attack, each example's numbers; folders: of the examples."""
+    images = result.images.cpu()
+    versions = {
+        "float": images,
+        "8 bits": to_unit(to_bytes(images)),
+        f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY),
+    }
+    again = [render_again(folder, verify, result.problem.scene.rasterizer) for folder in folders if verify]
+    versions |= {name: torch.stack([views[name] for views in again]) for name in verify}
+    return {name: _version(result, version.to(result.images)) for name, version in versions.items()}
+
+
+def _version(result: AttackResult, images: Tensor) -> list[dict[str, Any]]:
+    """Each example's numbers with other images (E, V, 3, size, size)."""
+    logits = logits_of(result.preprocessed_model, images, result.settings.batch_size)
+    success, differences = result.goal.reached(logits.argmax(2)), (images - result.images).abs().flatten(1)
+    return [
+        {
+            "success": bool(success[example]),
+            **predictions(logits[example], result.classifier.classes),
+            "largest_difference": float(difference.max()),
+            "mean_difference": float(difference.mean()),
+        }
+        for example, difference in enumerate(differences)
+    ]
+
+
+def render_again(folder: Path, renderers: Sequence[str], rasterizer: Rasterizer) -> dict[str, Tensor]:
+    """The images (V, 3, size, size) by each renderer, from an example's files alone."""
+    adversary, images = reload(folder), {}
+    if "reload" in renderers:
+        images["reload"] = adversary.render(rasterizer)
+    if MITSUBA in renderers:
+        encoding = adversary.settings.encoding
+        rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras))
+        composite = rgba[:, :3] + background_term(rgba[:, 3:], adversary.background, encoding)
+        tonemapped = tonemap_composite(composite, encoding)
+        images[MITSUBA] = tonemapped if adversary.pixels is None else clamp(tonemapped + adversary.pixels)
+    return images
+
+
+# ------------------------------------------------------------------------------------- figure
+
+
+def figure(result: AttackResult, example: int) -> Image.Image:
+    """The images of an example before and after, with predictions, their difference, and each view's light where the
+    attack has changed it; a row per view.
+
+    Differences are gray where there is none, and scaled alike so that the largest reaches black or white. Images are
+    enlarged without smoothing, so that one sees the pixels that the classifier saw.
+    """
+    problem, one = result.problem, result.problem.everything[[example]]
+    sides = [problem.conditions(values[one], one) for values in (problem.start, result.descent.values)]
+    lights = [(side.light[0], problem.scene.basis_under(side, 0)) for side in sides]
+    before, after = result.images_before[example], result.images[example]
+    differences = after - before
+    largest = differences.abs().amax((1, 2, 3)).tolist()
+    scale = 1 / max(1 / 255, *largest)  # smaller ones than a step of eight bits stay as small as they are
+    columns = {
+        "initial": _tiles(before, _captions(result, result.logits_before, example)),
+        "adversarial": _tiles(after, _captions(result, result.logits, example)),
+        "difference": _tiles(
+            (1 + scale * differences) / 2, [(f"largest {value:.3f}", f"shown {scale:.3g} times") for value in largest]
+        ),
+    }
+    if not torch.equal(lights[0][0], lights[1][0]) or lights[0][1] != lights[1][1]:
+        for name, (light, basis) in zip(("initial", "adversarial"), lights, strict=True):
+            spheres = [light_sphere(light, SIDE, camera, basis) for camera in problem.scene.cameras[example]]
+            columns[f"{name} light"] = _tiles(spheres, [()] * len(spheres))
+    return draw_grid([*zip(*columns.values(), strict=True)], [*columns])
+
+
+def _captions(result: AttackResult, logits: Tensor, example: int) -> list[tuple[str, ...]]:
+    """The predicted class of each view with its confidence and, where it is wrong, the right class with its own."""
+    classes, labels = result.classifier.classes, result.goal.source[example].tolist()
+    return [
+        tuple(f"{view[index]:.1%} {classes[index]}" for index in dict.fromkeys([int(view.argmax()), label]))
+        for view, label in zip(logits[example].softmax(1), labels, strict=True)
+    ]
+
+
+def _tiles(images: Tensor | Sequence[Tensor], captions: Sequence[tuple[str, ...]]) -> list[Tile]:
+    """Tiles of images (V, 3, H, W) in [0, 1], at least SIDE pixels wide."""
+    enlarged = [image.repeat_interleave(-(-SIDE // image.shape[2]), 1) for image in images]
+    enlarged = [image.repeat_interleave(-(-SIDE // image.shape[2]), 2) for image in enlarged]
+    return [Tile.of(image, caption) for image, caption in zip(enlarged, captions, strict=True)]

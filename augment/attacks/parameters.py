@@ -1,7 +1,6 @@
 """What an attack may change: light, sky, a projector's pattern, lamps, shape, colors, pixels; any at once."""
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,34 +10,46 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from augment.attacks.norm_ball import StepSettings, anywhere
+from augment.attacks.norm_ball import Domain, StepSettings, anywhere
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
-from renderer.light.basis import Harmonics, LocalBasis, parts_of
+from renderer.light.basis import parts_of
 from renderer.light.convex import Ball, nearest_in_box
-from renderer.light.local import Lamps, Projector
+from renderer.light.local import Lamps
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
 
+TURBIDITY_UNIT = 4.0  # its domain spans 2 of them, as the zenith's and the azimuth's span about 1.6 and 6
 
-class Parameter(ABC):
-    """One kind of parameter of a scene's E examples. `start` (E, D) is where attacks begin and its balls' center.
 
-    used: (E, D) bool, where examples differ in how many values they use: the others stay as they are. None: all.
+@dataclass
+class SkylightSettings(StepSettings):
+    """Where the sky begins: zenith and azimuth in degrees, turbidity."""
+
+    zenith: float = 45.0
+    azimuth: float = 0.0
+    turbidity: float = 3.0
+
+
+@dataclass
+class Parameter:
+    """One kind of values (E, D) of a scene's E examples.
+
+    start: (E, D), where attacks begin, and the center of the norm-balls. apply: the conditions of examples (A,) with
+    this part of them set to values (A, D). domain: the set of possible values. used: (E, D) bool, where examples differ
+    in how many values they use: the others stay as they are. None: all.
     """
 
     name: str
-
-    def __init__(self, scene: Scene, start: Tensor, settings: StepSettings, used: Tensor | None = None):
-        self.scene, self.start, self.settings, self.used = scene, start, settings, used
-
-    @abstractmethod
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        """The conditions of examples (A,) with this part of them set to values (A, D)."""
+    settings: StepSettings
+    start: Tensor
+    apply: Callable[[Tensor, Conditions, Tensor], Conditions]
+    domain: Domain = anywhere
+    used: Tensor | None = None
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        """The nearest values (A, D) of the examples (A,) within the norm-ball and its domain."""
-        return self.settings.project(values, self.start[examples], self.within_domain)
+        """The nearest values (A, D) of the examples (A,) within the norm-ball and the domain."""
+        return self.settings.project(values, self.start[examples], self.domain)
 
     def sample(self, generator: torch.Generator, examples: Tensor) -> Tensor:
         """Uniform draws (A, D) from the balls of the examples (A,), within the domain."""
@@ -55,206 +66,161 @@ class Parameter(ABC):
         if self.used is not None:
             offset = offset * self.used[examples]
         reach = (values - start).norm(dim=1, keepdim=True)
-        return self.within_domain(start + offset * reach / offset.norm(dim=1, keepdim=True))
-
-    def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """See `augment.attacks.norm_ball.Domain`; by default there is no bound."""
-        return anywhere(values, within)
+        return self.domain(start + offset * reach / offset.norm(dim=1, keepdim=True))
 
 
-TURBIDITY_UNIT = 4.0  # its domain spans 2 of them, as the zenith's and the azimuth's span about 1.6 and 6
+def lighting(scene: Scene, settings: StepSettings, nonnegative: bool = False) -> Parameter:
+    """The light of the scene, or the first of several: that of the sky."""
+    return _light(scene, settings, "lighting", parts_of(scene.basis)[0], nonnegative)
 
 
-@dataclass
-class SkylightSettings(StepSettings):
-    """Where the sky begins: zenith and azimuth in degrees, turbidity."""
-
-    zenith: float = 45.0
-    azimuth: float = 0.0
-    turbidity: float = 3.0
+def projector(scene: Scene, settings: StepSettings) -> Parameter:
+    """What a projector throws: each pixel's three channels, from 0 to its power."""
+    return _light(scene, settings, "projector", _local_light(scene, "projector"))
 
 
-class OfMesh(Parameter):
-    """Three values for each of the items, vertices or faces, that a mesh has; the first of them in a smaller mesh, and
-    used where they are the object's own."""
-
-    def __init__(self, scene: Scene, settings: StepSettings, own: Sequence[np.ndarray]):
-        """own: bool, of the items of each object."""
-        items = pad_sequence([torch.from_numpy(each) for each in own], batch_first=True).to(scene.lights.device)
-        used = items.repeat_interleave(3, dim=1)[scene.object_of]
-        start = scene.lights.new_zeros(used.shape)
-        super().__init__(scene, start, settings, None if used.all() else used)
-
-    def by_item(self, values: Tensor, examples: Tensor) -> Tensor:
-        """(A, items, 3) of values (A, D): zero where they are not used."""
-        used = values if self.used is None else values * self.used[examples]
-        return used.unflatten(1, (-1, 3))
+def lamps(scene: Scene, settings: StepSettings) -> Parameter:
+    """What each lamp emits, three channels from 0 to the largest power."""
+    return _light(scene, settings, "lamps", _local_light(scene, "lamps"))
 
 
-class OfLight(Parameter):
+def _light(
+    scene: Scene, settings: StepSettings, name: str, part: tuple[slice, Any], nonnegative: bool = True
+) -> Parameter:
     """Every coefficient of one of the bases that a scene's light is of. The start is the examples' own; or, where light
-    is not to be negative, the nearest light that can be emitted, and so is every light from there on."""
+    is not to be negative, the nearest light that can be emitted, and so is every light from there on.
 
-    def __init__(
-        self,
-        scene: Scene,
-        settings: StepSettings,
-        where: slice,
-        basis: Harmonics | LocalBasis,
-        nonnegative: bool,
-    ):
-        """where: the coefficients of the basis among the scene's."""
-        self.basis, self.nonnegative, self._where = basis, nonnegative or not basis.allow_negative, where
-        start = scene.lights[:, where]
-        super().__init__(scene, (basis.project_nonnegative(start) if self.nonnegative else start).flatten(1), settings)
+    part: the coefficients of the basis among the scene's, and the basis.
+    """
+    where, basis = part
+    start = scene.lights[:, where]
 
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        return _relit(conditions, self._where, values.unflatten(1, (-1, 3)))
-
-    def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        if not self.nonnegative:
-            return super().within_domain(values, within)
+    def possible(values: Tensor, within: Ball | None = None) -> Tensor:
         of_lights = None if within is None else within.unflatten(-1, 3)
-        return self.basis.project_nonnegative(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
+        return basis.project_nonnegative(values.unflatten(1, (-1, 3)), of_lights).flatten(1)
+
+    def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        return _relit(conditions, where, values.unflatten(1, (-1, 3)))
+
+    if not nonnegative and basis.allow_negative:
+        return Parameter(name, settings, start.flatten(1), apply)
+    return Parameter(name, settings, basis.project_nonnegative(start).flatten(1), apply, possible)
 
 
-def _relit(conditions: Conditions, where: slice, own: Tensor) -> Conditions:
+def _relit(conditions: Conditions, where: slice, coefficients: Tensor) -> Conditions:
     """With other coefficients of one of the light's bases."""
     light = conditions.light
-    if own.shape[1] < light.shape[1]:
-        own = torch.cat([light[:, : where.start], own, light[:, where.stop :]], dim=1)
-    return replace(conditions, light=own)
+    if coefficients.shape[1] < light.shape[1]:
+        coefficients = torch.cat([light[:, : where.start], coefficients, light[:, where.stop :]], dim=1)
+    return replace(conditions, light=coefficients)
 
 
-class Lighting(OfLight):
-    """The light of the scene, or the first of several: that of the sky."""
-
-    name = "lighting"
-
-    def __init__(self, scene: Scene, settings: StepSettings, nonnegative: bool = False):
-        super().__init__(scene, settings, *parts_of(scene.basis)[0], nonnegative)
-
-
-class OfLocalLight(OfLight):
-    """The local light of one basis, of which a scene has one each. InputError where it has none."""
-
-    def __init__(self, scene: Scene, settings: StepSettings):
-        super().__init__(scene, settings, *_of_name(scene, self.name, self.name), nonnegative=True)
-
-
-def _of_name(scene: Scene, name: str, attacked: str) -> tuple[slice, Any]:
-    """(the coefficients of, the) light of a scene that has a name. InputError where there is none to be attacked."""
+def _local_light(scene: Scene, name: str, attacked: str = "") -> tuple[slice, Any]:
+    """The coefficients and the basis of the scene's light of a name. InputError where there is none to be attacked."""
     for part in parts_of(scene.basis):
         if part[1].name == name:
             return part
-    raise InputError(f"attack={attacked}: the scene has no {name}: set scene.{name}")
+    raise InputError(f"attack={attacked or name}: the scene has no {name}: set scene.{name}")
 
 
-class ProjectorPattern(OfLocalLight):
-    """What a projector throws: each pixel's three channels, from 0 to its power."""
-
-    name = Projector.name
-
-
-class LampPowers(OfLocalLight):
-    """What each lamp emits, three channels from 0 to the largest power."""
-
-    name = Lamps.name
-
-
-class LampPlaces(Parameter):
-    """Where each lamp is, three coordinates in world units. Shadows are cast anew in each image, and are held in its
+def positions(scene: Scene, settings: StepSettings) -> Parameter:
+    """Where each lamp is, three coordinates in world units. Shadows are cast anew in each image, and are fixed in its
     derivative. InputError where the scene has no lamps."""
+    placed = _local_light(scene, Lamps.name, "positions")[1].positions
+    start = torch.tensor(placed).to(scene.lights).flatten().expand(len(scene), -1)
 
-    name = "positions"
-
-    def __init__(self, scene: Scene, settings: StepSettings):
-        lamps = _of_name(scene, Lamps.name, self.name)[1]
-        start = torch.tensor(lamps.positions).to(scene.lights).flatten()
-        super().__init__(scene, start.expand(len(scene), -1), settings)
-
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+    def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         return replace(conditions, positions=values.unflatten(1, (-1, 3)))
 
+    return Parameter("positions", settings, start, apply)
 
-class Skylight(Parameter):
+
+def skylight(scene: Scene, settings: SkylightSettings) -> Parameter:
     """Three values: zenith, azimuth, turbidity / 4. The sky is scaled to the mean luminance of the example's own light
     where the attack starts, and by the same factor elsewhere. Lights in the scene stay as they are."""
+    begin = math.radians(settings.zenith), math.radians(settings.azimuth), settings.turbidity
+    start = torch.tensor([*begin[:2], begin[2] / TURBIDITY_UNIT], dtype=torch.float64).to(scene.lights)
+    luminance = mean_luminance(coefficients(*begin))
+    where, _ = parts_of(scene.basis)[0]
+    scales = [mean_luminance(light) / luminance for light in scene.lights[:, where]]
+    scale = torch.tensor(scales, dtype=torch.float64, device=start.device)[:, None, None]
 
-    name = "skylight"
-
-    def __init__(self, scene: Scene, settings: SkylightSettings):
-        zenith, azimuth = math.radians(settings.zenith), math.radians(settings.azimuth)
-        turbidity = settings.turbidity
-        start = torch.tensor([zenith, azimuth, turbidity / TURBIDITY_UNIT], dtype=torch.float64).to(scene.lights)
-        super().__init__(scene, start.expand(len(scene), -1), settings)
-        sky = mean_luminance(coefficients(zenith, azimuth, turbidity))
-        self._where, _ = parts_of(scene.basis)[0]
-        scales = [mean_luminance(light) / sky for light in scene.lights[:, self._where]]
-        self._scale = torch.tensor(scales, dtype=torch.float64, device=start.device)[:, None, None]
-
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+    def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
         zenith, azimuth, turbidity = values.unbind(1)
-        sky = coefficients(zenith, azimuth, turbidity * TURBIDITY_UNIT) * self._scale[examples]
-        return _relit(conditions, self._where, sky.to(conditions.light))
+        sky = coefficients(zenith, azimuth, turbidity * TURBIDITY_UNIT) * scale[examples]
+        return _relit(conditions, where, sky.to(conditions.light))
 
-    def within_domain(self, values: Tensor, within: Ball | None = None) -> Tensor:
+    def possible(values: Tensor, within: Ball | None = None) -> Tensor:
         clear, hazy = (limit / TURBIDITY_UNIT for limit in TURBIDITY)
         low, high = values.new_tensor([[ZENITH[0], -math.inf, clear], [ZENITH[1], math.inf, hazy]])
         return nearest_in_box(values, low, high, within)
 
+    return Parameter("skylight", settings, start.expand(len(scene), -1), apply, possible)
 
-class Geometry(OfMesh):
+
+def geometry(scene: Scene, settings: StepSettings) -> Parameter:
     """Displacements of the object's vertices, in world units; it spans [-1, 1]. The gradient sees how normals turn."""
 
-    name = "geometry"
+    def change(conditions: Conditions, examples: Tensor, displacements: Tensor) -> Conditions:
+        return replace(conditions, vertices=scene.vertices[scene.object_of[examples]] + displacements)
 
-    def __init__(self, scene: Scene, settings: StepSettings):
-        super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
-
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        vertices = self.scene.vertices[self.scene.object_of[examples]]
-        return replace(conditions, vertices=vertices + self.by_item(values, examples))
+    return _of_mesh(scene, settings, "geometry", [item.own_vertices for item in scene.objects], change)
 
 
-class Albedo(OfMesh):
+def albedo(scene: Scene, settings: StepSettings) -> Parameter:
     """What is added to the linear albedo of each face, per channel; the sum is clamped to [0, 1]."""
 
-    name = "albedo"
+    def change(conditions: Conditions, examples: Tensor, added: Tensor) -> Conditions:
+        return replace(conditions, albedo=added)
 
-    def __init__(self, scene: Scene, settings: StepSettings):
-        super().__init__(scene, settings, [item.own_faces for item in scene.objects])
-
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        return replace(conditions, albedo=self.by_item(values, examples))
+    return _of_mesh(scene, settings, "albedo", [item.own_faces for item in scene.objects], change)
 
 
-class Pixels(Parameter):
+def _of_mesh(
+    scene: Scene,
+    settings: StepSettings,
+    name: str,
+    own: Sequence[np.ndarray],
+    change: Callable[[Conditions, Tensor, Tensor], Conditions],
+) -> Parameter:
+    """Three values for each of the items, vertices or faces, of a mesh; the first of them in a smaller mesh, and used
+    where they are the object's own.
+
+    own: (items,) bool, of each object. change: the conditions of examples (A,) with values (A, items, 3), which are
+    zero where they are not used.
+    """
+    items = pad_sequence([torch.from_numpy(mask) for mask in own], batch_first=True).to(scene.lights.device)
+    used = items.repeat_interleave(3, dim=1)[scene.object_of]
+    all_used = bool(used.all())
+
+    def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        own_values = values if all_used else values * used[examples]
+        return change(conditions, examples, own_values.unflatten(1, (-1, 3)))
+
+    return Parameter(name, settings, scene.lights.new_zeros(used.shape), apply, used=None if all_used else used)
+
+
+def pixels(scene: Scene, settings: StepSettings) -> Parameter:
     """What is added to each image's values, background included; the sum is clamped to [0, 1].
 
     One step of the radius along the sign is FGSM (Goodfellow et al. 2014); several smaller ones are the iterated
     method, and with random restarts PGD (Madry et al. 2017).
     """
+    shape = scene.views, 3, scene.settings.size, scene.settings.size
 
-    name = "pixels"
+    def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
+        return replace(conditions, pixels=values.unflatten(1, shape))
 
-    def __init__(self, scene: Scene, settings: StepSettings):
-        values = scene.views * 3 * scene.settings.size**2
-        super().__init__(scene, scene.lights.new_zeros(len(scene), values), settings)
-
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        size = self.scene.settings.size
-        return replace(conditions, pixels=values.unflatten(1, (self.scene.views, 3, size, size)))
+    return Parameter("pixels", settings, scene.lights.new_zeros(len(scene), math.prod(shape)), apply)
 
 
 PARAMETERS: dict[str, Callable[..., Parameter]] = {
-    parameter.name: parameter
-    for parameter in (Lighting, Skylight, ProjectorPattern, LampPowers, LampPlaces, Geometry, Albedo, Pixels)
+    make.__name__: make for make in (lighting, skylight, projector, lamps, positions, geometry, albedo, pixels)
 }
 
 
 class AttackProblem:
-    """Kinds side by side: values (E, D) are theirs, one after the other. See `augment.attacks.descent.Problem`."""
+    """Parameters side by side: values (E, D) are theirs, one after the other. See `augment.attacks.descent.Problem`."""
 
     def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
         self.scene, self.parameters = scene, parameters
@@ -263,9 +229,9 @@ class AttackProblem:
         self._sizes = [parameter.start.shape[1] for parameter in parameters]
 
     def conditions(self, values: Tensor, examples: Tensor) -> Conditions:
-        """What values (A, D) make of the scene of examples (A,)."""
+        """The scene's conditions of examples (A,), changed by values (A, D)."""
         conditions = self.scene.conditions(examples)
-        for parameter, part in zip(self.parameters, self.split(values), strict=True):
+        for parameter, part in self.by_parameter(values):
             conditions = parameter.apply(part, conditions, examples)
         return conditions
 
@@ -282,25 +248,27 @@ class AttackProblem:
         return images
 
     def step(self, gradient: Tensor) -> Tensor:
-        parts = zip(self.parameters, self.split(gradient), strict=True)
-        return torch.cat([parameter.settings.along(part) for parameter, part in parts], dim=1)
+        return torch.cat([parameter.settings.along(part) for parameter, part in self.by_parameter(gradient)], dim=1)
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        parts = zip(self.parameters, self.split(values), strict=True)
-        return torch.cat([parameter.project(part, examples) for parameter, part in parts], dim=1)
+        return torch.cat([parameter.project(part, examples) for parameter, part in self.by_parameter(values)], dim=1)
 
     def sample(self, generator: torch.Generator) -> Tensor:
-        """Uniform draws (E, D) from every kind's ball around its start, within its domain."""
+        """Uniform draws (E, D) from every parameter's ball around its start, within its domain."""
         drawn = [parameter.sample(generator, self.everything).to(self.start) for parameter in self.parameters]
         return torch.cat(drawn, dim=1)
 
     def sample_as_far(self, values: Tensor, generator: torch.Generator) -> Tensor:
-        """Draws (E, D) as far as values went: uniform in a kind's ball where it has a radius, else in a random
+        """Draws (E, D) as far as values went: uniform in a parameter's ball where it has a radius, else in a random
         direction at the values' own L2 distance from the start."""
-        parts = zip(self.parameters, self.split(values), strict=True)
+        parts = self.by_parameter(values)
         drawn = [parameter.sample_as_far(part, generator, self.everything).to(self.start) for parameter, part in parts]
         return torch.cat(drawn, dim=1)
 
+    def by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
+        """Each parameter with its part (A, D_k) of values (A, D)."""
+        return [*zip(self.parameters, self.split(values), strict=True)]
+
     def split(self, values: Tensor) -> tuple[Tensor, ...]:
-        """Each kind's part (A, D_k) of values (A, D)."""
+        """Each parameter's part (A, D_k) of values (A, D)."""
         return values.split(self._sizes, dim=1)

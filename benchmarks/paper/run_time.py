@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier, Scene
-from augment.attacks.criteria import Goal
-from augment.attacks.descent import DescentResult, descend
+from augment.attacks.descent import DescentResult, Goal, descend
 from augment.losses import adversarial_cost
 from augment.objects import SceneObject
 from augment.utils import Phases, generator

@@ -18,11 +18,10 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier
-from augment.attacks.criteria import Goal
-from augment.attacks.descent import Part, Problem, descend
+from augment.attacks.descent import Goal, Problem, descend
 from augment.attacks.parameters import AttackProblem
 from augment.objects import SceneObject
-from augment.utils import Phases, generator
+from augment.utils import generator
 from benchmarks.paper import common
 from renderer.errors import FACTOR
 from train.networks import load_classifier
@@ -59,10 +58,9 @@ def adversaries(
 ) -> tuple[Tensor, Tensor]:
     """(E, D) values where a descent first fools or ends, and (E, D) the best of `FURTHER` steps on. views: of each."""
     goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))
-    first = descend(classifier, problem, goal, settings, Phases())
-    onwards = Part(problem, torch.arange(len(first.values)), first.values)
+    first = descend(classifier, problem, goal, settings)
     longer = replace(settings, max_steps=FURTHER, margin=FACTOR)  # which no logit reaches: all steps are taken
-    return first.values, descend(classifier, onwards, goal, longer, Phases()).values
+    return first.values, descend(classifier, problem, goal, longer, start=first.values).values
 
 
 def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> Tensor:

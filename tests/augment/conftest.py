@@ -9,6 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+import augment
 from augment.objects import SceneObject
 from augment.scene import Example, Scene
 from renderer.camera import OrthographicCamera
@@ -71,3 +72,54 @@ def make_linear() -> Callable[..., nn.Module]:
         return network
 
     return build
+
+
+@pytest.fixture
+def by_color() -> augment.Classifier:
+    """Orange is red, lime is green, sky is blue, night is dark."""
+
+    def mean_color(images: Tensor) -> Tensor:
+        means = 30 * images.mean((2, 3))
+        return torch.cat([means, 12 - means.sum(1, keepdim=True)], dim=1)
+
+    return augment.Classifier(mean_color, 8, ("orange", "lime", "sky", "night"), "by_color")
+
+
+STEPS = {
+    "lighting": augment.StepSettings(step_size=0.1),
+    "skylight": augment.SkylightSettings(step_size=0.1),
+    "projector": augment.StepSettings(step_size=0.1),
+    "lamps": augment.StepSettings(step_size=0.1),
+    "positions": augment.StepSettings(step_size=0.1),
+    "geometry": augment.StepSettings("linf", 0.05, "sign", 0.01),
+    "albedo": augment.StepSettings("linf", 0.5, "sign", 0.1),
+    "pixels": augment.StepSettings("linf", 0.3, "sign", 0.05),
+}
+LOCAL = {
+    "projector": augment.ProjectorSettings(pixels=4, pattern=0.2),
+    "lamps": augment.LampsSettings([[2, 2, 2], [-2, 2, 2]], start=0.5),
+}
+
+
+@pytest.fixture
+def attacked(by_color) -> Callable[..., augment.AttackResult]:
+    """An attack on parameters by name, or with their steps, of an orange of 80 faces, until the classifier errs.
+
+    scene: keywords of `build_scene`. Further keywords are those of `AttackSettings`.
+    """
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    orange = Mesh.plain(ball.vertices, ball.faces, (0.9, 0.5, 0.1))
+
+    def run(parameters, scene=None, classifier=by_color, target=None, seed=0, force=False, **settings):
+        steps = parameters if isinstance(parameters, dict) else {name: STEPS[name] for name in parameters.split("+")}
+        local = {light: LOCAL[light] for name in steps if (light := name.replace("positions", "lamps")) in LOCAL}
+        shown = augment.build_scene(
+            [(orange, classifier.classes[0])],
+            classifier.size,
+            **{"rasterizer": "numpy", "width": 2.4, "normals": "flat", **local, **(scene or {})},
+        )
+        defaults = {"allow_negative": True, "margin": 0.0, "rounded": False, "max_steps": 8}
+        settings = augment.AttackSettings(**steps, **defaults | settings)
+        return augment.attack(classifier, shown, target, settings, seed=seed, force=force)
+
+    return run

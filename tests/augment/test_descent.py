@@ -7,8 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from augment.attacks.attack import AttackSettings
-from augment.attacks.criteria import Goal
-from augment.attacks.descent import DescentResult, descend
+from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import STEPS, StepSettings, direction
 from augment.utils import Phases
 from renderer.errors import InputError
@@ -343,7 +342,7 @@ def test_restarts_go_on_with_those_that_are_left_and_keep_what_fools():
     goal, settings = Goal(torch.arange(40)[:, None] % 2), settings_of(2)
     starts = [ball.sample(center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
     problem = LinearScene(center, "sign", 0.1, ball)
-    result = descend(network, problem, goal, settings, starts=starts)
+    result = descend(network, problem, goal, settings, restarts=starts)
     counted = problem.rendered.clone()
     problems = [LinearScene(start, "sign", 0.1, ball, center=center) for start in (center, *starts)]
     single = [descend(network, each, goal, settings) for each in problems]

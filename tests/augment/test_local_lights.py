@@ -7,7 +7,7 @@ import torch
 import augment
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import AttackProblem, LampPlaces, LampPowers, Lighting, ProjectorPattern
+from augment.attacks.parameters import PARAMETERS, AttackProblem
 from augment.build import LampsSettings, ProjectorSettings
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
@@ -30,11 +30,11 @@ def scene(size: int = SIZE, solid: str = "solid:orange", **choices) -> Scene:
     return augment.build_scene([(solid, "orange")], size, 2, rasterizer="numpy", **lights)
 
 
-@pytest.mark.parametrize("parameter", [Lighting, ProjectorPattern, LampPowers, LampPlaces])
+@pytest.mark.parametrize("parameter", ["lighting", "projector", "lamps", "positions"])
 def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parameter):
     """On an orange, on most of which no shadow moves with the lamps; two views share the lights."""
     shown, one = scene(exposure=0.3, shared=True, samples=4), torch.arange(1)
-    problem = AttackProblem(shown, [parameter(shown, StepSettings())])
+    problem = AttackProblem(shown, [PARAMETERS[parameter](shown, StepSettings())])
     draws = torch.Generator().manual_seed(0)
     values = problem.start.clone().requires_grad_(True)
     images = problem.render(values, one)
@@ -43,7 +43,7 @@ def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parame
     (gradient,) = torch.autograd.grad((images * weights).sum(), values)
     ends = [problem.render(problem.start + step * direction, one).double() for step in (1e-2, -1e-2)]
     slope = (weights * (ends[0] - ends[1])).sum() / 2e-2
-    moved = parameter is LampPlaces
+    moved = parameter == "positions"
     torch.testing.assert_close((gradient * direction).double().sum(), slope, rtol=2e-2 if moved else 1e-3, atol=0)
     changed = problem.conditions(problem.start + direction, one).light != shown.lights
     assert changed.any(2).any(0).sum() == (0 if moved else values.shape[1] // 3)
@@ -52,8 +52,8 @@ def test_each_light_changes_alone_with_the_gradient_of_finite_differences(parame
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 def test_patterns_and_powers_stay_in_range_and_in_their_norm_ball(norm):
     shown = scene()
-    for parameter, most in ((ProjectorPattern, 2.0), (LampPowers, 10.0)):
-        changed = parameter(shown, StepSettings(norm, 0.4))
+    for parameter, most in (("projector", 2.0), ("lamps", 10.0)):
+        changed = PARAMETERS[parameter](shown, StepSettings(norm, 0.4))
         wanted = changed.start + 9 * torch.randn(changed.start.shape, generator=torch.Generator().manual_seed(1))
         for values in (changed.project(wanted, EVERY), changed.sample(torch.Generator().manual_seed(2), EVERY)):
             assert values.min() >= 0 and values.max() <= most
@@ -80,9 +80,9 @@ def test_an_adversary_with_local_lights_is_reloaded_and_rendered_alike_by_mitsub
     torch.testing.assert_close(pattern, written.light[49:85], rtol=0, atol=projector.power / 255)
 
     pytest.importorskip("mitsuba")
-    from augment.attacks.evaluate import _rendered
+    from augment.attacks.files import render_again
 
-    seen = _rendered(tmp_path, ["mitsuba"], choose("numpy"))["mitsuba"]
+    seen = render_again(tmp_path, ["mitsuba"], choose("numpy"))["mitsuba"]
     assert (seen - done.images[0]).abs().median() < 2 / 255
 
 
@@ -107,8 +107,8 @@ def test_a_table_receives_the_projection_and_the_shadow():
         (lambda: LampsSettings([[math.nan, 0, 3]]).build(), r"a coordinate of lamps\.positions=nan"),
         (lambda: LampsSettings([[1, 0]]).build(), r"lamps: give positions"),
         (lambda: LampsSettings(start=[[11, 0, 0]] * 4).build(), r"start=.* to power=10$"),
-        (lambda: ProjectorPattern(scene(projector=None), StepSettings()), r"no projector: set scene\.projector"),
-        (lambda: LampPlaces(scene(lamps=None), StepSettings()), "the scene has no lamps"),
+        (lambda: PARAMETERS["projector"](scene(projector=None), StepSettings()), r"no projector: set scene\.projector"),
+        (lambda: PARAMETERS["positions"](scene(lamps=None), StepSettings()), "the scene has no lamps"),
     ],
 )
 def test_impossible_lights_are_refused_by_name(make, message):

@@ -10,10 +10,11 @@ from hypothesis.extra.numpy import arrays
 from scipy import optimize, stats
 from torch import Tensor
 
-from augment.attacks.norm_ball import NORMS, StepSettings
+from augment.attacks.norm_ball import NORMS, STEPS, StepSettings, direction
 from renderer.errors import InputError
 from renderer.light.convex import nearest_in_box
 
+EPS = torch.finfo(torch.float32).eps
 DTYPES = [torch.float32, torch.float64]
 COORDINATES = st.floats(-100, 100).map(lambda value: round(value, 6))  # squares of smaller ones vanish in float32
 RADII = st.one_of(st.just(0.0), st.floats(1e-3, 100))
@@ -128,12 +129,35 @@ def test_draws_repeat_with_the_generator_and_leave_the_global_one(name):
     assert torch.equal(StepSettings(name, 0.0).sample(center, torch.Generator()), center)
 
 
+@pytest.mark.parametrize(("scale", "tolerance"), [(1.0, EPS), (1e30, EPS), (1e-30, EPS), (1e-40, 1e-4)])
+def test_a_unit_step_has_unit_length_whatever_the_gradients_size(scale, tolerance):
+    """1e-40 is subnormal in float32, with five digits left."""
+    gradient = torch.randn(20, 50, generator=torch.Generator().manual_seed(0))
+    expected = gradient.double() / gradient.double().norm(dim=1, keepdim=True)
+    step = direction(gradient * scale, "unit")
+    torch.testing.assert_close(step.double(), expected, rtol=0, atol=4 * tolerance)
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_every_example_steps_by_its_own_gradient_and_a_zero_one_stays(step):
+    gradient = torch.tensor([[3.0, -4.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]])
+    expected = {
+        "unit": [[0.6, -0.8, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]],
+        "raw": gradient.tolist(),
+        "sign": [[1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]],
+    }[step]
+    torch.testing.assert_close(direction(gradient, step), torch.tensor(expected), rtol=0, atol=EPS)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: StepSettings("l1", 1.0), "norm=l1: choose one of linf, l2"),
         (lambda: StepSettings("l2", -0.1), "radius=-0.1 must be at least 0"),
         (lambda: StepSettings("linf", math.nan), "radius=nan"),
+        (lambda: StepSettings(step="newton"), "step=newton: choose one of unit, raw, sign"),
+        (lambda: StepSettings(step_size=0.0), "step_size=0.0 must be at least"),
+        (lambda: StepSettings(step_size=math.nan), "step_size=nan"),
         (lambda: StepSettings().sample(torch.zeros(1, 2), torch.Generator()), "radius=None has no uniform draw"),
     ],
 )

@@ -1,44 +1,38 @@
+"""Parameters of an attack, alone and side by side: gradients, norm-balls, domains, draws, and descents on them."""
+
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
+from torch import Tensor, nn
 
 from augment import reshading
 from augment.attacks.attack import AttackSettings
-from augment.attacks.criteria import Goal
-from augment.attacks.descent import descend
-from augment.attacks.norm_ball import STEPS, StepSettings, direction
-from augment.attacks.parameters import (
-    PARAMETERS,
-    Albedo,
-    AttackProblem,
-    Geometry,
-    Lighting,
-    Parameter,
-    Pixels,
-    Skylight,
-    SkylightSettings,
-)
+from augment.attacks.descent import DescentResult, Goal, descend
+from augment.attacks.norm_ball import StepSettings
+from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings
 from augment.scene import Conditions, Scene
+from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.environment import read_map, to_map, write_map
-from renderer.light.harmonics import project
+from renderer.light.harmonics import nonzero_coefficients, project
 from renderer.light.nonnegative import TOLERANCE
 from renderer.light.presets import directional, mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
-from renderer.transfer import DEGREE
+from renderer.transfer import DEGREE, build_operators
 
-EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
-FREE = StepSettings()
+EPS = torch.finfo(torch.float64).eps
 SKY = (0.9, 0.4, 3.0)
 EVERY = torch.arange(3)
+ZERO = torch.ones(49, dtype=torch.bool).index_fill(0, nonzero_coefficients(6), False)  # no effect on diffuse surfaces
+FRONT, SIDE, BACK = orbit_cameras(3, 2.2)
+ONE_VIEW, TWO_VIEWS = [[FRONT], [SIDE], [BACK]], [[FRONT, SIDE], [SIDE, BACK], [FRONT, BACK]]
 
 
 def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
@@ -47,24 +41,36 @@ def sky_at(start: tuple[float, float, float], **steps: Any) -> SkylightSettings:
     return SkylightSettings(zenith=math.degrees(zenith), azimuth=math.degrees(azimuth), turbidity=turbidity, **steps)
 
 
-MAKERS: dict[str, Callable[[Scene], Parameter]] = {"skylight": partial(Skylight, settings=sky_at(SKY))} | {
-    kind.name: partial(kind, settings=FREE) for kind in (Lighting, Geometry, Albedo, Pixels)
-}
+def problem_of(scene: Scene, **settings: StepSettings) -> AttackProblem:
+    return AttackProblem(scene, [PARAMETERS[name](scene, steps) for name, steps in settings.items()])
+
+
+def free(*names: str) -> dict[str, StepSettings]:
+    """Without a radius."""
+    return {name: sky_at(SKY) if name == "skylight" else StepSettings() for name in names}
+
+
+def attack(model: nn.Module, problem: AttackProblem, goal: Goal, steps: int, **settings) -> DescentResult:
+    return descend(model, problem, goal, AttackSettings(max_steps=steps, **{"margin": 0.0, **settings}))
+
+
+def towards(problem: AttackProblem, target: int | None = 1) -> Goal:
+    """Every image's class 0 falls and another, or none in particular, rises."""
+    classes = torch.zeros(len(problem.scene), problem.scene.views, dtype=torch.int64)
+    return Goal(classes, None if target is None else classes + target)
+
+
 SIZES = {"lighting": 49 * 3, "skylight": 3, "geometry": 12 * 3, "albedo": 20 * 3, "pixels": 2 * 3 * 6 * 6}
 
 
-def test_every_kind_has_a_name_of_its_own():
-    assert PARAMETERS.keys() - {"projector", "lamps", "positions"} == MAKERS.keys() == SIZES.keys()
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", MAKERS)
-def test_a_kind_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scene, name, dtype):
+@pytest.mark.parametrize("name", SIZES)
+def test_a_parameter_starts_at_the_scene_as_it_is_in_the_dtype_of_its_light(make_scene, name, dtype):
     """Under a sky the light is another, of the same mean luminance."""
     scene = make_scene(dtype=dtype)
-    kind = MAKERS[name](scene)
-    assert kind.start.shape == (3, SIZES[name]) and kind.start.dtype == dtype
-    conditions = kind.apply(kind.start, scene.conditions(EVERY), EVERY)
+    (parameter,) = problem_of(scene, **free(name)).parameters
+    assert parameter.start.shape == (3, SIZES[name]) and parameter.start.dtype == dtype
+    conditions = parameter.apply(parameter.start, scene.conditions(EVERY), EVERY)
     if name == "skylight":
         light = conditions.light[0]
         assert mean_luminance(light) == pytest.approx(mean_luminance(scene.lights[0]), rel=1e-6)
@@ -91,7 +97,7 @@ def fixed_visibility(monkeypatch) -> None:
 
 
 COMBINATIONS = [
-    *([name] for name in MAKERS),
+    *([name] for name in SIZES),
     ["lighting", "geometry", "albedo"],
     ["skylight", "geometry", "albedo", "pixels"],
 ]
@@ -111,10 +117,10 @@ def differences(function: Callable[[Tensor], Tensor], at: Tensor, directions: Te
 @pytest.mark.parametrize("names", COMBINATIONS, ids="+".join)
 def test_gradients_are_central_differences(make_scene, fixed_visibility, names, encoding):
     """Away from the start, with two views that share the values; by each value, or along eight mixtures of several
-    kinds'. The differences leave a fourth power of h = 2e-4, times fifth derivatives, and rounding over h."""
+    parameters'. The differences leave a fourth power of h = 2e-4, times fifth derivatives, and rounding over h."""
     scene, draws = make_scene(encoding=encoding), torch.Generator().manual_seed(2)
     scene.render(replace(scene.conditions(EVERY), albedo=scene.lights.new_zeros(3, 20, 3)), EVERY)  # is what is seen
-    problem = AttackProblem(scene, [MAKERS[name](scene) for name in names])
+    problem = problem_of(scene, **free(*names))
     at = problem.start[1] + 0.02 * torch.randn(problem.start.shape[1], generator=draws)
     weights = torch.randn(2, 3, 6, 6, generator=draws, dtype=torch.float64)
     directions = torch.eye(len(at)) if len(names) == 1 else torch.randn(8, len(at), generator=draws)
@@ -131,9 +137,12 @@ def test_gradients_are_central_differences(make_scene, fixed_visibility, names, 
 
 
 def test_vertices_that_move_along_the_view_have_the_gradient_of_the_image_rendered_anew(make_scene):
-    """No outline moves then, and so every change is one of normals: the one test in which nothing is held fixed."""
+    """No outline moves then, and so every change is one of normals: the one test in which nothing stays fixed."""
     scene, draws = make_scene(), torch.Generator().manual_seed(2)
-    geometry, weights = Geometry(scene, FREE), torch.randn(3, 6, 6, generator=draws, dtype=torch.float64)
+    (geometry,), weights = (
+        problem_of(scene, **free("geometry")).parameters,
+        torch.randn(3, 6, 6, generator=draws, dtype=torch.float64),
+    )
     for view, camera in enumerate(scene.cameras[1]):
         away = torch.from_numpy(camera.axes()[2])
         directions = torch.kron(torch.eye(12, dtype=torch.float64), away)
@@ -150,12 +159,6 @@ def test_vertices_that_move_along_the_view_have_the_gradient_of_the_image_render
         torch.testing.assert_close(directions @ gradient[0], expected, rtol=0, atol=1e-9)
 
 
-def attack(model: torch.nn.Module, problem: AttackProblem, goal: Goal, steps: int) -> tuple[Tensor, Tensor]:
-    """(values, images) that a descent of so many steps ends with."""
-    result = descend(model, problem, goal, AttackSettings(max_steps=steps, margin=0.0, batch_size=4))
-    return result.values, result.images
-
-
 @pytest.mark.parametrize("gray", [0.0, 0.5, 1.0])
 def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, gray):
     """x + ε sign(∂CE/∂x), clamped, with ∂CE/∂x = Σ (p_c - [c = y]) W_c; before black and white backgrounds too."""
@@ -164,20 +167,19 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     logits = model(before.flatten(0, 1)).detach()
     truth = logits.argmax(1)
     slopes = (logits.softmax(1) - torch.nn.functional.one_hot(truth, 4)) @ model[1].weight.detach()
-    problem = AttackProblem(scene, [Pixels(scene, StepSettings("linf", epsilon, "sign", epsilon))])
-    _, images = attack(model, problem, Goal(truth.view(3, 2)), steps=1)
+    problem = problem_of(scene, pixels=StepSettings("linf", epsilon, "sign", epsilon))
+    images = attack(model, problem, Goal(truth.view(3, 2)), steps=1).images
     expected = (before + epsilon * slopes.sign().view_as(before)).clamp(0, 1)
     assert torch.equal(images, expected)
     assert ((images - before).abs() > 0.99 * epsilon).double().mean() > 0.4
 
 
-@pytest.mark.parametrize(("steps", "reach"), [(2, 0.02), (3, 0.03), (9, 0.03)])
+@pytest.mark.parametrize(("steps", "reach"), [(2, 0.02), (9, 0.03)])
 def test_iterated_steps_on_pixels_stop_at_the_radius(make_scene, make_linear, steps, reach):
     scene = make_scene(backgrounds=torch.ones(3, 3, 6, 6))
     model, before = make_linear(2, bias=50.0), scene.render(scene.conditions(EVERY), EVERY)
-    problem = AttackProblem(scene, [Pixels(scene, StepSettings("linf", 0.03, "sign", 0.01))])
-    classes = torch.zeros(3, 2, dtype=torch.int64)
-    _, images = attack(model, problem, Goal(classes, classes + 1), steps)
+    problem = problem_of(scene, pixels=StepSettings("linf", 0.03, "sign", 0.01))
+    images = attack(model, problem, towards(problem), steps).images
     downhill = (model[1].weight[1] - model[1].weight[0]).detach().sign().view(3, 6, 6)
     torch.testing.assert_close(images, (before + reach * downhill).clamp(0, 1), rtol=0, atol=4 * EPS)
 
@@ -185,42 +187,13 @@ def test_iterated_steps_on_pixels_stop_at_the_radius(make_scene, make_linear, st
 def test_a_random_start_makes_it_projected_gradient_descent_within_the_same_ball(make_scene, make_linear):
     """Every restart ends in the corner that lies downhill of the middle, not of where it began."""
     scene = make_scene()
-    problem = AttackProblem(scene, [Pixels(scene, StepSettings("linf", 0.03, "sign", 0.01))])
+    problem = problem_of(scene, pixels=StepSettings("linf", 0.03, "sign", 0.01))
     problem.start = problem.sample(torch.Generator().manual_seed(0))
     assert problem.start.abs().max() <= 0.03 and problem.start.std() > 0.01
-    model, classes = make_linear(2, bias=50.0), torch.zeros(3, 2, dtype=torch.int64)
-    values, _ = attack(model, problem, Goal(classes, classes + 1), steps=7)
+    model = make_linear(2, bias=50.0)
+    values = attack(model, problem, towards(problem), steps=7).values
     downhill = (model[1].weight[1] - model[1].weight[0]).detach().sign()
     assert torch.equal(values, (0.03 * downhill).expand(3, 2, -1).flatten(1))
-
-
-class Exposure(Parameter):
-    """A kind that the package does not have: the logarithm of a factor on the light."""
-
-    name = "exposure"
-
-    def __init__(self, scene: Scene, settings: StepSettings):
-        super().__init__(scene, scene.lights.new_zeros(len(scene), 1), settings)
-
-    def apply(self, values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        return replace(conditions, light=conditions.light * values.exp()[:, :, None])
-
-
-def test_a_new_kind_is_one_class_and_goes_with_the_others(make_scene, make_linear):
-    """It ends at the end of its interval that lies downhill, on top of the light that is attacked beside it."""
-    scene, model, classes = make_scene(), make_linear(2, bias=50.0), torch.zeros(3, 2, dtype=torch.int64)
-    kinds = [kind(scene, StepSettings("linf", 0.1, "sign", 0.05)) for kind in (Lighting, Exposure)]
-    problem = AttackProblem(scene, kinds)
-    values, images = attack(model, problem, Goal(classes, classes + 1), steps=4)
-    light, exposure = problem.split(values)
-    assert exposure.abs().eq(0.1).all() and (light - problem.split(problem.start)[0]).abs().max() <= 0.1 + EPS
-    lit = scene.render(Conditions(light.view(3, 49, 3) * exposure.exp()[:, :, None]), EVERY)
-    torch.testing.assert_close(images, lit, rtol=0, atol=64 * EPS)
-    other = scene.render(Conditions(light.view(3, 49, 3) * (-exposure).exp()[:, :, None]), EVERY)
-    margin, worse = (
-        (model(p.flatten(0, 1)) @ torch.tensor([1.0, -1.0]).double()).view(3, 2).sum(1) for p in (lit, other)
-    )
-    assert (margin < worse).all()
 
 
 def ringing(scene: Scene) -> Scene:
@@ -234,32 +207,33 @@ def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm):
     """q is nearest to v exactly when (v - q)·(p - q) ≤ 0 for all p of the set: here other lights that were projected
     into it, the center, and the light's own way there and beyond."""
     scene, draws = ringing(make_scene()), torch.Generator().manual_seed(3)
-    light = Lighting(scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), nonnegative=True)
+    light = PARAMETERS["lighting"](scene, StepSettings(norm, {"linf": 0.05, "l2": 0.4}[norm]), nonnegative=True)
     assert not torch.equal(light.start, scene.lights.flatten(1))
-    wanted = light.start + 0.1 * torch.randn(3, 147, generator=draws, dtype=torch.float64)
-    nearest, offset = light.project(wanted, EVERY), light.start - wanted
+    values = light.start + 0.1 * torch.randn(3, 147, generator=draws, dtype=torch.float64)
+    nearest, offset = light.project(values, EVERY), light.start - values
     reach = nearest - light.start
     assert torch.all((reach.norm(dim=1) if norm == "l2" else reach.abs().amax(1)) <= light.settings.radius * (1 + 1e-9))
-    torch.testing.assert_close(light.within_domain(nearest), nearest, rtol=0, atol=TOLERANCE)
+    torch.testing.assert_close(light.domain(nearest), nearest, rtol=0, atol=TOLERANCE)
     others = [light.sample(draws, EVERY) for _ in range(5)] + [light.start, light.start + reach / 2]
     for other in others:
-        product = ((wanted - nearest) * (other - nearest)).sum(1)
+        product = ((values - nearest) * (other - nearest)).sum(1)
         assert (product <= 1e-3 * offset.norm(dim=1) * (other - nearest).norm(dim=1)).all()
     torch.testing.assert_close(light.project(nearest, EVERY), nearest, rtol=0, atol=10 * TOLERANCE)
 
 
 def test_a_descent_in_nonnegative_light_ends_in_light_that_an_environment_map_holds(make_scene, make_linear, tmp_path):
     """And begins with the nearest to the scene's: RGBE, which has no negative numbers, gives the images back."""
-    scene, classes = ringing(make_scene()), torch.zeros(3, 2, dtype=torch.int64)
-    problem = AttackProblem(scene, [Lighting(scene, StepSettings(step_size=0.5), nonnegative=True)])
-    values, images = attack(make_linear(2, bias=50.0), problem, Goal(classes, classes + 1), steps=6)
-    assert (values - problem.start).norm(dim=1).min() > 1
+    scene = ringing(make_scene())
+    light = PARAMETERS["lighting"](scene, StepSettings(step_size=0.5), nonnegative=True)
+    problem = AttackProblem(scene, [light])
+    result = attack(make_linear(2, bias=50.0), problem, towards(problem), steps=6)
+    assert (result.values - problem.start).norm(dim=1).min() > 1
     written = []
-    for light in values:
+    for light in result.values:
         write_map(tmp_path / "light.hdr", to_map(light.unflatten(0, (49, 3)), 128))
         written.append(project(read_map(tmp_path / "light.hdr"), DEGREE))
     read = scene.render(Conditions(torch.stack(written)), EVERY)
-    torch.testing.assert_close(read, images, rtol=0, atol=0.5 / 255)
+    torch.testing.assert_close(read, result.images, rtol=0, atol=0.5 / 255)
 
 
 FINITE = st.floats(-50, 50)
@@ -279,7 +253,7 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
     )
     @settings(max_examples=80, deadline=None)
     def check(start: tuple, values: tuple, radius: float | None):
-        sky = Skylight(scene, sky_at(start, norm=norm, radius=radius))
+        sky = PARAMETERS["skylight"](scene, sky_at(start, norm=norm, radius=radius))
         problem = AttackProblem(scene, [sky])
         center, ends = sky.start[0], torch.tensor([[ZENITH[0], -99, 0.5], [ZENITH[1], 99, 2.5]], dtype=dtype)
         torch.testing.assert_close(center * torch.tensor([1, 1, 4], dtype=dtype), torch.tensor(start, dtype=dtype))
@@ -301,53 +275,203 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
     check()
 
 
-def test_a_free_descent_over_the_sky_slides_along_the_end_of_its_domain(make_scene, make_linear):
-    """With steps far beyond it, up to the horizon and to the haziest or clearest air."""
-    scene, classes = make_scene(), torch.zeros(3, 2, dtype=torch.int64)
-    problem = AttackProblem(scene, [Skylight(scene, sky_at(SKY, step="sign", step_size=0.8))])
-    values, _ = attack(make_linear(2, bias=50.0), problem, Goal(classes, classes + 1), steps=6)
-    ends = torch.tensor([[0, math.pi / 2], [0.5, 2.5]], dtype=torch.float64)
-    reached = (values[:, [0, 2], None] == ends).any(2)
-    assert reached.any(0).all()
-
-
 @pytest.mark.parametrize("start", [(-0.1, 0, 3), (1.6, 0, 3), (1, 0, 1.9), (1, 0, 10.1), (1, math.nan, 3)])
 def test_a_sky_that_starts_outside_its_domain_is_refused(make_scene, start):
     with pytest.raises(InputError, match=r"zenith=|turbidity=|azimuth holds"):
-        Skylight(make_scene(), sky_at(start))
+        PARAMETERS["skylight"](make_scene(), sky_at(start))
 
 
-@pytest.mark.parametrize(("scale", "tolerance"), [(1.0, EPS32), (1e30, EPS32), (1e-30, EPS32), (1e-40, 1e-4)])
-def test_a_unit_step_has_unit_length_whatever_the_gradients_size(scale, tolerance):
-    """1e-40 is subnormal in float32, with five digits left."""
-    gradient = torch.randn(20, 50, generator=torch.Generator().manual_seed(0))
-    expected = gradient.double() / gradient.double().norm(dim=1, keepdim=True)
-    step = direction(gradient * scale, "unit")
-    torch.testing.assert_close(step.double(), expected, rtol=0, atol=4 * tolerance)
+def light_slope(scene: Scene, weight: Tensor) -> Tensor:
+    """(E, 49, 3) the derivative by the light of weight · images, summed over views, from the operators alone."""
+    slope = torch.zeros(len(scene), 49, 3, dtype=weight.dtype)
+    for row, cameras in enumerate(scene.cameras):
+        operators = build_operators(scene.mesh(row), cameras, scene.settings, scene.rasterizer, dtype=weight.dtype)
+        for operator in operators:
+            transfer, seen = operator.transfer * operator.albedo[:, None], weight.view(3, -1)[:, operator.pixels]
+            slope[row, nonzero_coefficients(6)] += torch.einsum("ckp,cp->kc", transfer, seen)
+    return slope
 
 
-@pytest.mark.parametrize("step", STEPS)
-def test_every_example_steps_by_its_own_gradient_and_a_zero_one_stays(step):
-    gradient = torch.tensor([[3.0, -4.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1e-3]])
-    expected = {
-        "unit": [[0.6, -0.8, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]],
-        "raw": gradient.tolist(),
-        "sign": [[1.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]],
-    }[step]
-    torch.testing.assert_close(direction(gradient, step), torch.tensor(expected), rtol=0, atol=EPS32)
+CASES = {  # cameras, classes, bias of the first class, the one to increase
+    "one view, untargeted": (ONE_VIEW, 2, 4.0, None),
+    "one view": (ONE_VIEW, 5, 50.0, 1),
+    "two views": (TWO_VIEWS, 5, 50.0, 1),
+}
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("norm", "step", "step_size", "steps"),
     [
-        ({"step": "newton"}, "step=newton: choose one of unit, raw, sign"),
-        ({"step_size": 0.0}, "step_size=0.0 must be at least"),
-        ({"step_size": -0.05}, "step_size=-0.05"),
-        ({"step_size": math.nan}, "step_size=nan"),
-        ({"norm": "l1"}, "norm=l1"),
-        ({"radius": -1.0}, "radius=-1.0"),
+        ("linf", "sign", 0.004, 3),
+        ("linf", "unit", 1e5, 1),  # so far that the smallest derivative reaches its face of the cube too
+        ("l2", "unit", 0.004, 3),
+        ("l2", "raw", 1e5, 1),
     ],
 )
-def test_steps_that_lead_nowhere_are_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        StepSettings(**change)
+def test_the_light_of_the_lowest_cost_of_a_linear_classifier_is_reached(
+    make_scene, make_linear, norm, step, step_size, steps, case, dtype
+):
+    """Where no pixel clamps, the margin is s · U + const, summed over the views that share the light. The ball's lowest
+    point is its corner U₀ - r sign(s), to the bit, or U₀ - r s/|s|, to rounding; coefficients without effect stay."""
+    radius, (cameras, classes, bias, target) = 0.01, CASES[case]
+    scene, model = make_scene(cameras=cameras, dtype=dtype), make_linear(classes, bias, dtype=dtype)
+    problem = problem_of(scene, lighting=StepSettings(norm, radius, step, step_size))
+    result = attack(model, problem, towards(problem, target=target), steps)
+    assert not result.success.any() and result.steps.eq(steps).all()
+    assert result.images.min() > 0 and result.images.max() < 1
+
+    weight, eps = (model[1].weight[0] - model[1].weight[1]).detach().double(), torch.finfo(dtype).eps
+    slope, start = light_slope(scene, weight), scene.lights
+    lights = result.values.unflatten(1, (49, 3))
+    nonzero = slope.abs() > 100 * eps  # a sum of 108 products of each view has a sign then
+    assert torch.equal(nonzero, ~ZERO[:, None].expand(3, 49, 3))
+    assert torch.equal(lights[:, ZERO], start[:, ZERO])
+    if norm == "linf":
+        corner = torch.where(slope > 0, start - radius, start + radius)
+        assert torch.equal(lights[nonzero], corner[nonzero])
+        reach = slope.abs().sum((1, 2))
+    else:
+        reach = slope.flatten(1).norm(dim=1)
+        surface = start - radius * slope / reach[:, None, None]
+        torch.testing.assert_close(lights.double(), surface, rtol=0, atol=16 * eps)
+    if target is not None:  # then the cost is the margin itself
+        lowest = result.cost_before.double() - radius * reach
+        torch.testing.assert_close(result.cost.double(), lowest, rtol=0, atol=4 * 50 * eps)
+
+
+@pytest.mark.parametrize("name", ["lighting", "skylight", "geometry", "albedo"])
+def test_views_that_share_what_is_attacked_add_their_gradients(make_scene, make_linear, name):
+    """A raw step with two views is the sum of the steps with either: of one light, sky, shape or paint."""
+
+    def moved(cameras: list) -> Tensor:
+        scene = make_scene(cameras=[cameras], backgrounds=torch.full((1, 3, 6, 6), 0.5))
+        problem = problem_of(scene, **{name: replace(free(name)[name], step="raw")})
+        result = attack(make_linear(5, bias=50.0), problem, towards(problem), steps=1)
+        return result.values - problem.start
+
+    both, front, side = moved([FRONT, SIDE]), moved([FRONT]), moved([SIDE])
+    assert (front != 0).any() and (side != 0).any()
+    torch.testing.assert_close(both, front + side, rtol=0, atol=64 * EPS)
+
+
+def test_pixels_of_one_view_do_not_change_those_of_another(make_scene, make_linear):
+    """Views share the values' example and nothing else: a raw step is either view's own."""
+    scene = make_scene(cameras=[[FRONT, SIDE]], backgrounds=torch.full((1, 3, 6, 6), 0.5))
+    problem = problem_of(scene, pixels=StepSettings(step="raw", step_size=0.1))
+    model = make_linear(5, bias=50.0)
+    values = attack(model, problem, towards(problem), steps=1).values
+    downhill = (model[1].weight[1] - model[1].weight[0]).detach()
+    torch.testing.assert_close(values, 0.1 * downhill.repeat(2)[None], rtol=0, atol=16 * EPS)
+
+
+def test_a_deep_optical_illusion_shows_each_view_another_class(make_scene, make_linear):
+    """One light per example makes two views of one thing two other things, in each way; it ends only when both are."""
+    targets = torch.tensor([[1, 2], [2, 1], [1, 1]])
+    scene = make_scene(cameras=[[FRONT, SIDE]] * 3, backgrounds=torch.full((3, 3, 6, 6), 0.5))
+    model, goal = make_linear(3, seed=6), Goal(torch.zeros_like(targets), targets)
+    problem = problem_of(scene, lighting=StepSettings())
+    result = attack(model, problem, goal, steps=30)
+    assert result.success.all() and not result.success_before.any()
+    assert torch.equal(model(result.images.flatten(0, 1)).argmax(1).view(3, 2), targets)
+    assert torch.equal(result.predicted, targets)
+    last = result.steps.argmax()
+    before = attack(model, problem, goal, steps=int(result.steps[last]) - 1)
+    assert not before.success[last] and (before.predicted[last] == targets[last]).sum() < 2
+
+
+def mixed(scene: Scene, **steps) -> AttackProblem:
+    """Light, shape, paint and pixels at once, with balls of their own."""
+    balls = {"lighting": ("linf", 0.02), "geometry": ("l2", 0.03), "albedo": ("l2", 0.1), "pixels": ("linf", 0.01)}
+    return problem_of(scene, **{name: StepSettings(*ball, **steps) for name, ball in balls.items()})
+
+
+def reaches(problem: AttackProblem, values: Tensor) -> list[Tensor]:
+    """The distance of each parameter from its start, as a fraction of its radius."""
+    return [
+        (part.norm(dim=1) if parameter.settings.norm == "l2" else part.abs().amax(1)) / parameter.settings.radius
+        for parameter, part in problem.by_parameter(values - problem.start)
+    ]
+
+
+def test_several_parameters_at_once_each_go_to_the_end_of_their_own_ball(make_scene, make_linear):
+    scene = make_scene()
+    problem = mixed(scene, step_size=0.3)
+    result = attack(make_linear(3, bias=50.0), problem, towards(problem), steps=4)
+    for reach in reaches(problem, result.values):
+        torch.testing.assert_close(reach, torch.ones(3, dtype=torch.float64), rtol=0, atol=1e-9)
+    torch.testing.assert_close(result.images, problem.render(result.values, EVERY), rtol=0, atol=0)
+    assert (result.cost < result.cost_before).all()
+
+
+def test_each_parameter_steps_and_is_projected_as_if_it_were_alone(make_scene):
+    """A unit step is one of each parameter. Examples may have starts of their own."""
+    problem, draws = mixed(make_scene()), torch.Generator().manual_seed(0)
+    for size, parameter in enumerate(problem.parameters, start=1):
+        parameter.settings, parameter.start = (
+            replace(parameter.settings, step_size=size),
+            parameter.start + torch.arange(3)[:, None],
+        )
+    values = problem.start + 0.1 * torch.randn(problem.start.shape, generator=draws)
+    parts, steps = problem.split(values), problem.split(problem.step(values))
+    chosen = torch.tensor([2, 0])
+    projected = problem.split(problem.project(values[chosen], chosen))
+    for parameter, part, step, nearest in zip(problem.parameters, parts, steps, projected, strict=True):
+        unit = part / part.norm(dim=1, keepdim=True)
+        torch.testing.assert_close(step, parameter.settings.step_size * unit, rtol=0, atol=16 * EPS)
+        assert torch.equal(nearest, parameter.settings.project(part[chosen], parameter.start[chosen]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_random_draws_keep_to_every_parameters_ball_and_repeat(make_scene, dtype):
+    problem = mixed(make_scene(dtype=dtype))
+    first, again = (problem.sample(torch.Generator().manual_seed(5)) for _ in range(2))
+    assert torch.equal(first, again) and first.dtype == dtype
+    assert not torch.equal(first, problem.sample(torch.Generator().manual_seed(6)))
+    for reach in reaches(problem, first):
+        # Of 36 values or more: the middle of the ball is rare.
+        assert (reach <= 1 + 1e-4).all() and (reach > 0.8).all() and len(reach.unique()) == 3
+    assert problem.render(first, EVERY).isfinite().all()
+
+
+def test_random_draws_go_as_far_as_an_attack_without_a_radius_went(make_scene):
+    scene, draws = make_scene(), torch.Generator().manual_seed(0)
+    problem = problem_of(scene, **free("lighting", "geometry"), albedo=StepSettings("l2", 0.1))
+    values = problem.start + torch.randn(problem.start.shape, generator=draws) * torch.tensor([[0.1], [0.0], [0.3]])
+    drawn = problem.sample_as_far(values, torch.Generator().manual_seed(1))
+    pairs = zip(problem.split(values - problem.start), problem.split(drawn - problem.start), strict=True)
+    for there, here in itertools.islice(pairs, 2):
+        torch.testing.assert_close(here.norm(dim=1), there.norm(dim=1), rtol=0, atol=64 * EPS)
+        assert there[0].norm() > 0 and (here[0] != there[0]).all() and not here[1].any()
+    assert (problem.split(drawn)[2].norm(dim=1) <= 0.1 + 1e-6).all()
+
+
+def test_an_attack_on_light_rasterizes_a_camera_once_and_one_on_shape_every_view_and_step(
+    make_scene, make_linear, rasterized
+):
+    model = make_linear(3, bias=50.0)
+    scene = make_scene(cameras=TWO_VIEWS)
+    problem = problem_of(scene, **free("lighting", "pixels"))
+    attack(model, problem, towards(problem), steps=9)
+    assert rasterized == [3]
+    problem = problem_of(scene, **free("lighting", "albedo"))
+    attack(model, problem, towards(problem), steps=9)
+    assert rasterized == [3] + [1] * 3
+    problem = problem_of(scene, **free("lighting", "geometry"))
+    result = attack(model, problem, towards(problem), steps=4)
+    assert result.steps.tolist() == [4, 4, 4] and rasterized == [3] + [1] * (3 + 5 * 6)
+
+
+def test_with_shortened_steps_no_shape_is_worse_than_the_one_before_when_rendered_anew(make_scene, make_linear):
+    """Steps of half the mesh's size; without shortening some raise the cost."""
+    scene, model = make_scene(), make_linear(3, bias=50.0)
+    problem = problem_of(scene, geometry=StepSettings(step_size=0.5))
+    costs = {}
+    for shorten in (False, True):
+        results = [attack(model, problem, towards(problem), steps, shorten=shorten) for steps in range(5)]
+        costs[shorten] = torch.stack([result.cost for result in results])
+        for result in results:
+            torch.testing.assert_close(result.images, problem.render(result.values, EVERY), rtol=0, atol=0)
+    assert (costs[False].diff(dim=0) > 0).any()
+    assert (costs[True].diff(dim=0) <= 0).all() and (costs[True][-1] < costs[True][0]).all()

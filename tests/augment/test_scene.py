@@ -10,10 +10,9 @@ import trimesh
 import renderer
 from augment import relighting
 from augment.attacks.attack import AttackSettings
-from augment.attacks.criteria import Goal
-from augment.attacks.descent import descend
+from augment.attacks.descent import Goal, descend
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import Albedo, AttackProblem, Geometry, Lighting
+from augment.attacks.parameters import PARAMETERS, AttackProblem
 from augment.backgrounds import load_backgrounds
 from augment.build import build_scene, count_views
 from augment.objects import ObjectSettings, SceneObject, load_object
@@ -120,11 +119,11 @@ def test_several_meshes_are_rendered_as_each_is_alone(several, examples, by):
     assert several.labels == ["cup", "plate", "cup", "plate"]
 
 
-@pytest.mark.parametrize("parameter", [Geometry, Albedo])
+@pytest.mark.parametrize("parameter", ["geometry", "albedo"])
 def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_only_its_values(several, parameter):
     """Unused values have no gradient and are never drawn; the L2 ball is that of the used values."""
-    own = parameter(several, StepSettings("l2", 0.2))
-    sizes = [len(item.mesh.vertices if parameter is Geometry else item.mesh.faces) for item in several.objects]
+    own = PARAMETERS[parameter](several, StepSettings("l2", 0.2))
+    sizes = [len(item.mesh.vertices if parameter == "geometry" else item.mesh.faces) for item in several.objects]
     everything, used = torch.arange(4), torch.tensor([3 * sizes[row.object] for row in several.examples])
     assert len(set(sizes)) == 2 and own.start.shape == (4, 3 * max(sizes))
     drawn = own.sample(torch.Generator().manual_seed(0), everything)
@@ -167,7 +166,7 @@ def test_a_new_basis_of_light_renders_and_is_attacked_within_its_norm_ball():
     expected = start[2].view(3, 1, 1).expand_as(image)
     torch.testing.assert_close(image, expected, rtol=0, atol=8 * torch.finfo(torch.float64).eps)
 
-    light = Lighting(scene, StepSettings("linf", 0.45, "sign", 0.15))
+    light = PARAMETERS["lighting"](scene, StepSettings("linf", 0.45, "sign", 0.15))
     problem, goal = AttackProblem(scene, [light]), Goal(torch.zeros(1, 1, dtype=torch.int64))
     dark = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 2)).double()
     torch.nn.init.constant_(dark[1].weight, 0)

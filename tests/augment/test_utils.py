@@ -8,8 +8,7 @@ from torch import nn
 
 from augment import utils
 from augment.attacks.attack import AttackSettings
-from augment.attacks.criteria import Goal
-from augment.attacks.descent import DescentResult, descend
+from augment.attacks.descent import DescentResult, Goal, descend
 from augment.build import build_scene
 from augment.utils import generator, require_memory, stream_seed
 from renderer.errors import InputError
@@ -49,7 +48,7 @@ class Shades:
 def attack(model: nn.Module, batch_size: int = 4, at_once: int = 10) -> DescentResult:
     goal = Goal(torch.zeros(10, 1, dtype=torch.int64))
     settings = AttackSettings(max_steps=6, margin=0.0, batch_size=batch_size)
-    return descend(model, Shades(), goal, settings, starts=[Shades.start.flip(0)], at_once=at_once)
+    return descend(model, Shades(), goal, settings, restarts=[Shades.start.flip(0)], at_once=at_once)
 
 
 def assert_same(actual: DescentResult, expected: DescentResult) -> None:

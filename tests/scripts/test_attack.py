@@ -31,20 +31,19 @@ ALWAYS = {
     "adversary.json", "mesh.glb", "light.json", "before_0.png", "after_0.png", "before.npy", "after.npy",
     "mitsuba/scene.xml", "mitsuba/part_0.ply", "mitsuba/light.exr",
 }  # fmt: skip
-KINDS = ["lighting", "skylight", "geometry", "albedo", "pixels", "lighting+geometry", "[albedo,pixels]"]
 
 
-@pytest.mark.parametrize("kinds", KINDS)
-def test_every_kind_and_several_at_once_run_and_write_what_they_promise(run, tmp_path, capsys, kinds):
-    assert run(f"attack={kinds}") == 0
+@pytest.mark.parametrize("parameters", ["skylight", "lighting+geometry", "[albedo,pixels]"])
+def test_one_parameter_and_several_at_once_run_and_write_what_they_promise(run, tmp_path, capsys, parameters):
+    assert run(f"attack={parameters}") == 0
     printed = capsys.readouterr()
-    names = kinds.strip("[]").replace(",", "+")
+    names = parameters.strip("[]").replace(",", "+")
     assert printed.err == "" and printed.out.startswith(f"solid:orange:0: {names} against run:")
     folder = tmp_path / "out" / "0_solid_orange_0"
     assert {path.name for path in folder.iterdir()} == {"attack.jsonl", "example_000.png", "example_000"}
     files = {str(path.relative_to(folder / "example_000")) for path in (folder / "example_000").rglob("*.*")}
     maps = {"light.hdr", "light.exr"} if example_is_physical(folder) else set()
-    assert files == ALWAYS | maps | ({"pixels.npy"} if "pixels" in kinds else set())
+    assert files == ALWAYS | maps | ({"pixels.npy"} if "pixels" in names else set())
     example, last = map(json.loads, (folder / "attack.jsonl").read_text().splitlines())
     assert list(example["largest_change"]) == names.split("+")
     assert all(example["largest_change"].values()) and ("shape" in example) == ("geometry" in names)
@@ -53,7 +52,7 @@ def test_every_kind_and_several_at_once_run_and_write_what_they_promise(run, tmp
     assert 0 <= last["checks"]["random_search"] <= 1 and last["checks"]["cost_fell"] == 1
     config = OmegaConf.load(tmp_path / "out" / "config.yaml")
     assert set(config.attack) >= set(names.split("+"))
-    assert config.command == shlex.join(["python", "scripts/attack.py", "out=out", *SMALL, f"attack={kinds}"])
+    assert config.command == shlex.join(["python", "scripts/attack.py", "out=out", *SMALL, f"attack={parameters}"])
 
 
 def example_is_physical(folder: Path) -> bool:
@@ -82,9 +81,11 @@ def test_an_adversary_is_rendered_again_and_gone_on_from(run, tmp_path, capsys):
     assert run(f"reload={first / 'example_000'}", "out=none") == 0
     lines = capsys.readouterr().out.splitlines()
     assert not (tmp_path / "none").exists() and len(lines) == 2
-    for view, (told, answer, confidence) in enumerate(zip(lines, line["predicted"], line["confidence"], strict=True)):
-        assert told.startswith(f"view {view}: orange is taken for {answer} ({confidence:.1%}); values differ ")
-        assert float(told.rpartition("by ")[2].partition("/255")[0]) <= 1
+    for view, (text, predicted, confidence) in enumerate(
+        zip(lines, line["predicted"], line["confidence"], strict=True)
+    ):
+        assert text.startswith(f"view {view}: orange is classified as {predicted} ({confidence:.1%}); values differ ")
+        assert float(text.rpartition("by ")[2].partition("/255")[0]) <= 1
     assert run(f"reload={first / 'example_000'}", "attack=lighting", "attack.checks=false", "out=again") == 0
     again = json.loads((tmp_path / "again" / "0_solid_orange_0" / "attack.jsonl").read_text())
     assert again["predicted_before"] == line["predicted"]

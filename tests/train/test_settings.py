@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from renderer.errors import InputError
-from train.attacks.settings import AttackExperimentSettings
+from train.attack import AttackExperimentSettings
 from train.run import load_data, prepare
 from train.settings import ExperimentSettings, as_override, compose, dotted, quoted, read_settings
 

@@ -70,7 +70,7 @@ def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, k
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=limit)
 
 
-def test_company_and_table_are_never_attacked_not_after_they_are_read_back_either(tmp_path):
+def test_props_and_table_are_never_attacked_not_after_they_are_read_back_either(tmp_path):
     """With textures of their own: the faces of a file are ordered by texture, and its vertices by place."""
     beside = replace(textured(), vertices=0.3 * solid("pear").vertices + np.array([0.7, 0.7, 0.3]))
     item = on_ground(with_props(SceneObject("orange", normalize(textured())), [beside]), (0.4, 0.3, 0.2))
@@ -97,10 +97,10 @@ def points(item: SceneObject, own: bool) -> set[tuple[float, ...]]:
     return set(map(tuple, item.mesh.vertices[used].astype(np.float32).tolist()))
 
 
-@pytest.mark.parametrize("perspective", [None, 50.0])
-def test_exposure_gain_background_and_place_are_kept(tmp_path, perspective):
+@pytest.mark.parametrize("fov", [None, 50.0])
+def test_exposure_albedo_scale_background_and_camera_are_kept(tmp_path, fov):
     """A row as training draws them: its own exposure, an image behind it, a camera that looks past the middle."""
-    scene = augment.build_scene([("solid:orange", "orange")], 16, rasterizer="numpy", fov=perspective)
+    scene = augment.build_scene([("solid:orange", "orange")], 16, rasterizer="numpy", fov=fov)
     backgrounds = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
     ((camera,),) = scene.cameras
     row = Example(0, (replace(camera, right=0.3, up=-0.2, width=3.0),), 1, exposure=1.7)
@@ -127,15 +127,12 @@ def described(**changes):
     return change
 
 
-def piped(name):
-    def change(folder: Path) -> None:
-        (folder / name).unlink()
-        os.mkfifo(folder / name)
-
-    return change
+def pipe(folder: Path) -> None:
+    (folder / "after.npy").unlink()
+    os.mkfifo(folder / "after.npy")
 
 
-def announced(folder):
+def announced(folder: Path) -> None:
     """10 TB by its header, which is all of the file."""
     with open(folder / "after.npy", "wb") as file:
         header = {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6, 3)}
@@ -145,37 +142,20 @@ def announced(folder):
 DAMAGES = {
     "no description": (lambda folder: (folder / DESCRIPTION).unlink(), "does not exist: give a folder that an attack"),
     "no JSON": (lambda folder: (folder / DESCRIPTION).write_text("{"), "does not describe an adversary"),
-    "a list": (lambda folder: (folder / DESCRIPTION).write_text("[]"), "does not describe an adversary"),
-    "a key less": (described(image={"size": 8, "color": 1}), "does not describe an adversary"),
-    "no size": (described(image={"size": 0}), "must be at least 1"),
+    "another key": (described(image={"size": 8, "color": 1}), "does not describe an adversary"),
     "another size": (described(image={"size": 9}), "has shape"),
-    "no cameras": (described(cameras=[]), "cameras: there are none"),
     "a flat camera": (described(cameras=[{"polar": 0, "azimuth": 0, "width": 0}]), "width=0"),
     "no faces of its own": (described(own_faces=0), "own_faces=0 must be at least 1"),
-    "more than all faces": (described(own_faces=10**6), "own_faces=1000000 must be at least 1 and at most"),
-    "no number of faces": (described(own_faces="all"), "does not describe an adversary"),
-    "a camera at the origin": (
-        described(cameras=[{"polar": 0, "azimuth": 0, "width": 2, "distance": 0}]),
-        "distance=0 must be at least",
-    ),
-    "no gain": (described(albedo_scale=0), "albedo_scale=0.0 must be at least"),
+    "black": (described(albedo_scale=0), "albedo_scale=0.0 must be at least"),
     "no mesh": (lambda folder: (folder / "mesh.glb").unlink(), "mesh.glb does not exist"),
-    "no light": (lambda folder: (folder / "light.json").unlink(), "light.json does not exist"),
-    "too bright a background": (described(background=3), "give gray values"),
-    "images cut short": (lambda folder: (folder / "after.npy").write_bytes(b"\\x93NUMPY"), "after.npy cannot be read"),
-    "no images": (lambda folder: (folder / "before.npy").unlink(), "before.npy does not exist"),
-    "a pipe for images": (piped("after.npy"), "after.npy is not a regular file"),
-    "a gain of 10⁴⁰⁰": (described(albedo_scale=10**400), "does not describe an adversary"),
-    "infinitely many faces": (described(own_faces=float("inf")), "does not describe an adversary"),
     "a list for a background": (described(background=[1]), r"adversary\.json: background=\[1\]: give gray values"),
     "a camera within the mesh": (
         described(cameras=[{"polar": 0, "azimuth": 0, "width": 2, "distance": 0.5}]),
         r"adversary\.json: the mesh reaches to a camera at distance 0\.5",
     ),
+    "a pipe for images": (pipe, "after.npy is not a regular file"),
     "images of 10 TB": (announced, "after.npy cannot be read"),
-    "images of text": (lambda folder: np.save(folder / "after.npy", np.array(["a"])), "after.npy cannot be read"),
     "images of 1e300": (lambda folder: np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300)), "cannot be read"),
-    "a size of NaN": (described(image={"size": float("nan")}), "size=nan must be"),
     "no such lamps": (described(local_lights=["lamps"]), "lamps.json does not exist"),
 }
 

@@ -1,7 +1,6 @@
 """Images as classifiers get them: of 8 bits, and under random transformations; success is by the former alone."""
 
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +12,6 @@ import augment
 from augment.attacks import eot
 from augment.attacks.eot import EOTSettings, ExpectationOverTransformations, Rounded, as_jpeg
 from augment.utils import generator
-from renderer.errors import InputError
-
-CLASSES = ("orange", "lime", "sky")
 
 
 class Means(nn.Module):
@@ -73,12 +69,6 @@ def test_each_change_does_what_it_says(monkeypatch):
     assert 0.05 < inner.abs().max() < 0.115  # a shift of a tenth of a ramp from 0 to 1, and a corner's turn
 
 
-def test_nothing_drawn_is_the_image_but_for_compression():
-    images = noise(1, 3, 16, 16)
-    _, (_, compressed) = transformed(images)
-    torch.testing.assert_close(compressed, as_jpeg(images, 100), rtol=0, atol=1e-6)
-
-
 def test_jpeg_is_pillows():
     images = noise(2, 3, 16, 16)
     for image, found in zip(images, as_jpeg(images, 60), strict=True):
@@ -88,77 +78,50 @@ def test_jpeg_is_pillows():
         assert torch.equal(found, expected)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("draws", -1), ("jitter", 2.0), ("noise", float("nan")), ("exposure", 99.0), ("jpeg", 0)]
-)
-def test_settings_out_of_range_are_refused(key, value):
-    with pytest.raises(InputError, match=f"^{key}={value} must be at least"):
-        EOTSettings(**{key: value})
-
-
 @pytest.mark.parametrize("rounded", [False, True])
-def test_adversaries_exceed_the_margin_and_without_one_stop_at_the_border(rounded):
+def test_adversaries_exceed_the_margin_and_without_one_stop_at_the_border(attacked, by_color, rounded):
     """By the classifier's own logits on the images, rounded where they are to be."""
-    classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES)
-    scene = augment.build_scene([("solid:orange", "orange")], 8, views=2, shared=True, rasterizer="numpy")
     for margin in (0.0, 2.0):
-        settings = augment.AttackSettings(
-            lighting=augment.StepSettings(step_size=0.02),
-            allow_negative=True,
-            max_steps=100,
-            margin=margin,
-            rounded=rounded,
-        )
-        done = augment.attack(classifier, scene, settings=settings)
-        images = (done.images * 255).round() / 255 if rounded else done.images
-        logits = 30 * images.mean((3, 4))
-        torch.testing.assert_close(done.logits, logits, rtol=0, atol=1e-4)
+        light = {"lighting": augment.StepSettings(step_size=0.02)}
+        result = attacked(light, {"views": 2, "shared": True}, max_steps=100, margin=margin, rounded=rounded)
+        images = (result.images * 255).round() / 255 if rounded else result.images
+        logits = by_color(images[0])[None]
+        torch.testing.assert_close(result.logits, logits, rtol=0, atol=1e-4)
         gap = (logits[..., 1:].amax(2) - logits[..., 0]).min()
-        assert done.success.all() and margin <= gap + 1e-4 < margin + 0.5
+        assert result.success.all() and margin <= gap + 1e-4 < margin + 0.5
 
 
-def test_what_fools_is_kept_where_the_margin_is_out_of_reach():
-    """Of those that fool, the one of the lowest cost; it fools though the last step may not."""
-    classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), 8, CLASSES)
-    scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")
-    light = augment.StepSettings(step_size=0.05)
-    settings = augment.AttackSettings(lighting=light, allow_negative=True, max_steps=60, margin=0.0)
-    first = augment.attack(classifier, scene, settings=settings)
-    done = augment.attack(classifier, scene, settings=replace(settings, margin=1e4))
-    assert done.success.all() and done.steps.item() == 60
-    assert done.descent.cost < first.descent.cost
+def test_a_success_is_kept_where_the_margin_is_out_of_reach(attacked):
+    first, last = (attacked("lighting", max_steps=60, margin=margin) for margin in (0.0, 1e4))
+    assert last.success.all() and last.steps.item() == 60
+    assert last.descent.cost < first.descent.cost
 
 
-def test_success_is_by_the_image_itself_and_not_by_the_mean_over_transformations():
+def test_success_is_by_the_image_itself_and_not_by_the_mean_over_transformations(attacked):
     """Of a classifier that errs on noisy images alone."""
 
     def smooth_or_rough(images: Tensor) -> Tensor:
         roughness = (images[..., 1:] - images[..., :-1]).abs().mean((1, 2, 3))
         return torch.stack([60 * (0.2 - roughness), 0 * roughness], dim=1)
 
-    scene = augment.build_scene([("solid:orange", "smooth")], 8, rasterizer="numpy")
     classifier = augment.Classifier(smooth_or_rough, 8, ("smooth", "rough"))
-    settings = augment.AttackSettings(
-        lighting=augment.StepSettings(), max_steps=0, eot=EOTSettings(draws=4, jitter=0.0, exposure=0.0, noise=0.5)
-    )
-    result = augment.attack(classifier, scene, settings=settings)
+    noise = EOTSettings(draws=4, jitter=0.0, exposure=0.0, noise=0.5)
+    result = attacked("lighting", classifier=classifier, max_steps=0, eot=noise)
     assert result.descent.cost < -1  # the mean log-probability of the right class
     assert not result.descent.success.any() and not result.success.any() and result.descent.predicted.item() == 0
 
 
-def test_expected_adversaries_survive_changes_that_others_do_not():
+def test_adversaries_of_eot_survive_transformations_that_others_do_not():
     """Noise and exposure of the classifier's own images, which are other ones than the attack's."""
-    classifier = augment.Classifier(lambda images: 100 * images.mean((2, 3)), 8, CLASSES)
+    classifier = augment.Classifier(lambda images: 100 * images.mean((2, 3)), 8, ("orange", "lime", "sky"))
     scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")
+    steps = {"lighting": augment.StepSettings(step_size=0.02), "max_steps": 100, "margin": 0.0, "rounded": False}
     survived = []
     for draws in (0, 8):
         changes = EOTSettings(draws=draws, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)
-        light = augment.StepSettings(step_size=0.02)
-        settings = augment.AttackSettings(
-            lighting=light, allow_negative=True, max_steps=100, margin=0.0, rounded=False, eot=changes
-        )
-        done = augment.attack(classifier, scene, settings=settings)
-        _, (_, *others) = transformed(done.images[:, 0], 1, draws=200, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)
+        settings = augment.AttackSettings(**steps, allow_negative=True, eot=changes)
+        result = augment.attack(classifier, scene, settings=settings)
+        _, (_, *others) = transformed(result.images[:, 0], 1, draws=200, jitter=0.2, exposure=0.5, noise=0.1, jpeg=60)
         means = torch.cat([image.mean((2, 3)) for image in others])
         survived.append((means.argmax(1) != 0).double().mean().item())
     assert survived[1] > survived[0] + 0.1

@@ -1,0 +1,129 @@
+"""The attack command: from its configuration to scenes, and its text."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from augment.attacks.attack import AttackResult
+from augment.attacks.evaluate import check
+from augment.classifiers import Classifier
+from renderer.camera import orbit_cameras
+from renderer.errors import InputError
+from renderer.light.presets import probe
+from train.attack import AttackExperimentSettings, attacks, format_attack, overrides
+from train.settings import compose, read_object, read_settings
+
+CLASSES = ("orange", "lime", "sky")
+
+
+def configured(*arguments: str) -> AttackExperimentSettings:
+    """The real configuration; arguments are further overrides."""
+    small = ["renderer.rasterizer=numpy", "renderer.cache=null", "renderer.shadows=false", "attack.max_steps=8"]
+    return read_settings(AttackExperimentSettings, compose("attack", [*small, "attack.margin=0", *arguments]))
+
+
+def by_color(classes: tuple[str, ...] = CLASSES) -> Classifier:
+    return Classifier(lambda images: 30 * images.mean((2, 3)), 8, classes, "by_color")
+
+
+def attacked(*arguments: str, classifier: Classifier | None = None) -> AttackResult:
+    ((_, _, result),) = attacks(configured(*arguments), classifier or by_color(), torch.device("cpu"))
+    return result
+
+
+def test_examples_are_each_view_before_all_backgrounds_at_equal_azimuths():
+    several = "scene.views=3", "scene.backgrounds=[0.2,0.6]", "scene.polar=90", "scene.azimuth=30"
+    result = attacked(*several, "attack.allow_negative=true", "attack.max_steps=0")
+    cameras = orbit_cameras(3, 2.0, math.pi / 2, math.pi / 6)
+    assert result.problem.scene.cameras == [(camera,) for camera in cameras for _ in range(2)]
+    assert result.images_before[:, 0, :, 0, 0].tolist() == [[pytest.approx(gray)] * 3 for gray in [0.2, 0.6] * 3]
+    assert torch.equal(result.problem.scene.lights, probe("grace").expand(6, -1, -1))
+
+
+def test_exposure_multiplies_the_light_and_albedo_scale_the_surface():
+    none = "attack.max_steps=0", "attack.force=true"
+    brighter, same = attacked(*none, "scene.exposure=1.5"), attacked(*none)
+    whiter = attacked(*none, "scene.meshes=[{mesh: 'solid:orange:0', albedo_scale: 1.5}]")
+    torch.testing.assert_close(brighter.images_before, whiter.images_before, rtol=0, atol=1e-6)
+    assert not torch.equal(brighter.images_before, same.images_before)
+
+
+@pytest.mark.parametrize("light", ["projector", "lamps"])
+def test_an_attacked_local_light_stands_in_the_scene_without_being_named(light):
+    alone, bare = (attacked(f"attack={name}", "attack.max_steps=1") for name in (light, "lighting"))
+    assert len(alone.problem.scene.lights[0]) > len(bare.problem.scene.lights[0])
+
+
+def test_a_class_whose_name_is_a_number_is_a_target():
+    result = attacked("target=7", "attack.max_steps=1", classifier=by_color(("orange", "7", "8")))
+    assert result.goal.target.tolist() == [[1]]
+
+
+def test_a_scene_is_searched_for_and_told_as_overrides():
+    """Of a classifier that knows oranges before light gray alone."""
+
+    def before_light(images: Tensor) -> Tensor:
+        score = 100 * (images[..., 0, 0].mean(1) - 0.8)
+        return torch.stack([score, -score], dim=1)
+
+    settings, classifier = configured(), Classifier(before_light, 8, ("orange", "other"))
+    ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
+    assert name == "solid:orange:0" and result.clean_correct.all()
+    assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
+    with pytest.raises(InputError, match=r"1 of 1 images of solid:orange:0 are .* before any attack"):
+        attacked("scene.search=0", classifier=classifier)
+
+
+# ------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["attack.lighting.norm=l3"], r"norm=l3: choose one of linf, l2"),
+        (["attack.restarts=2"], r"restarts draws from the norm-balls: set the radius of every parameter"),
+        (["attack.batch_size=0"], r"batch_size=0 must be at least 1"),
+        (["scene.polar=1e30"], r"polar=1e\+30 must be at least 0 and at most 180"),
+        (["scene.vertices=1000000000000"], r"vertices=1000000000000 must be at least 0 and at most"),
+        (["scene.meshes=[]"], r"meshes and backgrounds must not be empty"),
+        (["seed=-1"], r"seed=-1 must be at least 0"),
+        (["attack.max_steps=many"], r"attack.max_steps: Value 'many' of type 'str' could not be converted to Integer"),
+        (["label=mango"], r"classifier=by_color: 'mango' is not a class of the model"),
+        (["target=[lime]", "scene.views=2", "attack.shared=true"], r"names 1 classes for 2 views"),
+        (["target=[[lime]]"], r"target: give a class, least_likely, or a list of classes"),
+        (["scene.meshes=[{mesh: 'solid:orange:0', wight: 2}]"], r"scene.meshes\[0\]"),
+        (["scene.meshes=[{label: orange}]"], r"scene.meshes\[0\]"),
+        (["scene.meshes=[{mesh: a, props: [solid:cup]}]"], r"meshes\[0\].props: Invalid type"),
+        (["scene.meshes=[{mesh: a, props: [{mesh: b}]}]"], r"scene.meshes\[0\].*at is not set"),
+        (["scene.meshes=[{mesh: a, props: [{mesh: b, at: [1]}]}]"], r"at=\[1.0\] must be x and y"),
+        (["scene.light=moon"], r"light 'moon' is not known"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input_is_refused_in_one_sentence(arguments, message):
+    with pytest.raises(InputError, match=message) as refused:
+        attacked(*arguments)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_mesh_may_name_its_own_class():
+    item = read_object({"mesh": "solid:orange:0", "label": "lime", "albedo_scale": 2.0}, "orange", 0)
+    assert (item.mesh, item.label, item.albedo_scale) == ("solid:orange:0", "lime", 2.0)
+    assert read_object("solid:orange:0", "sky", 0).label == "sky"
+
+
+# ------------------------------------------------------------------------------------- text
+
+
+def test_success_is_printed_of_clean_correct_examples_and_of_their_views():
+    """No light makes both views' images green and blue, so that of two views with a target each one remains."""
+    result = attacked("target=[lime,sky]", "scene.views=2", "attack.shared=true", "attack.max_steps=20")
+    text = format_attack("mesh", result, None)
+    assert text.startswith("mesh: lighting against by_color: ") and len(text.splitlines()) == 1
+    assert f"{int(result.success)} of 1 [" in text and f", {int(result.success_in_views.sum())} of 2 views" in text
+    wrong = attacked("label=sky", "attack.force=true", "attack.max_steps=1", "scene.views=2")
+    assert "none of 2 examples was correct before" in format_attack("mesh", wrong, None)
+    checks = check(wrong)
+    assert (checks["success"], checks["random_search"], set(checks["success_by_steps"].values())) == (0, 0, {0})

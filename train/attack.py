@@ -1,0 +1,373 @@
+"""The attack command: its settings, which are the schema of conf/attack.yaml, the run over meshes, and its output."""
+
+import csv
+import json
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from augment.attacks.adversary import Adversary, reload
+from augment.attacks.attack import AttackResult, AttackSettings, attack, logits_of, predictions
+from augment.attacks.evaluate import check, require_transferable, success_by_radius, transfer, warnings
+from augment.attacks.files import LINES, require_renderers, save
+from augment.attacks.search import find_scene
+from augment.build import LampsSettings, ProjectorSettings, RendererSettings, SceneSettings, build_scene
+from augment.classifiers import Classifier
+from augment.objects import ObjectSettings, load_object, on_ground
+from augment.scene import Scene
+from augment.utils import generator
+from renderer.camera import MOST_VIEWS
+from renderer.errors import FACTOR, InputError, require_range
+from renderer.rasterizer import choose
+from train.device import choose_device
+from train.errors import writable_folder
+from train.networks import load_classifier
+from train.run_folder import sole_writer, write_config
+from train.settings import LARGEST_SEED, keyed, read_object
+from train.tables import aligned, format_fraction, fraction
+
+TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
+METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
+MOST_RADII = 100
+LAMP_POWER = 2.0  # of the default lamps whose positions alone are attacked
+
+# ------------------------------------------------------------------------------------- settings
+
+
+@dataclass
+class AttackCommandSettings(AttackSettings):
+    """shared: the views share what is attacked. force: go on where nothing is clean-correct. checks: `augment.check`.
+
+    radius_scales: of the radii to draw success against; see `augment.success_by_radius`.
+    verify: what renders the adversaries anew from their files, "reload" or "mitsuba" or both joined by +; or None.
+    """
+
+    shared: bool = False
+    force: bool = False
+    checks: bool = True
+    radius_scales: list[float] = field(default_factory=list)
+    verify: str | None = "reload"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_renderers(self.renderers)
+        require_range("radius_scales: their number", len(self.radius_scales), 0, MOST_RADII)
+        for scale in self.radius_scales:
+            require_range("radius_scales", scale, 1 / FACTOR, FACTOR)
+
+    @property
+    def renderers(self) -> list[str]:
+        """Those of `verify`."""
+        return self.verify.split("+") if self.verify else []
+
+
+@dataclass
+class AttackSceneSettings(SceneSettings):
+    """search: how many cameras to try where the classifier is wrong; see `augment.attacks.search`."""
+
+    views: int = 1
+    search: int = 10
+
+    def __post_init__(self) -> None:
+        if not self.meshes or not self.backgrounds:
+            raise InputError("meshes and backgrounds must not be empty: name one mesh and one background")
+        require_range("search", self.search, 0, MOST_VIEWS)
+        super().__post_init__()
+
+
+@dataclass
+class TransferSettings:
+    """Where else adversaries are shown. classifiers: as `classifier`, or {classifier, weights}. azimuths: degrees by
+    which cameras are turned. meshes: as those of a scene."""
+
+    classifiers: list[Any] = field(default_factory=list)
+    azimuths: list[float] = field(default_factory=list)
+    meshes: list[Any] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for angle in self.azimuths:
+            require_range("transfer.azimuths", angle, -360, 360)
+
+
+@dataclass
+class AttackExperimentSettings:
+    """One attack on one classifier. target: None, a class, least_likely, or a class per view. reload: an adversary's
+    folder, to render or to attack instead of the scene. A projector or lamps that are attacked stand in the scene,
+    where it names none with their defaults."""
+
+    classifier: str = "efficientnet_lite0"
+    weights: str | None = None
+    label: str = "orange"
+    target: Any = None
+    seed: int = 0
+    out: str = ""
+    reload: str | None = None
+    device: str = "auto"
+    attack: AttackCommandSettings = field(default_factory=AttackCommandSettings)
+    transfer: TransferSettings = field(default_factory=TransferSettings)
+    scene: AttackSceneSettings = field(default_factory=AttackSceneSettings)
+    renderer: RendererSettings = field(default_factory=lambda: RendererSettings(shadows=True))
+
+    def __post_init__(self) -> None:
+        require_range("seed", self.seed, 0, LARGEST_SEED)
+        names = self.target if isinstance(self.target, list) else [self.target]
+        if any(isinstance(name, dict | list) for name in names):
+            raise InputError("target: give a class, least_likely, or a list of classes, one per view")
+        if self.target is not None:
+            self.target = list(map(str, names)) if isinstance(self.target, list) else str(self.target)
+        require_transferable(self.attack.parameters, self.transfer.azimuths, self.transfer.meshes)
+        if self.attack.projector is not None and self.scene.projector is None:
+            self.scene.projector = ProjectorSettings()
+        if self.attack.lamps is not None and self.scene.lamps is None:
+            self.scene.lamps = LampsSettings()
+        if self.attack.positions is not None and self.scene.lamps is None:
+            self.scene.lamps = LampsSettings(start=LAMP_POWER)
+
+
+# ------------------------------------------------------------------------------------- the run
+
+
+def run(settings: AttackExperimentSettings) -> None:
+    """Attack each mesh or the reloaded adversary, write what came of it, and print a summary."""
+    adversary = reload(settings.reload) if settings.reload else None
+    if adversary is None:
+        settings.attack.require_parameters()
+    device = choose_device(settings.device)
+    classifier = load_classifier(settings.classifier, settings.weights).to(device)
+    if adversary is not None:
+        images = adversary.render(choose(settings.renderer.rasterizer)).to(device)
+        logits = logits_of(settings.attack.preprocessed_model(classifier), images[None], len(images))[0]
+        print(format_reloaded(adversary, images, logits, classifier.classes))
+        if not settings.attack.parameters:
+            return
+    others = load_others(settings, classifier, device)
+    out = writable_folder(settings.out, "out")
+    if any(out.glob(f"*/{LINES}")):  # whose examples would lie among the new ones
+        raise InputError(f"out={out} holds the adversaries of an earlier call: choose another folder, or remove it")
+    sweeps: dict[str, list[dict[str, Any]]] = {}
+    with sole_writer("out", out):
+        for index, (name, scene, result) in enumerate(attacks(settings, classifier, device, adversary)):
+            if scene != settings.scene:
+                print(f"{name} is misclassified in the scene as it is, but not with {overrides(scene, settings.scene)}")
+            checks = check(result) if settings.attack.checks else None
+            folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
+            lines = save(result, folder, checks, settings.attack.renderers)
+            print(format_attack(name, result, checks, lines))
+            print(f"images, adversaries and numbers: {folder}\n")
+            if others:
+                print(f"{write_transfers(transfer(result, **others), folder / TRANSFERS)}\n")
+            if settings.attack.radius_scales:
+                sweeps[folder.name] = success_by_radius(result, settings.attack.radius_scales)
+                print(f"{format_sweep(sweeps[folder.name])}\n")
+        if sweeps:
+            write_sweeps(sweeps, {name: steps.norm for name, steps in settings.attack.parameters.items()}, out)
+            print(f"success against radius: {out / TABLE} and {out / FIGURE}")
+        write_config(out, settings, command=shlex.join(["python", "scripts/attack.py", *sys.argv[1:]]))
+
+
+def attacks(
+    settings: AttackExperimentSettings, classifier: Classifier, device: torch.device, adversary: Adversary | None = None
+) -> Iterator[tuple[str, AttackSceneSettings, AttackResult]]:
+    """(name, settings of the attacked scene, result) of an adversary, around which norm-balls then are, or without one
+    of each mesh, in a scene that was searched for where `scene.search` says so.
+
+    InputError also where the classifier is wrong before the attack.
+    """
+    target, seed, force = settings.target, settings.seed, settings.attack.force
+    if adversary is not None:
+        if adversary.pixels is not None:
+            raise InputError(f"reload={settings.reload}: no attack goes on from changed pixels: leave attack= out")
+        scene = adversary.scene(choose(settings.renderer.rasterizer), device)
+        name = adversary.shown.name
+        yield name, settings.scene, attack(classifier, scene, target, settings.attack, seed=seed, force=True)
+        return
+    for index, item in enumerate(settings.scene.meshes):
+        named, chosen = read_object(item, settings.label, index), settings.scene
+        build = partial(build_attacked, named, settings, classifier.size, device)
+        if settings.scene.search and not force:
+            draws = generator(seed, named.mesh, "search")
+            chosen = find_scene(classifier, chosen, settings.attack, build, chosen.search, draws)
+        result = attack(classifier, build(chosen), target, settings.attack, seed=seed, force=force)
+        yield named.mesh, chosen, result
+
+
+def build_attacked(
+    item: ObjectSettings,
+    settings: AttackExperimentSettings,
+    size: int,
+    device: torch.device,
+    scene: AttackSceneSettings,
+) -> Scene:
+    """Views × backgrounds at `size` pixels per side, as an example each, or where views share what is attacked, an
+    example per background."""
+    with keyed("scene", vars(scene)):
+        shared, renderer = settings.attack.shared, settings.renderer
+        return build_scene([item], size, scene.views, shared=shared, scene=scene, renderer=renderer, device=device)
+
+
+def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:
+    """The arguments of `augment.transfer`; none where nothing is asked for. InputError: as the loaders, and where
+    a classifier lacks a class."""
+    others, scene = settings.transfer, settings.scene
+    named = [item if isinstance(item, dict) else {"classifier": item} for item in others.classifiers]
+    if unknown := next((key for item in named for key in item if key not in ("classifier", "weights")), None):
+        raise InputError(f"transfer.classifiers: {unknown} is not known: give names, or {{classifier, weights}}")
+    classifiers = [load_classifier(str(item.get("classifier")), item.get("weights")).to(device) for item in named]
+    items = [read_object(item, settings.label, index, "transfer.meshes") for index, item in enumerate(others.meshes)]
+    for classifier in classifiers:  # before anything is attacked
+        classifier.label(settings.label)
+    for item in items:
+        attacked.label(item.label)
+    objects = [on_ground(load_object(item, scene.vertices), scene.ground) for item in items]
+    arguments = {"classifiers": classifiers, "azimuths": others.azimuths, "objects": objects}
+    return {name: argument for name, argument in arguments.items() if argument}
+
+
+# ------------------------------------------------------------------------------------- text
+
+
+def overrides(scene: AttackSceneSettings, before: AttackSceneSettings) -> str:
+    """The arguments of the command line for a scene that was found in place of another."""
+    names = ("polar", "azimuth", "width", "fov", "backgrounds", "light", "exposure")
+    changed = (name for name in names if getattr(scene, name) != getattr(before, name))
+    return " ".join(shlex.quote(f"scene.{name}={getattr(scene, name)}") for name in changed)
+
+
+def format_attack(
+    name: str, result: AttackResult, checks: Mapping[str, Any] | None, lines: Sequence[Mapping[str, Any]] = ()
+) -> str:
+    """A paragraph on one mesh's attack, without a newline at the end. lines: as `augment.save` returns them."""
+    parameters = "+".join(parameter.name for parameter in result.problem.parameters)
+    steps = result.steps[result.success & ~result.success_before].double()
+    median = f"; median of {steps.median():.0f} steps" if len(steps) else ""
+    heading = f"{name}: {parameters} against {result.classifier.name}"
+    text = [f"{heading}: {_success(result)}{median} ({result.seconds['attack']:.1f} s)"]
+    if checks is not None:
+        by_steps = ", ".join(f"{rate:.0%} in {steps}" for steps, rate in checks["success_by_steps"].items())
+        text += [
+            "cost {cost_before:.2f} before and {cost:.2f} after; it fell in {cost_fell:.0%}; "
+            "first gradients that are zero: {zero_gradient:.0%}".format(**checks),
+            f"success of as many random draws: {checks['random_search']:.0%}; by longer attacks: {by_steps} steps",
+            *(f"warning: {warning}" for warning in warnings(checks)),
+        ]
+    adversaries = [line["versions"] for line in lines if line["success"] and line["clean_correct"]]
+    return "\n".join(text + [_survival(version, adversaries) for version in (adversaries or [{}])[0]])
+
+
+def _success(result: AttackResult) -> str:
+    """On clean-correct examples, and on their views, with the 95 % Wilson interval."""
+    clean = result.clean_correct
+    rate = fraction(int(result.success[clean].sum()), int(clean.sum()))
+    if not rate["n"]:
+        return f"none of {len(clean)} examples was correct before: there is nothing to count"
+    views, wrong = result.success_in_views[clean], int((~clean).sum())
+    text = f"success on {format_fraction(rate)} examples"
+    text += f", {int(views.sum())} of {views.numel()} views" if views.shape[1] > 1 else ""
+    return text + (f"; {wrong} wrong before, which do not count" if wrong else "")
+
+
+def _survival(version: str, adversaries: Sequence[Mapping[str, Any]]) -> str:
+    """How many of the adversaries succeed in another version, and how far its values are from theirs, of 255."""
+    numbers = [versions[version] for versions in adversaries]
+    largest = 255 * max(line["largest_difference"] for line in numbers)
+    mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
+    return (
+        f"{version}: {sum(line['success'] for line in numbers)} of {len(numbers)} still succeed; "
+        f"values differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
+    )
+
+
+def format_reloaded(adversary: Adversary, images: Tensor, logits: Tensor, classes: Sequence[str]) -> str:
+    """A line per view: the classification, by logits (V, C), of images (V, 3, size, size) that were rendered anew."""
+    largest = 255 * (images - adversary.images.to(images)).abs().flatten(1).amax(1)
+    rows = zip(*predictions(logits, classes).values(), largest.tolist(), strict=True)
+    return "\n".join(
+        f"view {view}: {adversary.shown.label} is classified as {predicted} ({confidence:.1%}); "
+        f"values differ from the saved image's by {difference:.3g}/255 at most"
+        for view, (predicted, confidence, difference) in enumerate(rows)
+    )
+
+
+# ------------------------------------------------------------------------------------- transfer and radius sweep
+
+
+def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
+    """Write a line for each result of `augment.transfer`, with the success rate; returns the rates as a table."""
+    lines, rows = [], []
+    for found in transfers:
+        clean = found["clean_correct"]
+        rate = fraction(sum(s for s, correct in zip(found["success"], clean, strict=True) if correct), sum(clean))
+        kind = next(iter(found))
+        lines.append(json.dumps({kind: found[kind], **rate, **found}) + "\n")
+        rows.append([f"{kind} {found[kind]}", f"{rate['n']} of {len(clean)}", format_fraction(rate)])
+    path.write_text("".join(lines), encoding="utf-8")
+    return aligned(["adversaries shown to", "correct before", "success"], rows)
+
+
+def format_sweep(sweep: Sequence[Mapping[str, Any]]) -> str:
+    """A result of `augment.success_by_radius`, a line per radius."""
+    if not len(sweep[0]["adversarial"]):
+        return "no example was correct before, so that there is no success against radius"
+    rows = []
+    for row in sweep:
+        radii = " + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())
+        rows.append([radii, *(format_fraction(_rate(row[method])) for method in METHODS)])
+    return aligned(["radius", *METHODS.values()], rows)
+
+
+def _rate(success: Tensor) -> dict[str, Any]:
+    return fraction(int(success.sum()), len(success))
+
+
+def write_sweeps(sweeps: Mapping[str, Sequence[Mapping[str, Any]]], norms: Mapping[str, str], out: Path) -> None:
+    """sweep.csv, a line per mesh (and all of several), method and radius, with the success rate on examples that were
+    correct before and its 95 % Wilson interval; and sweep.png, of the last mesh or of all. norms: by parameter."""
+    if len(sweeps) > 1:
+        pooled = [
+            {"radii": rows[0]["radii"], **{method: torch.cat([row[method] for row in rows]) for method in METHODS}}
+            for rows in zip(*sweeps.values(), strict=True)
+        ]
+        sweeps = {**sweeps, "all": pooled}
+    records = [
+        {"mesh": mesh, "method": method, **row["radii"], **_rate(row[method])}
+        for mesh, sweep in sweeps.items()
+        for method in METHODS
+        for row in sweep
+    ]
+    with open(out / TABLE, "w", encoding="utf-8", newline="") as file:
+        table = csv.DictWriter(file, list(records[0]))
+        table.writeheader()
+        table.writerows(records)
+    _draw([record for record in records if record["mesh"] == records[-1]["mesh"] and record["n"]], norms, out / FIGURE)
+
+
+def _draw(records: Sequence[Mapping[str, Any]], norms: Mapping[str, str], path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    from train.report.plots import COLORS, LINES, MARKERS
+
+    figure = Figure(figsize=(5, 3.8), layout="constrained")
+    axes, (first, *others) = figure.subplots(), norms
+    for (method, name), color, line, marker in zip(METHODS.items(), COLORS, LINES[1::-1], MARKERS, strict=False):
+        rows = [record for record in records if record["method"] == method]
+        radii, value, low, high = ([row[key] for row in rows] for key in (first, "value", "low", "high"))
+        axes.plot(radii, value, color=color, linestyle=line, marker=marker, label=name)
+        axes.fill_between(radii, low, high, color=color, alpha=0.15)
+    proportional = f"; {' and '.join(others)} in proportion" if others else ""
+    axes.set(xscale="log", ylim=(-0.03, 1.03), ylabel="success rate")
+    axes.set_xlabel(f"{norms[first]} radius of {first}{proportional}")
+    ticks = sorted({record[first] for record in records})
+    axes.set_xticks(ticks, [f"{radius:g}" for radius in ticks])
+    axes.set_xticks([], minor=True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if records:
+        axes.set_title(f"{records[0]['n']} examples correct before, 95 % intervals", fontsize=10)
+        figure.legend(loc="outside lower center", ncols=2, frameon=False)
+    figure.savefig(path, dpi=150)

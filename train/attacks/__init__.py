@@ -1,1 +1,0 @@
-"""Attacks on one image or several views of it, and what they leave behind: images, shapes, lights, numbers."""
