@@ -1,10 +1,9 @@
-"""What the benchmarks share: timing in turns, errors, and result files.
+"""Timing in turns, errors, and CSV files.
 
 Run a benchmark as a module from the repository's root: python -m benchmarks.renderer
 """
 
 import csv
-import json
 import os
 import platform
 import statistics
@@ -18,6 +17,7 @@ import torch
 from torch.utils.benchmark import Timer
 
 Key = TypeVar("Key")
+Row = dict[str, Any]
 BURST = 2e-3  # seconds: a shorter call is repeated for as long, since one call alone is within the clock's noise
 LIMIT = 20.0  # seconds of wall time, after which a comparison stops at the end of its third round
 
@@ -64,7 +64,7 @@ def machine(device: str = "cpu") -> str:
     return f"{gpu}{processor}, {torch.get_num_threads()} thread(s); {versions}; {load}"
 
 
-def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+def write_csv(path: Path, rows: Iterable[Row]) -> None:
     """All rows, floats to four significant digits, nothing for None; the columns are those of all rows, in order."""
     rows = [{name: f"{v:.4g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,10 +72,3 @@ def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
         writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-
-
-def append_json(path: Path, row: Mapping[str, Any]) -> None:
-    """One line of JSON at the end of a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")

@@ -5,34 +5,34 @@
 writes lights.csv in some minutes on one CPU thread. It needs the extra `shadows`, and for --mitsuba the extra `lab` and
 LLVM (apt install libllvm19). Its tables:
 
-cost          building an operator, and a light step (image, clamp, gradient), by light paths and size; errors are
-              against many rays and samples
-local lights  the same for lamps and projectors; errors are against 64² samples in float64
+cost          building an operator of one of 20 views, and a light step (image, clamp, gradient), by light paths and
+              size; errors are against many rays and samples
+local lights  the same for lamps and projectors; errors are against 64² samples
 mitsuba       difference to a path tracer; "noise" is its standard error, "direct" our error without light paths
 
 Errors are root mean squares of the difference over the reference's.
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
 import trimesh
 from torch import Tensor
 
-from benchmarks.common import machine, medians, relative_error, seconds, write_csv
-from renderer.camera import OrthographicCamera, orbit_cameras
+from benchmarks.common import Row, machine, medians, relative_error, seconds, write_csv
+from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.image import ImageSettings
-from renderer.io.mitsuba import DIFFERENTIABLE, SCENE, VARIANT, mitsuba, mitsuba_map, write_mitsuba_scene
-from renderer.light.basis import HARMONICS, SumBasis
+from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
+from renderer.light.basis import HARMONICS, Basis, SumBasis
 from renderer.light.environment import write_map
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light
@@ -44,111 +44,90 @@ from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import precomputed, rays
 
 CAMERA = OrthographicCamera(0.9, 0.6, 2.2)
-LIGHT_PATHS = {"direct": {}, "shadows": {"shadows": True}, "bounces:3": {"bounces": 3}}
 VIEWS, SEEDS = 20, 8  # SEEDS: Mitsuba's images, whose spread tells its noise
-CONVERGED, FINEST = (2**14, 2**13, 2**8), 16  # rays per pixel, patches and their rays; samples per side of a pixel
-REFERENCE = 64  # samples per side of a pixel for local lights
+RAYS, PATCHES, RAYS_OF_PATCH = 2**14, 2**13, 2**8  # per pixel; that light bounces between; per patch: converged
+SAMPLES = {"cost": (8, 16), "local lights": (2, 64)}  # per side of a pixel: of what is measured, and of its reference
+
+Case = tuple[Basis, Mapping[str, Any]]  # the light, and settings of the image
+DIRECT: Case = (HARMONICS, {})
+LIGHT_PATHS: dict[str, Case] = {
+    "direct": DIRECT,
+    "shadows": (HARMONICS, {"shadows": True}),
+    "bounces:3": (HARMONICS, {"bounces": 3}),
+}
 LAMPS = Lamps(((2.0, 2.0, 2.0), (-2.0, 2.0, 2.0), (2.0, -2.0, 2.0)))
-BASES = {
-    "harmonics": HARMONICS,
-    "3 lamps": LAMPS,
-    "3 discs": replace(LAMPS, radius=0.5),
-    "projector of 16²": Projector(16),
-    "projector of 32²": Projector(32),
-    "harmonics and projector of 16²": SumBasis((HARMONICS, Projector(16))),
+LOCAL_LIGHTS: dict[str, Case] = {
+    "harmonics": DIRECT,
+    "3 lamps": (LAMPS, {}),
+    "3 discs": (replace(LAMPS, radius=0.5), {}),
+    "projector of 16²": (Projector(16), {}),
+    "projector of 32²": (Projector(32), {}),
+    "harmonics and projector of 16²": (SumBasis((HARMONICS, Projector(16))), {}),
 }
 
-Row = dict[str, Any]
+
+def operators(
+    mesh: Mesh, size: int, samples: int, case: Case, cameras: Sequence[Camera] = (CAMERA,)
+) -> list[TransferOperator]:
+    basis, settings = case
+    return build_operators(mesh, cameras, ImageSettings(size, samples, **settings), choose("numpy"), basis=basis)
 
 
-def operator(
-    mesh: Mesh, size: int, transport: str = "direct", samples: int = 8, camera: OrthographicCamera = CAMERA, **more: Any
-) -> TransferOperator:
-    settings = ImageSettings(size, samples, **LIGHT_PATHS[transport])
-    return build_operators(mesh, [camera], settings, choose("numpy"), **more)[0]
+def converged(mesh: Mesh, size: int, samples: int, case: Case) -> TransferOperator:
+    """With many more samples and rays."""
+    with (
+        patch.object(rays, "DIRECTIONS", RAYS),
+        patch.multiple(precomputed, PATCHES=PATCHES, PATCH_DIRECTIONS=RAYS_OF_PATCH),
+    ):
+        return operators(mesh, size, samples, case)[0]
 
 
-def light_step(built: TransferOperator, light: Tensor) -> None:
-    """An image, clamped, and the gradient of a loss by the light, which requires it."""
-    torch.autograd.grad(built.image(light).square().sum(), light)
+# ---------------------------------------------------------------------------- costs
 
 
-def image_and_gradient(built: TransferOperator, light: Tensor) -> tuple[Tensor, Tensor]:
-    """The radiance (3, size²), and the gradient of Σ radiance × normal random numbers by the light."""
-    size = built.settings.size
-    weights = torch.randn(3, size**2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(light)
-    canvas = light.new_zeros(3, size**2).index_copy(1, built.pixels, built.radiance(light))
-    return canvas, built.light_gradient(weights[:, built.pixels])
-
-
-def errors(ours: tuple[Tensor, Tensor], reference: tuple[Tensor, Tensor]) -> Row:
-    image, gradient = map(relative_error, ours, reference)
-    return {"image_error": image, "gradient_error": gradient}
-
-
-def megabytes(built: TransferOperator) -> float:
-    return sum(tensor.nbytes for tensor in (built.transfer, *(built.sparse or ()))) / 1e6
-
-
-@contextmanager
-def quadrature(
-    directions: int, patches: int = precomputed.PATCHES, of_patch: int = precomputed.PATCH_DIRECTIONS
-) -> Iterator[None]:
-    """Other numbers of rays per pixel, of patches that light bounces between, and of rays per patch."""
-    before = rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS
-    try:
-        rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS = directions, patches, of_patch
-        yield
-    finally:
-        rays.DIRECTIONS, precomputed.PATCHES, precomputed.PATCH_DIRECTIONS = before
-
-
-# ---------------------------------------------------------------------------- tables
-
-
-def cost(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
-    light = load_light("grace").requires_grad_()
-    built = {(paths, size): operator(cup, size, paths) for paths in LIGHT_PATHS for size in sizes}
-    times = medians({key: partial(light_step, each, light) for key, each in built.items()}, rounds)
-    for (paths, size), each in built.items():
-        settings = ImageSettings(size, **LIGHT_PATHS[paths])
-        build = partial(build_operators, cup, orbit_cameras(VIEWS, 2.2), settings, choose("numpy"))
-        row: Row = {"table": "cost", "light": paths, "size": size, "step_ms": times[paths, size]}
-        row |= {"of_direct": times[paths, size] / times["direct", size], "megabytes": megabytes(each)}
+def costs(table: str, cases: Mapping[str, Case], cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
+    """A row per case and size; errors are at the first size."""
+    samples, finest = SAMPLES[table]
+    built = {(name, size): operators(cup, size, samples, cases[name])[0] for name, size in product(cases, sizes)}
+    bases = {name: basis for name, (basis, _) in cases.items()}
+    lights = {
+        name: load_light("grace") if bases[name] == HARMONICS else torch.rand(bases[name].size, 3) for name in bases
+    }
+    steps = {key: partial(light_step, operator, lights[key[0]].requires_grad_()) for key, operator in built.items()}
+    times = medians(steps, rounds)
+    for (name, size), operator in built.items():
+        row: Row = {"table": table, "light": name, "size": size, "step_ms": times[name, size]}
+        row["of_direct"] = times[name, size] / times[next(iter(cases)), size]
+        row["megabytes"] = sum(part.nbytes for part in (operator.transfer, *(operator.sparse or ()))) / 1e6
+        build = partial(operators, cup, size, samples, cases[name], orbit_cameras(VIEWS, 2.2))
         row["build_s"] = min(seconds(build) for _ in range(2)) / VIEWS
         if size == sizes[0]:
-            with quadrature(*CONVERGED):
-                exact = image_and_gradient(operator(cup, size, paths, FINEST), light.detach())
-            row |= errors(image_and_gradient(each, light.detach()), exact)
+            light, exact = lights[name].detach(), converged(cup, size, finest, cases[name])
+            pairs = zip(image_and_gradient(operator, light), image_and_gradient(exact, light), strict=True)
+            row["image_error"], row["gradient_error"] = (relative_error(*pair) for pair in pairs)
         yield row
 
 
-def local_lights(cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
-    keys = list(product(BASES, sizes))
-    built = {(name, size): operator(cup, size, samples=2, basis=BASES[name]) for name, size in keys}
-    lights = {name: torch.rand(basis.size, 3).requires_grad_() for name, basis in BASES.items()}
-    times = medians({key: partial(light_step, built[key], lights[key[0]]) for key in keys}, rounds)
-    for name, size in keys:
-        row: Row = {"table": "local lights", "light": name, "size": size, "step_ms": times[name, size]}
-        row |= {"of_direct": times[name, size] / times["harmonics", size], "megabytes": megabytes(built[name, size])}
-        row["build_s"] = seconds(partial(operator, cup, size, samples=2, basis=BASES[name]))
-        if size == sizes[0]:
-            light = lights[name].detach()
-            fine = operator(cup, size, samples=REFERENCE, basis=BASES[name], dtype=torch.float64)
-            row |= errors(image_and_gradient(built[name, size], light), image_and_gradient(fine, light.double()))
-        yield row
+def light_step(operator: TransferOperator, light: Tensor) -> None:
+    """An image, clamped, and the gradient of a loss by the light, which requires it."""
+    torch.autograd.grad(operator.image(light).square().sum(), light)
+
+
+def image_and_gradient(operator: TransferOperator, light: Tensor) -> tuple[Tensor, Tensor]:
+    """The radiance (3, size²), and the gradient of Σ radiance × normal random numbers by the light."""
+    size = operator.settings.size
+    weights = torch.randn(3, size**2, generator=torch.Generator().manual_seed(0))
+    image = light.new_zeros(3, size**2).index_copy(1, operator.pixels, operator.radiance(light))
+    return image, operator.light_gradient(weights[:, operator.pixels])
 
 
 # ---------------------------------------------------------------------------- Mitsuba
 
 
 def hard_meshes() -> dict[str, Mesh]:
-    shell, ring_shape = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.torus(0.45, 0.45)
-    lower = shell.vertices[shell.faces].mean(axis=1)[:, 2] < 0
-    ball, dents = (
-        Mesh.plain(shell.vertices, shell.faces),
-        np.random.default_rng(0).uniform(0.6, 1, (len(shell.vertices), 1)),
-    )
+    shell, torus = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.torus(0.45, 0.45)
+    lower, dents = shell.triangles_center[:, 2] < 0, np.random.default_rng(0).uniform(0.6, 1, (len(shell.vertices), 1))
+    ball = Mesh.plain(shell.vertices, shell.faces)
     plate = Mesh.plain([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]], [[0, 1, 2], [0, 2, 3]], (0.2, 0.6, 0.9))
     box, heights = trimesh.creation.box((0.8, 0.8, 0.02)), 0.05 * np.arange(5)
     boards = [Mesh.plain(box.vertices + np.array([0, 0, height]), box.faces, (0.9, 0.6, 0.4)) for height in heights]
@@ -158,7 +137,7 @@ def hard_meshes() -> dict[str, Mesh]:
         "concave: solid:table": normalize(solid("table", 0)),
         "rugged: a dented ball": replace(ball, vertices=shell.vertices * dents),
         "open: half a ball": Mesh.plain(shell.vertices, shell.faces[lower], (0.8, 0.7, 0.5)),
-        "self-touching: a ring without a hole": Mesh.plain(ring_shape.vertices, ring_shape.faces, (0.3, 0.8, 0.5)),
+        "self-touching: a ring without a hole": Mesh.plain(torus.vertices, torus.faces, (0.3, 0.8, 0.5)),
         "touching parts: a ball on a plate": concatenate([ball, plate]),
         "thin: boards 0.03 apart": concatenate(boards),
     }
@@ -170,77 +149,31 @@ def beside_mitsuba(size: int) -> Iterator[Row]:
 
 
 def differences(mesh: Mesh, size: int, paths: str) -> Row:
-    """Of the image, over its brightest value and inside the outline; and of the gradient by the light of its sum with
-    random weights there."""
-    with quadrature(CONVERGED[0], 2**15, CONVERGED[2]):
-        converged = operator(mesh, size, paths, FINEST)
-    ours = {"": operator(mesh, size, paths), "_converged": converged, "_direct": operator(mesh, size)}
-    theirs, noise = mitsuba_image(mesh, size, paths)
-    inside, brightest, row = theirs[3] > 0.999, theirs[:3].max(), {}
-    upstream = inside * torch.rand(3, size**2, generator=torch.Generator().manual_seed(0))
-    slope, slope_noise = mitsuba_gradient(mesh, size, paths, upstream)
-    for name, built in ours.items():
-        canvas = torch.zeros(3, size**2, dtype=torch.float64)
-        canvas[:, built.pixels] = built.radiance(st_peters()[0].detach().float()).double()
-        off = (canvas - theirs[:3])[:, inside]
-        row[f"image_error{name}"] = float(off.square().mean().sqrt() / brightest)
-        row[f"gradient_error{name}"] = relative_error(built.light_gradient(upstream[:, built.pixels]), slope)
-    row["image_noise"] = float(noise[:3, inside].square().mean().sqrt() / brightest)
-    return row | {"gradient_noise": float(slope_noise.norm() / slope.norm())}
+    """Of the image, over its brightest value and inside the outline."""
+    light, (samples, finest) = load_light("st_peters"), SAMPLES["cost"]  # a probe that is positive all around
+    ours = {
+        "image_error": operators(mesh, size, samples, LIGHT_PATHS[paths])[0],
+        "image_error_converged": converged(mesh, size, finest, LIGHT_PATHS[paths]),
+        "image_error_direct": operators(mesh, size, samples, DIRECT)[0],
+    }
+    image, coverage, noise = mitsuba_image(mesh, size, paths, light)
+    inside, row = coverage > 0.999, {}
+    for name, operator in ours.items():
+        canvas = torch.zeros(3, size**2).index_copy(1, operator.pixels, operator.radiance(light))
+        row[name] = float((canvas - image)[:, inside].square().mean().sqrt() / image.max())
+    return row | {"image_noise": float(noise[:, inside].square().mean().sqrt() / image.max())}
 
 
-@cache
-def st_peters() -> tuple[Tensor, Tensor]:
-    """Coefficients of a probe that is positive all around, and its map's texels with their graph."""
-    coefficients = load_light("st_peters").double().requires_grad_()
-    return coefficients, mitsuba_map(coefficients, 512)
-
-
-@contextmanager
-def mitsuba_scene(mesh: Mesh, size: int, paths: str, variant: str) -> Iterator[tuple[Any, Any]]:
-    """(the module, the scene)"""
-    with TemporaryDirectory() as folder, mitsuba(variant) as module:
-        settings = ImageSettings(size, **LIGHT_PATHS[paths])
+def mitsuba_image(mesh: Mesh, size: int, paths: str, light: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The mean of SEEDS images (3, size²), the coverage (size²,), and the standard error of the mean (3, size²)."""
+    settings = ImageSettings(size, **LIGHT_PATHS[paths][1])
+    with TemporaryDirectory() as folder, mitsuba() as module:
         write_mitsuba_scene(Path(folder), mesh, 1.0, [CAMERA], settings, "light.exr")
-        write_map(Path(folder, "light.exr"), st_peters()[1].detach())
-        yield module, module.load_file(str(Path(folder, SCENE)))
-
-
-def mitsuba_image(mesh: Mesh, size: int, paths: str) -> tuple[Tensor, Tensor]:
-    """The mean (4, size²) of radiance and coverage over SEEDS images, and its standard error."""
-    with mitsuba_scene(mesh, size, paths, VARIANT) as (module, scene):
-        images = np.stack([np.array(module.render(scene, seed=seed)) for seed in range(SEEDS)])
-    return mean_and_noise(torch.from_numpy(images).double().permute(0, 3, 1, 2).flatten(2))
-
-
-def mitsuba_gradient(mesh: Mesh, size: int, paths: str, upstream: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean (49, 3) over SEEDS of the gradient by the light of Σ image × upstream (3, size²), and its noise.
-
-    Mitsuba differentiates its integrator in reverse mode by the map's texels, which are linear in the light.
-    """
-    import drjit
-
-    (coefficients, texels), found = st_peters(), []
-    weights = torch.zeros(size**2, 4)
-    weights[:, :3] = upstream.T
-    with mitsuba_scene(mesh, size, paths, DIFFERENTIABLE) as (module, scene):
-        parameters = module.traverse(scene)
-        [name] = [name for name, _ in parameters if name.endswith(".data")]
-        for seed in range(SEEDS):
-            data = drjit.detach(module.TensorXf(parameters[name]))
-            drjit.enable_grad(data)
-            parameters[name] = data
-            parameters.update()
-            above = module.TensorXf(weights.view(size, size, 4).numpy())
-            drjit.backward(drjit.sum(module.render(scene, parameters, seed=seed) * above, axis=None))
-            by_texel = torch.from_numpy(np.array(drjit.grad(data)))[:, 1:-1]  # Mitsuba repeats a column on either side
-            found += torch.autograd.grad(texels, coefficients, by_texel.to(texels), retain_graph=True)
-    return mean_and_noise(torch.stack(found))
-
-
-def mean_and_noise(draws: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean of (SEEDS, ...) draws and its standard error."""
-    return draws.mean(0), draws.std(0) / SEEDS**0.5
+        write_map(Path(folder, "light.exr"), mitsuba_map(light, 512))
+        scene = module.load_file(str(Path(folder, SCENE)))
+        renders = np.stack([np.array(module.render(scene, seed=seed)) for seed in range(SEEDS)])
+    draws = torch.from_numpy(renders).permute(0, 3, 1, 2).flatten(2)
+    return draws.mean(0)[:3], draws.mean(0)[3], draws.std(0)[:3] / SEEDS**0.5
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -254,7 +187,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     print(machine())
     cup, sizes = subdivide(normalize(solid("cup", 0)), options.vertices), options.sizes
-    tables = [cost(cup, sizes, options.rounds), local_lights(cup, sizes, options.rounds)]
+    tables = [costs("cost", LIGHT_PATHS, cup, sizes, options.rounds)]
+    tables += [costs("local lights", LOCAL_LIGHTS, cup, sizes, options.rounds)]
     tables += [beside_mitsuba(sizes[0])] if options.mitsuba else []
     rows = []
     for row in chain.from_iterable(tables):

@@ -1,22 +1,25 @@
-"""The scene of the renderer's benchmark: an ellipsoid under a probe and a sun, and the image it converges to."""
+"""The scene of the renderer's benchmark: an ellipsoid under a probe and a sun.
+
+`Converged` is the image and the gradients that all methods converge to; `mitsuba_steps` renders the scene with Mitsuba.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 from torch import Tensor
 
-from benchmarks.common import relative_error
+from benchmarks.common import Row, relative_error
 from renderer import reference
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings
+from renderer.io.mitsuba import DIFFERENTIABLE, environment, integrator, load, mitsuba, mitsuba_map, sensor_of, shape
 from renderer.light.basis import Harmonics
 from renderer.light.harmonics import basis
 from renderer.light.presets import probe
@@ -28,11 +31,13 @@ SAMPLES = ImageSettings().samples  # the renderer's default, per side of a pixel
 ALBEDO = (0.8, 0.5, 0.3)
 CAMERA = OrthographicCamera(1.0, 0.5, 2.4)
 SUN_FROM = torch.tensor([0.48, -0.6, 0.64], dtype=torch.float64)
-SUN = torch.tensor([0.9, 0.8, 0.6], dtype=torch.float64)  # irradiance head on
-PROBE = probe("grace")[:9].double() / 2
+SUN = torch.tensor([0.45, 0.4, 0.3], dtype=torch.float64)  # irradiance head on: no pixel is clamped
+PROBE = probe("grace")[:9].double() / 4
+SHIFTS, FINEST, RESOLUTION = 4, 16, 2048  # of `Converged`: rasterizations per side; samples of a pixel, of an image
+MITSUBA_SAMPLES, MITSUBA_ROWS = 4, 32  # rays per side of a pixel; rows of the map, which dims band 2 by 0.5 %
 
-Row = dict[str, Any]
-Shading = Callable[[Fragments, Tensor, Tensor, Tensor], Tensor]
+Result = tuple[Tensor, Tensor, Tensor]  # covered pixels (P,), their radiance (3, P), and the gradient
+Step = Callable[[], Result]
 
 
 def ellipsoid(subdivisions: int) -> Mesh:
@@ -78,95 +83,111 @@ class View:
     def rasterized(self, samples: int, vertices: Tensor) -> tuple[Fragments, Tensor, Tensor]:
         """(fragments, albedo (S, 3), coverage (1, P)) of the mesh with its vertices there."""
         positions, settings = vertices.detach().double().cpu().numpy(), ImageSettings(self.size, samples)
-        [found] = build_fragments(positions, self.mesh.faces, [CAMERA], settings, self.rasterizer, self.mesh.closed)
-        fragments = found.to(self.device)
+        views = build_fragments(positions, self.mesh.faces, [CAMERA], settings, self.rasterizer, self.mesh.closed)
+        fragments = views[0].to(self.device)
         albedo = surface_albedo(self.mesh, fragments, "linear").to(vertices.dtype)
         return fragments, albedo, fragments.coverage.to(vertices.dtype)[None]
 
     def vertices(self, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.from_numpy(self.mesh.vertices).to(self.device, dtype)
 
-    def canvas(self, values: Tensor, pixels: Tensor) -> Tensor:
-        """(3, size, size) with values (3, P) where the mesh is, else 0."""
-        return values.new_zeros(3, self.size**2).index_copy(1, pixels, values).unflatten(1, (self.size, self.size))
-
     @cached_property
     def image_gradient(self) -> Tensor:
-        """(3, size, size) float64 normal numbers: the gradient of a loss by the image."""
+        """(3, size²) float64 normal numbers: the gradient of a loss by the image."""
         generator = torch.Generator().manual_seed(0)
-        return torch.randn(3, self.size, self.size, dtype=torch.float64, generator=generator).to(self.device)
+        return torch.randn(3, self.size**2, dtype=torch.float64, generator=generator).to(self.device)
 
     def upstream(self, pixels: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """(3, P) the image's gradient at the covered pixels."""
-        return self.image_gradient.flatten(1)[:, pixels].to(dtype)
-
-
-# ---------------------------------------------------------------------------- reference
+        return self.image_gradient[:, pixels].to(dtype)
 
 
 class Converged:
-    """Image and gradients of a view to which all methods converge: float64, plain autograd, up to 64² samples."""
+    """Image (3, size²) and gradients that all methods converge to: float64, plain autograd, up to 64² samples.
 
-    shifts, finest, resolution = 4, 16, 2048  # rasterizations per side; samples of a pixel and of an image in each
+    Visibility is the view's. The mesh is closed, so every visible face shows its front.
+    """
 
     def __init__(self, view: View, irradiance: Callable[[Tensor], Tensor] = whole_irradiance):
-        self._view = view
-        self._pixel, self._face, self._weight = self._coverage()
-        gradient = view.image_gradient.cpu()
+        pixel, face, weight = covered_fractions(view)
+        visible, index = face.unique(return_inverse=True)
+        vertices = view.vertices(torch.float64).cpu().requires_grad_()
         light = torch.zeros(21**2, 3, dtype=torch.float64, requires_grad=True)
-        vertices = torch.from_numpy(view.mesh.vertices).requires_grad_()
-        image = self.render(lambda normals: reference.irradiance(normals, light), vertices.detach())
-        [self.by_light] = torch.autograd.grad((image * gradient).sum(), light)
-        image = self.render(irradiance, vertices)
-        [self.by_vertices] = torch.autograd.grad((image * gradient).sum(), vertices)
-        self.image = image.detach()
+        normals = reference.unit(reference.doubled_area_vectors(vertices[torch.from_numpy(view.mesh.faces)[visible]]))
 
-    def _coverage(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(pixel, face, weight): the share of each pixel that each face covers, in several shifted rasterizations."""
-        size, faces, closed = self._view.size, self._view.mesh.faces, self._view.mesh.closed
-        samples = min(self.finest, max(1, self.resolution // size))
-        keys = []
-        for shift in product(range(self.shifts), repeat=2):
-            points = CAMERA.project(self._view.mesh.vertices)
-            points[:, :2] += 2 * ((np.array(shift) + 0.5) / self.shifts - 0.5) / (size * samples)
-            ids = self._view.rasterizer.rasterize(points[None], faces, size * samples, closed=closed)[0]
-            row, column = np.nonzero(ids >= 0)
-            keys.append((row // samples * size + column // samples) * len(faces) + ids[row, column])
-        key, count = np.unique(np.concatenate(keys), return_counts=True)
-        weight = count / (self.shifts * samples) ** 2
-        return torch.from_numpy(key // len(faces)), torch.from_numpy(key % len(faces)), torch.from_numpy(weight)
+        def image(at_faces: Tensor) -> Tensor:
+            shade = (at_faces * torch.tensor(ALBEDO, dtype=torch.float64))[index] * weight[:, None]
+            return torch.zeros(view.size**2, 3, dtype=torch.float64).index_add(0, pixel, shade).T
 
-    def render(self, irradiance: Callable[[Tensor], Tensor], vertices: Tensor) -> Tensor:
-        """(3, size, size) radiance; visibility is the view's. The mesh is closed: every visible face faces us."""
-        faces, index = self._face.unique(return_inverse=True)
-        corners = vertices[torch.from_numpy(self._view.mesh.faces)[faces]]
-        normals = reference.unit(reference.doubled_area_vectors(corners))
-        shade = (irradiance(normals) * torch.tensor(ALBEDO, dtype=torch.float64))[index] * self._weight[:, None]
-        size = self._view.size
-        return (
-            torch.zeros(size**2, 3, dtype=torch.float64).index_add(0, self._pixel, shade).T.unflatten(1, (size, size))
-        )
+        lit, by_any_light = image(irradiance(normals)), image(reference.irradiance(normals.detach(), light))
+        upstream, self.image = view.image_gradient.cpu(), lit.detach()
+        [self.by_light] = torch.autograd.grad((by_any_light * upstream).sum(), light)
+        [self.by_vertices] = torch.autograd.grad((lit * upstream).sum(), vertices)
 
-    def errors(self, image: Tensor, gradient: Tensor, expected: Tensor) -> Row:
-        return {
-            "image_error": relative_error(image, self.image),
-            "gradient_error": relative_error(gradient, expected),
-        }
+    def errors(self, step: Step, gradient: Tensor) -> Row:
+        """gradient: by_light, which is compared on the coefficients that the step's light has, or by_vertices."""
+        pixels, radiance, result = step()
+        image = radiance.new_zeros(self.image.shape).index_copy(1, pixels, radiance)
+        errors = relative_error(image, self.image), relative_error(result, gradient[: len(result)])
+        return dict(zip(("image_error", "gradient_error"), errors, strict=True))
 
-    def of_operator(self, operator: TransferOperator, light: Tensor) -> Row:
-        """The gradient is compared on the coefficients that the light has."""
-        variable = light.clone().requires_grad_()
-        radiance = operator.radiance(variable)
-        upstream = self._view.upstream(operator.pixels, light.dtype)
-        [gradient] = torch.autograd.grad((radiance * upstream).sum(), variable)
-        image = self._view.canvas(radiance.detach(), operator.pixels)
-        return self.errors(image, gradient, self.by_light[: len(light)])
 
-    def of_shading(self, samples: int, light: Tensor, shade: Shading) -> Row:
-        variable = self._view.vertices(light.dtype).requires_grad_()
-        fragments, albedo, _ = self._view.rasterized(samples, variable)
-        radiance = shade(fragments, variable, light, albedo)
-        [gradient] = torch.autograd.grad(
-            (radiance * self._view.upstream(fragments.pixels, light.dtype)).sum(), variable
-        )
-        return self.errors(self._view.canvas(radiance.detach(), fragments.pixels), gradient, self.by_vertices)
+def covered_fractions(view: View) -> tuple[Tensor, Tensor, Tensor]:
+    """(pixel, face, the fraction of the pixel that the face covers), in several shifted rasterizations."""
+    size, faces = view.size, view.mesh.faces
+    samples = min(FINEST, max(1, RESOLUTION // size))
+    keys = []
+    for shift in product(range(SHIFTS), repeat=2):
+        points = CAMERA.project(view.mesh.vertices)
+        points[:, :2] += 2 * ((np.array(shift) + 0.5) / SHIFTS - 0.5) / (size * samples)
+        ids = view.rasterizer.rasterize(points[None], faces, size * samples, closed=view.mesh.closed)[0]
+        row, column = np.nonzero(ids >= 0)
+        keys.append((row // samples * size + column // samples) * len(faces) + ids[row, column])
+    key, count = np.unique(np.concatenate(keys), return_counts=True)
+    weight = count / (SHIFTS * samples) ** 2
+    return torch.from_numpy(key // len(faces)), torch.from_numpy(key % len(faces)), torch.from_numpy(weight)
+
+
+def mitsuba_steps(view: View) -> tuple[Step, Step]:
+    """The gradient by the light (49, 3), and by the vertices (V, 3) through the shading alone, by Mitsuba 3 on one
+    thread, as its users would set it up.
+
+    Each camera ray draws one direction by the cosine and looks up an environment map there: Mitsuba's cheapest way, and
+    the least noisy for a smooth light. Automatic differentiation holds outlines fixed; moved vertices rebuild the ray
+    tracer's tree. InputError: not installed, or no LLVM library.
+    """
+    with mitsuba(DIFFERENTIABLE) as module:
+        import drjit
+    drjit.set_thread_count(1)
+    light, size = coefficients(DEGREE).requires_grad_(), view.size
+    texels = mitsuba_map(light, MITSUBA_ROWS).float()
+    repeated = torch.cat([texels[:, -1:], texels, texels[:, :1]], dim=1)  # as Mitsuba holds the map
+    surface = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ALBEDO)}}
+    scene = {
+        "type": "scene",
+        "integrator": integrator(bounces=0),
+        "light": environment({"bitmap": texels.detach().numpy()}),
+        "sensor": sensor_of(CAMERA, size, "rgb"),
+        "mesh": shape(module, surface, view.mesh.vertices, view.mesh.faces),
+    }
+    scene = load(module, scene)
+    parameters = module.traverse(scene)
+    upstream = module.TensorXf(np.pi * view.image_gradient.T.cpu().float().unflatten(0, (size, size)).numpy())
+    values = {"light.data": module.TensorXf(repeated.detach().numpy())}
+    values["mesh.vertex_positions"] = module.Float(view.mesh.vertices.astype(np.float32).ravel())
+
+    def step(name: str) -> Result:
+        value = drjit.detach(values[name])
+        drjit.enable_grad(value)
+        parameters[name] = value
+        parameters.update()
+        image = module.render(scene, parameters, spp=MITSUBA_SAMPLES**2)
+        drjit.backward(drjit.sum(image * upstream, axis=None))
+        gradient = torch.from_numpy(np.array(drjit.grad(value)))  # waits for the result
+        drjit.disable_grad(parameters[name])
+        if name == "light.data":
+            [gradient] = torch.autograd.grad(repeated, light, gradient, retain_graph=True)
+        radiance = np.pi * np.array(drjit.detach(image)).reshape(-1, 3).T
+        return torch.arange(size**2), torch.from_numpy(radiance), gradient.view(-1, 3)
+
+    return partial(step, "light.data"), partial(step, "mesh.vertex_positions")

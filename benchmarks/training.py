@@ -10,7 +10,6 @@ of renders, image sizes and meshes, each in a process of its own, whose peak mem
 """
 
 import argparse
-import itertools
 import json
 import multiprocessing
 import os
@@ -22,7 +21,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,7 +32,7 @@ from torchvision import transforms
 
 from augment import AugmentationService, AugmentationSettings
 from augment.service import TrainingAttackSettings
-from benchmarks.common import machine, write_csv
+from benchmarks.common import Row, machine, write_csv
 from train import checkpoint
 from train.networks import Dropout, WideResNet
 
@@ -42,46 +40,29 @@ EPOCH_IMAGES = 45_000  # that a whole epoch of CIFAR-100 trains on: nine tenths 
 GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
 SURE = 30.0  # a logit beyond all others, whose gradient float32 still holds: every attack takes all its steps
 
-Row = dict[str, Any]
-
 
 # ---------------------------------------------------------------------------- speed
 
 
-def write_data(source: Path | None, path: Path, images: int) -> Path:
-    """An .npz file with enough images for an epoch, of the source or random ones of 100 classes at 32 × 32 pixels."""
-    count = -(-images * 10 // 9) + 100
-    if source:
-        with np.load(source, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    else:
-        draws, classes = np.random.default_rng(0), ["orange", *(f"class {number}" for number in range(1, 100))]
-        arrays = {"classes": np.array(classes)}
-        for part, size in (("train", max(count, 1000)), ("test", 100)):
-            arrays[f"{part}_images"] = draws.integers(0, 256, (size, 3, 32, 32), dtype=np.uint8)
-            arrays[f"{part}_labels"] = np.arange(size) % 100
-    rows = np.random.default_rng(1).permutation(len(arrays["train_labels"]))[: max(count, 1000)]
-    arrays |= {name: arrays[name][rows] for name in ("train_images", "train_labels")}
-    np.savez(path, **arrays)
-    return path
-
-
-def train(run: Path, data: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
+def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
     """The last epoch's metrics of two of `python -m train`; the first compiles and warms up."""
-    command = [sys.executable, "-m", "train", "experiment=paper", "data=npz", f"data.path={data}", f"run={run}"]
-    command += ["train.epochs=2", f"train.images_per_epoch={options.images}", f"train.device={options.device}"]
-    command += [f"scene.meshes={options.meshes}", *overrides, *options.overrides]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    command = [sys.executable, "-m", "train", "experiment=paper", "data=npz", f"data.path={options.data}", f"run={run}"]
+    command += [
+        "data.validation=0.05",
+        "train.epochs=2",
+        f"train.images_per_epoch={options.images}",
+        f"train.device={options.device}",
+    ]
+    command += [f"model.depth={options.depth}", f"model.width={options.width}", f"scene.meshes={options.meshes}"]
+    subprocess.run([*command, *overrides, *options.overrides], check=True, stdout=subprocess.DEVNULL)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     return next(line for line in reversed(lines) if "epoch" in line)
 
 
-def make_sure(path: Path, label: int = 0) -> None:
-    """Edit a checkpoint so that its network calls every image by one class, with a gradient left."""
-    state = checkpoint.load(path)
-    state["model"]["head.weight"][label] = 0
-    state["model"]["head.bias"][label] = SURE
-    checkpoint.save(path, state)
+def make_sure(head: dict[str, Tensor], label: int = 0) -> None:
+    """Edit a network's last layer so that it predicts one class for every image, with a gradient left."""
+    head["weight"][label] = 0
+    head["bias"][label] = SURE
 
 
 class Images(Dataset[tuple[Tensor, int]]):
@@ -92,15 +73,10 @@ class Images(Dataset[tuple[Tensor, int]]):
             images, labels = archive["train_images"][:count], archive["train_labels"][:count]
             self.classes = len(archive["classes"])
         self.images, self.labels = images.transpose(0, 2, 3, 1).copy(), labels.tolist()
-        scaled = images / 255
-        self.transform = transforms.Compose(
-            [
-                transforms.RandomCrop(images.shape[-1], padding=4, padding_mode="reflect"),
-                transforms.RandomHorizontalFlip(),
-                transforms.ToTensor(),
-                transforms.Normalize(scaled.mean((0, 2, 3)).tolist(), scaled.std((0, 2, 3)).tolist()),
-            ]
-        )
+        crop = transforms.RandomCrop(images.shape[-1], padding=4, padding_mode="reflect")
+        mean, std = ((images / 255).mean((0, 2, 3)).tolist(), (images / 255).std((0, 2, 3)).tolist())
+        steps = [crop, transforms.RandomHorizontalFlip(), transforms.ToTensor(), transforms.Normalize(mean, std)]
+        self.transform = transforms.Compose(steps)
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -109,17 +85,11 @@ class Images(Dataset[tuple[Tensor, int]]):
         return self.transform(Image.fromarray(self.images[index])), self.labels[index]
 
 
-def plain_loop(data: Path, options: argparse.Namespace) -> Callable[[], float]:
+def plain_loop(options: argparse.Namespace) -> Callable[[], float]:
     """A function that trains one epoch and returns its seconds; the same network as `train`'s, eager, in float32."""
-    images = Images(data, options.images)
-    loader = DataLoader(
-        images,
-        batch_size=128,
-        shuffle=True,
-        num_workers=options.workers,
-        pin_memory=options.device == "cuda",
-        persistent_workers=options.workers > 0,
-    )
+    images = Images(options.data, options.images)
+    workers = {"num_workers": options.workers, "persistent_workers": options.workers > 0}
+    loader = DataLoader(images, batch_size=128, shuffle=True, pin_memory=options.device == "cuda", **workers)
     network = WideResNet(images.classes, options.depth, options.width, 0.3, mean=(0, 0, 0), std=(1, 1, 1))
     for parent in list(network.modules()):
         for name, child in parent.named_children():
@@ -148,29 +118,23 @@ def speed(options: argparse.Namespace) -> list[Row]:
     rows: list[Row] = []
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        data = write_data(options.data, folder / "data.npz", options.images)
-        network = (f"model.depth={options.depth}", f"model.width={options.width}")
-        plain = plain_loop(data, options)
-        train(folder / "sure", data, options, *network, "augment=none")
-        make_sure(folder / "sure" / checkpoint.BEST)
+        plain = plain_loop(options)
+        train(folder / "sure", options, "augment=none")
+        state = checkpoint.load(folder / "sure" / checkpoint.BEST)
+        make_sure({name: state["model"][f"head.{name}"] for name in ("weight", "bias")})
+        checkpoint.save(folder / "sure" / checkpoint.BEST, state)
+        attacked = ("augment=adversarial", f"train.init_from={folder}/sure", "train.learning_rate=1e-6")
         plain()  # warms up
-        attacked = (*network, "augment=adversarial", f"train.init_from={folder}/sure", "train.learning_rate=1e-6")
         for number in range(options.rounds):
-            none = train(folder / f"none_{number}", data, options, *network, "augment=none")
-            adversarial = train(folder / f"adversarial_{number}", data, options, *attacked)
+            none = train(folder / f"none_{number}", options, "augment=none")
+            adversarial = train(folder / f"adversarial_{number}", options, *attacked)
             loop, ours, attack = plain(), none["seconds/training"], adversarial["seconds/attack"]
-            rows.append(
-                {
-                    "round": number,
-                    "train_images_per_second": options.images / ours,
-                    "plain_loop_images_per_second": options.images / loop,
-                    "speedup": loop / ours,
-                    "attack_seconds": attack,
-                    "attack_steps": adversarial["augment/steps"],
-                    "attack_fraction_of_epoch": attack / (attack + ours * EPOCH_IMAGES / options.images),
-                }
-            )
-            print(rows[-1], flush=True)
+            row: Row = {"round": number, "train_images_per_second": options.images / ours}
+            row |= {"plain_loop_images_per_second": options.images / loop, "speedup": loop / ours}
+            row |= {"attack_seconds": attack, "attack_steps": adversarial["augment/steps"]}
+            row["attack_fraction_of_epoch"] = attack / (attack + ours * EPOCH_IMAGES / options.images)
+            rows.append(row)
+            print(row, flush=True)
     median = {name: statistics.median(row[name] for row in rows) for name in rows[0] if name != "round"}
     return [*rows, {"round": "median", **median}]
 
@@ -189,8 +153,7 @@ def attack_cost(renders: int, size: int, meshes: int, steps: int) -> Row:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     network = WideResNet(10, 10, 1, 0.0).eval()
-    with torch.no_grad():
-        network.head.weight[0], network.head.bias[0] = 0, SURE
+    make_sure(network.head.state_dict())
     views, before, start = renders // (meshes * len(GRAYS)), peak_memory(), time.process_time()
     service = AugmentationService.from_meshes(
         [(f"solid:orange:{seed}", 0) for seed in range(meshes)],
@@ -206,17 +169,10 @@ def attack_cost(renders: int, size: int, meshes: int, steps: int) -> Row:
     built = time.process_time()
     service.regenerate(network, 0)
     attack = time.process_time() - built
-    return {
-        "renders": renders,
-        "size": size,
-        "meshes": meshes,
-        "views": views * meshes,
-        "steps": steps,
-        "precompute_seconds": built - start,
-        "attack_seconds": attack,
-        "ms_per_render_and_pass": 1e3 * attack / (renders * (steps + 1)),
-        "memory_mb": (peak_memory() - before) / 1e6,
-    }
+    row = {"renders": renders, "size": size, "meshes": meshes, "views": views * meshes, "steps": steps}
+    row |= {"precompute_seconds": built - start, "attack_seconds": attack}
+    row["ms_per_render_and_pass"] = 1e3 * attack / (renders * (steps + 1))
+    return row | {"memory_mb": (peak_memory() - before) / 1e6}
 
 
 def renders(options: argparse.Namespace) -> list[Row]:
@@ -230,18 +186,15 @@ def renders(options: argparse.Namespace) -> list[Row]:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
             rows.append(pool.submit(attack_cost, *load, options.steps).result())
         print(rows[-1], flush=True)
-    for first, second in itertools.pairwise(rows[: len(options.numbers)]):
-        ratio = second["attack_seconds"] / first["attack_seconds"]
-        print(f"{second['renders'] / first['renders']:g} times the renders: {ratio:.3g} times the seconds")
     return rows
 
 
-def parser() -> argparse.ArgumentParser:
+def main(arguments: Sequence[str] | None = None) -> list[Row]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     command = commands.add_parser("speed", help="against a plain loop, and the attack's fraction of an epoch")
     command.set_defaults(measure=speed)
-    command.add_argument("--data", type=Path, help=".npz file; default: random images like CIFAR-100's")
+    command.add_argument("--data", type=Path, required=True, help=".npz file, as data=npz reads it")
     command.add_argument("--meshes", default="[solid:orange:0,solid:orange:1]", help="a list, as scene.meshes takes it")
     command.add_argument("--images", type=int, default=512, help="per epoch that is timed")
     command.add_argument("--rounds", type=int, default=5)
@@ -250,19 +203,15 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--workers", type=int, default=min(8, os.cpu_count() or 1), help="of the plain loop's loader")
     command.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     command.add_argument("--overrides", nargs="*", default=[], help="further ones of `python -m train`")
+    command.add_argument("--csv", type=Path)
     command = commands.add_parser("renders", help="the cost of attacks over the number of renders")
     command.set_defaults(measure=renders, device="cpu")
     command.add_argument("--numbers", nargs="+", type=int, default=[100, 1000, 10_000], help="multiples of 5 × meshes")
     command.add_argument("--sizes", nargs="+", type=int, default=[32, 64, 128, 224], help="pixels per side")
     command.add_argument("--meshes", nargs="+", type=int, default=[1, 2, 4, 8])
     command.add_argument("--steps", type=int, default=1)
-    for command in commands.choices.values():
-        command.add_argument("--csv", type=Path)
-    return parser
-
-
-def main(arguments: Sequence[str] | None = None) -> list[Row]:
-    options = parser().parse_args(arguments)
+    command.add_argument("--csv", type=Path)
+    options = parser.parse_args(arguments)
     print(machine(options.device))
     rows = options.measure(options)
     if options.csv:

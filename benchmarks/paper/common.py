@@ -1,4 +1,4 @@
-"""What the paper's benchmarks share: options, networks, meshes, views that a network recognizes, and JSON lines.
+"""What the paper's benchmarks share: options, networks, meshes, clean-correct views, and JSON lines.
 
 Run from the root of the clone: python -m benchmarks.paper.norm_balls --help. A mesh is a file, solid:NAME:SEED, or a
 YAML mapping such as '{mesh: banana.glb, label: banana, albedo_scale: 2}'.
@@ -7,7 +7,7 @@ YAML mapping such as '{mesh: banana.glb, label: banana, albedo_scale: 2}'.
 import argparse
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,20 @@ from augment import AttackSettings, Classifier, Scene, StepSettings
 from augment.attacks.attack import logits_of
 from augment.objects import ObjectSettings, SceneObject, load_object
 from augment.scene import Example
-from benchmarks.common import append_json as append
-from benchmarks.common import machine
+from benchmarks.common import Row, machine
 from renderer import ImageSettings, InputError, OrthographicCamera, load_light
 from renderer.rasterizer import choose
 from train.networks import load_classifier
 
 VERTICES = 10_000  # shapes that are attacked have more (the paper's Section 4)
-FIELDS_OF_VIEW = (2.0, 3.0)  # width of the image in world units (the paper's appendix on rendering quality)
+WIDTHS = (2.0, 3.0)  # of the image in world units (the paper's appendix on rendering quality)
 GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
 BATCH = 10  # examples that are rendered or attacked at once: a shape's gradient keeps all samples of its images
-LEAST_RECOGNIZED = 0.02  # a fraction; below it the search for recognized views is given up
+LEAST_CORRECT = 0.02  # a fraction; below it the search for clean-correct views is given up
+STEPS = {  # the paper's appendix C
+    "lighting": StepSettings("linf", None, "unit", 0.05),
+    "geometry": StepSettings("linf", 0.002, "sign", 0.0005),
+}
 
 View = tuple[OrthographicCamera, float]  # and the gray of the background
 
@@ -40,10 +43,9 @@ def parser(study: str | None, description: str | None) -> argparse.ArgumentParse
     options = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     if study is not None:
         options.set_defaults(study=study)
+    mesh = "files, solid:NAME:SEED or {mesh, label, albedo_scale}"
     options.add_argument("--out", type=Path, required=True, help="JSON lines are appended to this file")
-    options.add_argument(
-        "--meshes", nargs="+", required=True, help="files, solid:NAME:SEED or {mesh, label, albedo_scale}"
-    )
+    options.add_argument("--meshes", nargs="+", required=True, help=mesh)
     options.add_argument("--label", default="orange", help="class that meshes without a label show")
     options.add_argument("--classifier", default="efficientnet_lite0", help="the attacked network, also run:FOLDER")
     options.add_argument("--weights", help="its file of weights, where it brings none")
@@ -84,28 +86,25 @@ def begin(arguments: argparse.Namespace) -> None:
     append(arguments.out, {"run": settings | {"machine": machine()}})
 
 
-def last_run(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def append(path: Path, row: Mapping[str, Any]) -> None:
+    """One line of JSON at the end of a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def last_run(path: Path) -> tuple[Row, list[Row]]:
     """(settings, records) of the last run in a file of JSON lines."""
-    settings: dict[str, Any] = {}
-    records: list[dict[str, Any]] = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        record = json.loads(line)
-        if "run" in record:
-            settings, records = record["run"], []
-        else:
-            records.append(record)
-    return settings, records
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    last = max(index for index, row in enumerate(rows) if "run" in row)
+    return rows[last]["run"], rows[last + 1 :]
 
 
-def attack_settings(kind: str, max_steps: int = 30, **more: Any) -> AttackSettings:
-    """The paper's attack on light or shape (its appendix C): any light, an end where the network errs."""
-    steps = {
-        "lighting": StepSettings("linf", None, "unit", 0.05),
-        "geometry": StepSettings("linf", 0.002, "sign", 0.0005),
-    }
+def attack_settings(kind: str, max_steps: int = 30, step: StepSettings | None = None, **more: Any) -> AttackSettings:
+    """The paper's attack (its appendix C): any light, an end where the network errs. step: another than the paper's."""
+    settings = {kind: step or STEPS[kind], "max_steps": max_steps, "allow_negative": True, "margin": 0.0}
     shorten = kind == "geometry"  # its gradient holds visibility fixed, so that whole steps may raise the cost
-    paper = {"allow_negative": True, "margin": 0.0, "rounded": False}
-    return AttackSettings(**{kind: steps[kind]}, **paper | more, shorten=shorten, max_steps=max_steps)
+    return AttackSettings(**{**settings, "rounded": False, "shorten": shorten, **more})
 
 
 def scene_of(subject: SceneObject, size: int, light: str, views: Sequence[View]) -> Scene:
@@ -121,30 +120,30 @@ def scene_of(subject: SceneObject, size: int, light: str, views: Sequence[View])
 
 
 def random_views(count: int, draws: torch.Generator) -> list[View]:
-    """Views from π/3 off the zenith (the paper's) and any azimuth, with a field of view of 2 or 3, on a gray."""
+    """Views from π/3 off the zenith (the paper's) and any azimuth, of width 2 or 3, on a gray."""
     azimuths = (2 * math.pi * torch.rand(count, generator=draws)).tolist()
-    widths = torch.randint(len(FIELDS_OF_VIEW), (count,), generator=draws).tolist()
+    widths = torch.randint(len(WIDTHS), (count,), generator=draws).tolist()
     grays = torch.randint(len(GRAYS), (count,), generator=draws).tolist()
     return [
-        (OrthographicCamera(math.pi / 3, azimuth, FIELDS_OF_VIEW[width]), GRAYS[gray])
+        (OrthographicCamera(math.pi / 3, azimuth, WIDTHS[width]), GRAYS[gray])
         for azimuth, width, gray in zip(azimuths, widths, grays, strict=True)
     ]
 
 
-def recognized_views(
+def clean_correct_views(
     subject: SceneObject, classifier: Classifier, light: str, count: int, draws: torch.Generator
 ) -> list[View]:
-    """As many random views that the classifier recognizes. InputError: hardly any is."""
-    found: list[View] = []
+    """As many random views that the classifier gets right. InputError: hardly any is."""
+    correct: list[View] = []
     drawn = 0
-    while len(found) < count:
+    while len(correct) < count:
         views = random_views(BATCH, draws)
-        answers = answers_of(classifier, images_of(scene_of(subject, classifier.size, light, views)))
-        found += [view for view, answer in zip(views, answers, strict=True) if answer == subject.label]
+        predicted = predictions(classifier, images_of(scene_of(subject, classifier.size, light, views)))
+        correct += [view for view, name in zip(views, predicted, strict=True) if name == subject.label]
         drawn += len(views)
-        if len(found) < LEAST_RECOGNIZED * drawn - BATCH:
-            raise InputError(f"{classifier.name} recognizes only {len(found)} of {drawn} images of {subject.name}")
-    return found[:count]
+        if len(correct) < LEAST_CORRECT * drawn - BATCH:
+            raise InputError(f"{classifier.name} gets only {len(correct)} of {drawn} images of {subject.name} right")
+    return correct[:count]
 
 
 def batches(views: Sequence[View]) -> Iterator[Sequence[View]]:
@@ -159,6 +158,6 @@ def images_of(scene: Scene) -> Tensor:
     return scene.render(scene.conditions(examples), examples)
 
 
-def answers_of(classifier: Classifier, images: Tensor) -> list[str]:
-    """The class that a classifier gives to the one view of each of E examples (E, 1, 3, size, size)."""
+def predictions(classifier: Classifier, images: Tensor) -> list[str]:
+    """The predicted class of the one view of each of E examples (E, 1, 3, size, size)."""
     return [classifier.classes[index] for index in logits_of(classifier, images, BATCH)[:, 0].argmax(1).tolist()]

@@ -18,7 +18,8 @@ from augment import AttackSettings, StepSettings, attack
 from augment.attacks.attack import AttackResult, logits_of
 from augment.utils import generator
 from benchmarks.paper import common
-from renderer.light.harmonics import basis, project
+from renderer.light.environment import light_radiance
+from renderer.light.harmonics import project
 from renderer.transfer import DEGREE
 
 LIGHT_RADII = (0.02, 0.05, 0.1, 0.3, 1.0, None)
@@ -32,62 +33,33 @@ RADII: dict[str, tuple[float | None, ...]] = {  # L∞; the paper's are 0.1, 0.0
 
 def settings_of(space: str, radius: float | None, steps: int) -> AttackSettings:
     """Signed steps of a quarter of the radius; on pixels, of all of it: the fast gradient sign method, repeated."""
-    step = StepSettings("linf", None, "unit", 0.05)
+    kind, step = "lighting" if space == "physical" else space, None
     if radius is not None:
         step = StepSettings("linf", radius, "sign", radius if space == "pixels" else radius / 4)
-    return AttackSettings(
-        **{"lighting" if space == "physical" else space: step},
-        allow_negative=space != "physical",
-        max_steps=steps,
-        margin=0.0,
-        rounded=False,
-        shorten=space == "geometry",
-        batch_size=common.BATCH,
-    )
+    return common.attack_settings(kind, steps, step, allow_negative=space != "physical", batch_size=common.BATCH)
 
 
 def ball(attacked: AttackResult, space: str, radius: float | None, draws: torch.Generator) -> dict[str, Tensor]:
-    """What a ball holds for each of the examples (E,) that are recognized before."""
-    change = (attacked.images - attacked.images_before)[:, 0].abs().amax(1)
-    reach = change.flatten(1).amax(1)
-    found = {
-        "adversarial": attacked.success,
-        "reach": reach,
-        "changed_pixels": (change > reach.view(-1, 1, 1) / 2).float().mean((1, 2)),
-    }
+    """(E,) bool of each of the clean-correct examples: what succeeds in a ball."""
+    results = {"adversarial": attacked.success}
     if radius is not None:  # without one there is no uniform draw
         tries = [successes(attacked, attacked.problem.sample(draws)) for _ in range(attacked.settings.max_steps)]
-        found |= {"random": tries[0], "search": torch.stack(tries).any(0)}
+        results |= {"random": tries[0], "search": torch.stack(tries).any(0)}
     if space == "lighting":
         lights = torch.stack([without_negative(light) for light in attacked.conditions.light])
-        found["clipped"] = successes(attacked, lights.flatten(1))
-    return {name: values[attacked.clean_correct] for name, values in found.items()}
+        results["clipped"] = successes(attacked, lights.flatten(1))
+    return {name: values[attacked.clean_correct] for name, values in results.items()}
 
 
 def successes(attacked: AttackResult, values: Tensor) -> Tensor:
     """(E,) bool: whether the classifier errs under values (E, D)."""
-    return attacked.goal.reached(
-        logits_of(attacked.classifier, attacked.problem.images(values), common.BATCH).argmax(2)
-    )
+    logits = logits_of(attacked.classifier, attacked.problem.images(values), common.BATCH)
+    return attacked.goal.reached(logits.argmax(2))
 
 
 def without_negative(light: Tensor) -> Tensor:
     """A light (49, 3) as an environment map holds it, from which negative radiance is left out."""
-
-    def radiance(directions: Tensor) -> Tensor:
-        return (basis(directions, DEGREE) @ light.to(directions)).clamp(min=0)
-
-    return project(radiance, DEGREE).to(light)
-
-
-def record(mesh: str, space: str, radius: float | None, parts: Sequence[dict[str, Tensor]]) -> dict[str, object]:
-    """Counts, and means over all examples of reach and changed pixels."""
-    whole = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    numbers = {
-        name: int(values.sum()) if values.dtype == torch.bool else float(values.mean())
-        for name, values in whole.items()
-    }
-    return {"mesh": mesh, "space": space, "radius": radius, "n": len(whole["reach"]), **numbers}
+    return project(lambda directions: light_radiance(light, directions).clamp(min=0), DEGREE).to(light)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -97,18 +69,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     options.add_argument("--steps", type=int, default=10, help="of a descent at most, and draws of a search")
     args, classifier, subjects = common.prepare(options, argv, common.VERTICES)
     for subject in subjects:
-        views = common.recognized_views(
-            subject, classifier, args.light, args.examples, generator(args.seed, subject.name)
-        )
+        draws = generator(args.seed, subject.name)
+        views = common.clean_correct_views(subject, classifier, args.light, args.examples, draws)
         scenes = [common.scene_of(subject, classifier.size, args.light, part) for part in common.batches(views)]
         for space in args.spaces:
             draws = generator(args.seed, subject.name, space)
             for radius in RADII[space]:
-                parts = []
-                for scene in scenes:
-                    attacked = attack(classifier, scene, settings=settings_of(space, radius, args.steps), force=True)
-                    parts.append(ball(attacked, space, radius, draws))
-                common.append(args.out, record(subject.name, space, radius, parts))
+                settings = settings_of(space, radius, args.steps)
+                attacks = (attack(classifier, scene, settings=settings, force=True) for scene in scenes)
+                parts = [ball(attacked, space, radius, draws) for attacked in attacks]
+                counts = {name: int(sum(part[name].sum() for part in parts)) for name in parts[0]}
+                row = {"mesh": subject.name, "space": space, "radius": radius}
+                common.append(args.out, row | {"n": sum(len(part["adversarial"]) for part in parts)} | counts)
 
 
 if __name__ == "__main__":

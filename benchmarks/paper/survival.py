@@ -1,11 +1,11 @@
-"""Do adversaries still fool in 8 bits, as JPEG, read back from their files, and in Mitsuba?
+"""Do adversaries still succeed in 8 bits, as JPEG, read back from their files, and in Mitsuba?
 
 python -m benchmarks.paper.survival --out survival.jsonl --meshes orange_studio.glb \\
     '{mesh: banana.glb, label: banana}' '{mesh: "solid:cup:3", label: coffee mug}'
 python -m benchmarks.paper.table survival.jsonl
 
 Each is found and rendered anew by scripts/attack.py; --overrides are its own, such as renderer.shadows=false to
-count how many lights that were found without shadows fool where Mitsuba casts them.
+count how many lights that were found without shadows succeed where Mitsuba casts them.
 """
 
 import json
@@ -14,17 +14,18 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
+from benchmarks.common import Row
 from benchmarks.paper import common
 
 ATTACKS = ("lighting", "projector", "lamps", "geometry", "albedo", "lighting+geometry+albedo", "projector+geometry")
 ROOT = Path(__file__).parents[2]
 
 
-def run_attack(overrides: Sequence[str], threads: int) -> dict[str, Any]:
+def run_attack(overrides: Sequence[str], threads: int) -> Row:
     """The numbers of one example that scripts/attack.py attacks, {"refusal": its sentence} where it ended in one."""
     with TemporaryDirectory() as folder:
         command = [sys.executable, "scripts/attack.py", f"out={folder}/out", "attack.checks=false", *overrides]
@@ -34,9 +35,8 @@ def run_attack(overrides: Sequence[str], threads: int) -> dict[str, Any]:
             return {"refusal": done.stderr.strip().splitlines()[-1]}
         if done.returncode:
             raise RuntimeError(f"{command} ended with {done.returncode}: {done.stderr}")
-        (lines,) = Path(folder).glob("out/*/attack.jsonl")
-        numbers: dict[str, Any] = json.loads(lines.read_text(encoding="utf-8").splitlines()[0])
-        return numbers
+        [lines] = Path(folder).glob("out/*/attack.jsonl")
+        return json.loads(lines.read_text(encoding="utf-8").splitlines()[0])
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -49,16 +49,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     common.begin(args)
     chosen = [f"classifier={args.classifier}", f"scene.light={args.light}", f"attack.verify={args.verify}"]
     chosen += [f"weights={args.weights}"] if args.weights else []
-    for mesh in args.meshes:
+    for mesh, attack, example in product(args.meshes, args.attacks, range(args.examples)):
         item = common.read_item(mesh, args.label)
-        given = {name: value for name, value in asdict(item).items() if value}
-        shown = [f"scene.meshes=[{{{','.join(f'{name}:{json.dumps(value)}' for name, value in given.items())}}}]"]
-        for attack in args.attacks:
-            for example in range(args.examples):
-                view = [f"scene.azimuth={360 * example / args.examples}", f"seed={args.seed + example}"]
-                found = run_attack([f"attack={attack}", *shown, *view, *chosen, *args.overrides], args.threads)
-                kept = {name: found[name] for name in ("refusal", "steps", "success", "versions") if name in found}
-                common.append(args.out, {"mesh": Path(item.mesh).stem, "attack": attack, "example": example, **kept})
+        given = (f"{name}:{json.dumps(value)}" for name, value in asdict(item).items() if value)
+        view = [f"scene.azimuth={360 * example / args.examples}", f"seed={args.seed + example}"]
+        shown = [f"attack={attack}", f"scene.meshes=[{{{','.join(given)}}}]", *view]
+        result = run_attack([*shown, *chosen, *args.overrides], args.threads)
+        result = {name: result[name] for name in ("refusal", "steps", "success", "versions") if name in result}
+        common.append(args.out, {"mesh": Path(item.mesh).stem, "attack": attack, "example": example, **result})
 
 
 if __name__ == "__main__":

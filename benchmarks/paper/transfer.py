@@ -1,18 +1,19 @@
-"""Do lights and shapes that fool one network, from one side, fool others, or from other sides (Tables 3 and 4)?
+"""Do lights and shapes that deceive one network, from one side, deceive others, or from other sides (Tables 3 and 4)?
 
 python -m benchmarks.paper.transfer networks --out transfer.jsonl --examples 50 \\
     --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
 python -m benchmarks.paper.transfer views --out unseen_views.jsonl --sets 10 --examples 25 --meshes ...
 python -m benchmarks.paper.table transfer.jsonl
 
-An adversary is recorded as found, at the first step that fools the network, and after ten further steps, beside random
-changes that are as large in every coefficient or coordinate.
+An adversary is recorded at the first step that succeeds, and after ten further steps, beside random changes that are as
+large in every coefficient or coordinate.
 """
 
-import math
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,37 +27,25 @@ from benchmarks.paper import common
 from renderer.errors import FACTOR
 from train.networks import load_classifier
 
-KINDS = ("lighting", "geometry")
 FURTHER = 10  # steps that an adversary goes on for
 ATTACKED = (1, 5)  # views that share one light or shape
 TARGETS = ["efficientnet_lite2", "run:pretrained/none", "run:pretrained/random", "run:pretrained/adversarial"]
 
 
-@dataclass(frozen=True)
-class Shared:
+def as_one_example(problem: AttackProblem) -> Any:
     """All examples of a problem, of one view each, as the views of a single one that share one light or shape."""
+    everything = problem.everything
 
-    problem: AttackProblem
+    def render(values: Tensor, examples: Tensor) -> Tensor:
+        return problem.render(values.expand(len(everything), -1), everything).transpose(0, 1)
 
-    @property
-    def start(self) -> Tensor:
-        return self.problem.start[:1]
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        everything = self.problem.everything
-        return self.problem.render(values.expand(len(everything), -1), everything).transpose(0, 1)
-
-    def step(self, gradient: Tensor) -> Tensor:
-        return self.problem.step(gradient)
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self.problem.project(values, examples)
+    return SimpleNamespace(start=problem.start[:1], render=render, step=problem.step, project=problem.project)
 
 
 def adversaries(
     classifier: Classifier, problem: Problem, settings: AttackSettings, label: str, views: int
 ) -> tuple[Tensor, Tensor]:
-    """(E, D) values where a descent first fools or ends, and (E, D) the best of `FURTHER` steps on. views: of each."""
+    """(E, D) values where a descent first succeeds or ends, and the best of `FURTHER` steps on. views: of each."""
     goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))
     first = descend(classifier, problem, goal, settings)
     longer = replace(settings, max_steps=FURTHER, margin=FACTOR)  # which no logit reaches: all steps are taken
@@ -73,57 +62,44 @@ def with_random_signs(values: Tensor, start: Tensor, draws: torch.Generator) -> 
 
 
 def to_networks(subject: SceneObject, classifier: Classifier, others: Sequence[Classifier], args: Namespace) -> None:
-    """A record per batch of views and kind of attack: the answers of all networks, each at its own size."""
+    """A record per batch of views and kind of attack: the predictions of all networks, each at its own size."""
     draws = generator(args.seed, subject.name, "transfer")
-    for views in common.batches(common.recognized_views(subject, classifier, args.light, args.examples, draws)):
+    for views in common.batches(common.clean_correct_views(subject, classifier, args.light, args.examples, draws)):
         scenes = [common.scene_of(subject, network.size, args.light, views) for network in (classifier, *others)]
-        for kind in KINDS:
+        for kind in common.STEPS:
             settings = common.attack_settings(kind, args.steps)
             problems = [settings.problem(scene) for scene in scenes]
             start = problems[0].start
             first, further = adversaries(classifier, problems[0], settings, subject.label, views=1)
-            states = {
-                "before": start,
-                "first": first,
-                "first_random": with_random_signs(first, start, draws),
-                "further": further,
-                "further_random": with_random_signs(further, start, draws),
-            }
-            answers = {
-                network.name: {
-                    name: common.answers_of(network, problem.images(values)) for name, values in states.items()
-                }
+            states = {"before": start, "first": first, "first_random": with_random_signs(first, start, draws)}
+            states |= {"further": further, "further_random": with_random_signs(further, start, draws)}
+            predicted = {
+                network.name: {name: common.predictions(network, problem.images(states[name])) for name in states}
                 for network, problem in zip((classifier, *others), problems, strict=True)
             }
-            common.append(args.out, {"kind": kind, "mesh": subject.name, "label": subject.label, "answers": answers})
+            record = {"kind": kind, "mesh": subject.name, "label": subject.label}
+            common.append(args.out, record | {"predictions": predicted})
 
 
 def to_views(subject: SceneObject, classifier: Classifier, index: int, args: Namespace) -> None:
-    """A record per number of attacked views and kind of attack: the answers in views that the attack did not have, and
-    their degrees about the vertical from the nearest attacked view."""
+    """A record per number of attacked views and kind of attack: the predictions in views that were not attacked."""
     draws = generator(args.seed, subject.name, "unseen views", index)
-    unseen = common.recognized_views(subject, classifier, args.light, args.examples, draws)
+    unseen = common.clean_correct_views(subject, classifier, args.light, args.examples, draws)
     for count in ATTACKED:
-        attacked = common.recognized_views(subject, classifier, args.light, count, draws)
-        angles = [min(degrees_apart(view, near) for near in attacked) for view in unseen]
-        for kind in KINDS:
+        attacked = common.clean_correct_views(subject, classifier, args.light, count, draws)
+        for kind in common.STEPS:
             settings = common.attack_settings(kind, args.steps)
-            shared = Shared(settings.problem(common.scene_of(subject, classifier.size, args.light, attacked)))
-            first, further = adversaries(classifier, shared, settings, subject.label, count)
-            random = with_random_signs(further, shared.start, draws)
-            answers: dict[str, list[str]] = {"first": [], "further": [], "random": []}
+            problem = as_one_example(settings.problem(common.scene_of(subject, classifier.size, args.light, attacked)))
+            first, further = adversaries(classifier, problem, settings, subject.label, count)
+            random = with_random_signs(further, problem.start, draws)
+            states = {"first": first, "further": further, "random": random}
+            predicted: dict[str, list[str]] = {name: [] for name in states}
             for part in common.batches(unseen):
-                problem = settings.problem(common.scene_of(subject, classifier.size, args.light, part))
-                for name, values in zip(answers, (first, further, random), strict=True):
-                    answers[name] += common.answers_of(classifier, problem.images(values.expand(len(part), -1)))
+                elsewhere = settings.problem(common.scene_of(subject, classifier.size, args.light, part))
+                for name, values in states.items():
+                    predicted[name] += common.predictions(classifier, elsewhere.images(values.expand(len(part), -1)))
             record = {"mesh": subject.name, "label": subject.label, "set": index, "kind": kind, "attacked": count}
-            common.append(args.out, record | {"angle": angles, "answers": answers})
-
-
-def degrees_apart(one: common.View, other: common.View) -> float:
-    """About the vertical."""
-    azimuths = one[0].azimuth - other[0].azimuth
-    return round(math.degrees(abs(math.remainder(azimuths, 2 * math.pi))), 2)
+            common.append(args.out, record | {"predictions": predicted})
 
 
 def main(argv: Sequence[str] | None = None) -> None:
