@@ -74,7 +74,7 @@ def operators(
 
 
 def converged(mesh: Mesh, size: int, samples: int, case: Case) -> TransferOperator:
-    """With many more samples and rays."""
+    """With many more rays per pixel, patches, and rays per patch."""
     with (
         patch.object(rays, "DIRECTIONS", RAYS),
         patch.multiple(precomputed, PATCHES=PATCHES, PATCH_DIRECTIONS=RAYS_OF_PATCH),
