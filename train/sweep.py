@@ -22,7 +22,7 @@ from renderer.errors import InputError
 from train import checkpoint, console
 from train.errors import one_sentence, writable_folder
 from train.report.page import report_of
-from train.report.summary import format_spread, format_table, is_finished, summarize
+from train.report.summary import format_table, is_finished, summarize
 from train.run import load_data, run, write_images
 from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
 from train.settings import ExperimentSettings, compose, given_command, read_settings
@@ -125,6 +125,6 @@ def format_sweep(folders: Sequence[Path]) -> str:
     finished = [summarize(folder) for folder in folders if is_finished(folder)]
     parts = [f"{len(finished)} of {len(folders)} runs are finished"]
     if finished:
-        parts += filter(None, [format_table(finished), format_spread(finished)])
+        parts.append(format_table(finished))
     parts += [f"{folder}: {state(folder)}" for folder in folders if not is_finished(folder)]
     return "\n" + "\n\n".join(parts)

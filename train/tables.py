@@ -7,14 +7,15 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a title, which may be empty. As text: aligned Markdown without the title."""
+    """A table with a title, which may be empty. As text: aligned Markdown below the title."""
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[object]]
 
     def __str__(self) -> str:
-        return aligned(self.header, self.rows)
+        table = aligned(self.header, self.rows)
+        return f"{self.title}:\n\n{table}" if self.title else table
 
 
 def aligned(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -51,12 +52,12 @@ def fraction(hits: int, n: int) -> dict[str, Any]:
 
 
 def format_fraction(result: Mapping[str, Any]) -> str:
-    """A result of `fraction`: hits of n [low, high]."""
-    return "{hits} of {n} [{low:.0%}, {high:.0%}]".format(**result) if result["n"] else "none of 0"
+    """A result of `fraction`: hits of n [low, high]; "-" where n is 0."""
+    return "{hits} of {n} [{low:.0%}, {high:.0%}]".format(**result) if result["n"] else "-"
 
 
 def format_interval(metric: Mapping[str, Any]) -> str:
-    """A metric's value [low, high]; "-" where it is unknown or absent."""
+    """A metric's value [low, high], or the value alone without an interval; "-" where it is unknown or absent."""
     if metric.get("value") is None:
         return "-"
-    return "{value:.3f} [{low:.3f}, {high:.3f}]".format(**metric)
+    return ("{value:.3f} [{low:.3f}, {high:.3f}]" if "low" in metric else "{value:.3f}").format(**metric)

@@ -122,7 +122,7 @@ def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(run_swee
     printed = capsys.readouterr().out
     assert all(f"finished before: {folder}\n" in printed for folder in folders)
     assert [row[:2] for row in rows(printed)] == [
-        ["augment", "seed"], ["none", "0"], ["none", "1"], ["augment", "seeds"], ["none", "2"]
+        ["augment", "seed"], ["none", "0"], ["none", "1"], ["none", "2 seeds"]
     ]  # fmt: skip
 
 

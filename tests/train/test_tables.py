@@ -17,4 +17,4 @@ def test_a_fraction_has_the_wilson_interval(hits, n):
 
 def test_a_fraction_of_nothing_is_unknown():
     assert fraction(0, 0) == {"value": None, "low": None, "high": None, "hits": 0, "n": 0}
-    assert (format_fraction(fraction(0, 0)), format_interval(fraction(0, 0))) == ("none of 0", "-")
+    assert (format_fraction(fraction(0, 0)), format_interval(fraction(0, 0))) == ("-", "-")

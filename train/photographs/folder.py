@@ -14,7 +14,7 @@ import torch
 
 from augment.classifiers.adapter import class_index, nearest
 from augment.utils import progress, require_memory
-from renderer.errors import InputError, in_one_line, require_file
+from renderer.errors import InputError, in_one_line
 from renderer.io.images import read_square
 from train import console
 
@@ -54,50 +54,40 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
 
     The folder holds either a sub-folder per class, named as in `classes` (or `other_NAME` for a class that the model
     lacks), or images only, which are then all of class `label`. Sub-folders are searched to any depth, through symbolic
-    links, too; hidden files and other kinds of file (`left_out`) are skipped. `photos.csv` in the folder is optional.
-    Its columns `path` and `source_tag` give sources; its column `hard_negatives` names further sources, separated by
-    `;`, whose images of other things an image is ranked against.
+    links, too; hidden files and other kinds of file (`left_out`) are skipped. An optional `photos.csv` gives sources in
+    its columns `path` and `source_tag`; its column `hard_negatives` names further sources, separated by `;`.
 
     InputError: the folder is missing, unreadable, empty or mixes both layouts; a sub-folder or `label` is not a class;
-    `photos.csv` lacks its columns, names no file of the folder, has two different rows for one file, or names a source
-    of hard negatives that does not exist.
+    `photos.csv` lacks its columns, contradicts itself, or names no file of the folder or a source without images.
     """
     class_index(classes, label, "label")
     if not folder.is_dir():
-        fault = "is not a folder" if folder.exists() else "does not exist"
-        raise InputError(f"{folder} {fault}: name a folder of photographs")
+        raise InputError(f"{folder} is not a folder: name a folder of photographs")
     files = list(_files(folder))
-    paths = sorted(path for path in files if _is_image(folder, path))
+    paths = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
     if not paths:
-        others = f" among its {len(files)} files" if files else ""
-        raise InputError(f"{folder} holds no photographs{others}: put some there ({', '.join(SUFFIXES)})")
-    has_class_folders = _check_layout(folder, paths, classes)
+        raise InputError(f"{folder} holds no photographs: put some there ({', '.join(SUFFIXES)})")
+    has_class_folders = _has_class_folders(folder, paths, classes)
     rows = _read_table(folder / TABLE)
     if unknown := sorted(rows.keys() - set(files)):
-        fault = (
-            f"{folder / TABLE} has {len(unknown)} of {len(rows)} rows for no file of the folder, such as {unknown[0]}"
-        )
+        fault = f"{folder / TABLE} has {len(unknown)} of {len(rows)} rows for no file of the folder, like {unknown[0]}"
         if len(unknown) == len(rows):
             raise InputError(f"{fault}; give paths such as {paths[0]}")
         console.warning(fault)
+    labels = [path.parts[0] if has_class_folders else label for path in paths]
     photographs = [
-        Photograph(path, path.parts[0] if has_class_folders else label, *rows.get(path, (None, ()))) for path in paths
+        Photograph(path, name, *rows.get(path, (None, ()))) for path, name in zip(paths, labels, strict=True)
     ]
-    sources = {photograph.source for photograph in photographs if photograph.source is not None}
-    for photograph in photographs:
-        if missing := set(photograph.hard_negatives) - sources:
-            raise InputError(
-                f"{folder / TABLE} gives {photograph.path} hard_negatives of source {min(missing)!r}, which has no "
-                f"image: name one of {', '.join(sorted(sources))}"
-            )
+    sources = {item.source for item in photographs}
+    if missing := {name for item in photographs for name in item.hard_negatives} - sources:
+        raise InputError(f"{folder / TABLE} names hard_negatives of source {min(missing)!r}, which has no image")
     return photographs
 
 
 def left_out(folder: Path) -> list[PurePosixPath]:
     """The files of a folder that are of no kind that is read; sorted."""
-    return sorted(
-        path for path in _files(folder) if not _is_image(folder, path) and str(path) not in (TABLE, DESCRIPTION)
-    )
+    known = PurePosixPath(TABLE), PurePosixPath(DESCRIPTION)
+    return sorted(path for path in _files(folder) if path.suffix.lower() not in SUFFIXES and path not in known)
 
 
 def is_hidden(name: str) -> bool:
@@ -109,59 +99,45 @@ def _files(folder: Path) -> Iterator[PurePosixPath]:
     """Paths of files in the folder that are not hidden; links are followed, except to a folder that they lie in."""
 
     def refuse(error: OSError) -> NoReturn:
-        raise InputError(f"{error.filename} cannot be read: {error.strerror}") from error
+        raise error
 
     for root, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
         inside = Path(os.path.realpath(root))
-        folders[:] = [
-            name
-            for name in folders
-            if not is_hidden(name) and not inside.is_relative_to(os.path.realpath(os.path.join(root, name)))
-        ]
+        targets = {name: os.path.realpath(os.path.join(root, name)) for name in folders if not is_hidden(name)}
+        folders[:] = [name for name, target in targets.items() if not inside.is_relative_to(target)]
         parent = PurePosixPath(Path(root).relative_to(folder).as_posix())
         yield from (parent / name for name in files if not is_hidden(name))
 
 
-def _is_image(folder: Path, path: PurePosixPath) -> bool:
-    """A broken link is an image that cannot be read; a pipe is none, since reading it would block."""
-    return path.suffix.lower() in SUFFIXES and ((folder / path).is_file() or not (folder / path).exists())
-
-
-def _check_layout(folder: Path, paths: Sequence[PurePosixPath], classes: Sequence[str]) -> bool:
-    """Whether the folder is made of class folders; InputError if a name among them is not a class."""
+def _has_class_folders(folder: Path, paths: Sequence[PurePosixPath], classes: Sequence[str]) -> bool:
+    """Whether images lie in class folders; InputError for another folder, or for images beside folders."""
     names = sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not is_hidden(entry.name))
     for name in names:
         if name not in classes and not name.startswith(FOREIGN):
             raise InputError(
-                f"{folder / name} is not named after a class of the model (such as "
-                f"{nearest(name, classes)}): rename it, to {FOREIGN}{name} if the model lacks its class"
+                f"{folder / name} is not named after a class of the model (such as {nearest(name, classes)}): rename "
+                f"it, to {FOREIGN}{name} if the model lacks its class"
             )
-    loose = [path for path in paths if len(path.parts) == 1]
-    if names and loose:
+    if names and (loose := [path for path in paths if len(path.parts) == 1]):
         raise InputError(f"{folder / loose[0]} lies beside class folders: move it into the folder of its class")
     return bool(names)
 
 
 def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str, ...]]]:
     """Source and hard negatives by path; empty without a table."""
-    if not os.path.lexists(table):
-        return {}
-    advice = "make it UTF-8 with the columns path and source_tag, separated by commas"
-    require_file(table, advice)
     rows: dict[PurePosixPath, tuple[str | None, tuple[str, ...]]] = {}
+    if not os.path.lexists(table):
+        return rows
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, restval="", strict=True)
-            lines = list(reader)
-        if not {"path", "source_tag"} <= set(reader.fieldnames or ()):
-            raise ValueError("a column is missing")
-    except (ValueError, csv.Error, OSError) as error:
+            for line in csv.DictReader(file, restval="", strict=True):
+                path = PurePosixPath(line["path"].replace("\\", "/"))
+                row = line["source_tag"] or None, split_sources(line.get("hard_negatives", ""))
+                if rows.setdefault(path, row) != row:
+                    raise ValueError(f"two different rows for {path}")
+    except (ValueError, LookupError, csv.Error, OSError) as error:
+        advice = "make it UTF-8 with the columns path and source_tag, separated by commas, and a row per file"
         raise InputError(f"{table} cannot be used ({in_one_line(error)}): {advice}") from error
-    for line in lines:
-        path = PurePosixPath(line["path"].replace("\\", "/"))
-        row = line["source_tag"] or None, split_sources(line.get("hard_negatives", ""))
-        if rows.setdefault(path, row) != row:
-            raise InputError(f"{table} has two different rows for {path}: keep one")
     return rows
 
 
@@ -181,8 +157,7 @@ def load_photographs(
     Returns the photographs that could be read, their images as (N, 3, size, size) uint8 sRGB, and the paths of the
     others. Each image is turned as its EXIF orientation says, converted to RGB (alpha over white, 16 bits to 8),
     cropped to its central square and reduced with Pillow's Lanczos filter, which widens with the reduction: detail too
-    fine for `size` averages out instead of aliasing, and the rest stays as sharp as possible, which counts at 32
-    pixels.
+    fine for `size` averages out instead of aliasing.
 
     InputError: broken or oversized images unless `skip_unreadable`; no image can be read; memory is too small.
     advice: how to skip them, in the words of the caller.
@@ -190,30 +165,26 @@ def load_photographs(
     shape = len(photographs), 3, size, size
     require_memory(f"{len(photographs)} photographs of {size} pixels per side", prod(shape), torch.device("cpu"))
     images = torch.empty(shape, dtype=torch.uint8)
-    readable: list[Photograph] = []
-    errors: dict[Photograph, Exception] = {}
+
+    def read(row: int) -> Exception | None:
+        try:
+            pixels = np.array(read_square(folder / photographs[row].path, size))  # a copy: Pillow's memory is read-only
+        except Exception as error:  # Pillow's decoders raise almost anything at a broken file
+            return error
+        images[row] = torch.from_numpy(pixels).permute(2, 0, 1)
+        return None
+
     pool = ThreadPoolExecutor()  # Pillow releases the interpreter while it decodes and resizes
     try:
-        results = pool.map(lambda photograph: _try_read(folder / photograph.path, size), photographs)
-        for photograph, result in zip(progress(photographs, "photographs"), results, strict=True):
-            if isinstance(result, Exception):
-                errors[photograph] = result
-            else:
-                images[len(readable)] = torch.from_numpy(result).permute(2, 0, 1)
-                readable.append(photograph)
+        results = pool.map(read, range(len(photographs)))
+        errors = [error for _, error in zip(progress(photographs, "photographs"), results, strict=True)]
     finally:
         pool.shutdown(cancel_futures=True)  # so that Ctrl-C does not wait for the rest
-    if errors and not (readable and skip_unreadable):
-        first, reason = next(iter(errors.items()))
+    rows = [row for row, error in enumerate(errors) if error is None]
+    broken = [(item.path, error) for item, error in zip(photographs, errors, strict=True) if error is not None]
+    if broken and not (rows and skip_unreadable):
         raise InputError(
-            f"{len(errors)} of {len(photographs)} photographs cannot be read, the first being "
-            f"{folder / first.path} ({reason}): replace them{advice if readable else ''}"
+            f"{len(broken)} of {len(photographs)} photographs cannot be read, the first being {folder / broken[0][0]} "
+            f"({broken[0][1]}): replace them{advice if rows else ''}"
         )
-    return readable, images[: len(readable)], [str(photograph.path) for photograph in errors]
-
-
-def _try_read(path: Path, size: int) -> np.ndarray | Exception:
-    try:
-        return np.array(read_square(path, size))  # a copy, since Pillow's memory is read-only
-    except Exception as error:  # Pillow's decoders raise almost anything at a broken file
-        return error
+    return [photographs[row] for row in rows], images[rows] if broken else images, [str(path) for path, _ in broken]

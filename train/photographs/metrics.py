@@ -1,17 +1,13 @@
-"""The metrics of an evaluation, with 95 % intervals: recall, false positive rate, AUC, recall at fixed FPR.
+"""The metrics of an evaluation, with 95 % intervals: recall, false positive rate, AUC, recall at fixed FPR."""
 
-Bootstrap replicates are samples of the images at hand, drawn with replacement, the same ones at every call, so that the
-metrics of two networks on the same images are replicated in pairs.
-"""
-
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
 from typing import Any
 
 import numpy as np
+import torch
 
 from train.photographs.predictions import Prediction
 from train.tables import fraction
@@ -25,29 +21,25 @@ OVERALL = ""  # in the place of a source: all images
 REPLICATES = 2000
 BLOCK = 250  # replicates at a time, which bounds the memory
 IMAGES, RUNS = 0, 1  # seeds, so that images and runs are drawn independently
+Scores = Sequence[float] | np.ndarray
 
 
 # ------------------------------------------------------------------------------------- bootstrap
 
 
-def draw_samples(*sizes: int, seed: int = IMAGES) -> Iterator[tuple[np.ndarray, ...]]:
-    """Blocks of replicates: how often each image, or run, is drawn, (BLOCK, size) counts for each of the sizes.
+def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
+    """A statistic's values in the bootstrap's replicates, (..., REPLICATES).
 
-    Each group is drawn apart (stratified), as many as it has. Equal sizes get equal draws.
+    groups: values (n,) of images, n at least 1. A replicate draws as many from each group, with replacement. The
+    statistic takes an array (BLOCK, n) per group and returns (..., BLOCK). Groups of equal sizes get equal draws at
+    every call, so that the metrics of two networks on the same images are replicated in pairs.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(IMAGES)
+    blocks = []
     for _ in range(REPLICATES // BLOCK):
-        yield tuple(_draw_counts(generator, size) for size in sizes)
-
-
-def _draw_counts(generator: np.random.Generator, size: int) -> np.ndarray:
-    drawn = generator.integers(size, size=(BLOCK, size)) + size * np.arange(BLOCK)[:, None]
-    return np.bincount(drawn.ravel(), minlength=BLOCK * size).reshape(BLOCK, size)
-
-
-def replicate_fraction(outcomes: np.ndarray) -> np.ndarray:
-    """The fraction of true outcomes, (n,) with n at least 1, in each replicate: (REPLICATES,)."""
-    return np.concatenate([counts @ outcomes / len(outcomes) for (counts,) in draw_samples(len(outcomes))])
+        samples = [group[generator.integers(len(group), size=(BLOCK, len(group)))] for group in groups]
+        blocks.append(statistic(*samples))
+    return np.concatenate(blocks, axis=-1)
 
 
 def interval(replicates: np.ndarray) -> dict[str, float]:
@@ -66,101 +58,61 @@ def replicate_difference(one: np.ndarray, other: np.ndarray, paired: bool) -> np
     one, other: the replicates of each run, (S, REPLICATES) and (T, REPLICATES). paired: S = T, and the s-th runs of
     both groups are drawn together.
     """
+    generator = np.random.default_rng(RUNS)
     groups = [one - other] if paired else [one, -other]
-    blocks = zip(*draw_samples(*map(len, groups), seed=RUNS), strict=True)
-    counts = [np.concatenate(block) for block in blocks]  # each row sums to the group's size
-    return sum((drawn.T * group).mean(axis=0) for drawn, group in zip(counts, groups, strict=True))
+    drawn = [np.take_along_axis(group, generator.integers(len(group), size=group.shape), axis=0) for group in groups]
+    return sum(group.mean(axis=0) for group in drawn)
 
 
 # ------------------------------------------------------------------------------------- ROC
 
 
-class Roc:
-    """The ROC curve of scores (n,) of positives and (m,) of negatives, n and m at least 1.
+def rank(positives: np.ndarray, negatives: np.ndarray) -> np.ndarray:
+    """RANKED, (4, ...), of scores (..., n) of positives and (..., m) of negatives.
 
-    An image is called positive where its score exceeds the threshold. The metrics are functions of a sample: how often
-    each image counts. So scores are sorted once, and a bootstrap replicate costs a few sums.
+    AUC is the probability that a positive scores above a negative, a tie counting half (Mann and Whitney 1947). Recall
+    at a rate is the fraction of positives above the threshold; a positive that ties with it is missed.
     """
-
-    def __init__(self, positives: Sequence[float], negatives: Sequence[float]):
-        positive_scores, negative_scores = np.asarray(positives, np.float64), np.asarray(negatives, np.float64)
-        self._positive_order, self._negative_order = positive_scores.argsort(), negative_scores.argsort()
-        self._positives = positive_scores[self._positive_order]
-        self._negatives = negative_scores[self._negative_order]
-
-    def metrics(self, positive_counts: np.ndarray, negative_counts: np.ndarray) -> dict[str, np.ndarray]:
-        """RANKED, (B,) each, of B samples: (B, n) and (B, m) counts whose rows sum to n and m.
-
-        AUC is the probability that a positive scores above a negative, a tie counting half (Mann and Whitney 1947).
-        Recall at a rate is the fraction of positives above the threshold, which is the lowest score that at most this
-        fraction of the negatives exceeds; a positive that ties with it is missed.
-        """
-        n, m = len(self._positives), len(self._negatives)
-        missed = _prefix_sums(positive_counts[:, self._positive_order])
-        below = _prefix_sums(negative_counts[:, self._negative_order])
-        beaten = [below[:, self._negatives.searchsorted(self._positives, side)] for side in ("left", "right")]
-        auc = (positive_counts[:, self._positive_order] * sum(beaten)).sum(axis=1) / (2 * n * m)
-        rows = np.arange(len(missed))
-        return {"auc": auc} | {
-            f"recall_at/{rate}": (n - missed[rows, self._positives.searchsorted(threshold, "right")]) / n
-            for rate, threshold in self._thresholds(below).items()
-        }
-
-    def _thresholds(self, below: np.ndarray) -> dict[str, np.ndarray]:
-        """The threshold at each of RATES, (B,), from the samples' sums over the sorted negatives, (B, 1 + m)."""
-        m = len(self._negatives)
-        above = m - below[:, self._negatives.searchsorted(self._negatives, "right")]  # falls along sorted scores
-        allowed = {rate: int(Fraction(rate) * m) for rate in RATES}  # exact, unlike 0.29 * 100
-        return {rate: self._negatives[(above > count).sum(axis=1)] for rate, count in allowed.items()}
-
-    def values(self) -> dict[str, float]:
-        """RANKED of the images themselves."""
-        once = (np.ones((1, len(scores)), np.int64) for scores in (self._positives, self._negatives))
-        return {name: float(value[0]) for name, value in self.metrics(*once).items()}
-
-    def thresholds(self) -> dict[str, float]:
-        """The threshold at each of RATES."""
-        thresholds = self._thresholds(np.arange(len(self._negatives) + 1)[None])
-        return {rate: float(threshold[0]) for rate, threshold in thresholds.items()}
-
-    def replicates(self) -> dict[str, np.ndarray]:
-        """RANKED in the bootstrap's replicates, (REPLICATES,) each."""
-        blocks = [self.metrics(*counts) for counts in draw_samples(len(self._positives), len(self._negatives))]
-        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-
-    def curve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """False positive rate, recall and threshold from (0, 0) to (1, 1), a point per distinct score.
-
-        The last threshold is minus infinity, which all images exceed.
-        """
-        thresholds = np.append(np.unique(np.concatenate([self._positives, self._negatives]))[::-1], -np.inf)
-        rate, recall = (
-            (len(scores) - scores.searchsorted(thresholds, "right")) / len(scores)
-            for scores in (self._negatives, self._positives)
-        )
-        return rate, recall, thresholds
+    values, ordered = (torch.from_numpy(np.sort(scores, axis=-1)) for scores in (positives, negatives))
+    below = sum(torch.searchsorted(ordered, values, side=side).sum(-1).numpy() for side in ("left", "right"))
+    recalls = [(positives > threshold[..., None]).mean(axis=-1) for threshold in thresholds(negatives)]
+    return np.stack([below / (2 * positives.shape[-1] * negatives.shape[-1]), *recalls])
 
 
-def _prefix_sums(counts: np.ndarray) -> np.ndarray:
-    """(B, k) to (B, 1 + k): the sums of the first 0, 1, ..., k counts."""
-    return np.pad(counts.cumsum(axis=1), ((0, 0), (1, 0)))
+def thresholds(negatives: np.ndarray) -> list[np.ndarray]:
+    """At each of RATES, (...), the lowest of the scores (..., m) that at most this fraction of them exceeds."""
+    ordered, m = np.sort(negatives, axis=-1), negatives.shape[-1]
+    return [ordered[..., m - 1 - int(Fraction(rate) * m)] for rate in RATES]  # exact, unlike 0.29 * 100
 
 
-def roc_metrics(positives: Sequence[float], negatives: Sequence[float]) -> dict[str, Any]:
+def roc_curve(positives: Scores, negatives: Scores) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """False positive rate, recall and threshold from (0, 0) to (1, 1), a point per distinct score.
+
+    An image is called positive where its score exceeds the threshold; all exceed the last one, minus infinity.
+    """
+    thresholds = np.append(np.unique([*positives, *negatives])[::-1], -np.inf)
+    rate, recall = (
+        (len(scores) - np.sort(scores).searchsorted(thresholds, "right")) / len(scores)
+        for scores in (negatives, positives)
+    )
+    return rate, recall, thresholds
+
+
+def roc_metrics(positives: Scores, negatives: Scores) -> dict[str, Any]:
     """auc and recall_at, a mapping by rate: each {value, low, high}, None where either kind of image is missing.
 
     auc also has the numbers of positives and negatives, and each recall its threshold.
     """
-    results: dict[str, dict[str, Any]] = {name: {"value": None, "low": None, "high": None} for name in RANKED}
-    thresholds: Mapping[str, float | None] = dict.fromkeys(RATES)
+    results: list[dict[str, Any]] = [{"value": None, "low": None, "high": None}] * len(RANKED)
+    bars: list[float | None] = [None] * len(RATES)
     if len(positives) and len(negatives):
-        roc = Roc(positives, negatives)
-        replicates, thresholds = roc.replicates(), roc.thresholds()
-        results = {name: {"value": value, **interval(replicates[name])} for name, value in roc.values().items()}
-    return {
-        "auc": {**results["auc"], "positives": len(positives), "negatives": len(negatives)},
-        "recall_at": {rate: {**results[f"recall_at/{rate}"], "threshold": thresholds[rate]} for rate in RATES},
-    }
+        groups = np.asarray(positives), np.asarray(negatives)
+        pairs = zip(rank(*groups), bootstrap(rank, *groups), strict=True)
+        results = [{"value": float(value), **interval(replicates)} for value, replicates in pairs]
+        bars = [float(bar) for bar in thresholds(groups[1])]
+    auc, *recalls = results
+    recall_at = {rate: {**recall, "threshold": bar} for rate, recall, bar in zip(RATES, recalls, bars, strict=True)}
+    return {"auc": {**auc, "positives": len(positives), "negatives": len(negatives)}, "recall_at": recall_at}
 
 
 # ------------------------------------------------------------------------------------- pools of predictions
@@ -168,10 +120,9 @@ def roc_metrics(positives: Sequence[float], negatives: Sequence[float]) -> dict[
 
 @dataclass(frozen=True)
 class Pool:
-    """Predictions that are scored together.
+    """Predictions that are scored together: of the class under study, and of everything else.
 
-    positives: of the class under study. negatives: of everything else, which may become false positives. ranked: the
-    negatives of the ROC curve, with the named hard negatives of other sources.
+    ranked: the negatives of the ROC curve, with the named hard negatives of other sources.
     """
 
     positives: Sequence[Prediction]
@@ -179,9 +130,18 @@ class Pool:
     ranked: Sequence[Prediction]
 
     @property
-    def scores(self) -> tuple[list[float], list[float]]:
+    def scores(self) -> tuple[np.ndarray, np.ndarray]:
         """The log-odds of the positives, and of the negatives that they are ranked against."""
-        return [item.log_odds for item in self.positives], [item.log_odds for item in self.ranked]
+        return np.array([item.log_odds for item in self.positives]), np.array([item.log_odds for item in self.ranked])
+
+    def outcomes(self, label: str) -> dict[str, list[bool]]:
+        """Whether each image counts in recall, top5 and false_positive_rate."""
+        ranks = [item.true_rank or np.inf for item in self.positives]
+        return {
+            "recall": [rank == 1 for rank in ranks],
+            "top5": [rank <= 5 for rank in ranks],
+            "false_positive_rate": [item.predicted == label for item in self.negatives],
+        }
 
 
 def pool(predictions: Sequence[Prediction], label: str) -> Pool:
@@ -190,49 +150,34 @@ def pool(predictions: Sequence[Prediction], label: str) -> Pool:
     return Pool([item for item in predictions if item.photograph.label == label], negatives, negatives)
 
 
-def pool_by_source(predictions: Sequence[Prediction], label: str) -> dict[str, Pool]:
-    """A pool per source, and OVERALL.
+def pool_by_source(predictions: Sequence[Prediction], label: str, exclude: Sequence[str] = ()) -> dict[str, Pool]:
+    """OVERALL, without the sources to exclude, and a pool per source.
 
     A source's positives are ranked against its own negatives and those of the sources that the positives name as hard
     negatives, as far as those could be read.
     """
-    by_source = defaultdict(list)
-    for item in predictions:
-        if item.photograph.source is not None:
-            by_source[item.photograph.source].append(item)
-    pools = {source: pool(group, label) for source, group in sorted(by_source.items())}
-    ranked = {}
-    for source, group in pools.items():
-        named = {source}.union(*(item.photograph.hard_negatives for item in group.positives))
-        negatives = [item for name in sorted(named & pools.keys()) for item in pools[name].negatives]
-        ranked[source] = Pool(group.positives, group.negatives, negatives)
-    return {OVERALL: pool(predictions, label), **ranked}
+    pools = {OVERALL: pool([item for item in predictions if item.photograph.source not in exclude], label)}
+    for source in sorted({item.photograph.source for item in predictions if item.photograph.source is not None}):
+        group = pool([item for item in predictions if item.photograph.source == source], label)
+        named = {name for item in group.positives for name in item.photograph.hard_negatives} - {source}
+        others = pool([item for item in predictions if item.photograph.source in named], label).negatives
+        pools[source] = Pool(group.positives, group.negatives, [*group.negatives, *others])
+    return pools
 
 
 def compute_metrics(group: Pool, label: str) -> dict[str, Any]:
     """recall, top5 and false_positive_rate, as `fraction` returns them, and auc and recall_at of `roc_metrics`."""
-    return {
-        "recall": true_fraction(item.true_rank == 1 for item in group.positives),
-        "top5": true_fraction(item.true_rank is not None and item.true_rank <= 5 for item in group.positives),
-        "false_positive_rate": true_fraction(item.predicted == label for item in group.negatives),
-        **roc_metrics(*group.scores),
-    }
+    counted = {name: fraction(sum(values), len(values)) for name, values in group.outcomes(label).items()}
+    return {**counted, **roc_metrics(*group.scores)}
 
 
 def replicate_metrics(group: Pool, label: str) -> dict[str, np.ndarray]:
-    """METRICS in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown."""
-    outcomes = {
-        "recall": [item.true_rank == 1 for item in group.positives],
-        "false_positive_rate": [item.predicted == label for item in group.negatives],
-    }
-    replicates = {name: replicate_fraction(np.array(values)) for name, values in outcomes.items() if values}
-    return replicates | (Roc(*group.scores).replicates() if all(group.scores) else {})
-
-
-def true_fraction(outcomes: Iterable[bool]) -> dict[str, Any]:
-    """The fraction of true outcomes, with its interval."""
-    outcomes = list(outcomes)
-    return fraction(sum(outcomes), len(outcomes))
+    """METRICS and top5 in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown."""
+    outcomes = {name: np.array(values) for name, values in group.outcomes(label).items() if values}
+    counted = {name: bootstrap(lambda drawn: drawn.mean(axis=-1), values) for name, values in outcomes.items()}
+    if not all(map(len, group.scores)):
+        return counted
+    return counted | dict(zip(RANKED, bootstrap(rank, *group.scores), strict=True))
 
 
 def find_metric(summary: dict[str, Any], name: str) -> dict[str, Any]:

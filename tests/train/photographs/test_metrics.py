@@ -9,10 +9,11 @@ from scipy.stats import bootstrap, mannwhitneyu
 from train.photographs.metrics import (
     RATES,
     REPLICATES,
-    Roc,
-    draw_samples,
+    rank,
     replicate_difference,
+    roc_curve,
     roc_metrics,
+    thresholds,
 )
 
 SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)  # of few values, so that ties are common
@@ -28,26 +29,20 @@ def brute_force_recall(positives: list[float], negatives: list[float], rate: str
 
 @settings(deadline=None)
 @given(positives=SCORES, negatives=SCORES)
-def test_auc_is_the_mann_whitney_statistic_with_ties_counted_half(positives, negatives):
+def test_auc_is_the_mann_whitney_statistic_and_recall_that_at_the_lowest_threshold_within_a_rate(positives, negatives):
+    """Ties count half in the AUC."""
     statistic = mannwhitneyu(positives, negatives, method="asymptotic").statistic
-    auc, swapped = Roc(positives, negatives).values()["auc"], Roc(negatives, positives).values()["auc"]
+    auc, *recalls = rank(np.array(positives), np.array(negatives))
     assert auc == pytest.approx(statistic / (len(positives) * len(negatives)), rel=0, abs=1e-12)
-    assert auc + swapped == pytest.approx(1, rel=0, abs=1e-12)
-
-
-@settings(deadline=None)
-@given(positives=SCORES, negatives=SCORES)
-def test_recall_at_a_false_positive_rate_uses_the_lowest_threshold_within_that_rate(positives, negatives):
-    roc = Roc(positives, negatives)
-    values, thresholds = roc.values(), roc.thresholds()
-    for rate in RATES:
-        assert (values[f"recall_at/{rate}"], thresholds[rate]) == brute_force_recall(positives, negatives, rate)
+    bars = thresholds(np.array(negatives))
+    for rate, recall, threshold in zip(RATES, recalls, bars, strict=True):
+        assert (recall, threshold) == brute_force_recall(positives, negatives, rate)
 
 
 @pytest.mark.parametrize(("m", "allowed"), [(19, 0), (20, 1), (39, 1), (40, 2), (100, 5), (60, 3), (2000, 100)])
 def test_a_rate_allows_exactly_its_number_of_false_positives(m, allowed):
     negatives = np.arange(m, dtype=float)
-    assert (negatives > Roc([0.0], negatives).thresholds()["0.05"]).sum() == allowed
+    assert (negatives > thresholds(negatives)[0]).sum() == allowed
 
 
 @pytest.mark.parametrize(("positives", "negatives"), [([], [1.0]), ([1.0, 2.0], []), ([], [])])
@@ -88,16 +83,6 @@ def test_intervals_are_those_of_scipys_stratified_percentile_bootstrap(scores, n
     assert metrics == roc_metrics(*scores)  # the same at every call
 
 
-def test_counts_stand_for_images_drawn_twice_or_not_at_all(scores):
-    generator = np.random.default_rng(4)
-    counts = [generator.multinomial(len(group), [1 / len(group)] * len(group), size=5) for group in scores]
-    metrics = Roc(*scores).metrics(*counts)
-    for row in range(5):
-        sample = [np.repeat(group, drawn[row]) for group, drawn in zip(scores, counts, strict=True)]
-        for name, values in metrics.items():
-            assert values[row] == pytest.approx(statistic_of(name, *sample), rel=0, abs=1e-12)
-
-
 @pytest.mark.slow
 def test_95_percent_of_the_intervals_cover_the_true_auc():
     """Normal scores one standard deviation apart have an AUC of Φ(1/√2) = 0.760; 3 % is two standard errors of 200."""
@@ -108,7 +93,7 @@ def test_95_percent_of_the_intervals_cover_the_true_auc():
 
 def test_the_curve_has_a_point_per_threshold_and_the_trapezoids_below_it_are_the_auc(scores):
     positives, negatives = scores
-    rates, recalls, thresholds = Roc(positives, negatives).curve()
+    rates, recalls, thresholds = roc_curve(positives, negatives)
     assert (rates[0], recalls[0], rates[-1], recalls[-1], thresholds[-1]) == (0, 0, 1, 1, -np.inf)
     assert len(rates) == len(np.unique([*positives, *negatives])) + 1 and (np.diff(thresholds) < 0).all()
     for rate, recall, threshold in zip(rates, recalls, thresholds, strict=True):
@@ -117,16 +102,6 @@ def test_the_curve_has_a_point_per_threshold_and_the_trapezoids_below_it_are_the
 
 
 # ------------------------------------------------------------------------------------- bootstrap
-
-
-def test_samples_have_the_size_and_the_variance_of_draws_with_replacement():
-    """A multinomial count has the variance 1 - 1/n."""
-    counts = [np.concatenate(blocks) for blocks in zip(*draw_samples(7, 30), strict=True)]
-    for drawn, size in zip(counts, (7, 30), strict=True):
-        assert drawn.shape == (REPLICATES, size) and (drawn.sum(axis=1) == size).all()
-        np.testing.assert_allclose(drawn.mean(axis=0), 1, atol=5 / np.sqrt(REPLICATES))
-        np.testing.assert_allclose(drawn.var(), 1 - 1 / size, atol=0.05)
-    assert abs(np.corrcoef(counts[0][:, 0], counts[1][:, 0])[0, 1]) < 5 / np.sqrt(REPLICATES)
 
 
 def test_pairing_cancels_what_both_runs_share():

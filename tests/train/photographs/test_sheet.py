@@ -5,7 +5,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from train.photographs.metrics import Roc
+from train.photographs.metrics import roc_curve
 from train.photographs.scoring import evaluate_photographs
 from train.photographs.sheet import FRAME, IMAGE, draw_roc
 
@@ -63,13 +63,14 @@ def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both
 
 
 def test_the_figure_has_a_line_per_roc_and_the_mean_auc_of_each_name():
-    rocs = {"all": [Roc([1.0, 2.0], [0.0, 1.5]), Roc([1.0], [0.0])], "lab": [Roc([1.0], [0.0])]}
+    scores = {"all": [([1.0, 2.0], [0.0, 1.5]), ([1.0], [0.0])], "lab": [([1.0], [0.0])]}
+    pairs = {name: [tuple(map(np.array, pair)) for pair in group] for name, group in scores.items()}
     axes = Figure().subplots()
-    draw_roc(axes, rocs, "orange", {"lab": {"color": "red"}})
+    draw_roc(axes, pairs, "orange", {"lab": {"color": "red"}})
     handles, labels = axes.get_legend_handles_labels()
     assert labels == ["all: AUC 0.875", "lab: AUC 1.000"] and handles[1].get_color() == "red"
-    for line, roc in zip(axes.lines[-3:], [*rocs["all"], *rocs["lab"]], strict=True):
-        np.testing.assert_array_equal(line.get_xydata(), np.stack(roc.curve()[:2], axis=1))
+    for line, pair in zip(axes.lines[-3:], [*pairs["all"], *pairs["lab"]], strict=True):
+        np.testing.assert_array_equal(line.get_xydata(), np.stack(roc_curve(*pair)[:2], axis=1))
 
 
 def test_a_folder_without_negatives_has_an_empty_table_and_figure(known_model, tmp_path):
