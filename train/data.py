@@ -57,10 +57,7 @@ def stratified_split(split: Split, fraction: float, seed: int, key: str = "data.
         members = torch.nonzero(split.labels == label).squeeze(1)
         count = round(fraction * len(members))
         if not 0 < count < len(members):
-            raise InputError(
-                f"{key}={fraction} of the {len(members)} images of class {int(label)} is all or nothing: "
-                "add images or change the fraction"
-            )
+            raise InputError(f"{key}={fraction} of class {int(label)}, {len(members)} images, is all or nothing")
         held_out[members[torch.randperm(len(members), generator=draws)[:count]]] = True
     return split[~held_out], split[held_out]
 
@@ -83,10 +80,7 @@ def load_cifar100(path: str) -> DataSet:
     try:
         train, test = (CIFAR100(path, train=part, download=True) for part in (True, False))
     except (OSError, RuntimeError) as error:
-        raise InputError(
-            f"data.path={path}: CIFAR-100 is not there and cannot be downloaded ({error}); "
-            "fetch it on a machine with a network, or use data=npz"
-        ) from error
+        raise InputError(f"data.path={path}: CIFAR-100 is not there and cannot be downloaded ({error})") from error
     splits = [
         Split(torch.from_numpy(part.data).permute(0, 3, 1, 2).contiguous(), torch.tensor(part.targets))
         for part in (train, test)
@@ -137,16 +131,13 @@ def load_folder(path: str, size: int, test_fraction: float) -> DataSet:
         raise InputError(f"data.path={path} is not a folder: give a folder with one folder of images per class")
     parts = [name for name in _folders(root) if name.lower() in PARTS]
     if parts not in ([], ["test", "train"]):
-        raise InputError(
-            f"data.path={path} holds the folders {', '.join(parts)}: divide it into train and test alone, or not at all"
-        )
+        raise InputError(f"data.path={path} holds {', '.join(parts)}: divide it into train and test, or not at all")
     train_root = root / "train" if parts else root
     classes = tuple(_folders(train_root))
     if len(classes) < 2:
         raise InputError(f"data.path={path} holds {len(classes)} class folders: it needs two or more")
     if unread := left_out(root):
-        names = ", ".join([*map(str, unread[:3]), *(["..."] if len(unread) > 3 else [])])
-        console.warning("%d files in %s are not images that can be read: %s", len(unread), root, names)
+        console.warning("%d files in %s are not images: %s", len(unread), root, ", ".join(map(str, unread[:3])))
     train = _folder_split(train_root, classes, size)
     if empty := set(range(len(classes))).difference(train.labels.tolist()):
         raise InputError(f"{train_root / classes[min(empty)]} holds no image: put some there or remove the folder")

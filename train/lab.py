@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from omegaconf import MISSING
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from augment.objects import load_object
 from augment.utils import progress, stream_seed
@@ -183,7 +184,7 @@ def _draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot
         camera=aim + _position(azimuth, rng.uniform(18, 60), half_width / math.tan(math.radians(FOV / 2))),
         center=center,
         aim=aim,
-        rotation=_turn(2, rng.uniform(0, 360)) @ _turn(0, rng.uniform(0, 60)) @ _turn(2, rng.uniform(0, 360)),
+        rotation=Rotation.from_euler("ZXZ", rng.uniform(0, (360, 60, 360)), degrees=True).as_matrix(),
         scale=scale,
     )
 
@@ -193,15 +194,6 @@ def _position(azimuth: float, elevation: float, distance: float) -> np.ndarray:
     azimuth, elevation = math.radians(azimuth), math.radians(elevation)
     horizontal = math.cos(elevation)
     return distance * np.array([horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(elevation)])
-
-
-def _turn(axis: int, angle: float) -> np.ndarray:
-    """(3, 3) about a coordinate axis, by degrees."""
-    sine, cosine = math.sin(math.radians(angle)), math.cos(math.radians(angle))
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[[first, first, second, second], [first, second, first, second]] = cosine, -sine, sine, cosine
-    return matrix
 
 
 # ------------------------------------------------------------------------------------- path tracing
@@ -312,15 +304,6 @@ class LabSettings:
             require_range(name, getattr(self, name), 1, most)
 
 
-@dataclass(frozen=True)
-class Subject:
-    """An object: the name of its class, that of its mesh, and its parts."""
-
-    label: str
-    mesh: str
-    parts: list[Part]
-
-
 def write_laboratory(settings: LabSettings) -> int:
     """Write the folder `settings.out` and return its number of photographs; the settings decide their bytes.
 
@@ -331,8 +314,8 @@ def write_laboratory(settings: LabSettings) -> int:
     out = writable_folder(settings.out, "out")
     subjects = [read_subject(item, index) for index, item in enumerate(settings.meshes)]
     environments = {Path(path).stem: _read_environment(Path(path)) for path in settings.environments}
-    positives = [subject for subject in subjects if subject.label == settings.label]
-    negatives = [subject for subject in subjects if subject.label != settings.label]
+    positives = [subject for subject in subjects if subject[0] == settings.label]
+    negatives = [subject for subject in subjects if subject[0] != settings.label]
     if not (positives and negatives):
         raise InputError(f"meshes: name at least one of label={settings.label} and one of another class")
     shots = draw_shots(settings.setups, settings.patterns, settings.brightness, settings.seed, environments)
@@ -343,13 +326,13 @@ def write_laboratory(settings: LabSettings) -> int:
         for number, shot in progress(enumerate(shots), "setups", settings.setups):
             seed = stream_seed(settings.seed, "samples", number) % 2**32
             for subjects in (positives, negatives):
-                subject = subjects[number % len(subjects)]
-                radiance = photograph(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
+                label, mesh, parts = subjects[number % len(subjects)]
+                radiance = photograph(parts, shot, settings.size, settings.spp, settings.bounces, seed)
                 image = encode(torch.from_numpy(settings.exposure * radiance).clamp(0, 1), "srgb")
-                path = Path(subject.label) / f"{number:04d}_{shot.family}.png"
+                path = Path(label) / f"{number:04d}_{shot.family}.png"
                 (out / path).parent.mkdir(parents=True, exist_ok=True)
                 Image.fromarray((image * 255).round().byte().numpy()).save(out / path)
-                rows.append((path.as_posix(), shot.family, number, subject.mesh, f"{shot.brightness:.4f}"))
+                rows.append((path.as_posix(), shot.family, number, mesh, f"{shot.brightness:.4f}"))
         with open(out / TABLE, "w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([("path", "source_tag", "setup", "mesh", "brightness"), *sorted(rows)])
         versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
@@ -365,8 +348,9 @@ def _read_environment(path: Path) -> np.ndarray:
     return radiance
 
 
-def read_subject(item: str | dict[str, Any], index: int) -> Subject:
-    """An entry of `meshes`. The label of a solid is its own name by default, with `other_` before hard negatives.
+def read_subject(item: str | dict[str, Any], index: int) -> tuple[str, str, list[Part]]:
+    """The label, mesh and parts of an entry of `meshes`. The label of a solid is its own name by default, with `other_`
+    before hard negatives.
 
     InputError: as `load_object`; a file without a label; a label that is not a folder's name.
     """
@@ -379,4 +363,4 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
         raise InputError(f"meshes[{index}] has no label: give {{mesh: {settings.mesh}, label: CLASS or {FOREIGN}NAME}}")
     if Path(label).name != label or label == "..":
         raise InputError(f"meshes[{index}]: the label {label!r} names the photographs' folder: leave out slashes")
-    return Subject(label, settings.mesh, lab_parts(load_object(settings).mesh, settings.albedo_scale))
+    return label, settings.mesh, lab_parts(load_object(settings).mesh, settings.albedo_scale)

@@ -27,6 +27,8 @@ from train.checkpoint import BEST, VERSION, checked, load
 WIDERESNET, TORCHVISION, PYTHON = "wideresnet", "torchvision:", "python:"
 DEEPEST, MOST_PARAMETERS = 1000, 1e9  # 4 GB; a checkpoint from elsewhere may ask for anything
 DROPOUT_LEVELS = 2**16
+Color = Sequence[float]  # (3,) RGB
+MEAN, STD = (0.5, 0.5, 0.5), (0.25, 0.25, 0.25)  # where those of the data are not given
 PUBLISHED = "model.safetensors"
 SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
 _WITHOUT_AUXILIARY = {"aux_logits": False, "init_weights": True}
@@ -47,23 +49,14 @@ class WideResNet(nn.Module):
     std: Tensor
 
     def __init__(
-        self,
-        classes: int,
-        depth: int = 16,
-        width: int = 4,
-        dropout: float = 0.3,
-        mean: Sequence[float] = (0.5, 0.5, 0.5),
-        std: Sequence[float] = (0.25, 0.25, 0.25),
+        self, classes: int, depth: int = 16, width: int = 4, dropout: float = 0.3, mean: Color = MEAN, std: Color = STD
     ):
         super().__init__()
         parameters = 9 * (depth - 4) // 3 * width**2 * 16**2 * (1 + 4 + 16)
         if depth < 10 or (depth - 4) % 6 or width < 1:
             raise InputError(f"model.depth={depth}, model.width={width}: depth is 10, 16, 22, ... and width at least 1")
         if depth > DEEPEST or parameters > MOST_PARAMETERS:
-            raise InputError(
-                f"model.depth={depth}, model.width={width}: {parameters:.1g} parameters are too many; "
-                f"{MOST_PARAMETERS:g} are the limit"
-            )
+            raise InputError(f"model.depth={depth}, model.width={width}: {parameters:.1g} parameters are too many")
         if not 0 <= dropout < 1:
             raise InputError(f"model.dropout={dropout} must be at least 0 and below 1")
         channels, blocks = [16, 16 * width, 32 * width, 64 * width], (depth - 4) // 6
@@ -94,8 +87,8 @@ class _Block(nn.Module):
         self.norm2 = nn.BatchNorm2d(outputs)
         self.dropout = Dropout(dropout)
         self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
-        same = inputs == outputs and stride == 1
-        self.shortcut = None if same else nn.Conv2d(inputs, outputs, 1, stride, bias=False)
+        changed = inputs != outputs or stride > 1
+        self.shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False) if changed else None
 
     def forward(self, x: Tensor) -> Tensor:
         activated = F.relu(self.norm1(x))
@@ -146,12 +139,7 @@ class Dropout(nn.Dropout):
 
 
 def build_network(
-    classes: Sequence[str],
-    size: int,
-    name: str = WIDERESNET,
-    mean: Sequence[float] = (0.5, 0.5, 0.5),
-    std: Sequence[float] = (0.25, 0.25, 0.25),
-    **shape: Any,
+    classes: Sequence[str], size: int, name: str = WIDERESNET, mean: Color = MEAN, std: Color = STD, **shape: Any
 ) -> nn.Module:
     """A network with fresh weights from images (N, 3, size, size), RGB in [0, 1], to logits of the classes.
 
@@ -170,9 +158,7 @@ def build_network(
     elif name.startswith(TORCHVISION):
         require_architecture(name.removeprefix(TORCHVISION), f"model={name}")
     else:
-        raise InputError(
-            f"model={name} is not known: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION"
-        )
+        raise InputError(f"model={name}: choose {WIDERESNET}, {TORCHVISION}NAME or {PYTHON}MODULE:FUNCTION")
     try:
         if name.startswith(TORCHVISION):
             network = Normalized(_torchvision_network(name.removeprefix(TORCHVISION), len(classes), size), mean, std)
@@ -219,16 +205,14 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
     because a file does. InputError for weights=, since the run holds its own.
     """
     if weights is not None:
-        raise InputError(
-            f"weights={weights} is not for classifier=run:{run}, which has weights of its own: leave it out"
-        )
+        raise InputError(f"weights={weights} is not for classifier=run:{run}, which has its own: leave it out")
     path, state = load_selected(Path(run))
     shape = {key: value for key, value in state["architecture"].items() if key not in ("version", "encoding")}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         raise InputError(
-            f"the network in {path} is made by {name}: give model={name} to run that code, which a file alone must not "
-            "do; an attack takes it as classifier=python: with a function that loads its weights"
+            f"the network in {path} is made by {name}: give model={name} to run that code or, for an attack, "
+            "classifier=python: with a function that loads the weights"
         )
     with _of_one_architecture(path):
         size, classes = int(shape.pop("size")), tuple(map(str, shape.pop("classes")))
@@ -245,8 +229,7 @@ def _of_one_architecture(path: Path) -> Iterator[None]:
     except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
         reason = textwrap.shorten(in_one_line(error), 300)
         raise InputError(
-            f"checkpoint {path} is from another architecture ({reason}): use the model settings that it was trained "
-            "with, or another file"
+            f"checkpoint {path} is from another architecture ({reason}): use the model settings of its training"
         ) from error
 
 
@@ -254,9 +237,7 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     """The file of a run's selected network, best.pt or model.safetensors or such a file itself, and its content."""
     path = next((file for file in (run, run / BEST, run / PUBLISHED) if file.is_file()), None)
     if path is None:
-        raise InputError(
-            f"run={run} holds neither {BEST} nor {PUBLISHED}: give a run folder that `python -m train` wrote"
-        )
+        raise InputError(f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that `python -m train` wrote")
     return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
 
 

@@ -76,9 +76,7 @@ class TrainingSceneSettings(SceneSettings):
 
 @dataclass
 class ModelSettings:
-    """name: as `train.networks.build_network` takes it. The rest is the WideResNet's; its dropout acts between the two
-    convolutions of a block.
-    """
+    """name: as `train.networks.build_network` takes it. The rest is the WideResNet's."""
 
     name: str = WIDERESNET
     depth: int = 16
@@ -108,10 +106,7 @@ class EvaluationSettings:
             raise InputError(f"photos={photos} must be a folder, or a mapping of names to folders")
         for name in self.folders:
             if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
-                raise InputError(
-                    f"photos: {name} must be a name of letters, digits, _ and -, and none of {', '.join(RESERVED)}, "
-                    "since it becomes a sub-folder of the run"
-                )
+                raise InputError(f"photos: {name} must be a name of letters, digits, _ and -, not one of {RESERVED}")
 
     @property
     def folders(self) -> dict[str, Path]:
@@ -152,10 +147,11 @@ class ExperimentSettings:
     @property
     def objects(self) -> dict[str, ObjectSettings]:
         """By their keys, the meshes of the scene, and its hard negatives, of the class OTHER where they name none."""
-        objects = {}
-        for key, label in (("meshes", self.label), ("hard_negatives", OTHER)):
-            for index, item in enumerate(getattr(self.scene, key)):
-                objects[f"scene.{key}[{index}]"] = read_object(item, label, index, f"scene.{key}")
+        objects = {
+            f"scene.{key}[{index}]": read_object(item, label, index, f"scene.{key}")
+            for key, label in (("meshes", self.label), ("hard_negatives", OTHER))
+            for index, item in enumerate(getattr(self.scene, key))
+        }
         for key, item in objects.items():
             if key.startswith("scene.hard_negatives") and item.label == self.label:
                 raise InputError(f"{key} is of the class {self.label}: name it in scene.meshes, or leave it out")

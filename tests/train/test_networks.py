@@ -1,6 +1,5 @@
 import math
 import re
-import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -35,24 +34,20 @@ SOURCE = """
 import torch
 from torch import nn
 
-class Network(nn.Module):
-    def __init__(self, outputs=3):
-        super().__init__()
-        self.layer = nn.Linear(3, outputs)
-
+class Network(nn.Linear):
     def forward(self, images):
-        return self.layer(images.mean((2, 3)))
+        return super().forward(images.mean((2, 3)))
 
-def build(): return Network(), 16, ["apple", "orange", "pear"]
-def of_other_size(): return Network(), 32, ["apple", "orange", "pear"]
-def of_other_classes(): return Network(), 16, ["orange", "apple", "pear"]
-def of_other_logits(): return Network(4), 16, ["apple", "orange", "pear"]
+def build(): return Network(3, 3), 16, ["apple", "orange", "pear"]
+def of_other_size(): return Network(3, 3), 32, ["apple", "orange", "pear"]
+def of_other_classes(): return Network(3, 3), 16, ["orange", "apple", "pear"]
+def of_other_logits(): return Network(3, 4), 16, ["apple", "orange", "pear"]
 """
 
 
 @pytest.fixture(autouse=True)
 def own_models(tmp_path, monkeypatch) -> None:
-    (tmp_path / "own_models.py").write_text(textwrap.dedent(SOURCE))
+    (tmp_path / "own_models.py").write_text(SOURCE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
 
@@ -194,7 +189,7 @@ def test_a_torchvision_network_is_torchvisions_own_after_normalization():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "size"),
-    [("vit_b_32", 64), ("inception_v3", 96), ("googlenet", 64), ("vgg11", 32), ("swin_t", 64)],
+    [("vit_b_32", 64), ("inception_v3", 96), ("googlenet", 64)],
 )
 def test_every_family_of_torchvision_gives_logits_in_training_too(name, size):
     network = build_network(CLASSES, size, f"torchvision:{name}").train()
@@ -213,7 +208,7 @@ def test_every_family_of_torchvision_gives_logits_in_training_too(name, size):
     ],
 )
 def test_a_network_that_does_not_take_the_data_is_refused_by_name(name, size, message):
-    with pytest.raises(InputError, match=f"^model={name} .*{re.escape(message)}"):
+    with pytest.raises(InputError, match=rf"^model={name}\W.*{re.escape(message)}"):
         build_network(CLASSES, size, name)
 
 
@@ -282,10 +277,10 @@ def test_a_network_starts_with_the_weights_and_the_normalization_of_another(netw
     [({"classes": ["pear", "apple", "orange"]}, "other classes"), ({"depth": 16}, "depth 10, not 16")],
 )
 def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, change, fault):
-    write(tmp_path, network)
-    message = f"train.init_from={tmp_path} was trained with {fault}: give this run the same"
-    with pytest.raises(InputError, match=message):
-        start_from(network, {**description_of(network), **change}, tmp_path)
+    with pytest.raises(
+        InputError, match=f"train.init_from={tmp_path} was trained with {fault}: give this run the same"
+    ):
+        start_from(network, {**description_of(network), **change}, write(tmp_path, network))
 
 
 # ---------------------------------------------------------------------------------------- publishing
