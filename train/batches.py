@@ -5,7 +5,7 @@ Images are uint8 and live on the device, cropped and flipped there for many batc
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,8 +21,7 @@ CHUNK_BYTES = 2**28  # holds a whole epoch of CIFAR-100; larger data sets are cr
 FLIPS = ("random", "alternating")
 
 
-@dataclass(frozen=True)
-class Round:
+class Round(NamedTuple):
     """The training between two regenerations of the renders: an epoch, or a part of one.
 
     number: counts a run's rounds from 0. epoch: from 0. rows: (N,) int64, ascending, the images that it shows.

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, cuda
 
-from renderer.errors import InputError
+from renderer.errors import InputError, require_file
 
 LAST, PREVIOUS, BEST = "last.pt", "previous.pt", "best.pt"
 HASH = "sha256"
@@ -53,8 +53,7 @@ def save(path: Path, state: Mapping[str, Any], previous: Path | None = None) -> 
 
 def load(path: Path) -> dict[str, Any]:
     """The state that `save` wrote, on the CPU; InputError for a file that is missing, damaged or not a checkpoint."""
-    if not path.is_file():
-        raise InputError(f"checkpoint {path} does not exist: give a run folder that holds one")
+    require_file(path, "give a run folder that holds a checkpoint")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(state, dict) or state.pop(HASH, None) != content_hash(state):

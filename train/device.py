@@ -59,15 +59,12 @@ def choose_precision(precision: str, device: torch.device) -> str:
     require_choice("train.precision", precision, PRECISIONS)
     if precision != "auto":
         return precision
-    match device.type:
-        case "cuda":
-            supported = torch.cuda.is_bf16_supported(including_emulation=False)
-        case "cpu" if platform.machine() in ("x86_64", "AMD64"):
-            supported = torch.cpu._is_avx512_bf16_supported()
-        case "cpu":
-            supported = torch.ops.mkldnn._is_mkldnn_bf16_supported()
-        case _:
-            supported = False
+    if device.type == "cuda":
+        supported = torch.cuda.is_bf16_supported(including_emulation=False)
+    elif platform.machine() in ("x86_64", "AMD64"):
+        supported = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
+    else:
+        supported = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     return "bfloat16" if supported else "float32"
 
 

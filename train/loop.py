@@ -45,13 +45,9 @@ class EpochState:
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values and tensors, over all processes; the renders as bytes, as they are trained on."""
-        return {
-            "images": to_bytes(self.renders.images),
-            "labels": self.renders.labels,
-            "diagnostics": [dict(diagnostics) for diagnostics in self.diagnostics],
-            "sums": summed(self.sums.clone()),
-            "step": self.step,
-        }
+        renders = {"images": to_bytes(self.renders.images), "labels": self.renders.labels}
+        diagnostics = [dict(diagnostics) for diagnostics in self.diagnostics]
+        return {**renders, "diagnostics": diagnostics, "sums": summed(self.sums.clone()), "step": self.step}
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any], device: torch.device) -> "EpochState":
@@ -81,14 +77,11 @@ class Trainer:
 
         InputError where the processes cannot share a batch equally, or for a ranking without hard negatives.
         """
-        if settings.batch_size % utils.world_size():
-            raise InputError(
-                f"train.batch_size={settings.batch_size} is not a multiple of the {utils.world_size()} processes"
-            )
+        processes = utils.world_size()
+        if settings.batch_size % processes:
+            raise InputError(f"train.batch_size={settings.batch_size} is no multiple of the {processes} processes")
         if settings.ranking and service.label is None:
-            raise InputError(
-                f"train.ranking={settings.ranking} ranks hard negatives: name some in scene.hard_negatives"
-            )
+            raise InputError("train.ranking ranks hard negatives: name some in scene.hard_negatives")
         self.settings, self.architecture, self.service, self.folder = settings, architecture, service, folder
         self.phases, self.seed, self.epoch = service.phases, service.seed, 0
         self.history: list[dict[str, float]] = []  # the metrics of each epoch
@@ -228,21 +221,17 @@ class Trainer:
         rounds = state.diagnostics
         diagnostics = {name: fmean(part[name] for part in rounds) for name in rounds[0]}
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()  # one resumed after its last attack has no more
-        metrics = {
-            "train/loss": loss_sum / images,
-            "train/accuracy": hits / images,
-            **{f"validation/{name}": value for name, value in validated.items()},
-            "train/learning_rate": self.optimizer.param_groups[0]["lr"],
-            **{f"augment/{name}": value for name, value in diagnostics.items()},
-            **{f"seconds/{name}": value for name, value in seconds.items()},
-        }
+        rate = self.optimizer.param_groups[0]["lr"]
+        trained = {"loss": loss_sum / images, "accuracy": hits / images, "learning_rate": rate}
+        groups = {"train": trained, "validation": validated, "augment": diagnostics, "seconds": seconds}
+        metrics = {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
         self.history.append({"epoch": self.epoch, **metrics})
         if log:
             log.scalars(metrics, self.epoch)
         success = diagnostics.get("attack_success")
         console.info(
-            f"epoch {self.epoch}/{self.settings.epochs}  train loss {metrics['train/loss']:.3f} accuracy "
-            f"{metrics['train/accuracy']:.3f}  validation accuracy {validated['accuracy']:.3f}"
+            f"epoch {self.epoch}/{self.settings.epochs}  train loss {trained['loss']:.3f} accuracy "
+            f"{trained['accuracy']:.3f}  validation accuracy {validated['accuracy']:.3f}"
             f"{'' if success is None else f'  attack success {success:.2f}'}"
             f"  {sum(seconds[name] for name in PHASES):.0f} s (attack {seconds['attack']:.1f} s)"
         )
@@ -251,11 +240,8 @@ class Trainer:
         """InputError where the loss or a weight is NaN or infinite, before either is kept."""
         settings, weights = self.settings, self.model.network.state_dict().values()
         if not (math.isfinite(loss) and torch.stack([value.isfinite().all() for value in weights]).all()):
-            raise InputError(
-                f"train.learning_rate={settings.learning_rate} with train.weight_decay={settings.weight_decay} made "
-                f"the loss or weights NaN or infinite in epoch {epoch}: set lower ones; the checkpoint before, if any, "
-                "is kept"
-            )
+            rates = f"train.learning_rate={settings.learning_rate} with train.weight_decay={settings.weight_decay}"
+            raise InputError(f"{rates} made the loss or weights NaN or infinite in epoch {epoch}: set lower ones")
 
     # --------------------------------------------------------------------------------- checkpoints
 
@@ -321,8 +307,8 @@ class Trainer:
         if problem:
             console.warning("%s: going on from the one before", problem)
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or it would take the place of the whole one
-        steps = f" and {self._under_way.step} steps" if self._under_way else ""
-        console.info("resumed %s after epoch %d%s", self.folder, self.epoch, steps)
+        steps = self._under_way.step if self._under_way else 0
+        console.info("resumed %s after epoch %d and %d steps", self.folder, self.epoch, steps)
 
 
 @torch.no_grad()

@@ -85,9 +85,8 @@ class TrainSettings:
                 raise InputError(f"{name}={getattr(self, name)} must be at least 0 and below 1")
         for name in ("ranking", "distillation", "weight_decay"):
             require_range(name, getattr(self, name), 0, FACTOR)
-        for name in ("distillation", "soup"):
-            if getattr(self, name) and not self.init_from:
-                raise InputError(f"{name} needs a network to begin with: set train.init_from")
+        if (self.distillation or self.soup) and not self.init_from:
+            raise InputError("distillation and soup need a network to begin with: set train.init_from")
         if not 0 < self.learning_rate <= FACTOR:
             raise InputError(f"learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
 
@@ -152,11 +151,8 @@ def augmentation(name: str, model: nn.Module, seed: int) -> Augment:
         return lambda images, labels, step: pgd(model, images, labels, generator(seed, step, "pgd", utils.rank()))
     from torchvision.transforms import v2  # takes a second, as wherever torchvision is imported where it is used
 
-    transform = {
-        "color_jitter": v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1),
-        "trivial_augment": v2.TrivialAugmentWide(),
-        "augmix": v2.AugMix(),
-    }[name]
+    jitter = v2.ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.1)
+    transform = {"color_jitter": jitter, "trivial_augment": v2.TrivialAugmentWide(), "augmix": v2.AugMix()}[name]
     return lambda images, labels, step: _transform_each(transform, images, seed, step)
 
 

@@ -26,7 +26,7 @@ from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings, to_bytes
 from renderer.light.presets import ambient, directional
 from renderer.mesh import Mesh, normalize
-from renderer.rasterizer import Rasterizer, choose
+from renderer.rasterizer import choose
 from renderer.shapes import SOLIDS, solid
 from train import console
 from train.data import DataSet, Split
@@ -46,18 +46,13 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache 
 
     The cache keeps the images, not the operators: every one of those is used for four images and never again.
     """
-    settings = replace(SETTINGS, size=size)
-    splits = [
-        _render_split(name, per_class, seed, settings, cache or TensorCache())
-        for name, per_class in [("train", train), ("test", test)]
-    ]
-    return DataSet(CLASSES, *splits)
+    parts = {"train": train, "test": test}
+    return DataSet(CLASSES, *(_render_split(part, count, size, seed, cache) for part, count in parts.items()))
 
 
 def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None = None) -> None:
     """Class folders of PNG images in hard light; photos.csv calls them rendered and numbers the lights."""
-    settings = replace(SETTINGS, size=size)
-    split = _render_split(HELD_OUT, HELD_OUT_PER_CLASS, seed, settings, cache or TensorCache())
+    split = _render_split(HELD_OUT, HELD_OUT_PER_CLASS, size, seed, cache)
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
@@ -86,7 +81,8 @@ def hard_light(back: Tensor, draws: torch.Generator) -> Tensor:
     return ambient(0.06 * tint) + directional(direction, strength * tint)
 
 
-def _render_split(part: str, per_class: int, seed: int, settings: ImageSettings, cache: TensorCache) -> Split:
+def _render_split(part: str, per_class: int, size: int, seed: int, cache: TensorCache | None) -> Split:
+    cache, settings = cache or TensorCache(), replace(SETTINGS, size=size)
     key = content_key(CODE, CLASSES, per_class, seed, part, settings)
     cached = cache.read(key)
     if cached is None:
@@ -99,7 +95,6 @@ def _render_split(part: str, per_class: int, seed: int, settings: ImageSettings,
 def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:
     """Images of every class, in order: uint8 (classes × per_class, 3, size, size). Held out, all classes have the same
     draws of light and camera."""
-    rasterizer = choose("numpy")
     instances = math.ceil(per_class / (VIEWS * BACKGROUNDS))
     light = hard_light if part == HELD_OUT else even_light
     draws = seeds = generator(seed, part)
@@ -108,14 +103,11 @@ def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Te
         if part == HELD_OUT:
             draws, seeds = generator(seed, part), generator(seed, part, name)
         meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(instances))
-        portraits = [_portraits(name, mesh, light, settings, rasterizer, draws) for mesh in meshes]
-        images.append(torch.cat(portraits)[:per_class])
+        images.append(torch.cat([_portraits(mesh, light, settings, draws) for mesh in meshes])[:per_class])
     return torch.cat(images)
 
 
-def _portraits(
-    name: str, mesh: Mesh, light: Lights, settings: ImageSettings, rasterizer: Rasterizer, draws: torch.Generator
-) -> Tensor:
+def _portraits(mesh: Mesh, light: Lights, settings: ImageSettings, draws: torch.Generator) -> Tensor:
     """20 images of one instance: uint8 (20, 3, size, size)."""
     polar, azimuth, width = torch.rand(3, VIEWS, generator=draws, dtype=torch.float64)
     cameras = [
@@ -126,5 +118,5 @@ def _portraits(
     towards = [torch.tensor(camera.axes()[2], dtype=torch.float32) for camera in cameras for _ in backgrounds]
     lights = torch.stack([light(back, draws) for back in towards])
     images = load_backgrounds(backgrounds, settings.size)
-    scene = Scene.grid([SceneObject(name, normalize(mesh))], cameras, images, lights, settings, rasterizer)
+    scene = Scene.grid([SceneObject("", normalize(mesh))], cameras, images, lights, settings, choose("numpy"))
     return to_bytes(scene.render(Conditions(lights), torch.arange(len(scene))).flatten(0, 1))

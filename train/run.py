@@ -1,6 +1,5 @@
 """One run from its settings: data, network, augmentation service, training, scores on the test set and photographs."""
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,11 +9,10 @@ from augment import utils
 from augment.build import build_scene
 from augment.classifiers.adapter import class_index
 from augment.losses import complementary_label
-from augment.scene import Scene
 from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed
 from renderer.cache import TensorCache, cache_folder
-from renderer.errors import InputError, require_choice
+from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE
 from train import checkpoint, console
 from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
@@ -84,10 +82,8 @@ def load_data(settings: ExperimentSettings) -> DataSet:
     console.info("data: %s", data.name)
     with first_process_first():
         loaded = loaders[data.name]()
-    if not SMALLEST_SIZE <= loaded.size <= LARGEST_SIZE:
-        raise InputError(
-            f"data.path={data.path} has images of {loaded.size} pixels per side: give {SMALLEST_SIZE} to {LARGEST_SIZE}"
-        )
+    with keyed("data.path"):
+        require_range("image size", loaded.size, SMALLEST_SIZE, LARGEST_SIZE)
     return loaded
 
 
@@ -95,7 +91,7 @@ def write_images(settings: ExperimentSettings, size: int) -> None:
     """Write the rendered held-out images that `data=shapes` is scored on, where the settings ask for them."""
     data = settings.data
     if data.name == "shapes" and data.images:
-        console.info("writing held-out renders in hard light (not photographs) to %s", data.images)
+        console.info("held-out renders in hard light (not photographs): %s", data.images)
         write_held_out(Path(data.images), size, data.seed, TensorCache(cache_folder(settings.renderer.cache)))
 
 
@@ -104,49 +100,35 @@ def write_images(settings: ExperimentSettings, size: int) -> None:
 
 def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
     """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before."""
-    phases = Phases(device)
     precision = choose_precision(settings.train.precision, device)
-    mean, std = channel_statistics(data.train.images)
-    shape = settings.model.shape
+    (mean, std), shape = channel_statistics(data.train.images), settings.model.shape
     torch.manual_seed(stream_seed(settings.seed, "weights"))
     network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
     facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
     if settings.train.init_from:
         start_from(network, facts, Path(settings.train.init_from))
-    service = build_service(settings, data, device, phases)
+    service = build_service(settings, data, device)
     model = MixedPrecision(network.to(device), precision)
     return Trainer(settings.train, model, describe(network, **facts), service, folder)
 
 
-def build_service(
-    settings: ExperimentSettings, data: DataSet, device: torch.device, phases: Phases
-) -> AugmentationService:
-    """The scene, its labels and the service that regenerates its renders."""
+def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
+    """The scene, its labels and the service that regenerates its renders; logs the rasterizer."""
     scene, labels, ranked = None, torch.zeros(0, dtype=torch.int64, device=device), None
+    phases, process = Phases(device), (utils.rank(), utils.world_size())
     if settings.augment.renders:
-        with phases("operators"), first_process_first():
-            scene = _build_scene(settings, data, device)
-        label = class_index(data.classes, settings.label, "label")
-        numbers = {OTHER: complementary_label(label)} | {name: index for index, name in enumerate(data.classes)}
+        label, objects = class_index(data.classes, settings.label, "label"), settings.objects
+        numbers = {OTHER: complementary_label(label)}
+        for key, item in objects.items():
+            if item.label != OTHER:
+                numbers[item.label] = class_index(data.classes, item.label, f"label of {key}")
+        options = {"scene": settings.scene, "renderer": settings.renderer, "device": device}
+        with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
+            scene = build_scene(list(objects.values()), data.size, settings.views, **options)
+        console.info("rasterizer: %s", scene.rasterizer.description)
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
         ranked = label if settings.scene.hard_negatives else None
-    process = utils.rank(), utils.world_size()
     return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process)
-
-
-def _build_scene(settings: ExperimentSettings, data: DataSet, device: torch.device) -> Scene:
-    """The scene; logs its rasterizer and how long it took."""
-    for key, item in settings.objects.items():
-        if item.label != OTHER:
-            class_index(data.classes, item.label, f"label of {key}")
-    start, objects = time.perf_counter(), list(settings.objects.values())
-    with keyed("scene", vars(settings.scene)):
-        scene = build_scene(
-            objects, data.size, settings.views, scene=settings.scene, renderer=settings.renderer, device=device
-        )
-    seconds = time.perf_counter() - start
-    console.info("scene: %d examples in %.2f s; rasterizer: %s", len(scene), seconds, scene.rasterizer.description)
-    return scene
 
 
 # ------------------------------------------------------------------------------------- the folder

@@ -63,9 +63,7 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
     with ExitStack() as stack:
         for folder in folders:
             if not stack.enter_context(locked(folder)):
-                raise InputError(
-                    f"{key}={folder} is being written by another process: wait for it, or choose another {key}="
-                )
+                raise InputError(f"{key}={folder} is being written by another process: wait, or choose another")
         try:
             yield
         finally:
@@ -101,10 +99,7 @@ def _text_of(path: Path) -> Iterator[str]:
             raise ValueError(f"it is larger than {LARGEST_FILE} bytes")
         yield path.read_text(encoding="utf-8")
     except Exception as error:
-        reason = in_one_line(error)
-        raise InputError(
-            f"{path} is damaged or not as `python -m train` wrote it ({reason}): use another run"
-        ) from error
+        raise InputError(f"{path} is damaged or of another kind ({in_one_line(error)}): use another run") from error
 
 
 def read_config(path: Path) -> DictConfig:
@@ -189,10 +184,7 @@ def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool 
         old, new = before.get(key), asked.get(key)
         longer = key == "train.epochs" and isinstance(old, int) and settings.train.epochs > old
         if old != new and (finished or not (longer or key.startswith("evaluate."))):
-            raise InputError(
-                f"{folder} was trained with {key}={old}, not {new}: give the settings of {folder / CONFIG}, or "
-                f"{elsewhere}"
-            )
+            raise InputError(f"{folder} was trained with {key}={old}, not {new}: give its setting, or {elsewhere}")
     hashes = config.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
         if hashes.get(path, fingerprint) != fingerprint:

@@ -14,25 +14,12 @@ from train.settings import ExperimentSettings, compose, read_settings
 
 CLASSES = ["apple", "orange", "pear"]
 TINY = [
-    "data=npz",
+    "data=npz", "model.depth=10", "model.width=1", "model.dropout=0.3", "train.epochs=3", "train.batch_size=16",
+    "train.learning_rate=0.05", "train.precision=float32", "train.device=cpu", "evaluate.photos=null",
     "seed=7",  # the attack then moves the lights in every epoch
-    "model.depth=10",
-    "model.width=1",
-    "model.dropout=0.3",
-    "train.epochs=3",
-    "train.batch_size=16",
-    "train.learning_rate=0.05",
-    "train.precision=float32",
-    "train.device=cpu",
-    "augment.examples=4",
-    "augment.warm_start=true",
-    "augment.attack.max_steps=3",
-    "augment.attack.step_size=0.3",
-    "scene.backgrounds=[0.2,0.8]",
-    "renderer.rasterizer=numpy",
-    "renderer.samples=2",
-    "evaluate.photos=null",
-]
+    "augment.examples=4", "augment.warm_start=true", "augment.attack.max_steps=3", "augment.attack.step_size=0.3",
+    "scene.backgrounds=[0.2,0.8]", "renderer.rasterizer=numpy", "renderer.samples=2",
+]  # fmt: skip
 
 
 def colored_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
@@ -46,16 +33,10 @@ def colored_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
 def tiny_npz(tmp_path_factory) -> Path:
     """60 training and 30 test images of three classes, 16 × 16."""
     path = tmp_path_factory.mktemp("data") / "tiny.npz"
-    rng = np.random.default_rng(0)
-    train, test = np.repeat(np.arange(3), 20), np.repeat(np.arange(3), 10)
-    np.savez(
-        path,
-        train_images=colored_noise(rng, train),
-        train_labels=train,
-        test_images=colored_noise(rng, test),
-        test_labels=test,
-        classes=np.array(CLASSES),
-    )
+    rng, arrays = np.random.default_rng(0), {"classes": np.array(CLASSES)}
+    for part, labels in [("train", np.repeat(np.arange(3), 20)), ("test", np.repeat(np.arange(3), 10))]:
+        arrays |= {f"{part}_images": colored_noise(rng, labels), f"{part}_labels": labels}
+    np.savez(path, **arrays)
     return path
 
 

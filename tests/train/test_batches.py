@@ -1,6 +1,7 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from scipy.stats import binomtest, chisquare
 
 from augment.service import Renders
 from train import batches
@@ -12,8 +13,8 @@ def noise(*shape: int) -> torch.Tensor:
     return torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
 
 
-def whole_epoch(images: torch.Tensor, epoch: int) -> Round:
-    return Round(epoch, epoch, torch.arange(len(images)))
+def epoch_round(images: int, epoch: int) -> Round:
+    return Round(epoch, epoch, torch.arange(images))
 
 
 def numbered(images: torch.Tensor) -> Split:
@@ -24,7 +25,7 @@ def numbered(images: torch.Tensor) -> Split:
 def epoch_of(count: int, batch_size: int = 7) -> list[tuple[torch.Tensor, ...]]:
     """Batches of plain images, each of its own value, which is its label too."""
     images = torch.arange(count).view(-1, 1, 1, 1).expand(-1, 3, 8, 8).to(torch.uint8)
-    return list(training_batches(numbered(images), batch_size, 0, whole_epoch(images, 0)))
+    return list(training_batches(numbered(images), batch_size, 0, epoch_round(count, 0)))
 
 
 @pytest.mark.parametrize("shape", [(5, 5), (6, 11)])
@@ -46,14 +47,12 @@ def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flippe
 def test_shifts_and_flips_are_all_drawn_about_equally_often():
     count, size, middle = 6000, 11, 5
     pixel = torch.arange(size * size).view(1, 1, size, size).expand(count, 3, -1, -1).to(torch.uint8)
-    (images, *_), *_ = training_batches(Split(pixel, torch.zeros(count)), count, 0, whole_epoch(pixel, 0))
+    (images, *_), *_ = training_batches(Split(pixel, torch.zeros(count)), count, 0, epoch_round(count, 0))
     rows = images[:, 0, middle].long()
     flipped = rows[:, middle - 1] > rows[:, middle + 1]
-    assert abs(flipped.double().mean() - 0.5) < 4 * 0.5 / count**0.5  # four standard deviations
+    assert binomtest(int(flipped.sum()), count).pvalue > 1e-4
     counts = rows[:, middle].bincount(minlength=size * size).view(size, size)[1:-1, 1:-1]
-    assert counts.sum() == count
-    chi_square = ((counts - count / 81) ** 2 / (count / 81)).sum()
-    assert chi_square < 80 + 4 * (2 * 80) ** 0.5  # four standard deviations at 80 degrees of freedom
+    assert counts.sum() == count and chisquare(counts.flatten()).pvalue > 1e-4
 
 
 def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
@@ -61,7 +60,7 @@ def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
 
     def mirrored(epoch: int) -> torch.Tensor:
         """By image."""
-        ((images, labels, _),) = training_batches(numbered(ramp), 40, 0, whole_epoch(ramp, epoch), "alternating")
+        ((images, labels, _),) = training_batches(numbered(ramp), 40, 0, epoch_round(40, epoch), "alternating")
         flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
         return flipped[labels.argsort()]
 
@@ -82,26 +81,20 @@ def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last
     assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
 
 
-def test_batches_tell_which_of_their_images_are_renders():
-    rows = torch.arange(30)
-    epoch = training_batches(numbered(noise(30, 3, 8, 8)), 7, 0, Round(0, 0, rows[5:], renders=4))
-    assert all(torch.equal(rendered, labels >= 26) for _, labels, rendered in epoch)
-
-
 @pytest.mark.parametrize("flips", ["random", "alternating"])
 @pytest.mark.parametrize("images_at_once", [1, 20])
 def test_an_epoch_goes_on_from_any_batch_as_if_it_had_never_stopped(monkeypatch, flips, images_at_once):
     split = numbered(noise(50, 3, 8, 8))
-    whole = list(training_batches(split, 8, 0, whole_epoch(split.images, 1), flips))
+    whole = list(training_batches(split, 8, 0, epoch_round(50, 1), flips))
     monkeypatch.setattr(batches, "CHUNK_BYTES", images_at_once * 3 * 8 * 8)
     for first in range(len(whole) + 1):
-        rest = list(training_batches(split, 8, 0, whole_epoch(split.images, 1), flips, first))
+        rest = list(training_batches(split, 8, 0, epoch_round(50, 1), flips, first))
         assert len(rest) == len(whole) - first
         for batch, expected in zip(rest, whole[first:], strict=True):
             assert all(torch.equal(*pair) for pair in zip(batch, expected, strict=True))
 
 
-def test_the_rounds_renders_follow_the_data_as_bytes_with_their_labels():
+def test_the_rounds_renders_follow_the_data_as_bytes_with_their_labels_and_batches_tell_them_apart():
     data = numbered(noise(5, 3, 16, 16))
     mixed = with_room(data, 2)
     for renders in (torch.ones(2, 3, 16, 16), torch.rand(2, 3, 16, 16)):
@@ -109,6 +102,9 @@ def test_the_rounds_renders_follow_the_data_as_bytes_with_their_labels():
         assert torch.equal(mixed.images[:5], data.images)
         assert (mixed.images[5:] / 255 - renders).abs().max() <= 0.5 / 255 + 1e-6
         assert mixed.labels.tolist() == [*data.labels.tolist(), 1, 0]
+    rows = torch.arange(30)
+    epoch = training_batches(numbered(noise(30, 3, 8, 8)), 7, 0, Round(0, 0, rows[5:], renders=4))
+    assert all(torch.equal(rendered, labels >= 26) for _, labels, rendered in epoch)
 
 
 def test_rounds_divide_the_epochs_images_and_each_has_all_renders():

@@ -27,19 +27,13 @@ def test_a_gpu_trains_as_a_cpu_does_to_rounding(tiny, tmp_path, compile):
     assert lines[1][0]["augment/steps"] == pytest.approx(lines[0][0]["augment/steps"], abs=0.5)
 
 
-def test_deterministic_runs_repeat_bit_for_bit(tiny, tmp_path):
-    config = tiny("train.device=cuda", "train.precision=bfloat16", "train.deterministic=true", "train.epochs=2")
-    first, again = (weights_of(config, tmp_path / name) for name in ("first", "again"))
-    assert all(torch.equal(value, again[name]) for name, value in first.items())
-
-
-def test_an_interrupted_run_goes_on_bit_for_bit(tiny, tmp_path):
-    overrides = ("train.device=cuda", "train.deterministic=true")
+def test_deterministic_runs_repeat_and_interrupted_ones_go_on_bit_for_bit(tiny, tmp_path):
+    overrides = ("train.device=cuda", "train.deterministic=true", "train.precision=bfloat16")
     whole = weights_of(tiny(*overrides), tmp_path / "whole")
-    weights_of(tiny(*overrides), tmp_path / "parts")
+    again = weights_of(tiny(*overrides), tmp_path / "parts")
     (tmp_path / "parts" / checkpoint.LAST).unlink()  # the last epoch is lost
     parts = weights_of(tiny(*overrides, "train.resume=true"), tmp_path / "parts")
-    assert all(torch.equal(value, parts[name]) for name, value in whole.items())
+    assert all(torch.equal(value, again[name]) and torch.equal(value, parts[name]) for name, value in whole.items())
 
 
 @pytest.mark.parametrize("ema_decay", [0.0, 0.9])

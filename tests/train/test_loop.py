@@ -64,19 +64,13 @@ def state_of(folder, name: str = checkpoint.LAST) -> dict:
     return checkpoint.load(folder / name)
 
 
-def validation(monkeypatch, accuracies, losses=itertools.repeat(1.0)) -> None:  # noqa: B008
-    """Script the results of validation."""
-    results = ({"loss": loss, "accuracy": accuracy} for loss, accuracy in zip(losses, accuracies, strict=False))
-    monkeypatch.setattr("train.loop.evaluate", lambda *arguments: next(results))
-
-
 def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tmp_path, monkeypatch):
     """Two steps of a linear network against the update written down."""
     images, labels = torch.rand(2, 4, 3, 2, 2), torch.tensor([[0, 1, 2, 0], [1, 1, 2, 0]])
     as_bytes = (images * 255).round().to(torch.uint8)
     images = as_bytes / 255
     monkeypatch.setattr("train.loop.training_batches", lambda *rest: zip(as_bytes, labels, labels < 0, strict=True))
-    validation(monkeypatch, [0.0])
+    monkeypatch.setattr("train.loop.evaluate", lambda *rest: {"loss": 1.0, "accuracy": 0.0})
     network = nn.Sequential(nn.Flatten(), nn.Linear(12, 3))
     weight, bias = (parameter.detach().clone().requires_grad_() for parameter in network[1].parameters())
     recipe = {"learning_rate": 0.5, "momentum": 0.9, "weight_decay": 0.1, "schedule": "cosine"}
@@ -161,24 +155,8 @@ def test_a_soup_is_the_mean_of_epochs_that_each_begin_anew(tmp_path, monkeypatch
     assert not torch.equal(ends[0]["network.head.weight"], ends[1]["network.head.weight"])
 
 
-@pytest.mark.parametrize("soup", [False, True])
-def test_a_resumed_average_goes_on_bit_for_bit(tmp_path, soup):
-    settings = {"ema_decay": 0.8, "soup": soup}
-    fit_noise(make_trainer(tmp_path, **settings))
-    whole = state_of(tmp_path)
-    (tmp_path / checkpoint.LAST).unlink()  # the epoch before the last is left
-    resumed = make_trainer(tmp_path, **settings)
-    resumed.resume()
-    assert resumed.epoch == 2
-    fit_noise(resumed)
-    again, key = state_of(tmp_path), "soup" if soup else "ema"
-    assert again[key].keys() == whole[key].keys()
-    assert all(torch.equal(value, whole[key][name]) for name, value in again[key].items())
-
-
 def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_path, monkeypatch):
-    trainer, weights = make_trainer(tmp_path, epochs=5), []
-    accuracies = iter([0.2, 0.6, 0.5, 0.6, 0.1])
+    trainer, weights, accuracies = make_trainer(tmp_path, epochs=5), [], iter([0.2, 0.6, 0.5, 0.6, 0.1])
 
     def scripted(model, split):
         weights.append(copy.deepcopy(model.network.state_dict()))
@@ -187,25 +165,14 @@ def test_best_pt_holds_the_first_epoch_of_the_highest_validation_accuracy(tmp_pa
     monkeypatch.setattr("train.loop.evaluate", scripted)
     fit_noise(trainer)
     best, last = state_of(tmp_path, checkpoint.BEST), state_of(tmp_path)
-    assert (best["epoch"], best["validation_accuracy"]) == (2, 0.6)
-    assert last["epoch"] == 5
+    assert (best["epoch"], best["validation_accuracy"], last["epoch"]) == (2, 0.6, 5)
     for state, expected in [(best, weights[1]), (last, weights[4])]:
         assert all(torch.equal(value, expected[name]) for name, value in state["model"].items())
 
 
-def test_a_loss_that_is_not_finite_ends_the_run_with_the_last_good_checkpoint(tmp_path, monkeypatch):
-    validation(monkeypatch, [0.5, 0.5], losses=[1.0, math.nan])
-    with pytest.raises(
-        InputError, match=r"_rate=0.05 with .*_decay=.* made the loss or weights NaN or infinite in epoch 2"
-    ):
-        fit_noise(make_trainer(tmp_path))
-    assert state_of(tmp_path)["epoch"] == 1
-    assert [line["epoch"] for line in read_metrics(tmp_path)] == [1]
-
-
-def test_weights_that_are_not_finite_are_named_even_where_a_signal_came_before(tmp_path, monkeypatch):
-    """The last good checkpoint stays."""
-    trainer, steps = make_trainer(tmp_path), itertools.count(1)
+@pytest.mark.parametrize("diverges", ["in a step, before a signal", "in validation"])
+def test_what_is_not_finite_ends_the_run_with_the_last_good_checkpoint(tmp_path, monkeypatch, diverges):
+    trainer, steps, losses = make_trainer(tmp_path), itertools.count(1), iter([1.0, math.nan])
     finite = trainer._loss
 
     def infinite(*batch):
@@ -215,10 +182,16 @@ def test_weights_that_are_not_finite_are_named_even_where_a_signal_came_before(t
         signal.raise_signal(signal.SIGTERM)
         return loss * math.inf, hits
 
-    monkeypatch.setattr(trainer, "_loss", infinite)
-    with pytest.raises(InputError, match=r"made the loss or weights NaN or infinite in epoch 2: set lower"):
+    if diverges == "in validation":
+        monkeypatch.setattr("train.loop.evaluate", lambda *rest: {"loss": next(losses), "accuracy": 0.5})
+    else:
+        monkeypatch.setattr(trainer, "_loss", infinite)
+    with pytest.raises(
+        InputError, match=r"_rate=0.05 with .*_decay=.* made the loss or weights NaN .* in epoch 2: set"
+    ):
         fit_noise(trainer)
     assert state_of(tmp_path)["epoch"] == 1
+    assert [line["epoch"] for line in read_metrics(tmp_path)] == [1]
 
 
 def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tmp_path):
@@ -233,25 +206,18 @@ def test_a_damaged_checkpoint_does_not_take_the_place_of_the_whole_one_before(tm
 
 
 @pytest.mark.parametrize(
-    "changes",
+    "changes, settings",
     [
-        {"optimizer": [1]},
-        {"under_way": {"step": 1}},
-        {"architecture": {**ARCHITECTURE, "classes": ["fig", "lime", "plum"]}},
-        {"model": {"stem.weight": torch.full((16, 3, 3, 3), math.nan)}},
+        ({}, {"ema_decay": 0.8}),
+        ({}, {"soup": True}),
+        ({"optimizer": [1]}, {}),
+        ({"under_way": {"step": 1}}, {}),
+        ({"architecture": {**ARCHITECTURE, "classes": ["fig", "lime", "plum"]}}, {}),
     ],
-    ids=list,
+    ids=str,
 )
-def test_a_forged_checkpoint_with_a_right_hash_is_refused_in_one_sentence(tmp_path, changes):
+def test_the_checkpoint_of_another_run_is_refused_in_one_sentence(tmp_path, changes, settings):
     fit_noise(make_trainer(tmp_path, epochs=1))
     checkpoint.save(tmp_path / checkpoint.LAST, state_of(tmp_path) | changes)
-    with pytest.raises(InputError, match=str(tmp_path)) as caught:
-        make_trainer(tmp_path).resume()
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("settings", [{"ema_decay": 0.8}, {"soup": True}], ids=str)
-def test_resuming_with_an_average_that_the_run_does_not_have_is_an_error(tmp_path, settings):
-    fit_noise(make_trainer(tmp_path, epochs=1))
-    with pytest.raises(InputError, match=f"the checkpoint in {tmp_path} is not one that this run can go on from"):
+    with pytest.raises(InputError, match=rf"^the checkpoint in {tmp_path} is not one that this run [^\n]*$"):
         make_trainer(tmp_path, **settings).resume()
