@@ -55,9 +55,8 @@ def radiance(
 ) -> Float[Tensor, "3 P"]:
     """Linear radiance of the P covered pixels, weighted with coverage, in the dtype of `vertices`.
 
-    light: (degree + 1)² coefficients, any degree. albedo: linear, at the S samples (`renderer.albedo`). smooth_faces:
-    all faces of the mesh, to shade with interpolated vertex normals; without them each face has its own normal.
-    InputError: NaN in any of them.
+    light: of any degree. albedo: linear, at the S samples (`renderer.albedo`). smooth_faces: all faces of the mesh, to
+    shade with interpolated vertex normals; None: a normal per face. InputError: NaN in any of them.
     """
     require_bounded(albedo=albedo)  # the normals and the irradiance check the rest
     wide = torch.promote_types(vertices.dtype, torch.float32)
@@ -131,12 +130,8 @@ class _Irradiance(torch.autograd.Function):
 
 
 def _polynomial(light: Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """One light's irradiance as a polynomial: unit vectors (3, N) → value (3, N) and slope (3 axes, 3, N), of which the
-    tangential part counts.
-
-    Even bands from 2 on are a homogeneous polynomial, by its slopes in monomials: its value is its slope times its
-    argument, over its degree (Euler).
-    """
+    """One light's irradiance: unit vectors (3, N) → value (3, N) and slope (3 axes, 3, N), whose tangential part
+    counts."""
     degree = _even(math.isqrt(len(light)) - 1)
     per_light = _slopes_per_light(math.isqrt(len(light)) - 1, light.dtype, light.device)
     slopes = (per_light @ light[: per_light.shape[2]]).mT.flatten(0, 1)  # (3 axes × 3 channels, J + 1)

@@ -14,7 +14,7 @@ from numpy.polynomial.chebyshev import chebpts1, chebvander2d
 from numpy.polynomial.legendre import leggauss
 from safetensors.torch import save
 
-from renderer.errors import InputError, require_range
+from renderer.errors import InputError
 from renderer.light.harmonics import basis
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
 from train.errors import writable_file
@@ -33,30 +33,24 @@ CHROMATICITY = [
     [[0.00275, -0.00610, 0.00317, 0], [-0.04214, 0.08970, -0.04153, 0.00516], [0.15346, -0.26756, 0.06670, 0.26688]],
 ]
 RGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]  # IEC 61966-2-1
+DEGREES = (13, 11)  # in the zenith, the paper's, and in 1/turbidity: with the paper's 7 the error is 25 times larger
 UPRIGHT = [l * l + l + m for l in range(7) for m in range(l + 1)]  # the 28 coefficients that are fitted
 
 
 @dataclass
 class Settings:
     out: str = "renderer/light/skylight_fit.safetensors"  # the file that the renderer reads
-    zenith_degree: int = 13  # of the polynomials in the sun's zenith, as in the paper
-    turbidity_degree: int = 11  # of those in 1/turbidity; with the paper's 7 the error is 25 times larger
-    held_out: int = 200  # random skies on which the largest error is measured
-
-    def __post_init__(self) -> None:
-        for name, least, most in [("zenith_degree", 0, 50), ("turbidity_degree", 0, 50), ("held_out", 1, 10**4)]:
-            require_range(name, getattr(self, name), least, most)
 
 
 def main(settings: Settings) -> None:
     out = writable_file(settings.out, "out")
     if out.suffix != ".safetensors":  # or a mistaken name would cost another file
         raise InputError(f"out={out}: name a .safetensors file")
-    fit = fit_polynomials(settings.zenith_degree, settings.turbidity_degree).float()
+    fit = fit_polynomials(*DEGREES).float()
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_bytes(save({"fit": fit}))
-    error = fit_error(fit, settings.held_out, np.random.default_rng(0))
-    print(f"{out}: off by up to {error:.1e} of the coefficients' norm on {settings.held_out} held-out skies")
+    error = fit_error(fit, 50, np.random.default_rng(0))
+    print(f"{out}: off by up to {error:.1e} of the coefficients' norm on 50 random skies")
 
 
 def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) -> torch.Tensor:
@@ -76,7 +70,7 @@ def fit_polynomials(zenith_degree: int, turbidity_degree: int, nodes: int = 32) 
 
 
 def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
-    """The largest error of a fit on random skies, relative to the L2 norm of each one's coefficients by quadrature."""
+    """The largest error of a fit on random skies, relative to the L2 norm of a sky's coefficients by quadrature."""
     suns = rng.uniform([ZENITH[0], 0, TURBIDITY[0]], [ZENITH[1], 2 * math.pi, TURBIDITY[1]], (skies, 3))
     exact = np.stack([coefficients_by_quadrature(*sun) for sun in suns])
     errors = coefficients(*torch.from_numpy(suns.T), fit).numpy() - exact

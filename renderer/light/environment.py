@@ -46,8 +46,7 @@ def light_radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
 
 def negative_fraction(radiance: Tensor) -> float:
     """The negative part of a map's radiance (H, W, 3), integrated over the sphere, as a fraction of its magnitude."""
-    _, solid_angles = equirectangular(*radiance.shape[:2])
-    power = radiance * solid_angles[..., None]
+    power = radiance * equirectangular(*radiance.shape[:2])[1][..., None]
     return float((-power).clamp(min=0).sum() / power.abs().sum().clamp(min=torch.finfo(power.dtype).tiny))
 
 
@@ -76,10 +75,8 @@ def read_panorama(path: Path) -> Tensor:
     radiance = read_map(path)
     height, width = radiance.shape[:2]
     if height < FEWEST_ROWS or abs(width - 2 * height) > height // 8:
-        raise InputError(
-            f"environment map {path} has {width} × {height} texels: give an equirectangular one, twice as wide as "
-            f"high, of {FEWEST_ROWS} rows or more"
-        )
+        advice = f"give an equirectangular one, twice as wide as high, of {FEWEST_ROWS} rows or more"
+        raise InputError(f"environment map {path} has {width} × {height} texels: {advice}")
     return radiance
 
 

@@ -70,9 +70,7 @@ class Lamps(LocalBasis):
         angle = ray * math.pi * (3 - math.sqrt(5)) + number * 2 * math.pi / SETS
         across = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2).to(positions)
         x, y, z = F.normalize(positions, dim=1).unbind(1)
-        sign = torch.where(z < -0.5, -1.0, 1.0).to(
-            z
-        )  # axes are continuous but where a disc faces 30° off straight down
+        sign = torch.where(z < -0.5, -1.0, 1.0).to(z)  # the axes jump where a disc faces 30° off straight down
         axes = torch.stack([torch.stack(axis, dim=1) for axis in tangent_axes(x, y, z, sign)], dim=1)
         return positions[:, None] + torch.einsum("sra,laj->slrj", across, axes)
 
@@ -135,7 +133,7 @@ class Projector(LocalBasis):
         row = ((1 - up / (depth * edge)) / 2 * self.pixels).floor()
         cosine = ((source - points) * normals).sum(1) / depth  # over that of the angle from the axis
         within = (row >= 0) & (row < self.pixels) & (column >= 0) & (column < self.pixels)
-        (point,) = torch.nonzero(within & (depth > 0) & (cosine > 0), as_tuple=True)
+        point = torch.nonzero(within & (depth > 0) & (cosine > 0)).squeeze(1)
+        irradiance = cosine * (self.distance / depth) ** 2
         function = (row * self.pixels + column)[point].long()
-        irradiance = (cosine * (self.distance / depth) ** 2)[point]
-        return LightPaths(point, function, source.expand(len(point), 3), irradiance)
+        return LightPaths(point, function, source.expand(len(point), 3), irradiance[point])

@@ -60,7 +60,7 @@ def load_light(light: str) -> Tensor:
             raise InputError(f"light {light} is of {basis_read}: give one of {HARMONICS}")
         return coefficients
     if suffix in SUFFIXES:
-        return _read_light_map(Path(light)).float()
+        return _read_light_map(Path(light))
     raise InputError(
         f"light {light!r} is not known: choose {', '.join(PROBES)}, {UNIFORM} or the path of an environment map "
         f"({', '.join(SUFFIXES)}) or of coefficients (.json)"
@@ -99,8 +99,7 @@ def perturb(light: Tensor, count: int, amplitude: float, radius: float | None, g
     require_bounded(light=light)
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
-        nonzero = torch.zeros(COEFFICIENTS, 1).index_fill_(0, nonzero_coefficients(DEGREE), 1.0)
-        offsets = offsets * nonzero
+        offsets = offsets * torch.zeros(COEFFICIENTS, 1).index_fill_(0, nonzero_coefficients(DEGREE), 1.0)
         offsets = offsets * (radius / offsets.flatten(1).norm(dim=1).clamp(min=1e-12))[:, None, None]
     return light + offsets.to(light)
 
@@ -110,7 +109,7 @@ def mean_luminance(coefficients: Tensor) -> float:
 
 
 def _read_light_map(path: Path) -> Tensor:
-    """Coefficients (49, 3) float64 of a map, at the grace probe's mean luminance."""
+    """Coefficients (49, 3) float32 of a map, at the grace probe's mean luminance."""
     coefficients = project(read_panorama(path), DEGREE)
     luminance = mean_luminance(coefficients)
     if not luminance > 0:
@@ -118,4 +117,4 @@ def _read_light_map(path: Path) -> Tensor:
     scaled = coefficients * (mean_luminance(probe("grace")) / luminance)
     if not (scaled.abs() <= FACTOR).all():
         raise InputError(f"environment map {path} is nearly as negative as it is bright: give a map with light in it")
-    return scaled
+    return scaled.float()

@@ -224,13 +224,13 @@ def shadow(view: View, points: np.ndarray, corners: np.ndarray, directions: np.n
     solid_angle = as_in(points, 4 * MP.pi) / len(directions)
     lost = []
     for point, normal in zip(points, normals, strict=True):
-        cosine = (directions @ normal).clip(0) * _blocked(point, directions, corners)
+        cosine = (directions @ normal).clip(0) * blocked(point, directions, corners)
         lost.append(cosine @ sky * solid_angle)
     by_sample = np.stack(lost)[:, :, None] * view.albedo[view.face][:, None]
     return added(len(view.pixels), view.pixel, by_sample) / view.samples
 
 
-def _blocked(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def blocked(point: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """(D,) whether rays from a point (3,) meet a face: they pass all of its edges on the side that it lies on."""
     a, b, c = (corners[:, corner] - point for corner in range(3))
     passed = np.stack([directions @ np.cross(first, second).T for first, second in ((a, b), (b, c), (c, a))])

@@ -1,4 +1,4 @@
-"""What several tests compare with: scipy's harmonics, a many-colored mesh, and parts of scenes for Mitsuba 3."""
+"""What several tests compare with: scipy's harmonics, a many-colored mesh, and scenes for Mitsuba 3."""
 
 import math
 from dataclasses import replace
@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from scipy.special import sph_harm_y_all
 
-from renderer.camera import Camera, PerspectiveCamera
+from renderer.camera import Camera
+from renderer.io.mitsuba import load, sensor_of, shape
 from renderer.light.harmonics import lambertian_factors
 from renderer.mesh import Mesh
 
@@ -58,38 +59,14 @@ def patchwork(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> Mesh:
     )
 
 
-def mitsuba_pose(mi, camera: Camera, distance: float):
-    """Mitsuba's transform to the place of a camera at a distance from the plane through the origin."""
-    right, up, back = camera.axes()
-    target = -camera.right * right - camera.up * up
-    return mi.ScalarTransform4f().look_at(origin=list(target + distance * back), target=list(target), up=list(up))
-
-
-def mitsuba_sensor(mi, camera: Camera, size: int, **others) -> dict:
-    """A camera with a box filter and alpha."""
-    half = camera.width / 2
-    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "rfilter": {"type": "box"}}
-    if isinstance(camera, PerspectiveCamera):
-        pose, fov = mitsuba_pose(mi, camera, camera.distance), 2 * math.degrees(math.atan(half / camera.distance))
-        return {"type": "perspective", "fov": fov, "to_world": pose, "film": film, **others}
-    scale = mi.ScalarTransform4f().scale([half, half, 1])  # Mitsuba's image spans [-1, 1]
-    return {"type": "orthographic", "to_world": mitsuba_pose(mi, camera, 4) @ scale, "film": film, **others}
-
-
-def mitsuba_shape(mi, mesh: Mesh):
-    """A diffuse mesh with two sides, corners per face, as our colors are stored, and its texture if it has one."""
+def mitsuba_scene(mi, mesh: Mesh, camera: Camera, size: int, light: dict, integrator: dict):
+    """A diffuse mesh with two sides, flat faces and its texture if it has one, before a camera with alpha."""
     albedo = {"type": "mesh_attribute", "name": "vertex_color"}
     if mesh.textures:
-        albedo = {"type": "bitmap", "bitmap": mi.Bitmap(mesh.textures[0]), "raw": True}
-    properties = mi.Properties()
-    properties["face_normals"] = True
-    properties["bsdf"] = mi.load_dict({"type": "twosided", "material": {"type": "diffuse", "reflectance": albedo}})
-    corners = 3 * len(mesh.faces)
-    shape = mi.Mesh("mesh", corners, len(mesh.faces), props=properties, has_vertex_texcoords=True)
-    shape.add_attribute("vertex_color", 3, mesh.corner_colors.ravel())
-    buffers = mi.traverse(shape)
-    buffers["faces"] = np.arange(corners, dtype=np.uint32)
-    buffers["vertex_positions"] = mesh.vertices[mesh.faces].astype(np.float32).ravel()
-    buffers["vertex_texcoords"] = (mesh.corner_uvs * [1, -1] + [0, 1]).astype(np.float32).ravel()  # v runs down
-    buffers.update()
-    return shape
+        albedo = {"type": "bitmap", "bitmap": mesh.textures[0], "raw": True}
+    surface = {"type": "twosided", "material": {"type": "diffuse", "reflectance": albedo}}
+    corners = (mesh.vertices[mesh.faces], mesh.corner_uvs, mesh.corner_colors)
+    positions, uvs, colors = (values.reshape(-1, values.shape[-1]) for values in corners)
+    body = shape(mi, surface, positions, np.arange(len(positions)).reshape(-1, 3), uvs=uvs, colors=colors)
+    parts = {"sensor": sensor_of(camera, size), "mesh": body, "light": light, "integrator": integrator}
+    return load(mi, {"type": "scene", **parts})

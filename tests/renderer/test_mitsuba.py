@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import mitsuba_sensor, mitsuba_shape, scipy_basis
+from oracles import mitsuba_scene
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.io.mitsuba import mitsuba
+from renderer.io.mitsuba import environment, integrator, mitsuba, mitsuba_map
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.transfer import ImageSettings, build_operators
@@ -46,19 +46,11 @@ def mi() -> Iterator[ModuleType]:
         yield module
 
 
-def light_map(light: np.ndarray) -> np.ndarray:
-    """(H, W, 3) radiance by scipy's harmonics, as Mitsuba's maps have it, with a row at either pole."""
-    polar = np.linspace(0, math.pi, MAP_ROWS)[:, None]
-    azimuth = math.pi - 2 * math.pi * (np.arange(2 * MAP_ROWS) + 0.5) / (2 * MAP_ROWS)
-    axes = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth
-    return (scipy_basis(np.stack(axes, axis=-1).reshape(-1, 3), 6) @ light).reshape(MAP_ROWS, -1, 3)
-
-
 def positive_light(seed: int) -> np.ndarray:
     """(49, 3): every coefficient at random, over just enough ambient light to be positive everywhere."""
     weights = np.repeat(BAND_WEIGHTS, 2 * np.arange(7) + 1)
     light = weights[:, None] * np.random.default_rng(seed).normal(size=(49, 3))
-    light[0] = (0.1 - light_map(light).min(axis=(0, 1))) * math.sqrt(4 * math.pi)
+    light[0] = (0.1 - mitsuba_map(torch.from_numpy(light), MAP_ROWS).numpy().min(axis=(0, 1))) * math.sqrt(4 * math.pi)
     return light / light[0]
 
 
@@ -108,21 +100,9 @@ def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, **settings) -
 
 def mitsuba_image(mi, mesh: Mesh, camera: Camera, size: int, spp: int, bounces: int = 0) -> tuple[np.ndarray, ...]:
     """The mean (size, size, 4) of SEEDS images of so many rays per pixel, and its standard error."""
-    direct = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
-    path = {"type": "path", "max_depth": bounces + 2, "rr_depth": 1000}
-    # Mitsuba's maps have y up and +z in the middle column; ours have z up and +x there.
-    to_world = mi.ScalarTransform4f([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    bitmap = mi.Bitmap(light_map(LIGHT).astype(np.float32))
-    parts = {
-        "type": "scene",
-        "integrator": {**(path if bounces else direct), "hide_emitters": True},
-        "light": {"type": "envmap", "bitmap": bitmap, "to_world": to_world},
-        "mesh": mitsuba_shape(mi, mesh),
-        "sensor": mitsuba_sensor(mi, camera, size),
-    }
-    scene = mi.load_dict(parts)
+    sky = environment({"bitmap": mitsuba_map(torch.from_numpy(LIGHT), MAP_ROWS).float().numpy()}, math.pi)
+    scene = mitsuba_scene(mi, mesh, camera, size, sky, integrator(bounces))
     images = np.stack([np.array(mi.render(scene, spp=spp, seed=seed)) for seed in range(SEEDS)]).astype(float)
-    images[..., :3] *= math.pi
     return images.mean(axis=0), images.std(axis=0, ddof=1) / math.sqrt(SEEDS)
 
 
@@ -130,10 +110,7 @@ def mitsuba_image(mi, mesh: Mesh, camera: Camera, size: int, spp: int, bounces: 
     ("solid", "view"),
     [
         (ball, "near the pole"),
-        (ball, "from above"),
         (colored_cube, "from below"),
-        (textured_hull, "from below"),
-        (colored_cube, "from close by"),
         (textured_hull, "from close by"),
     ],
 )
@@ -169,16 +146,9 @@ def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(mi, solid, v
         (bowl, "near the pole", 0),
         (hard.heap, "from above", 3),
         *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in [
-                (bowl, "near the pole", 1),
-                (bowl, "near the pole", 3),
-                (hard.heap, "from above", 0),
-                (hard.heap, "from above", 1),
-                (partial(hard.sphere, 2, 0.5), "from above", 0),
-                (partial(hard.sphere, 2, 0.5), "from above", 1),
-                (partial(hard.sphere, 2, 0.5), "from above", 3),
-            ]
+            pytest.param(solid, view, bounces, marks=pytest.mark.slow)
+            for solid, view in [(bowl, "near the pole"), (partial(hard.sphere, 2, 0.5), "from above")]
+            for bounces in (1, 3)
         ),
     ],
 )

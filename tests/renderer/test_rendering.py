@@ -139,15 +139,6 @@ def test_lamps_and_projectors_are_added_as_by_operators(light, samples):
     assert (images > 0.5).any()
 
 
-def test_an_image_is_linear_in_a_pattern_and_differentiable():
-    projector = Projector(4, 0.5, 1.6)
-    pattern = torch.full((16, 3), 0.01).requires_grad_()
-    lights = [(projector, pattern)]
-    image = renderer.render(renderer.solid("plate"), CAMERAS, None, lights=lights, background=0.0, **SMALL)
-    (gradient,) = torch.autograd.grad(image.sum(), pattern)
-    torch.testing.assert_close((gradient * pattern).sum(), image.sum())
-
-
 def on_the_ball(size: int) -> tuple[Tensor, Tensor]:
     """Normals (size, size, 3) of a ball of radius 1 seen from above, right is +y, and the pixels well inside it."""
     at = (torch.arange(size).double() + 0.5) * 2 / size - 1

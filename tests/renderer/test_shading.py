@@ -5,7 +5,7 @@ clamp and encoding, and the pixels around the mesh.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +14,7 @@ import torch
 import trimesh
 from oracles import draw, patchwork, scipy_irradiance
 
-from renderer.albedo import face_albedo, surface_albedo
+from renderer.albedo import surface_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.fragments import Fragments, build_fragments
@@ -80,20 +80,6 @@ def solid(closed: bool = True) -> Mesh:
     return patchwork(shape.vertices, shape.faces[: 20 if closed else 13])
 
 
-def with_inverted_winding(mesh: Mesh) -> Mesh:
-    per_corner = {name: getattr(mesh, name)[:, ::-1].copy() for name in ("faces", "corner_colors", "corner_uvs")}
-    return replace(mesh, **per_corner)
-
-
-def degenerate(mesh: Mesh) -> Mesh:
-    """With three more faces of different kinds without area, and every face twice."""
-    count = len(mesh.faces)
-    rows = [*range(count), 0, 1, 2, *range(count)]
-    per_face = {name: getattr(mesh, name)[rows] for name in ("faces", "corner_colors", "corner_uvs", "texture_ids")}
-    per_face["faces"][count : count + 3] = [[0, 0, 0], [1, 1, 2], [3, 4, 4]]
-    return replace(mesh, **per_face)
-
-
 IN_FRONT, BEHIND = OrthographicCamera(1.0, 0.4, 2.2), OrthographicCamera(math.pi - 1.0, 0.4 + math.pi, 2.2)
 
 
@@ -121,8 +107,6 @@ SCENES = {
     "solid": Scene(solid()),
     "open, from in front": Scene(solid(closed=False)),
     "open, from behind": Scene(solid(closed=False), BEHIND),
-    "inverted winding": Scene(with_inverted_winding(solid())),
-    "degenerate faces": Scene(degenerate(solid())),
     "one sample per pixel": Scene(solid(), size=9, samples=1),
     "from close by": Scene(solid(), PerspectiveCamera(1.0, 0.4, 2.2, distance=1.8)),
 }
@@ -217,21 +201,6 @@ def test_gradients_are_exactly_zero_where_nothing_is_visible_or_clamped(scene, s
     for upstream in (background, at_an_end):
         gradients = torch.autograd.grad(values, inputs, upstream.double(), retain_graph=True)
         assert not any(gradient.any() for gradient in gradients)
-
-
-@flat_and_smooth
-def test_albedo_per_face_has_the_derivative_of_central_differences(smooth):
-    scene = SCENES["solid"]
-    fragments, vertices, light = scene.fragments, scene.vertices(), draw(49, 3)
-
-    def lit(albedo: torch.Tensor) -> torch.Tensor:
-        return radiance(fragments, vertices, light, face_albedo(albedo, fragments), scene.all_faces(smooth))
-
-    albedo = draw(len(scene.mesh.faces), 3).requires_grad_(True)
-    assert torch.autograd.gradcheck(lit, albedo)
-    (gradient,) = torch.autograd.grad(lit(albedo).sum(), albedo)
-    hidden = np.setdiff1d(np.arange(len(albedo)), fragments.faces)
-    assert len(hidden) and not gradient[hidden].any()
 
 
 @all_scenes

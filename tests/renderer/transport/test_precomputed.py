@@ -11,19 +11,16 @@ import torch
 import torch.nn.functional as F
 import trimesh
 
-from renderer import reference
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
-from renderer.fragments import build_fragments
 from renderer.image import ImageSettings
-from renderer.light.harmonics import basis, nonzero_coefficients
+from renderer.light.harmonics import nonzero_coefficients
 from renderer.light.presets import ambient, load_light
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.rendering import precompute_transfer, render
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import precomputed, rays
-from renderer.transport.rays import DIRECTIONS, sphere
 
 RASTERIZER = choose("numpy")
 ABOVE = OrthographicCamera(0, 0, 2.0)
@@ -98,48 +95,6 @@ def test_a_mesh_outside_the_image_has_no_pixels_and_faces_without_area_do_no_har
     assert not operator_of(dented(), outside, bounces=bounces).transfer.numel()
     thin = replace(hard.heap(), faces=np.concatenate([hard.heap().faces[:-1], [[0, 0, 1]]]))
     assert operator_of(thin, bounces=bounces).transfer.isfinite().all()
-
-
-def blocked(points: torch.Tensor, directions: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
-    """(S, D), whether rays from points (S, 3) in directions (D, 3) meet a face, of corners (F, 3 corners, 3).
-
-    By Cramer's rule for point + t direction = a + u (b - a) + v (c - a) (Möller and Trumbore 1997).
-    """
-    a, b, c = corners.unbind(1)
-    met = torch.zeros(len(points), len(directions), dtype=torch.bool)
-    for origin, meets in zip(points, met, strict=True):
-        ahead = torch.linalg.cross(directions[:, None], (c - a)[None])
-        area = (ahead * (b - a)).sum(-1)  # zero where ray and face are parallel: nothing then is within bounds
-        across = torch.linalg.cross(origin - a, b - a)
-        u, v, t = (ahead * (origin - a)).sum(-1) / area, directions @ across.T / area, (across * (c - a)).sum(1) / area
-        meets |= ((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)).any(1)
-    return met
-
-
-@pytest.mark.parametrize("normals", ["flat", "smooth"])
-@pytest.mark.parametrize("mesh", [dented(), hard.heap(), pit(1.0)], ids=["dented", "heap", "pit"])
-def test_coefficients_are_those_of_a_slow_ray_caster(mesh, normals):
-    """One sample per pixel looks in all directions, so that both add up the same rays."""
-    camera = OrthographicCamera(0.8, 0.4, 2.1)
-    settings = ImageSettings(6, 1, normals=normals)
-    [view] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, RASTERIZER, mesh.closed)
-    corners, directions = torch.from_numpy(mesh.vertices[mesh.faces]), sphere(DIRECTIONS)
-    own = corners[view.faces]
-    planes = reference.unit(reference.doubled_area_vectors(own)) * view.facing
-    at_corners = planes[:, None].expand(-1, 3, -1)
-    if normals == "smooth":
-        smooth = reference.vertex_normals(torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces))
-        at_corners = smooth[view.corners] * view.facing[:, None]
-    weights = view.barycentric[..., None]
-    at = (weights * own[view.face]).sum(1) + 1e-5 * planes[view.face] * np.abs(mesh.vertices).max()
-    cosine = (reference.unit((weights * at_corners[view.face]).sum(1)) @ directions.T).clamp(min=0)
-    cosine[planes[view.face] @ directions.T <= 0] = 0
-    lost = torch.where(blocked(at, directions, corners), cosine, 0) @ basis(directions, 6)
-
-    direct, shadowed = (operator_of(mesh, camera, shadows=t, normals=normals) for t in (False, True))
-    expected = all_rows(direct) - direct.albedo[:, None] * lost.T * 4 * math.pi / DIRECTIONS
-    assert lost.any()
-    torch.testing.assert_close(all_rows(shadowed), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("depth", [0.25, 0.5, 1.0])
