@@ -14,14 +14,14 @@ from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
 from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import MOST_VIEWS, orbit_cameras
-from renderer.errors import FACTOR, InputError, as_device, require_range
+from renderer.errors import FACTOR, InputError, as_device, require_choice, require_range
 from renderer.image import ImageSettings
 from renderer.io.lights import read_light
 from renderer.light.basis import with_local_lights
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light
 from renderer.mesh import Mesh, normalize
-from renderer.rasterizer import choose
+from renderer.rasterizer import NAMES, choose
 from renderer.subdivision import MOST_VERTICES, subdivide
 
 
@@ -130,7 +130,9 @@ class RendererSettings:
     cache: str | None = "auto"
 
     def __post_init__(self) -> None:
-        self.image(size=1)  # which checks them
+        self.image(size=1)  # which checks most
+        if isinstance(self.rasterizer, str):
+            require_choice("rasterizer", self.rasterizer, NAMES)
 
     def image(self, size: int) -> ImageSettings:
         """The settings of an image of `size` pixels per side."""

@@ -142,19 +142,14 @@ def cup(rng: np.random.Generator) -> Mesh:
     glaze = choose(rng, (0.93, 0.93, 0.90), (0.20, 0.35, 0.62), (0.75, 0.16, 0.14), (0.30, 0.52, 0.42))
     white, coffee = (0.95, 0.94, 0.90), (0.28, 0.16, 0.08)
     body = paint(*revolve(outside, inside, surface), glaze, white, coffee)
-    mid_wall = np.interp([-0.4, 0.4], [-0.7, 0.7], [foot, rim]) - 0.035
-    return concatenate([body, _handle(mid_wall, 0.4, glaze)])
-
-
-def _handle(ends: np.ndarray, rise: float, color: np.ndarray) -> Mesh:
-    """A bent tube in the xz plane from (ends[0], −rise) to (ends[1], rise) that bulges towards +x."""
+    ends = np.interp([-0.4, 0.4], [-0.7, 0.7], [foot, rim]) - 0.035  # of the handle, in the middle of the wall
     bend = np.pad(np.linspace(-np.pi / 2, np.pi / 2, 17), 1, mode="edge")[:, None, None]
     thickness = np.pad(np.full(17, 0.07), 1)[:, None, None]  # zero closes the ends
     around = np.linspace(0, 2 * np.pi, 12, endpoint=False)[None, :, None]
     outward = np.cos(bend) * [1, 0, 0] + np.sin(bend) * [0, 0, 1]
-    spine = np.interp(np.sin(bend), [-1, 1], ends) * [1, 0, 0] + outward * [0.4, 0, rise]
+    spine = np.interp(np.sin(bend), [-1, 1], ends) * [1, 0, 0] + outward * [0.4, 0, 0.4]
     vertices, faces, _ = loft(spine + thickness * (np.cos(around) * outward + np.sin(around) * [0, 1, 0]))
-    return Mesh.plain(vertices, faces, color)
+    return concatenate([body, Mesh.plain(vertices, faces, glaze)])
 
 
 def plate(rng: np.random.Generator) -> Mesh:

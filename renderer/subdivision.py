@@ -37,15 +37,14 @@ def refine(mesh: Mesh, area: float) -> Mesh:
 
     The faces come in another order; the old vertices keep their indices, and new ones may lie on a neighbor's edge.
     """
-    parts = []
-    while True:
-        large = mesh.face_areas() > area
-        parts.append(_select(mesh, ~large))
-        if not large.any():
-            break
-        mesh = _quartered(_select(mesh, large))
-    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_FACE}
-    return replace(mesh, **joined)
+    large = mesh.face_areas() > area
+    if not large.any():
+        return mesh
+    small, finer = _select(mesh, ~large), refine(_quartered(_select(mesh, large)), area)
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in (small, finer)]) for name in PER_FACE
+    }
+    return replace(finer, **joined)
 
 
 def _select(mesh: Mesh, faces: np.ndarray) -> Mesh:

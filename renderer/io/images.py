@@ -28,8 +28,11 @@ def read_square(path: Path, size: int) -> np.ndarray:
     with Image.open(path) as image:
         # A large JPEG is decoded at 1/2, 1/4 or 1/8 of its size, several times faster.
         image.draft(None, (DECODED_SIZES * size, DECODED_SIZES * size))
-        upright = ImageOps.exif_transpose(image)
-    return np.asarray(ImageOps.fit(_over_white(upright), (size, size), Image.Resampling.LANCZOS))
+        upright = eight_bits(ImageOps.exif_transpose(image))
+    if upright.has_transparency_data:
+        upright = upright.convert("RGBA")
+        upright = Image.alpha_composite(Image.new("RGBA", upright.size, "white"), upright)
+    return np.asarray(ImageOps.fit(upright.convert("RGB"), (size, size), Image.Resampling.LANCZOS))
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
@@ -40,14 +43,6 @@ def eight_bits(image: Image.Image) -> Image.Image:
         return Image.fromarray(np.clip(np.asarray(image) // 256, 0, 255).astype(np.uint8))
     image.load()
     return image
-
-
-def _over_white(image: Image.Image) -> Image.Image:
-    image = eight_bits(image)
-    if image.has_transparency_data:
-        image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return image.convert("RGB")
 
 
 def read_numbers(path: Path) -> np.ndarray:

@@ -33,24 +33,18 @@ from renderer.light.local import Lamps, Projector
 from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 
+Scene = dict[str, Any]
 SCENE, PATTERN = "scene.xml", "pattern.exr"
 SAMPLES = 256  # per pixel, spread evenly: the noise in a smooth light is then below 1/255
 VARIANT = "scalar_rgb"  # needs no LLVM, and renders the same bits on any number of threads
 DIFFERENTIABLE = "llvm_ad_rgb"
 TO_Z_UP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # its maps: y up, +z in the middle
-XML_TAGS: dict[Any, str] = {
-    **dict.fromkeys(("path", "direct"), "integrator"),
-    **dict.fromkeys(("envmap", "projector", "point", "area"), "emitter"),
-    **dict.fromkeys(("perspective", "orthographic"), "sensor"),
-    **dict.fromkeys(("ply", "disk"), "shape"),
-    **dict.fromkeys(("twosided", "diffuse"), "bsdf"),
-    **dict.fromkeys(("bitmap", "mesh_attribute"), "texture"),
-    "hdrfilm": "film",
-    "box": "rfilter",
-    "multijitter": "sampler",
-    **{bool: "boolean", int: "integer", float: "float", str: "string", list: "point"},
-}
-Scene = dict[str, Any]
+VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string", list: "point"}
+PLUGINS = {  # by the tags that they have in files
+    "integrator": ("path", "direct"), "emitter": ("envmap", "projector", "point", "area"), "shape": ("ply", "disk"),
+    "sensor": ("perspective", "orthographic"), "bsdf": ("twosided", "diffuse"), "texture": ("bitmap", "mesh_attribute"),
+    "film": ("hdrfilm",), "rfilter": ("box",), "sampler": ("multijitter",),
+}  # fmt: skip
 
 
 @contextmanager
@@ -76,14 +70,13 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
 
 def load(module: Any, scene: Mapping[str, Any]) -> Any:
     """Mitsuba's object of a dictionary, with its arrays as transforms and bitmaps."""
-    converted = {}
+    scene = dict(scene)
     for name, value in scene.items():
         if isinstance(value, dict) and value["type"] != "rgb":
-            value = load(module, value)
+            scene[name] = load(module, value)
         elif isinstance(value, np.ndarray):
-            value = module.ScalarTransform4f(value) if value.shape == (4, 4) else module.Bitmap(value)
-        converted[name] = value
-    return module.load_dict(converted)
+            scene[name] = module.ScalarTransform4f(value) if value.shape == (4, 4) else module.Bitmap(value)
+    return module.load_dict(scene)
 
 
 def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
@@ -106,9 +99,6 @@ def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
     around, _ = equirectangular(1, 2 * height)  # z is 0, the mean
     polar = torch.linspace(0, math.pi, height, dtype=torch.float64)[:, None, None]
     return light_radiance(coefficients, polar.sin() * around + polar.cos() * torch.tensor([0.0, 0.0, 1.0]))
-
-
-# Parts of a scene
 
 
 def integrator(bounces: int, emitter_samples: int = 0) -> Scene:
@@ -182,11 +172,11 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
     if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
+    corners = mesh.vertices[mesh.faces], normals, mesh.corner_uvs, colors
     parts = []
     for index in np.unique(mesh.texture_ids):
-        faces, texture = mesh.texture_ids == index, mesh.textures[index] if index >= 0 else None
-        corners = mesh.vertices[mesh.faces[faces]]
-        parts.append(Part(corners, normals[faces], mesh.corner_uvs[faces], colors[faces], texture))
+        selected = mesh.texture_ids == index
+        parts.append(Part(*(values[selected] for values in corners), mesh.textures[index] if index >= 0 else None))
     return parts
 
 
@@ -209,15 +199,12 @@ def shape(
         mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
     buffers = module.traverse(mesh)
     buffers["faces"] = faces.astype(np.uint32).ravel()
-    values = {"positions": positions, "normals": normals, "texcoords": None if uvs is None else uvs * [1, -1] + [0, 1]}
-    for name, value in values.items():
-        if value is not None:
-            buffers[f"vertex_{name}"] = value.astype(np.float32).ravel()
+    texcoords = None if uvs is None else uvs * [1, -1] + [0, 1]
+    for name, values in (("positions", positions), ("normals", normals), ("texcoords", texcoords)):
+        if values is not None:
+            buffers[f"vertex_{name}"] = values.astype(np.float32).ravel()
     buffers.update()
     return mesh
-
-
-# Files
 
 
 def write_mitsuba_scene(
@@ -254,11 +241,12 @@ def _append(parent: xml.Element, name: str, value: Any) -> None:
         xml.SubElement(transform, "matrix", value=" ".join(f"{entry:.17g}" for entry in value.ravel()))
     elif not isinstance(value, dict):
         text = " ".join(map(str, value)) if isinstance(value, list) else str(value)
-        xml.SubElement(parent, XML_TAGS[type(value)], named, value=text.lower() if isinstance(value, bool) else text)
+        xml.SubElement(parent, VALUE_TAGS[type(value)], named, value=text.lower() if isinstance(value, bool) else text)
     elif value["type"] == "rgb":
         xml.SubElement(parent, "rgb", named, value=" ".join(map(str, value["value"])))
     else:
-        element = xml.SubElement(parent, XML_TAGS[value["type"]], named, type=value["type"])
+        [tag] = [tag for tag, plugins in PLUGINS.items() if value["type"] in plugins]
+        element = xml.SubElement(parent, tag, named, type=value["type"])
         for key, entry in value.items():
             if key != "type":
                 _append(element, key, entry)

@@ -17,7 +17,7 @@ from renderer.rasterizer.numpy import FAR, SUBSAMPLE_BITS, to_fixed_point
 try:
     import numba
 except ImportError as error:  # also where it does not know this version of NumPy
-    raise InputError(f"numba does not start ({error}): pip install numba, or set rasterizer=numpy") from error
+    raise InputError(f"numba does not start ({error}): pip install numba, or choose the rasterizer numpy") from error
 
 VERSION = numba.__version__
 TYPES = "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, ::1], float32[:, ::1])"

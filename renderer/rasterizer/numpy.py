@@ -50,8 +50,9 @@ def _keys(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) 
             at_row, offset = depth + (row - y) * by_row, left - x
             sample, face = row * resolution + left, ids.take(triangle)
             for span, step in _parts(right - left):
-                depth = at_row.take(span) + slope.take(span) * (offset.take(span) + step)
-                np.minimum.at(keys, sample.take(span) + step, _key(depth, face.take(span)))
+                depth = np.rint(at_row.take(span) + slope.take(span) * (offset.take(span) + step)).astype(np.int64)
+                depth = np.minimum(depth.view(np.uint64), FAR).view(np.int64)  # negative ones are large as unsigned
+                np.minimum.at(keys, sample.take(span) + step, (depth << FACE_BITS) | face.take(span))
     return keys
 
 
@@ -133,13 +134,6 @@ def _planes(corners: np.ndarray, depths: np.ndarray) -> np.ndarray:
     by_column = ((b - a) * (cy - ay) - (c - a) * (by - ay)) * scale
     by_row = ((c - a) * (bx - ax) - (b - a) * (cx - ax)) * scale
     return np.stack([ax / SUBSAMPLES, ay / SUBSAMPLES, a, by_column, by_row])
-
-
-def _key(depth: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Depths, rounded and limited to [0, FAR), above face indices."""
-    depth = np.rint(depth).astype(np.int64)
-    depth = np.minimum(depth.view(np.uint64), FAR).view(np.int64)  # negative ones are large as unsigned
-    return (depth << FACE_BITS) | face
 
 
 def _parts(counts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -44,8 +44,10 @@ def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
 
     InputError: no EGL device, or a driver that renders wrong ids or fails.
     """
+    least = faces.argmin(axis=1)[:, None]  # first, so that duplicate faces have one depth, and tie
+    ordered = np.take_along_axis(faces, (least + np.arange(3)) % 3, axis=1) if closed else np.sort(faces, axis=1)
     with _context() as context:
-        return _draw(context, points, _normalized_corners(faces, closed), resolution, closed)
+        return _draw(context, points, ordered, resolution, closed)
 
 
 def device() -> str:
@@ -63,12 +65,12 @@ def _context() -> Iterator[moderngl.Context]:
     try:
         context = moderngl.create_context(standalone=True, backend="egl")  # type: ignore[arg-type]  # annotated as though a dict
     except Exception as error:  # moderngl raises no narrower class
-        raise InputError("no EGL device: apt install libegl1 libgl1, or set rasterizer=numpy") from error
+        raise InputError("no EGL device: apt install libegl1 libgl1, or choose the rasterizer numpy") from error
     try:
         _check(context)
         yield context
     except moderngl.Error as error:
-        raise InputError(f"the OpenGL driver failed ({error}): set rasterizer=numpy") from error
+        raise InputError(f"the OpenGL driver failed ({error}): choose the rasterizer numpy") from error
     finally:
         context.release()
 
@@ -79,14 +81,7 @@ def _check(context: moderngl.Context) -> None:
     ids = _draw(context, points, np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]]), 4, closed=True)
     if ids[0].tolist() != [[2, 2, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]]:
         name = context.info["GL_RENDERER"]
-        raise InputError(f"the OpenGL driver {name} renders wrong face ids: set rasterizer=numpy")
-
-
-def _normalized_corners(faces: np.ndarray, closed: bool) -> np.ndarray:
-    """Sorted corners or, where the winding counts, the least first: duplicate faces have one depth, and tie."""
-    if not closed:
-        return np.sort(faces, axis=1)
-    return np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+        raise InputError(f"the OpenGL driver {name} renders wrong face ids: choose the rasterizer numpy")
 
 
 def _draw(

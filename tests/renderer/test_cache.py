@@ -3,7 +3,6 @@
 import errno
 import shutil
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,9 +59,6 @@ def same(first: list[TransferOperator], second: list[TransferOperator]) -> bool:
     )
 
 
-# ---------------------------------------------------------------------------------------- what is shared
-
-
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 def test_a_second_run_builds_nothing_and_has_the_same_operators_to_the_bit(mesh, tmp_path, rasterized):
     cameras = orbit_cameras(3, 2.0)
@@ -87,9 +83,6 @@ def test_orbits_share_the_views_that_they_have_in_common(tmp_path, rasterized):
     )
     assert rasterized == [10] and same(five, ten[::2])
     assert same(ten, build_operators(PLATE, orbit_cameras(10, 2.0), SETTINGS, RASTERIZER))
-
-
-# ---------------------------------------------------------------------------------------- what is not
 
 
 def changed(array: np.ndarray, index: tuple, by: float) -> np.ndarray:
@@ -142,12 +135,8 @@ def test_a_change_of_anything_that_goes_into_an_operator_builds_it_anew(change, 
 def test_keys_differ_where_the_parts_only_look_alike_when_joined(first, second):
     assert content_key(*first) != content_key(*second)
     assert content_key(*first) == content_key(*first)
-
-
-@pytest.mark.parametrize("part", [torch.zeros(2), {"a": 1}, None])
-def test_values_without_a_key_are_refused(part):
-    with pytest.raises(TypeError, match="has no content key"):
-        content_key(part)
+    with pytest.raises(TypeError, match="a Tensor has no content key"):
+        content_key(first, torch.zeros(2))
 
 
 def test_any_change_of_the_sources_is_another_key(tmp_path):
@@ -163,9 +152,6 @@ def test_any_change_of_the_sources_is_another_key(tmp_path):
         change()
         keys.add(source_key(package))
     assert len(keys) == 4
-
-
-# ---------------------------------------------------------------------------------------- damage
 
 
 @pytest.fixture
@@ -225,9 +211,6 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(written, monk
     assert list(path.parent.iterdir()) == [path] and path.read_bytes() == before
 
 
-# ---------------------------------------------------------------------------------------- folders
-
-
 def test_a_full_disk_stops_no_run_and_is_tried_once(tmp_path, monkeypatch):
     tries = []
 
@@ -243,22 +226,6 @@ def test_a_full_disk_stops_no_run_and_is_tried_once(tmp_path, monkeypatch):
     assert len(tries) == 1 and not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_made_stops_no_run(tmp_path):
-    (tmp_path / "file").touch()
-    operators = OperatorCache(tmp_path / "file" / "below").operators(PLATE, [CAMERA], SETTINGS, RASTERIZER)
-    assert same(operators, build_operators(PLATE, [CAMERA], SETTINGS, RASTERIZER))
-
-
-def test_runs_may_share_a_folder_at_once(tmp_path):
-    def run(_) -> list[TransferOperator]:
-        return OperatorCache(tmp_path).operators(PLATE, orbit_cameras(3, 2.0), SETTINGS, RASTERIZER)
-
-    with ThreadPoolExecutor(4) as pool:
-        runs = list(pool.map(run, range(8)))
-    assert all(same(runs[0], other) for other in runs)
-    assert len(list(tmp_path.iterdir())) == 3
-
-
 @pytest.mark.parametrize(
     ("choice", "environment", "folder"),
     [
@@ -270,8 +237,7 @@ def test_runs_may_share_a_folder_at_once(tmp_path):
     ],
 )
 def test_the_folder_is_the_users_cache_folder_unless_chosen(choice, environment, folder, monkeypatch):
-    for name in ("XDG_CACHE_HOME", "HOME"):
-        monkeypatch.delenv(name, raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME")
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert cache_folder(choice) == (folder and Path(folder))

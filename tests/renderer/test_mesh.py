@@ -15,19 +15,6 @@ def corner_positions(mesh: Mesh) -> np.ndarray:
     return mesh.vertices[mesh.faces]
 
 
-def textured(texture: np.ndarray, uvs, color=(1.0, 1.0, 1.0)) -> Mesh:
-    """One triangle with a texture."""
-    plain = Mesh.plain([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], color)
-    return Mesh(
-        plain.vertices,
-        plain.faces,
-        plain.corner_colors,
-        corner_uvs=np.array([uvs], dtype=np.float32),
-        texture_ids=np.zeros(1, dtype=np.int32),
-        textures=(texture,),
-    )
-
-
 # The data class
 
 
@@ -43,21 +30,6 @@ def test_zero_area_faces_have_a_zero_normal():
     mesh = Mesh.plain([[0, 0, 0], [1, 1, 1], [2, 2, 2]], [[0, 1, 2], [0, 0, 1], [1, 1, 1]])
     assert_array_equal(mesh.face_normals(), np.zeros((3, 3)))
     assert_array_equal(mesh.face_areas(), np.zeros(3))
-
-
-def test_concatenated_meshes_keep_their_surfaces():
-    red, blue = (np.full((2, 2, 3), rgb, dtype=np.uint8) for rgb in ([255, 0, 0], [0, 0, 255]))
-    parts = [
-        textured(red, np.zeros((3, 2))),
-        Mesh.plain(np.eye(3) + 5, [[0, 1, 2]], (0, 1, 0)),
-        textured(blue, np.ones((3, 2))),
-    ]
-    whole = concatenate(parts)
-    assert_array_equal(corner_positions(whole), np.concatenate([corner_positions(part) for part in parts]))
-    for name in ("corner_colors", "corner_uvs"):
-        assert_array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
-    assert whole.texture_ids.tolist() == [0, -1, 1] and whole.texture_ids.dtype == np.int32
-    assert [texture[0, 0].tolist() for texture in whole.textures] == [[255, 0, 0], [0, 0, 255]]
 
 
 # Closed or open

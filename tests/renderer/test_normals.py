@@ -55,9 +55,6 @@ def sliver(height: float, edge: float = 1.0, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(Rotation.random(rng=draws).apply(corners) + draws.uniform(-1, 1, 3))
 
 
-# ---------------------------------------------------------------------------- of faces
-
-
 def test_face_normals_are_the_meshs_and_outward():
     vertices, faces = shape("torus")
     mesh = Mesh.plain(vertices.numpy(), faces.numpy())
@@ -120,9 +117,6 @@ def test_second_derivatives_are_refused_rather_than_wrong(function):
     )
     with pytest.raises(RuntimeError, match="once_differentiable"):
         gradient.pow(2).sum().backward()
-
-
-# ---------------------------------------------------------------------------- of vertices
 
 
 def test_vertex_normals_are_the_sum_of_the_faces_areas():

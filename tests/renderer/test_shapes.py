@@ -85,11 +85,3 @@ def test_an_orange_is_an_oblate_sphere_with_small_dents_and_a_dark_navel_on_top(
     brightness = mesh.corner_colors.mean(axis=(1, 2))
     near_top = (np.hypot(centers[:, 0], centers[:, 1]) < 0.08) & (centers[:, 2] > 0)
     assert brightness[near_top].max() < 0.8 * brightness.mean()
-
-
-def test_a_tables_volume_is_that_of_its_board_and_legs():
-    mesh = solid("table")
-    board, leg, cells = 14 * 10, 9, 14 * 10 * 10
-    box = np.ptp(mesh.vertices, axis=0).prod()
-    expected = box * (board + 4 * leg) / cells
-    assert enclosed_volume(mesh.vertices, mesh.faces) == pytest.approx(expected, rel=1e-12)
