@@ -45,24 +45,19 @@ def content_key(*parts: object) -> str:
     TypeError for anything else, since a key that misses a change would be worse than no key.
     """
     digest = hashlib.sha256()
-    _update(digest, parts)
+    for part in parts:
+        if is_dataclass(part):
+            part = (type(part).__name__, *(getattr(part, field.name) for field in fields(part)))
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype.str}{part.shape};".encode())
+            digest.update(np.ascontiguousarray(part).data)
+        elif isinstance(part, tuple | list):
+            digest.update(content_key(*part).encode())
+        elif isinstance(part, str | bytes | int | float | torch.dtype):
+            digest.update(f"{part!r};".encode())
+        else:
+            raise TypeError(f"a {type(part).__name__} has no content key")
     return digest.hexdigest()
-
-
-def _update(digest: hashlib._Hash, part: object) -> None:
-    if is_dataclass(part):
-        part = (type(part).__name__, *(getattr(part, field.name) for field in fields(part)))
-    if isinstance(part, np.ndarray):
-        digest.update(f"{part.dtype.str}{part.shape};".encode())
-        digest.update(np.ascontiguousarray(part).data)
-    elif isinstance(part, tuple | list):
-        digest.update(f"{len(part)} parts;".encode())
-        for item in part:
-            _update(digest, item)
-    elif isinstance(part, str | bytes | int | float | torch.dtype):
-        digest.update(f"{part!r};".encode())
-    else:
-        raise TypeError(f"a {type(part).__name__} has no content key")
 
 
 def source_key(*packages: Path) -> str:
