@@ -46,9 +46,6 @@ def require_outside(out: Path, folder: Path) -> None:
         raise InputError(f"out={out} lies inside the photographs' folder: choose another")
 
 
-# ------------------------------------------------------------------------------------- finding
-
-
 def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[Photograph]:
     """The images of a folder, sorted by path, each with its class.
 
@@ -144,9 +141,6 @@ def _read_table(table: Path) -> dict[PurePosixPath, tuple[str | None, tuple[str,
 def split_sources(cell: str) -> tuple[str, ...]:
     """The sources in a cell of `hard_negatives`."""
     return tuple(name.strip() for name in cell.split(SEPARATOR) if name.strip())
-
-
-# ------------------------------------------------------------------------------------- loading
 
 
 def load_photographs(

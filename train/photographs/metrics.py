@@ -24,9 +24,6 @@ IMAGES, RUNS = 0, 1  # seeds, so that images and runs are drawn independently
 Scores = Sequence[float] | np.ndarray
 
 
-# ------------------------------------------------------------------------------------- bootstrap
-
-
 def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.ndarray:
     """A statistic's values in the bootstrap's replicates, (..., REPLICATES).
 
@@ -45,8 +42,7 @@ def bootstrap(statistic: Callable[..., np.ndarray], *groups: np.ndarray) -> np.n
 def interval(replicates: np.ndarray) -> dict[str, float]:
     """low and high of the 95 % percentile interval (Efron and Tibshirani 1993, ch. 13) of (REPLICATES,) values.
 
-    Percentiles, which pROC also uses for ROC curves (Robin et al. 2011), stay within the metric's range; the correction
-    of BCa is undefined where all replicates agree, as at a recall of 1.
+    Percentiles stay within the metric's range; BCa is undefined where all replicates agree, as at a recall of 1.
     """
     low, high = np.quantile(replicates, (0.025, 0.975))
     return {"low": float(low), "high": float(high)}
@@ -62,9 +58,6 @@ def replicate_difference(one: np.ndarray, other: np.ndarray, paired: bool) -> np
     groups = [one - other] if paired else [one, -other]
     drawn = [np.take_along_axis(group, generator.integers(len(group), size=group.shape), axis=0) for group in groups]
     return sum(group.mean(axis=0) for group in drawn)
-
-
-# ------------------------------------------------------------------------------------- ROC
 
 
 def rank(positives: np.ndarray, negatives: np.ndarray) -> np.ndarray:
@@ -113,9 +106,6 @@ def roc_metrics(positives: Scores, negatives: Scores) -> dict[str, Any]:
     auc, *recalls = results
     recall_at = {rate: {**recall, "threshold": bar} for rate, recall, bar in zip(RATES, recalls, bars, strict=True)}
     return {"auc": {**auc, "positives": len(positives), "negatives": len(negatives)}, "recall_at": recall_at}
-
-
-# ------------------------------------------------------------------------------------- pools of predictions
 
 
 @dataclass(frozen=True)
@@ -168,7 +158,7 @@ def pool_by_source(predictions: Sequence[Prediction], label: str, exclude: Seque
 def compute_metrics(group: Pool, label: str) -> dict[str, Any]:
     """recall, top5 and false_positive_rate, as `fraction` returns them, and auc and recall_at of `roc_metrics`."""
     counted = {name: fraction(sum(values), len(values)) for name, values in group.outcomes(label).items()}
-    return {**counted, **roc_metrics(*group.scores)}
+    return counted | roc_metrics(*group.scores)
 
 
 def replicate_metrics(group: Pool, label: str) -> dict[str, np.ndarray]:

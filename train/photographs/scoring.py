@@ -118,10 +118,10 @@ def format_summary(summary: dict[str, Any]) -> str:
     pools = {"all": summary, **summary["by_source"]}
     counts = [[name, *(format_fraction(metrics[key]) for key in COUNTED)] for name, metrics in pools.items()]
     ranked = [[name, *(format_interval(find_metric(metrics, k)) for k in RANKED)] for name, metrics in pools.items()]
-    by_class = [
-        [name, *(format_fraction(metrics[key]) for key in BY_CLASS), _listed(metrics["most_common_wrong"])]
-        for name, metrics in summary["by_class"].items()
-    ]
+    by_class = []
+    for name, metrics in summary["by_class"].items():
+        wrong = ", ".join(f"{other} {count}" for other, count in metrics["most_common_wrong"].items())
+        by_class.append([name, *(format_fraction(metrics[key]) for key in BY_CLASS), wrong])
     paragraphs = [
         f"{n['positives']} images of {label}, {n['negatives']} of other things",
         aligned(["", "recall", "top-5", "FPR"], counts),
@@ -133,7 +133,3 @@ def format_summary(summary: dict[str, Any]) -> str:
     if files:
         paragraphs.append(f"{len(files)} left out, of kinds that are not read, like {files[0]}")
     return "\n\n".join(paragraphs)
-
-
-def _listed(counts: dict[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in counts.items())

@@ -39,11 +39,10 @@ def contact_sheet(predictions: Sequence[Prediction], images: torch.Tensor, label
     ]
     grids = []
     for name, color, group, total in sections:
-        title = f"{label}: {len(group)} {name} of {total}"
-        if len(group) > PER_SECTION:
-            title += f" ({PER_SECTION} shown, evenly by probability)"
+        part = f" ({PER_SECTION} shown, evenly by probability)" if len(group) > PER_SECTION else ""
         tiles = [_tile(prediction, image, color) for prediction, image in evenly(group, PER_SECTION)]
-        grids.append(draw_grid([tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)], heading=title))
+        rows = [tiles[i : i + COLUMNS] for i in range(0, len(tiles), COLUMNS)]
+        grids.append(draw_grid(rows, heading=f"{label}: {len(group)} {name} of {total}{part}"))
     sheet = Image.new("RGB", (max(grid.width for grid in grids), sum(grid.height for grid in grids)), PAPER)
     for grid, bottom in zip(grids, accumulate(grid.height for grid in grids), strict=True):
         sheet.paste(grid, (0, bottom - grid.height))

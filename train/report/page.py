@@ -1,6 +1,5 @@
 """A page of runs and attacks, report.html, which loads nothing else."""
 
-import base64
 import os
 import re
 import traceback
@@ -53,7 +52,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"as_text": as_text, "data_uri": _data_uri, "yaml": OmegaConf.to_yaml}
+    environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml}
     page = environment.get_template("page.html.jinja").render(
         arms=arms,
         findings=findings,
@@ -80,14 +79,6 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
         return f"report: {write_report(folders, out)}"
     except Exception as error:  # the run is finished and saved
         return f"no report: {one_sentence(error) or traceback.format_exc()}"
-
-
-def _data_uri(picture: Picture) -> str:
-    kind = "svg+xml" if picture.kind == "svg" else picture.kind
-    return f"data:image/{kind};base64,{base64.b64encode(picture.data).decode()}"
-
-
-# ------------------------------------------------------------------------------------- runs
 
 
 def _curves(arms: Arms, findings: Findings) -> list[Picture]:
@@ -138,9 +129,6 @@ def _side(label: str, when: str, side: Side) -> Picture:
     return plots.encoded(pair, f"{label} {when}: {predicted}; a ball in its light", f"{when}: {predicted}")
 
 
-# ------------------------------------------------------------------------------------- photographs
-
-
 def _photographs(arms: Arms, name: str) -> dict[str, Any]:
     """What the page shows of the photographs `name`: plots, tables, and the contact sheet of each arm's first run."""
     runs = {arm: [run for run in group if name in run.photographs] for arm, group in arms.items()}
@@ -186,9 +174,6 @@ def _difference_sentence(arms: compare.Evaluations, images: str) -> str:
     return (
         f"{arm} minus {reference}, {metric_title(HEADLINE)} on {images}: {compare.format_difference(result)}{unsure}."
     )
-
-
-# ------------------------------------------------------------------------------------- attacks
 
 
 def _attack_sentence(attacks: Sequence[AttackSummary]) -> str:

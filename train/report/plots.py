@@ -1,5 +1,6 @@
 """Images of a report: plots as SVG for light and dark pages, and small images."""
 
+import base64
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,13 +42,18 @@ Line = tuple[Sequence[float], Sequence[float]]  # x and y
 
 @dataclass(frozen=True)
 class Picture:
-    """A file's bytes. kind: svg, png or jpeg. alt: a description. width: CSS pixels to show it at."""
+    """A file's bytes. kind: svg+xml, png or jpeg. alt: a description. width: CSS pixels to show it at."""
 
     data: bytes
     kind: str
     alt: str
     width: int
     caption: str = ""
+
+    @property
+    def uri(self) -> str:
+        """The whole file, as an address in a page."""
+        return f"data:image/{self.kind};base64,{base64.b64encode(self.data).decode()}"
 
 
 def style(index: int) -> dict[str, Any]:
@@ -62,7 +68,7 @@ def curves(arms: Mapping[str, Sequence[Line]], title: str) -> Picture | None:
 
     def draw(axes: "Axes") -> None:
         for index, (arm, lines) in enumerate(arms.items()):
-            for number, (x, y) in enumerate(line for line in lines if line[0]):
+            for number, (x, y) in enumerate(line for line in lines if len(line[0]) > 1):
                 marker = MARKERS[index % len(MARKERS)] if len(x) < 30 else None
                 axes.plot(x, y, marker=marker, ms=4, label=None if number else arm, **style(index))
         axes.set(xlabel="epoch")
@@ -121,7 +127,7 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
             figure.legend([*legend.values()], [*legend], loc="outside lower center", ncols=columns)
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
     start, tag, rest = file.getvalue().partition("<defs>")
-    return Picture((start + STYLE + tag + rest.replace(INK, "currentColor")).encode(), "svg", alt, WIDTH, title)
+    return Picture((start + STYLE + tag + rest.replace(INK, "currentColor")).encode(), "svg+xml", alt, WIDTH, title)
 
 
 def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:

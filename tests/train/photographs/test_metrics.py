@@ -6,15 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, mannwhitneyu
 
-from train.photographs.metrics import (
-    RATES,
-    REPLICATES,
-    rank,
-    replicate_difference,
-    roc_curve,
-    roc_metrics,
-    thresholds,
-)
+from train.photographs.metrics import RATES, REPLICATES, rank, replicate_difference, roc_curve, roc_metrics, thresholds
 
 SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)  # of few values, so that ties are common
 
@@ -37,20 +29,6 @@ def test_auc_is_the_mann_whitney_statistic_and_recall_that_at_the_lowest_thresho
     bars = thresholds(np.array(negatives))
     for rate, recall, threshold in zip(RATES, recalls, bars, strict=True):
         assert (recall, threshold) == brute_force_recall(positives, negatives, rate)
-
-
-@pytest.mark.parametrize(("m", "allowed"), [(19, 0), (20, 1), (39, 1), (40, 2), (100, 5), (60, 3), (2000, 100)])
-def test_a_rate_allows_exactly_its_number_of_false_positives(m, allowed):
-    negatives = np.arange(m, dtype=float)
-    assert (negatives > thresholds(negatives)[0]).sum() == allowed
-
-
-@pytest.mark.parametrize(("positives", "negatives"), [([], [1.0]), ([1.0, 2.0], []), ([], [])])
-def test_without_positives_or_negatives_the_metrics_are_unknown(positives, negatives):
-    unknown = {"value": None, "low": None, "high": None}
-    metrics = roc_metrics(positives, negatives)
-    assert metrics["auc"] == {**unknown, "positives": len(positives), "negatives": len(negatives)}
-    assert metrics["recall_at"] == {rate: {**unknown, "threshold": None} for rate in RATES}
 
 
 @pytest.fixture(scope="module")
@@ -99,9 +77,6 @@ def test_the_curve_has_a_point_per_threshold_and_the_trapezoids_below_it_are_the
     for rate, recall, threshold in zip(rates, recalls, thresholds, strict=True):
         assert (rate, recall) == ((negatives > threshold).mean(), (positives > threshold).mean())
     assert np.trapezoid(recalls, rates) == pytest.approx(statistic_of("auc", positives, negatives), rel=0, abs=1e-12)
-
-
-# ------------------------------------------------------------------------------------- bootstrap
 
 
 def test_pairing_cancels_what_both_runs_share():

@@ -1,6 +1,7 @@
 import csv
 import json
-from pathlib import Path
+from collections import defaultdict
+from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
@@ -9,10 +10,13 @@ from PIL import Image
 from scipy.special import logsumexp, softmax
 
 from renderer.errors import InputError
+from train.photographs.folder import Photograph
+from train.photographs.predictions import Prediction, read_predictions, write_predictions
 from train.photographs.scoring import evaluate_photographs, format_summary
+from train.photographs.sheet import FRAME, IMAGE
 from train.tables import fraction
 
-from .conftest import FRUIT
+from .conftest import FRUIT, FRUIT_CLASSES
 
 
 def score(rows: list[tuple[str, str]]) -> dict[str, object]:
@@ -68,45 +72,33 @@ def test_a_source_is_ranked_against_the_hard_negatives_that_it_names(fruit, tmp_
     assert (lab["auc"]["value"], lab["auc"]["positives"], lab["auc"]["negatives"]) == (0.5, 2, 2)
     assert lab["false_positive_rate"]["n"] == 0  # its own
     assert summary["auc"]["value"] == 0.34 and summary["by_source"]["street"]["auc"]["value"] == 0.25
-    table = {row["path"]: row["hard_negatives"] for row in read_csv(tmp_path / "out" / "predictions.csv")}
-    assert {path: names for path, names in table.items() if names} == {"orange/a.png": "shop"}
 
 
 def test_the_score_is_the_log_odds_also_where_the_probability_rounds_to_0_or_1(known_model, tmp_path):
     logits = [[0, 100, 3], [0, -900, 3], [1, 2, 3], [0, -4000, -5000]]
     names = [f"{index}.png" for index in range(4)]
     evaluate_photographs(*known_model(names, logits, ["a", "b", "c"]), "b", tmp_path)
-    rows = read_csv(tmp_path / "predictions.csv")
+    predictions = read_predictions(tmp_path / "predictions.csv", "b")
     expected = [100 - logsumexp([0, 3]), -900 - logsumexp([0, 3]), 2 - logsumexp([1, 3]), -4000]
-    assert [float(row["b_log_odds"]) for row in rows] == pytest.approx(expected, rel=1e-15)
-    assert [row["b_rank"] for row in rows] == ["1", "3", "2", "2"]
-
-
-def read_csv(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    assert [prediction.log_odds for prediction in predictions] == pytest.approx(expected, rel=1e-15)
+    assert [prediction.label_rank for prediction in predictions] == [1, 3, 2, 2]
 
 
 def test_the_csv_gives_each_photograph_its_probabilities_and_brute_force_ranks(known_model, tmp_path):
-    classes = ["apple", "fig", "lime", "orange", "pear", "plum"]
     names = [f"{label}/{index}.png" for label in ("orange", "other_x", "plum") for index in range(4)]
-    logits = np.random.default_rng(0).normal(0, 3, (len(names), len(classes))).astype(np.float32)
-    evaluate_photographs(*known_model(names, logits, classes), "orange", tmp_path)
-    rows = read_csv(tmp_path / "predictions.csv")
-    assert [row["path"] for row in rows] == names
-    for row, scores in zip(rows, logits.astype(float), strict=True):
-        probabilities = dict(zip(classes, softmax(scores), strict=True))
-        ranking = sorted(classes, key=probabilities.get, reverse=True)
-        label = row["path"].split("/")[0]
-        assert (row["label"], row["source"], row["predicted"]) == (label, "", ranking[0])
-        assert float(row["probability"]) == pytest.approx(probabilities[ranking[0]], rel=1e-12)
-        assert float(row["orange_probability"]) == pytest.approx(probabilities["orange"], rel=1e-12)
-        assert int(row["orange_rank"]) == ranking.index("orange") + 1
-        if label == "other_x":
-            assert (row["true_probability"], row["true_rank"]) == ("", "")
-        else:
-            assert float(row["true_probability"]) == pytest.approx(probabilities[label], rel=1e-12)
-            assert int(row["true_rank"]) == ranking.index(label) + 1
+    logits = np.random.default_rng(0).normal(0, 3, (len(names), len(FRUIT_CLASSES))).astype(np.float32)
+    evaluate_photographs(*known_model(names, logits, FRUIT_CLASSES), "orange", tmp_path)
+    predictions = read_predictions(tmp_path / "predictions.csv", "orange")
+    for name, prediction, scores in zip(names, predictions, logits.astype(float), strict=True):
+        probabilities = dict(zip(FRUIT_CLASSES, softmax(scores), strict=True))
+        ranking, label = sorted(FRUIT_CLASSES, key=probabilities.get, reverse=True), name.split("/")[0]
+        true = None if label == "other_x" else ranking.index(label) + 1
+        ranks = prediction.true_rank, prediction.label_rank, prediction.predicted
+        assert (str(prediction.photograph.path), prediction.photograph.label) == (name, label)
+        assert ranks == (true, ranking.index("orange") + 1, ranking[0])
+        found = prediction.probability, prediction.label_probability, prediction.true_probability or 0
+        expected = probabilities[ranking[0]], probabilities["orange"], probabilities.get(label, 0)
+        assert found == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("place", [0, 4, 5])
@@ -114,19 +106,7 @@ def test_a_tie_of_all_classes_goes_to_the_first_class(known_model, tmp_path, pla
     classes = [f"class {index}" for index in range(300)]  # sorts that are not stable show it at this size
     undecided = known_model(["a.png"], np.zeros((1, 300)), classes)
     summary = evaluate_photographs(*undecided, classes[place], tmp_path)
-    assert summary["recall"]["value"] == (place == 0)
-    assert summary["top5"]["value"] == (place < 5)
-
-
-def test_black_reaches_the_model_as_0_and_white_as_1(tmp_path):
-    (tmp_path / "photos").mkdir()
-    Image.new("RGB", (32, 32), (0, 255, 51)).save(tmp_path / "photos" / "a.png")
-
-    def check(images):
-        assert images.tolist() == torch.tensor([0, 1, 0.2]).view(1, 3, 1, 1).expand(1, 3, 8, 8).tolist()
-        return torch.zeros(1, 2)
-
-    evaluate_photographs(check, ["orange", "pear"], tmp_path / "photos", "orange", tmp_path, size=8)
+    assert (summary["recall"]["value"], summary["top5"]["value"]) == (place == 0, place < 5)
 
 
 def test_skipped_photographs_are_counted_and_named_but_not_scored(fruit, tmp_path):
@@ -143,21 +123,12 @@ def test_skipped_photographs_are_counted_and_named_but_not_scored(fruit, tmp_pat
 
 def test_the_model_runs_in_eval_mode_without_gradients_and_is_left_as_it_was(fruit, tmp_path):
     fruit_model, classes, folder = fruit
-
-    class Network(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.training_norm, self.frozen_norm = torch.nn.BatchNorm2d(3), torch.nn.BatchNorm2d(3).eval()
-
-        def forward(self, images):
-            assert not any(module.training for module in self.modules())
-            assert not self.training_norm(images).requires_grad
-            return fruit_model(images)
-
-    model = Network()
+    model = torch.nn.Sequential(torch.nn.BatchNorm2d(3), torch.nn.BatchNorm2d(3).eval())
+    model.register_forward_pre_hook(lambda module, _: pytest.fail() if any(part.training for part in model) else None)
+    model.register_forward_hook(lambda _, images, result: result.requires_grad or fruit_model(*images))
     before = {name: value.clone() for name, value in model.state_dict().items()}
     evaluate_photographs(model, classes, folder, "orange", tmp_path)
-    assert (model.training, model.training_norm.training, model.frozen_norm.training) == (True, True, False)
+    assert [part.training for part in (model, *model)] == [True, True, False]
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
@@ -181,3 +152,74 @@ def test_scores_are_never_written_among_the_photographs(fruit, tmp_path, out):
         evaluate_photographs(*fruit, "orange", tmp_path / out)
     assert sorted(folder.rglob("*")) == before
     evaluate_photographs(*fruit, "orange", tmp_path / "photos_scored")  # beside them is not among them
+
+
+PREDICTIONS = [
+    Prediction(
+        Photograph(PurePosixPath("orange/a, b.png"), "orange", "web", ("lab", "studio")),
+        *("orange", 1 / 3, 1 / 3, 1, 1 / 3, 1, -0.1),
+    ),
+    Prediction(Photograph(PurePosixPath("other_x/ü.png"), "other_x", None), "pear", 1.0, None, None, 1e-300, 2, -690.0),
+]
+
+
+def test_written_predictions_are_read_bit_by_bit_and_those_of_another_class_are_refused(tmp_path):
+    write_predictions(tmp_path / "a.csv", PREDICTIONS, "orange")
+    assert read_predictions(tmp_path / "a.csv", "orange") == PREDICTIONS
+    with pytest.raises(InputError, match=r"a\.csv cannot be used .* with label=pear"):
+        read_predictions(tmp_path / "a.csv", "pear")
+
+
+FRAMES = {"true positives": (46, 158, 91), "false negatives": (208, 59, 59), "false positives": (232, 163, 23)}
+FRAMED = IMAGE + 2 * FRAME
+
+
+def count_tiles(sheet: Image.Image) -> list[int]:
+    pixels = np.asarray(sheet)
+    areas = [int((pixels == color).all(axis=2).sum()) for color in FRAMES.values()]
+    counts = [divmod(area, FRAMED**2 - IMAGE**2) for area in areas]
+    assert all(rest == 0 for _, rest in counts)
+    return [count for count, _ in counts]
+
+
+def test_the_contact_sheet_frames_each_hit_miss_and_false_positive(fruit, tmp_path):
+    evaluate_photographs(*fruit, "orange", tmp_path)
+    with Image.open(tmp_path / "contact_sheet.png") as sheet:
+        assert count_tiles(sheet) == [1, 4, 2]
+
+
+def test_the_contact_sheet_shows_at_most_40_images_from_the_surest_to_the_least_sure(known_model, tmp_path):
+    """Of 101 true positives 40 are shown, image 100 being the surest and image 0 the least."""
+    names = [f"{index:03}.png" for index in range(101)]
+    table = np.stack([np.arange(1, 102), np.zeros(101)], axis=1) / 20
+    evaluate_photographs(*known_model(names, table, ["orange", "pear"]), "orange", tmp_path)
+    with Image.open(tmp_path / "contact_sheet.png") as sheet:
+        assert count_tiles(sheet) == [40, 0, 0]
+        red, green, blue = np.moveaxis(np.asarray(sheet).astype(int), 2, 0)
+    areas = np.bincount(red[(green == 0) & (blue == 0)])
+    shown = np.flatnonzero(areas >= IMAGE**2)
+    assert len(shown) == 40 and shown[0] == 0 and shown[-1] == 100 and set(np.diff(shown)) == {2, 3}
+    lines = np.where((green == 0) & (blue == 0), red, -1)
+    assert any(list(dict.fromkeys(line[line >= 0])) == list(shown[::-1][:10]) for line in lines)
+
+
+def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_classes(fruit, tmp_path):
+    """Of the ranks of orange, 1, 2, 6, 5, 2 and of the others 1, 5, 2, 1, 2; of the street 6, 2 and 1, 5."""
+    evaluate_photographs(*fruit, "orange", tmp_path)
+    curves = defaultdict(list)
+    with (tmp_path / "roc.csv").open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            point = tuple(float(row[name]) for name in ("false_positive_rate", "recall", "threshold"))
+            curves[row["source"]].append(point)
+    assert list(curves) == ["", "street"]
+    assert [point[:2] for point in curves[""]] == [(0, 0), (0.4, 0.2), (0.8, 0.6), (1, 0.8), (1, 1)]
+    assert [point[:2] for point in curves["street"]] == [(0, 0), (0.5, 0), (0.5, 0.5), (1, 0.5), (1, 1)]
+    for curve in curves.values():
+        assert curve == sorted(curve, key=lambda point: -point[2]) and curve[-1][2] == -np.inf
+
+
+def test_a_folder_without_negatives_has_an_empty_table_and_figure(known_model, tmp_path):
+    evaluate_photographs(*known_model(["a.png"], [[1, 0]], ["orange", "pear"]), "orange", tmp_path)
+    assert (tmp_path / "roc.csv").read_text() == "source,false_positive_rate,recall,threshold\n"
+    with Image.open(tmp_path / "roc.png") as image:
+        image.load()

@@ -1,9 +1,6 @@
 import json
-from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from renderer.errors import InputError
 from train.report.summary import format_table, read_attack, summarize
@@ -37,36 +34,21 @@ def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_
     assert tables["settings in which the arms differ"][1:] == [[first, "3"], [second, "9"]]
 
 
-# ------------------------------------------------------------------------------------- attacks
-
 LINE = {
     "example": 0, "label": ["orange", "orange"], "predicted_before": ["orange", "plum"],
     "confidence_before": [0.875, 0.5], "predicted": ["plum", "plum"], "confidence": [0.75, 0.625], "success": True,
     "success_before": False, "steps": 7,
 }  # fmt: skip
-ANYTHING = st.recursive(
-    st.none() | st.booleans() | st.floats() | st.text(max_size=3), lambda inner: st.lists(inner, max_size=3)
-)
-
-
-def write(folder: Path, *lines: dict) -> None:
-    (folder / "attack.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
 def test_an_attack_counts_successes_on_examples_that_were_correct_before(tmp_path):
     lines = [LINE, {**LINE, "example": 1, "success_before": True}, {**LINE, "example": 2, "success": False}]
-    write(tmp_path, *lines, {"checks": {"random_search": 0.5}})
+    lines.append({"checks": {"random_search": 0.5}})
+    (tmp_path / "attack.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     attack = read_attack(tmp_path)
     assert (attack.successes, attack.correct, attack.checks) == (1, 2, {"random_search": 0.5})
     outcomes = ["success in 7 steps", "wrong before any step", "no success in 7 steps"]
     assert [(row[0], row[-1]) for row in attack.rows] == list(enumerate(outcomes))
-
-
-@given(st.sampled_from([*LINE]), ANYTHING)
-def test_a_line_with_any_value_is_read_or_refused_in_one_sentence(tmp_path_factory, key, value):
-    folder = tmp_path_factory.mktemp("attack")
-    write(folder, LINE | {key: value})
-    try:
-        read_attack(folder)
-    except InputError as error:
-        assert str(error).startswith(f"{folder / 'attack.jsonl'} is damaged or was written by no attack (")
+    (tmp_path / "attack.jsonl").write_text(json.dumps(LINE | {"confidence": "high"}))
+    with pytest.raises(InputError, match=rf"^{tmp_path}/attack.jsonl is damaged or was written by no attack \("):
+        read_attack(tmp_path)
