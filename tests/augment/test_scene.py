@@ -1,32 +1,25 @@
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 import renderer
 from augment import relighting
-from augment.attacks.attack import AttackSettings
-from augment.attacks.descent import Goal, descend
 from augment.attacks.norm_ball import StepSettings
-from augment.attacks.parameters import PARAMETERS, AttackProblem
-from augment.backgrounds import load_backgrounds
+from augment.attacks.parameters import PARAMETERS
 from augment.build import build_scene, count_views
-from augment.objects import ObjectSettings, SceneObject, load_object
+from augment.objects import ObjectSettings, load_object
 from augment.reshading import NEAR
 from augment.scene import Conditions, Example, Scene
 from augment.service import AugmentationService, AugmentationSettings, TrainingAttackSettings
 from augment.utils import Phases
-from renderer.camera import OrthographicCamera, orbit_cameras
+from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.image import ImageSettings
-from renderer.light.convex import nearest_in_box
-from renderer.light.harmonics import nonzero_coefficients
 from renderer.light.presets import ambient, probe
-from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.transfer import build_operators
 
@@ -34,7 +27,6 @@ EPS32 = torch.finfo(torch.float32).eps
 RASTERIZER = choose("numpy")
 SETTINGS = ImageSettings(size=8, samples=2)
 GRAYS = [0.0, 0.25, 1.0]
-NONZERO = nonzero_coefficients(6)
 
 
 def random_lights(count: int, seed: int = 0) -> torch.Tensor:
@@ -134,48 +126,6 @@ def test_a_smaller_mesh_in_a_scene_of_larger_ones_uses_only_its_values(several, 
     images = several.render(own.apply(values, several.conditions(everything), everything), everything)
     (gradient,) = torch.autograd.grad(images.square().sum(), values)
     assert not gradient[beyond].any() and gradient.any(1).all()
-
-
-@dataclass(frozen=True)
-class Lamps:
-    """A basis that the package does not have: three lamps far away, along the axes, of power from 0 to 1."""
-
-    name = "lamps"
-    allow_negative = False
-    size = 3
-    nonzero = torch.arange(3)
-
-    def irradiance(self, normals: torch.Tensor) -> torch.Tensor:
-        return normals.clamp(min=0)
-
-    def radiance(self, directions: torch.Tensor) -> torch.Tensor:
-        raise NotImplementedError  # lamps are points
-
-    def project_nonnegative(self, coefficients: torch.Tensor, within=None) -> torch.Tensor:
-        return nearest_in_box(coefficients, 0, 1, within)
-
-
-def test_a_new_basis_of_light_renders_and_is_attacked_within_its_norm_ball():
-    """A white box before the camera from above: its top has the power of the lamp above, which falls to 0 at most."""
-    box = SceneObject("box", Mesh.plain(trimesh.creation.box().vertices, trimesh.creation.box().faces))
-    start = torch.tensor([[0.2] * 3, [0.3] * 3, [0.4, 0.5, 0.6]], dtype=torch.float64)
-    above = OrthographicCamera(0.0, 0.0, 0.9)  # nothing but the top
-    scene = Scene.grid([box], [above], load_backgrounds([1.0], 8), start, SETTINGS, RASTERIZER, basis=Lamps())
-    chosen = torch.zeros(1, dtype=torch.int64)
-    image = scene.render(scene.conditions(chosen), chosen)
-    expected = start[2].view(3, 1, 1).expand_as(image)
-    torch.testing.assert_close(image, expected, rtol=0, atol=8 * torch.finfo(torch.float64).eps)
-
-    light = PARAMETERS["lighting"](scene, StepSettings("linf", 0.45, "sign", 0.15))
-    problem, goal = AttackProblem(scene, [light]), Goal(torch.zeros(1, 1, dtype=torch.int64))
-    dark = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 64, 2)).double()
-    torch.nn.init.constant_(dark[1].weight, 0)
-    with torch.no_grad():
-        dark[1].weight[1], dark[1].bias[:] = -0.01, torch.tensor([5.0, 0.0])  # no darkness is enough
-    result = descend(dark, problem, goal, AttackSettings(max_steps=5, margin=0.0))
-    lamps = result.values.view(3, 3)
-    torch.testing.assert_close(lamps[:2], start[:2], rtol=0, atol=0)
-    torch.testing.assert_close(lamps[2], torch.tensor([0.0, 0.05, 0.15], dtype=torch.float64), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(("names", "bounces"), [(["cup", "ball"], 0), (["cup"], 2)])
