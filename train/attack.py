@@ -35,7 +35,6 @@ from train.tables import aligned, format_fraction, fraction
 
 TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
-MOST_RADII = 100
 LAMP_POWER = 2.0  # of the default lamps whose positions alone are attacked
 
 # ------------------------------------------------------------------------------------- settings
@@ -58,7 +57,6 @@ class AttackCommandSettings(AttackSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_renderers(self.renderers)
-        require_range("radius_scales: their number", len(self.radius_scales), 0, MOST_RADII)
         for scale in self.radius_scales:
             require_range("radius_scales", scale, 1 / FACTOR, FACTOR)
 
@@ -120,8 +118,8 @@ class AttackExperimentSettings:
         names = self.target if isinstance(self.target, list) else [self.target]
         if any(isinstance(name, dict | list) for name in names):
             raise InputError("target: give a class, least_likely, or a list of classes, one per view")
-        if self.target is not None:
-            self.target = list(map(str, names)) if isinstance(self.target, list) else str(self.target)
+        if isinstance(self.target, int | float):  # a class whose name is a number
+            self.target = str(self.target)
         require_transferable(self.attack.parameters, self.transfer.azimuths, self.transfer.meshes)
         if self.attack.projector is not None and self.scene.projector is None:
             self.scene.projector = ProjectorSettings()
@@ -215,16 +213,14 @@ def build_attacked(
 def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:
     """The arguments of `augment.transfer`; none where nothing is asked for. InputError: as the loaders, and where
     a classifier lacks a class."""
-    others, scene = settings.transfer, settings.scene
+    others, scene, label = settings.transfer, settings.scene, settings.label
     named = [item if isinstance(item, dict) else {"classifier": item} for item in others.classifiers]
     if unknown := next((key for item in named for key in item if key not in ("classifier", "weights")), None):
         raise InputError(f"transfer.classifiers: {unknown} is not known: give names, or {{classifier, weights}}")
     classifiers = [load_classifier(str(item.get("classifier")), item.get("weights")).to(device) for item in named]
-    items = [read_object(item, settings.label, index, "transfer.meshes") for index, item in enumerate(others.meshes)]
-    for classifier in classifiers:  # before anything is attacked
-        classifier.label(settings.label)
-    for item in items:
-        attacked.label(item.label)
+    items = [read_object(item, label, index, "transfer.meshes") for index, item in enumerate(others.meshes)]
+    for network, name in [*((other, label) for other in classifiers), *((attacked, item.label) for item in items)]:
+        network.label(name)  # before anything is attacked
     objects = [on_ground(load_object(item, scene.vertices), scene.ground) for item in items]
     arguments = {"classifiers": classifiers, "azimuths": others.azimuths, "objects": objects}
     return {name: argument for name, argument in arguments.items() if argument}
@@ -313,8 +309,6 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
 
 def format_sweep(sweep: Sequence[Mapping[str, Any]]) -> str:
     """A result of `augment.success_by_radius`, a line per radius."""
-    if not len(sweep[0]["adversarial"]):
-        return "no example was correct before, so that there is no success against radius"
     rows = []
     for row in sweep:
         radii = " + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())

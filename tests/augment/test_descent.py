@@ -1,4 +1,3 @@
-import itertools
 import math
 from dataclasses import dataclass, field, fields
 
@@ -9,8 +8,6 @@ from torch import Tensor, nn
 from augment.attacks.attack import AttackSettings
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.attacks.norm_ball import STEPS, StepSettings, direction
-from augment.utils import Phases
-from renderer.errors import InputError
 
 EPS = torch.finfo(torch.float64).eps
 PIXELS, DIMENSIONS = (3, 2, 2), 5
@@ -83,11 +80,7 @@ def closed_form(step: str, size: float, max_steps: int, slope: Tensor, margin: f
     """
     displacement, steps = torch.zeros(DIMENSIONS, dtype=torch.float64), 0
     while margin > 0 and steps < max_steps:
-        move = {
-            "unit": slope / slope.norm(),
-            "sign": slope.sign(),
-            "raw": slope / (1 + math.exp(margin)),
-        }[step]
+        move = {"unit": slope / slope.norm(), "sign": slope.sign(), "raw": slope / (1 + math.exp(margin))}[step]
         displacement -= size * move
         margin -= size * float(slope @ move)
         steps += 1
@@ -112,7 +105,7 @@ def test_on_a_linear_classifier_every_step_is_as_in_closed_form(step, size):
         torch.testing.assert_close(result.values[row] - start[row], displacement, rtol=0, atol=64 * EPS)
         for cost, margin in ((result.cost_before, before), (result.cost, after)):
             assert float(cost[row]) == pytest.approx(-math.log1p(math.exp(-margin)), rel=128 * EPS)
-    assert {0, 6} < taken  # examples that were fooled at once, on the way, and never
+    assert {0, 6} < taken  # examples that succeed at once, on the way, and never
     assert torch.equal(result.predicted[:, 0] != classes, result.success)
     images = problem.render(result.values, torch.arange(16))
     torch.testing.assert_close(result.images, images, rtol=0, atol=16 * EPS)
@@ -133,7 +126,7 @@ def test_the_lowest_point_of_a_sphere_is_reached_from_anywhere_in_it(views, step
     torch.testing.assert_close(result.values, expected, rtol=0, atol=64 * EPS)
 
 
-def test_fooled_examples_stay_and_are_not_looked_at_again():
+def test_successful_examples_stay_and_are_not_rendered_again():
     start, classes, model = random(16, DIMENSIONS, seed=2), torch.arange(16) % 2, Linear(WEIGHT)
     problem = LinearScene(start, "unit", 0.3)
     result = attack(model, problem, classes, steps=6)
@@ -144,13 +137,6 @@ def test_fooled_examples_stay_and_are_not_looked_at_again():
     assert torch.equal(result.values[at_once], start[at_once])
     logits = model(result.images.flatten(0, 1))
     assert torch.equal(logits.argmax(1) != classes, result.success)
-
-
-def test_without_steps_nothing_moves_and_the_costs_are_told():
-    start, classes = random(16, DIMENSIONS, seed=2), torch.arange(16) % 2
-    result = attack(Linear(WEIGHT), LinearScene(start), classes, steps=0)
-    assert torch.equal(result.values, start) and torch.equal(result.cost, result.cost_before)
-    assert not result.steps.any() and torch.equal(result.success, result.success_before)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +151,7 @@ def test_without_steps_nothing_moves_and_the_costs_are_told():
         ([[0], [1], [2]], [[1], [1], [1]], [[1], [2], [0]], [True, False, False]),
     ],
 )
-def test_a_goal_is_reached_when_every_view_is_given_what_was_asked(source, target, predicted, success):
+def test_a_goal_is_reached_when_every_view_is_predicted_as_asked(source, target, predicted, success):
     goal = Goal(torch.tensor(source), None if target is None else torch.tensor(target))
     reached = goal.reached(torch.tensor(predicted))
     assert reached.tolist() == torch.tensor(success).flatten().tolist()
@@ -228,12 +214,7 @@ def test_a_step_that_does_not_lower_the_cost_is_taken_back_and_tried_at_half_its
         assert result.steps.tolist() == [steps] * 3 and result.predicted.flatten().tolist() == [0] * 3
 
 
-def test_without_shortening_every_step_is_kept():
-    for steps, expected in enumerate([(1, 0.125, 0.75), (-0.5, -1.375, -0.75), (1, 0.125, 0.75)]):
-        assert tuple(on_the_axis(steps, shorten=False).values.flatten().tolist()) == expected
-
-
-def test_a_step_that_fools_is_kept_whatever_its_cost():
+def test_a_step_that_succeeds_is_kept_whatever_its_cost():
     """With three classes the true one may gain while another overtakes it."""
     start = torch.ones(1, 1, dtype=torch.float64)
     result = attack(Detour(), Axis(start), torch.zeros(1, dtype=torch.int64), steps=5, shorten=True)
@@ -243,33 +224,8 @@ def test_a_step_that_fools_is_kept_whatever_its_cost():
     )
 
 
-class Waves(LinearScene):
-    """Images that oscillate with the values."""
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        return (1 + super().render(values, examples).sin()) / 2
-
-
-def test_with_shortened_steps_towards_the_least_likely_class_the_cost_never_rises():
-    """By steps that are too long; one that is taken back leaves everything but its count."""
-    network, start = small_network().eval(), 3 * random(9, DIMENSIONS, seed=3)
-    logits = network(Waves(start).render(start, torch.arange(9))[:, 0])
-    goal = Goal(logits.argmax(1, keepdim=True), logits.argmin(1, keepdim=True))
-    runs = [descend(network, Waves(start, size=4.0), goal, settings_of(steps, shorten=True)) for steps in range(12)]
-    rejected = 0
-    for before, after in itertools.pairwise(runs):
-        assert (after.cost[~after.success] <= before.cost[~after.success]).all()
-        back = (after.cost == before.cost) & ~before.success
-        rejected += int(back.sum())
-        assert torch.equal(after.steps[back], before.steps[back] + 1)
-        for name in set(FIELDS) - {"steps"}:
-            assert torch.equal(getattr(after, name)[back], getattr(before, name)[back])
-    assert rejected > 9 and runs[-1].success.any() and not runs[-1].success.all()
-    assert torch.equal(runs[-1].success[:, None], runs[-1].predicted == goal.target)
-
-
 @pytest.mark.parametrize("step", STEPS)
-def test_a_zero_gradient_leaves_the_values_and_is_told(step):
+def test_a_zero_gradient_leaves_the_values_and_is_reported(step):
     """The second example's image is clamped all over."""
 
     class Clamped(LinearScene):
@@ -295,7 +251,7 @@ def small_network() -> nn.Sequential:
 def small_attack(
     views: int, batch_size: int = 128, shorten: bool = False, margin: float = 0.0
 ) -> tuple[LinearScene, DescentResult]:
-    """Nine examples, of which some are fooled at once, on the way and never."""
+    """Nine examples, of which some succeed at once, on the way and never."""
     problem = LinearScene(3 * random(9, DIMENSIONS, seed=3), size=0.3, views=views)
     classes = (torch.arange(9) % 4)[:, None].expand(9, views)
     settings = settings_of(8, shorten=shorten, batch_size=batch_size, margin=margin)
@@ -331,13 +287,8 @@ def test_every_example_is_attacked_as_if_alone(views, shorten):
             torch.testing.assert_close(getattr(result, name)[0], getattr(together, name)[row], rtol=0, atol=1e-12)
 
 
-def test_the_same_attack_gives_the_same_to_the_bit():
-    (_, first), (_, again) = small_attack(2, shorten=True), small_attack(2, shorten=True)
-    assert all(torch.equal(getattr(first, name), getattr(again, name)) for name in FIELDS)
-
-
-def test_restarts_go_on_with_those_that_are_left_and_keep_what_fools():
-    """Against as many descents one by one: an example's result is that of the first that fools it, or of the first."""
+def test_restarts_go_on_with_those_that_are_left_and_keep_successes():
+    """Against as many descents one by one: an example's result is that of the first that succeeds, or of the first."""
     center, ball, network = random(40, DIMENSIONS, seed=3), StepSettings("linf", 0.5), Linear(WEIGHT)
     goal, settings = Goal(torch.arange(40)[:, None] % 2), settings_of(2)
     starts = [ball.sample(center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
@@ -346,7 +297,7 @@ def test_restarts_go_on_with_those_that_are_left_and_keep_what_fools():
     counted = problem.rendered.clone()
     problems = [LinearScene(start, "sign", 0.1, ball, center=center) for start in (center, *starts)]
     single = [descend(network, each, goal, settings) for each in problems]
-    assert torch.isclose((single[1].values - center).abs(), torch.tensor(0.5).double()).any()  # the ball holds some
+    assert torch.isclose((single[1].values - center).abs(), torch.tensor(0.5).double()).any()  # the ball limits some
     rounds = torch.stack([each.success for each in single]).long().argmax(0)
     assert set(rounds.tolist()) == {0, 1, 2} and not result.success.all()
     assert torch.equal(result.success, torch.stack([each.success for each in single]).any(0))
@@ -364,7 +315,7 @@ def test_restarts_go_on_with_those_that_are_left_and_keep_what_fools():
 
 
 @pytest.mark.parametrize("shorten", [False, True])
-def test_a_margin_does_not_change_when_an_example_is_first_fooled(shorten):
+def test_a_margin_does_not_change_when_an_example_first_succeeds(shorten):
     (_, border), (_, beyond) = small_attack(2, shorten=shorten), small_attack(2, shorten=shorten, margin=0.5)
     assert torch.equal(beyond.success, border.success) and (beyond.steps > border.steps)[border.success].any()
     for result in (border, beyond):
@@ -395,9 +346,7 @@ class Watched(nn.Module):
         return {
             "modes": [module.training for module in self.modules()],
             "requires_grad": [parameter.requires_grad for parameter in self.parameters()],
-            "grads": [
-                parameter.grad if parameter.grad is None else parameter.grad.clone() for parameter in self.parameters()
-            ],
+            "gradients": [None if parameter.grad is None else parameter.grad + 0 for parameter in self.parameters()],
             "weights and buffers": {name: value.clone() for name, value in self.state_dict().items()},
             "random": torch.random.get_rng_state(),
             "grad mode": torch.is_grad_enabled(),
@@ -439,17 +388,3 @@ def test_the_start_is_not_written_to():
     result = attack(Linear(WEIGHT), LinearScene(shared, size=0.3), torch.arange(4) % 2)
     assert torch.equal(start, random(1, DIMENSIONS, seed=2))
     assert not result.values.requires_grad and not result.images.requires_grad
-
-
-def test_the_classifiers_share_of_the_time_is_told():
-    phases, goal = Phases(), Goal(torch.arange(2)[:, None])
-    descend(Linear(WEIGHT), LinearScene(random(2, DIMENSIONS, seed=2)), goal, settings_of(), phases)
-    assert phases.take()["attack_classifier"] > 0
-
-
-@pytest.mark.parametrize(
-    ("change", "message"), [({"max_steps": -1}, "max_steps=-1"), ({"batch_size": 0}, "batch_size=0")]
-)
-def test_settings_that_make_no_attack_are_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        settings_of(**change)

@@ -3,7 +3,15 @@ import pytest
 import torch
 from scipy.special import log_softmax, logit, rel_entr, softmax
 
-from augment.losses import complementary_label, divergence, is_right, label_loss, log_odds, ranking_loss
+from augment.losses import (
+    adversarial_cost,
+    complementary_label,
+    divergence,
+    is_right,
+    label_loss,
+    log_odds,
+    ranking_loss,
+)
 
 EPS = torch.finfo(torch.float64).eps
 LOGITS = 3 * torch.randn(6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -64,3 +72,12 @@ def test_ranking_is_zero_with_a_zero_gradient_without_a_pair():
         loss = ranking_loss(logits, labels, 2)
         loss.backward()
         assert loss == 0 and not logits.grad.any()
+
+
+def test_the_cost_is_the_log_probability_of_the_right_class_less_that_of_the_target():
+    """With a target the normalization cancels: the cost is the difference of the logits."""
+    rows, target = torch.arange(6), (CLASSES + 2) % 5
+    expected = torch.from_numpy(log_softmax(LOGITS.numpy(), axis=1))[rows, CLASSES]
+    torch.testing.assert_close(adversarial_cost(LOGITS, CLASSES), expected, rtol=16 * EPS, atol=16 * EPS)
+    difference = LOGITS[rows, CLASSES] - LOGITS[rows, target]
+    torch.testing.assert_close(adversarial_cost(LOGITS, CLASSES, target), difference, rtol=0, atol=64 * EPS)

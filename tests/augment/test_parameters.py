@@ -395,16 +395,6 @@ def reaches(problem: AttackProblem, values: Tensor) -> list[Tensor]:
     ]
 
 
-def test_several_parameters_at_once_each_go_to_the_end_of_their_own_ball(make_scene, make_linear):
-    scene = make_scene()
-    problem = mixed(scene, step_size=0.3)
-    result = attack(make_linear(3, bias=50.0), problem, towards(problem), steps=4)
-    for reach in reaches(problem, result.values):
-        torch.testing.assert_close(reach, torch.ones(3, dtype=torch.float64), rtol=0, atol=1e-9)
-    torch.testing.assert_close(result.images, problem.render(result.values, EVERY), rtol=0, atol=0)
-    assert (result.cost < result.cost_before).all()
-
-
 def test_each_parameter_steps_and_is_projected_as_if_it_were_alone(make_scene):
     """A unit step is one of each parameter. Examples may have starts of their own."""
     problem, draws = mixed(make_scene()), torch.Generator().manual_seed(0)
