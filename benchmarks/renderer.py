@@ -91,7 +91,7 @@ def vertex_step(
 
 
 def shade_by_face(fragments: Fragments, vertices: Tensor, light: Tensor, albedo: Tensor) -> Tensor:
-    """`reference.radiance` with each face shaded once, not each sample: plain autograd at its cheapest."""
+    """`shading.radiance` by plain autograd at its cheapest: each face is shaded once, not each sample."""
     normals = reference.unit(reference.doubled_area_vectors(vertices[fragments.corners]))
     irradiance = reference.irradiance(normals * fragments.facing.to(vertices), light)
     shade = irradiance[fragments.face] * albedo / fragments.samples**2

@@ -1,7 +1,7 @@
 """The slow, readable shading beside `renderer.shading`: plain torch operations, which autograd differentiates.
 
-Each sample is shaded on its own, in the dtype of its inputs, with the harmonics by the Legendre recurrences of the
-paper's appendix B.1. In float64 it is what the fast paths are tested against; in float32, what they are timed against.
+Computed in the dtype of its inputs, with the harmonics by the Legendre recurrences of the paper's appendix B.1. The
+fast paths are compared with it and timed against it.
 """
 
 import math
@@ -9,26 +9,6 @@ from collections.abc import Iterator
 
 import torch
 from torch import Tensor
-
-from renderer.fragments import Fragments
-
-
-def radiance(
-    fragments: Fragments, vertices: Tensor, light: Tensor, albedo: Tensor, smooth_faces: Tensor | None = None
-) -> Tensor:
-    """Linear radiance (3, P), weighted with coverage; arguments as for `renderer.shading.radiance`.
-
-    A face of no area, where `renderer.shading` takes a gradient of zero, makes the gradient NaN.
-    """
-    corners = vertices[fragments.corners]
-    if smooth_faces is None:
-        at_samples = unit(doubled_area_vectors(corners))[fragments.face]
-    else:
-        at_corners = vertex_normals(vertices, smooth_faces)[fragments.corners[fragments.face]]
-        at_samples = unit((fragments.barycentric.to(vertices)[:, :, None] * at_corners).sum(1))
-    normals = at_samples * fragments.facing.to(vertices)[fragments.face]
-    shade = irradiance(normals, light) * albedo / fragments.samples**2
-    return shade.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel, shade).T
 
 
 def irradiance(normals: Tensor, light: Tensor) -> Tensor:
@@ -65,12 +45,6 @@ def clamped_cosine(l: int) -> float:
         return 2 * math.pi / 3 if l == 1 else 0.0
     sign = (-1) ** (l // 2 + 1)
     return sign * 2 * math.pi * math.comb(l, l // 2) / ((l + 2) * (l - 1) * 2**l)
-
-
-def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """(V, 3) unit normals: the mean of those of the faces around a vertex, weighted with their areas."""
-    weighted = doubled_area_vectors(vertices[faces]).repeat_interleave(3, dim=0)
-    return unit(torch.zeros_like(vertices).index_add(0, faces.flatten(), weighted))
 
 
 def doubled_area_vectors(corners: Tensor) -> Tensor:

@@ -81,8 +81,7 @@ def render(
     backgrounds = as_background(background, size, like).expand(len(views), -1, -1, -1)
     smooth_faces = torch.from_numpy(mesh.faces).to(like.device) if normals == "smooth" else None
     moved = replace(mesh, vertices=positions)
-    emitters: list[tuple[Harmonics | LocalBasis, Tensor]]
-    emitters = [(basis, values.to(like)) for basis, values in local]
+    emitters: list[tuple[Harmonics | LocalBasis, Tensor]] = [(basis, values.to(like)) for basis, values in local]
     if light is not None:
         emitters.insert(0, (Harmonics(degree_of(light)), light))
     basis = SumBasis(tuple(basis for basis, _ in emitters))

@@ -228,10 +228,8 @@ def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N
     return torch.from_numpy(np.stack(grid, -1).reshape(-1, 3)), torch.from_numpy(weights)
 
 
-def equirectangular(
-    height: int, width: int
-) -> tuple[Float64[Tensor, "height width 3"], Float64[Tensor, "height width"]]:
-    """Directions and solid angles of an environment map's texels.
+def equirectangular(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Directions (height, width, 3) and solid angles (height, width) of an environment map's texels, float64.
 
     Row 0 is up (+z); the middle column faces +x and azimuth grows to the left, as seen from inside.
     """
@@ -265,10 +263,8 @@ def project(
     return basis(directions, degree).T @ (weights[:, None] * values)
 
 
-def rotate(
-    coefficients: Float[Tensor, "coefficients channels"], rotation: Float[Tensor, "3 3"]
-) -> Float[Tensor, "coefficients channels"]:
-    """Coefficients of the light turned by a rotation: u'(ω) = u(Rᵀω).
+def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
+    """Coefficients ((degree + 1)², channels) of the light turned by a rotation: u'(ω) = u(Rᵀω).
 
     rotation: orthonormal. Exact: the integrand is a polynomial. InputError: NaN.
     """
