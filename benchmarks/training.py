@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -27,7 +28,7 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 from torchvision import transforms
 
 from augment import AugmentationService, AugmentationSettings
@@ -65,32 +66,23 @@ def make_sure(head: dict[str, Tensor], label: int = 0) -> None:
     head["bias"][label] = SURE
 
 
-class Images(Dataset[tuple[Tensor, int]]):
-    """uint8 images that become PIL images one by one, as torchvision.datasets.CIFAR100 holds them."""
-
-    def __init__(self, data: Path, count: int):
-        with np.load(data, allow_pickle=False) as archive:
-            images, labels = archive["train_images"][:count], archive["train_labels"][:count]
-            self.classes = len(archive["classes"])
-        self.images, self.labels = images.transpose(0, 2, 3, 1).copy(), labels.tolist()
-        crop = transforms.RandomCrop(images.shape[-1], padding=4, padding_mode="reflect")
-        mean, std = ((images / 255).mean((0, 2, 3)).tolist(), (images / 255).std((0, 2, 3)).tolist())
-        steps = [crop, transforms.RandomHorizontalFlip(), transforms.ToTensor(), transforms.Normalize(mean, std)]
-        self.transform = transforms.Compose(steps)
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, int]:
-        return self.transform(Image.fromarray(self.images[index])), self.labels[index]
+def collate(transform: Callable[[Image.Image], Tensor], batch: list[tuple[Image.Image, int]]) -> tuple[Tensor, Tensor]:
+    return torch.stack([transform(image) for image, _ in batch]), torch.tensor([label for _, label in batch])
 
 
 def plain_loop(options: argparse.Namespace) -> Callable[[], float]:
     """A function that trains one epoch and returns its seconds; the same network as `train`'s, eager, in float32."""
-    images = Images(options.data, options.images)
-    workers = {"num_workers": options.workers, "persistent_workers": options.workers > 0}
-    loader = DataLoader(images, batch_size=128, shuffle=True, pin_memory=options.device == "cuda", **workers)
-    network = WideResNet(images.classes, options.depth, options.width, 0.3, mean=(0, 0, 0), std=(1, 1, 1))
+    with np.load(options.data, allow_pickle=False) as archive:
+        pixels, labels = (archive[f"train_{name}"][: options.images] for name in ("images", "labels"))
+        count = len(archive["classes"])
+    crop = transforms.RandomCrop(pixels.shape[-1], padding=4, padding_mode="reflect")
+    mean, std = (getattr(pixels / 255, name)((0, 2, 3)).tolist() for name in ("mean", "std"))
+    steps = [crop, transforms.RandomHorizontalFlip(), transforms.ToTensor(), transforms.Normalize(mean, std)]
+    images = [Image.fromarray(image) for image in pixels.transpose(0, 2, 3, 1)]
+    more = {"collate_fn": partial(collate, transforms.Compose(steps)), "pin_memory": options.device == "cuda"}
+    more |= {"num_workers": options.workers, "persistent_workers": options.workers > 0}
+    loader = DataLoader(list(zip(images, labels, strict=True)), batch_size=128, shuffle=True, **more)
+    network = WideResNet(count, options.depth, options.width, 0.3, mean=(0, 0, 0), std=(1, 1, 1))
     for parent in list(network.modules()):
         for name, child in parent.named_children():
             if isinstance(child, Dropout):
@@ -100,9 +92,8 @@ def plain_loop(options: argparse.Namespace) -> Callable[[], float]:
 
     def epoch() -> float:
         start = time.perf_counter()
-        for batch, labels in loader:
-            batch, labels = batch.to(options.device), labels.to(options.device)
-            loss = F.cross_entropy(network(batch), labels)
+        for batch, classes in loader:
+            loss = F.cross_entropy(network(batch.to(options.device)), classes.to(options.device))
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +35,7 @@ Process = subprocess.Popen[str]
 
 
 def colored_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
-    """Images (N, 3, 16, 16) uint8 whose channel `label` is a little brighter, so that accuracy changes for many
-    epochs."""
+    """Images (N, 3, 16, 16) uint8 with a little brighter channel `label`: accuracy changes for many epochs."""
     images = rng.integers(0, 245, (len(labels), 3, 16, 16))
     images[np.arange(len(labels)), labels] += 10
     return images.astype(np.uint8)
@@ -43,27 +43,15 @@ def colored_noise(rng: np.random.Generator, labels: np.ndarray) -> np.ndarray:
 
 def write_data(folder: Path) -> None:
     """data.npz, class folders, photographs and the textured mesh.obj."""
-    rng = np.random.default_rng(0)
-    train, test = np.repeat(np.arange(3), 20), np.repeat(np.arange(3), 10)
-    np.savez(
-        folder / "data.npz",
-        train_images=colored_noise(rng, train),
-        train_labels=train,
-        test_images=colored_noise(rng, test),
-        test_labels=test,
-        classes=np.array(["apple", "orange", "pear"]),
-    )
-    for name in (
-        "images/apple",
-        "images/orange",
-        "photographs/orange",
-        "photographs/apple",
-        "photographs/other_tomato",
-    ):
-        (folder / name).mkdir(parents=True)
-        for number in range(3):
-            pixels = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
-            Image.fromarray(pixels).save(folder / name / f"{number}.png")
+    rng, arrays = np.random.default_rng(0), {"classes": np.array(["apple", "orange", "pear"])}
+    for part, count in (("train", 20), ("test", 10)):
+        arrays[f"{part}_labels"] = np.repeat(np.arange(3), count)
+        arrays[f"{part}_images"] = colored_noise(rng, arrays[f"{part}_labels"])
+    np.savez(folder / "data.npz", **arrays)
+    shown = ("images/apple", "images/orange", "photographs/orange", "photographs/apple", "photographs/other_tomato")
+    for name, number in product(shown, range(3)):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)).save(folder / name / f"{number}.png")
     paths = [path.relative_to(folder / "photographs").as_posix() for path in sorted(folder.glob("photographs/*/*"))]
     (folder / "photographs" / "photos.csv").write_text("path,source_tag\n" + "".join(f"{path},web\n" for path in paths))
     sphere = trimesh.creation.icosphere(subdivisions=2)
@@ -77,11 +65,11 @@ def write_data(folder: Path) -> None:
 
 def write_scene_files(folder: Path) -> None:
     """Meshes, lights, lamps, a projector's pattern and a background."""
-    sphere, light = trimesh.creation.icosphere(subdivisions=2), probe("grace")
-    export_mesh(solid("lemon", 0), folder / "mesh.glb")
-    export_mesh(solid("lemon", 0), folder / "mesh.ply")
-    sphere.export(folder / "mesh.stl")
-    sphere.export(folder / "mesh.off")
+    light = probe("grace")
+    for name in ("mesh.glb", "mesh.ply"):
+        export_mesh(solid("lemon", 0), folder / name)
+    for name in ("mesh.stl", "mesh.off"):
+        trimesh.creation.icosphere(subdivisions=2).export(folder / name)
     for name in ("light.npy", "light.hdr", "light.exr"):
         write_map(folder / name, to_map(light, 8))
     save_light(folder / "light.json", light)
@@ -107,13 +95,8 @@ def start_command(
 ) -> Process:
     """`python` with these arguments in a process of its own, in a folder; the words of scripts/ are the project's.
 
-    It heeds Ctrl-C even if the tests run in the background. limit: is called in the process before Python starts.
+    limit: is called in the process before Python starts.
     """
-
-    def prepare() -> None:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        limit()
-
     return subprocess.Popen(
         [sys.executable, *(str(ROOT / word) if word.startswith("scripts/") else word for word in arguments)],
         cwd=folder,
@@ -121,7 +104,7 @@ def start_command(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=prepare,
+        preexec_fn=limit,
     )
 
 

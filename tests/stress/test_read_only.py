@@ -45,11 +45,6 @@ def test_an_output_that_is_read_only_is_refused_by_its_key(folder, command, repo
     assert status == 2 and errors.startswith(f"error: {reported}") and errors.count("\n") == 1
 
 
-def test_a_read_only_current_folder_is_refused_by_the_key_of_the_output(folder):
-    status, errors = call("-m", "train", folder=folder.with_name("locked"))
-    assert status == 2 and errors.startswith("error: run=runs/") and errors.count("\n") == 1
-
-
 def test_a_read_only_cache_stops_no_run(folder):
     overrides = [word for word in TRAIN if not word.startswith("renderer.cache=")]
     status, errors = call(*overrides, "run=out", "renderer.cache=../locked/cache", folder=folder)
