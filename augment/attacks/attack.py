@@ -255,12 +255,10 @@ def require_clean_correct(scene: Scene, logits: Tensor, labels: Tensor, classifi
     if wrong:
         example, view = wrong[0]
         item = scene.objects[scene.examples[example].object]
-        best = logits[example, view].softmax(0).topk(min(5, len(classifier.classes)))
-        most_probable = ", ".join(
-            f"{classifier.classes[index]} {confidence:.1%}"
-            for confidence, index in zip(best.values.tolist(), best.indices.tolist(), strict=True)
-        )
+        confidence, best = logits[example, view].softmax(0).topk(min(5, len(classifier.classes)))
+        names = (classifier.classes[index] for index in best.tolist())
+        most_probable = ", ".join(f"{name} {p:.1%}" for name, p in zip(names, confidence.tolist(), strict=True))
         raise NotCleanCorrectError(
-            f"{len(wrong)} of {logits.shape[0] * logits.shape[1]} images of {item.name} are not recognized as "
-            f"{item.label!r} before any attack (the first: {most_probable}): change the scene, or set force=true"
+            f"{len(wrong)} of {logits[..., 0].numel()} images of {item.name} are not classified as {item.label!r} "
+            f"before any attack (the first: {most_probable}): change the scene, or set force=true"
         )

@@ -35,9 +35,13 @@ def check(result: AttackResult) -> dict[str, Any]:
     >>> checks["success"], checks["cost"] < checks["cost_before"]
     (1.0, True)
     """
-    descent, clean = result.descent, result.clean_correct
+    descent, settings, problem, clean = result.descent, result.settings, result.problem, result.clean_correct
     open_cases = ~result.success_before
     fell = (descent.cost < descent.cost_before) | result.success
+    longest = replace(settings, max_steps=settings.max_steps * max(GROWTH))
+    end = descend(result.preprocessed_model, problem, result.goal, longest, seed=result.seed)
+    success = _confirmed(result, problem, end.success, end.values, problem.everything, end.images)
+    limits = [settings.max_steps * factor for factor in GROWTH]
     return {
         "cost_before": float(descent.cost_before.mean()),
         "cost": float(descent.cost.mean()),
@@ -45,7 +49,7 @@ def check(result: AttackResult) -> dict[str, Any]:
         "zero_gradient": _fraction(descent.zero_gradient),
         "success": _fraction(result.success[clean]),
         "random_search": _fraction(random_search(result)[clean]),
-        "success_by_steps": {limit: _fraction(success[clean]) for limit, success in _success_by_steps(result).items()},
+        "success_by_steps": {limit: _fraction((success & (end.success_at <= limit))[clean]) for limit in limits},
     }
 
 
@@ -100,16 +104,6 @@ def _confirmed(
 
 def _predicted(result: AttackResult, images: Tensor) -> Tensor:
     return logits_of(result.preprocessed_model, images, result.settings.batch_size).argmax(2)
-
-
-def _success_by_steps(result: AttackResult) -> dict[int, Tensor]:
-    """(E,) bool by number of steps, of one long descent."""
-    settings, problem = result.settings, result.problem
-    longest = replace(settings, max_steps=settings.max_steps * max(GROWTH))
-    end = descend(result.preprocessed_model, problem, result.goal, longest, seed=result.seed)
-    success = _confirmed(result, problem, end.success, end.values, problem.everything, end.images)
-    limits = [settings.max_steps * factor for factor in GROWTH]
-    return {limit: success & (end.success_at <= limit) for limit in limits}
 
 
 def _fraction(values: Tensor) -> float:
@@ -184,20 +178,42 @@ def transfer(
     ([['other']], '+20°')
     """
     require_transferable([parameter.name for parameter in result.problem.parameters], azimuths, objects)
-    problem, attacked = result.problem, result.classifier
+    problem, attacked, scene = result.problem, result.classifier, result.problem.scene
     ends = problem.conditions(problem.start, problem.everything), result.conditions
     chosen = torch.nonzero(result.clean_correct & result.success).flatten().tolist()
     images = [(result.images_before[example], result.images[example]) for example in chosen]
     sides = [
-        [Adversary.of(problem.scene, example, end, *pair) for example, pair in zip(chosen, images, strict=True)]
-        for end in ends
+        [Adversary.of(scene, example, end, *pair) for example, pair in zip(chosen, images, strict=True)] for end in ends
     ]
 
     def elsewhere(
         kind: str, name: str, change: Callable[[Adversary], Adversary], classifier: Classifier = attacked
     ) -> dict[str, Any]:
         before, after = ([change(adversary) for adversary in side] for side in sides)
-        return {kind: name, **_transferred(result, chosen, before, after, classifier)}
+        source, target = labels([[adversary.shown.label] * scene.views for adversary in after], classifier), None
+        if result.goal.target is not None:
+            names = [[attacked.classes[index] for index in result.goal.target[example]] for example in chosen]
+            target = labels(names, classifier)
+        logits_before, logits_after = logits(before, classifier), logits(after, classifier)
+        predicted_before = predictions(logits_before, classifier.classes)
+        return {
+            kind: name,
+            "clean_correct": (logits_before.argmax(2) == source).all(1).tolist(),
+            "success": Goal(source, target).reached(logits_after.argmax(2)).tolist(),
+            **{f"{key}_before": values for key, values in predicted_before.items()},
+            **predictions(logits_after, classifier.classes),
+        }
+
+    def labels(names: list[list[str]], classifier: Classifier) -> Tensor:
+        indices = [classifier.label(name) for views in names for name in views]
+        return torch.tensor(indices).long().view(-1, scene.views)
+
+    def logits(adversaries: Sequence[Adversary], classifier: Classifier) -> Tensor:
+        if not adversaries:
+            return torch.empty(0, scene.views, len(classifier.classes))
+        images = torch.stack([adversary.render(scene.rasterizer) for adversary in adversaries]).to(result.images)
+        model, batch_size = result.settings.preprocessed_model(classifier), result.settings.batch_size
+        return logits_of(model, images, batch_size).cpu()
 
     return [
         *(elsewhere("network", other.name, partial(_resized, size=other.size), other) for other in classifiers),
@@ -232,37 +248,3 @@ def _resized(adversary: Adversary, size: int) -> Adversary:
 def _turned(adversary: Adversary, angle: float) -> Adversary:
     cameras = tuple(replace(camera, azimuth=camera.azimuth + angle) for camera in adversary.cameras)
     return replace(adversary, cameras=cameras)
-
-
-def _transferred(
-    result: AttackResult,
-    chosen: Sequence[int],
-    before: Sequence[Adversary],
-    after: Sequence[Adversary],
-    classifier: Classifier,
-) -> dict[str, Any]:
-    """The classifier's predictions of adversaries before and after; chosen: their examples."""
-    scene, settings = result.problem.scene, result.settings
-
-    def labels(names: list[list[str]]) -> Tensor:
-        indices = [classifier.label(name) for views in names for name in views]
-        return torch.tensor(indices).long().view(-1, scene.views)
-
-    def logits(adversaries: Sequence[Adversary]) -> Tensor:
-        if not adversaries:
-            return torch.empty(0, scene.views, len(classifier.classes))
-        images = torch.stack([adversary.render(scene.rasterizer) for adversary in adversaries]).to(result.images)
-        return logits_of(settings.preprocessed_model(classifier), images, settings.batch_size).cpu()
-
-    source, target = labels([[adversary.shown.label] * scene.views for adversary in after]), result.goal.target
-    if target is not None:
-        attacked = result.classifier.classes
-        target = labels([[attacked[index] for index in target[example]] for example in chosen])
-    logits_before, logits_after = logits(before), logits(after)
-    predicted_before = predictions(logits_before, classifier.classes)
-    return {
-        "clean_correct": (logits_before.argmax(2) == source).all(1).tolist(),
-        "success": Goal(source, target).reached(logits_after.argmax(2)).tolist(),
-        **{f"{name}_before": values for name, values in predicted_before.items()},
-        **predictions(logits_after, classifier.classes),
-    }

@@ -259,8 +259,7 @@ class AttackProblem:
         return torch.cat(drawn, dim=1)
 
     def sample_as_far(self, values: Tensor, generator: torch.Generator) -> Tensor:
-        """Draws (E, D) as far as values went: uniform in a parameter's ball where it has a radius, else in a random
-        direction at the values' own L2 distance from the start."""
+        """Draws (E, D) as far as values went; see `Parameter.sample_as_far`."""
         parts = self.by_parameter(values)
         drawn = [parameter.sample_as_far(part, generator, self.everything).to(self.start) for parameter, part in parts]
         return torch.cat(drawn, dim=1)

@@ -356,16 +356,6 @@ def test_views_that_share_what_is_attacked_add_their_gradients(make_scene, make_
     torch.testing.assert_close(both, front + side, rtol=0, atol=64 * EPS)
 
 
-def test_pixels_of_one_view_do_not_change_those_of_another(make_scene, make_linear):
-    """Views share the values' example and nothing else: a raw step is either view's own."""
-    scene = make_scene(cameras=[[FRONT, SIDE]], backgrounds=torch.full((1, 3, 6, 6), 0.5))
-    problem = problem_of(scene, pixels=StepSettings(step="raw", step_size=0.1))
-    model = make_linear(5, bias=50.0)
-    values = attack(model, problem, towards(problem), steps=1).values
-    downhill = (model[1].weight[1] - model[1].weight[0]).detach()
-    torch.testing.assert_close(values, 0.1 * downhill.repeat(2)[None], rtol=0, atol=16 * EPS)
-
-
 def test_a_deep_optical_illusion_shows_each_view_another_class(make_scene, make_linear):
     """One light per example makes two views of one thing two other things, in each way; it ends only when both are."""
     targets = torch.tensor([[1, 2], [2, 1], [1, 1]])
@@ -451,17 +441,3 @@ def test_an_attack_on_light_rasterizes_a_camera_once_and_one_on_shape_every_view
     problem = problem_of(scene, **free("lighting", "geometry"))
     result = attack(model, problem, towards(problem), steps=4)
     assert result.steps.tolist() == [4, 4, 4] and rasterized == [3] + [1] * (3 + 5 * 6)
-
-
-def test_with_shortened_steps_no_shape_is_worse_than_the_one_before_when_rendered_anew(make_scene, make_linear):
-    """Steps of half the mesh's size; without shortening some raise the cost."""
-    scene, model = make_scene(), make_linear(3, bias=50.0)
-    problem = problem_of(scene, geometry=StepSettings(step_size=0.5))
-    costs = {}
-    for shorten in (False, True):
-        results = [attack(model, problem, towards(problem), steps, shorten=shorten) for steps in range(5)]
-        costs[shorten] = torch.stack([result.cost for result in results])
-        for result in results:
-            torch.testing.assert_close(result.images, problem.render(result.values, EVERY), rtol=0, atol=0)
-    assert (costs[False].diff(dim=0) > 0).any()
-    assert (costs[True].diff(dim=0) <= 0).all() and (costs[True][-1] < costs[True][0]).all()
