@@ -15,21 +15,7 @@ from renderer.mesh import Mesh
 from renderer.normals import corner_normals
 from renderer.shapes import HARD_NEGATIVES, SOLIDS, solid
 from train import lab
-from train.lab import (
-    FAMILIES,
-    FOV,
-    ROUGHNESS,
-    SHARP,
-    TWO_COLORED,
-    LabSettings,
-    Shot,
-    draw_pattern,
-    draw_shots,
-    lab_parts,
-    photograph,
-    read_subject,
-    write_laboratory,
-)
+from train.lab import FAMILIES, FOV, LabSettings, Shot, draw_pattern, draw_shots, lab_parts, photograph
 from train.photographs.folder import find_photographs, load_photographs
 
 pytest.importorskip("mitsuba")
@@ -60,7 +46,7 @@ def rows(folder: Path) -> list[dict[str, str]]:
 @pytest.fixture(scope="module")
 def laboratory(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("laboratory") / "lab"
-    assert write_laboratory(settings(folder)) == 8
+    assert lab.write_laboratory(settings(folder)) == 8
     return folder
 
 
@@ -88,7 +74,7 @@ def test_a_setup_shows_one_object_of_the_label_and_one_other_under_the_same_ligh
 
 def test_the_same_settings_write_the_same_bytes_and_another_seed_or_exposure_writes_others(laboratory, tmp_path):
     for name, changes in [("same", {}), ("seed", {"seed": 1}), ("exposure", {"exposure": 4.0})]:
-        write_laboratory(settings(tmp_path / name, **changes))
+        lab.write_laboratory(settings(tmp_path / name, **changes))
         for row in rows(laboratory):
             first, again = ((folder / row["path"]).read_bytes() for folder in (laboratory, tmp_path / name))
             assert (first == again) is (name == "same")
@@ -98,7 +84,7 @@ def test_the_same_settings_write_the_same_bytes_and_another_seed_or_exposure_wri
 def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
     """One and the same mesh under both labels: the photographs of a setup are the same, byte for byte."""
     meshes = ["solid:orange:7", {"mesh": "solid:orange:7", "label": "other_orange"}]
-    write_laboratory(settings(tmp_path, meshes=meshes))
+    lab.write_laboratory(settings(tmp_path, meshes=meshes))
     for path in (tmp_path / "orange").iterdir():
         assert path.read_bytes() == (tmp_path / "other_orange" / path.name).read_bytes()
 
@@ -106,8 +92,8 @@ def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
 def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_else():
     for name in ("orange", "pear", *HARD_NEGATIVES):
         expected = name if name in SOLIDS else f"other_{name}"
-        assert read_subject(f"solid:{name}:1", 0)[0] == expected
-    assert read_subject({"mesh": "solid:orange", "label": "pear"}, 0)[0] == "pear"
+        assert lab.read_subject(f"solid:{name}:1", 0)[0] == expected
+    assert lab.read_subject({"mesh": "solid:orange", "label": "pear"}, 0)[0] == "pear"
 
 
 @pytest.mark.parametrize(
@@ -122,14 +108,14 @@ def test_a_solid_without_a_label_has_its_own_name_as_a_class_or_as_something_els
 )
 def test_what_cannot_be_photographed_is_refused_before_anything_is_written(tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
-        write_laboratory(settings(tmp_path / "lab", **changes))
+        lab.write_laboratory(settings(tmp_path / "lab", **changes))
     assert not (tmp_path / "lab").exists()
 
 
 def test_a_folder_that_holds_something_is_left_alone(laboratory):
     before = {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}
     with pytest.raises(InputError, match=r"out=.*lab is not an empty folder: name another, or delete it"):
-        write_laboratory(settings(laboratory))
+        lab.write_laboratory(settings(laboratory))
     assert before == {path: path.stat().st_mtime_ns for path in laboratory.rglob("*")}
 
 
@@ -137,9 +123,9 @@ def test_environments_stand_beside_patterns_and_name_the_source(tmp_path):
     changes = {"patterns": ["solid"], "environments": [str(tmp_path / "noon.npy")], "setups": 2}
     np.save(tmp_path / "noon.npy", np.zeros((8, 16, 3), np.float32))
     with pytest.raises(InputError, match=r"noon\.npy is negative somewhere or dark above"):
-        write_laboratory(settings(tmp_path / "lab", **changes))
+        lab.write_laboratory(settings(tmp_path / "lab", **changes))
     np.save(tmp_path / "noon.npy", np.ones((8, 16, 3), np.float32))
-    write_laboratory(settings(tmp_path / "lab", **changes))
+    lab.write_laboratory(settings(tmp_path / "lab", **changes))
     assert {row["source_tag"] for row in rows(tmp_path / "lab")} == {"noon", "solid"}
 
 
@@ -159,7 +145,7 @@ def test_a_pattern_mixes_two_colors_one_of_which_is_darkness_in_some_families(fa
         assert np.linalg.matrix_rank(colors - colors[0], tol=1e-3) == 1
     else:
         assert len(colors) == (1 if family == "solid" else 2)
-        assert (colors.min(axis=0).max() == 0) == (family not in (*TWO_COLORED, "solid"))
+        assert (colors.min(axis=0).max() == 0) == (family not in (*lab.TWO_COLORED, "solid"))
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +243,7 @@ def test_a_texture_lies_upright_on_its_faces():
 def test_a_card_reflects_its_linear_albedo_times_the_albedo_scale_and_the_brightness():
     """Facing projector and camera, with its gloss: 4 % of the light times the GGX peak, 1 / (4 α²)."""
     gray = np.full((4, 4, 3), 128, dtype=np.uint8)  # linear 0.216
-    gloss = 0.04 / (4 * ROUGHNESS**4)  # α is the roughness's square
+    gloss = 0.04 / (4 * lab.ROUGHNESS**4)  # α is the roughness's square
     for albedo_scale, brightness in [(1, 1), (2, 1), (1, 0.5)]:
         shot = frontal(brightness=brightness)
         image = photograph(lab_parts(card(gray), albedo_scale), shot, 8, 16, bounces=1, seed=0)
@@ -295,6 +281,8 @@ def test_right_angles_stay_sharp_and_round_surfaces_are_smooth(divisions):
     for _ in range(divisions):
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)
     mesh = Mesh.plain(vertices, faces)
-    np.testing.assert_array_equal(corner_normals(mesh, "smooth", SHARP), mesh.face_normals()[:, None].repeat(3, axis=1))
+    np.testing.assert_array_equal(
+        corner_normals(mesh, "smooth", lab.SHARP), mesh.face_normals()[:, None].repeat(3, axis=1)
+    )
     mesh = Mesh.plain(ball.vertices, ball.faces)
-    np.testing.assert_allclose(corner_normals(mesh, "smooth", SHARP), mesh.vertices[mesh.faces], atol=0.02)
+    np.testing.assert_allclose(corner_normals(mesh, "smooth", lab.SHARP), mesh.vertices[mesh.faces], atol=0.02)

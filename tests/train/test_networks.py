@@ -9,19 +9,9 @@ from torch import nn
 from torchvision.models import resnet18
 
 from renderer.errors import InputError
+from train import networks
 from train.checkpoint import BEST, save
-from train.networks import (
-    PUBLISHED,
-    Dropout,
-    WideResNet,
-    build_network,
-    describe,
-    load_classifier,
-    load_run,
-    load_selected,
-    publish,
-    start_from,
-)
+from train.networks import PUBLISHED, Dropout, WideResNet, build_network, describe, load_run, load_selected, publish
 
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
 CLASSES = ("apple", "orange", "pear")
@@ -213,7 +203,7 @@ def test_an_impossible_architecture_names_its_key(settings):
 
 @pytest.mark.parametrize("file", ["", BEST, PUBLISHED], ids=["folder", "checkpoint", "published"])
 def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_path, file):
-    classifier = load_classifier(f"run:{write(tmp_path, network) / file}")
+    classifier = networks.load_classifier(f"run:{write(tmp_path, network) / file}")
     assert (classifier.classes, classifier.size) == (CLASSES, 48)
     assert classifier.name == f"run:{tmp_path / file}"
     images = torch.rand(3, 3, 48, 48)
@@ -232,7 +222,7 @@ def test_other_networks_come_back_from_their_file_code_only_where_it_is_named(tm
     assert torch.equal(load_run(tmp_path / BEST, model=name)(images), network(images))
     fresh = build_network(CLASSES, 16, name)
     (tmp_path / "own_models.py").write_text("raise SystemExit('code ran')")
-    start_from(fresh, {"classes": [*CLASSES], "size": 16, "name": name}, tmp_path / BEST)
+    networks.start_from(fresh, {"classes": [*CLASSES], "size": 16, "name": name}, tmp_path / BEST)
     assert torch.equal(fresh.eval()(images), network(images))
     if name.startswith("python:"):
         with pytest.raises(InputError, match=f"give model={name} to run that code"):
@@ -256,7 +246,7 @@ def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(
 
 def test_a_network_starts_with_the_weights_and_the_normalization_of_another(network, tmp_path):
     fresh = WideResNet(3, 10, 1, 0.3, mean=(0.5, 0.5, 0.5))
-    start_from(fresh, description_of(fresh, dropout=0.3), write(tmp_path, network))
+    networks.start_from(fresh, description_of(fresh, dropout=0.3), write(tmp_path, network))
     images = torch.rand(3, 3, 32, 32)
     assert torch.equal(fresh.eval()(images), network(images))
 
@@ -269,7 +259,7 @@ def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, cha
     with pytest.raises(
         InputError, match=f"train.init_from={tmp_path} was trained with {fault}: give this run the same"
     ):
-        start_from(network, {**description_of(network), **change}, write(tmp_path, network))
+        networks.start_from(network, {**description_of(network), **change}, write(tmp_path, network))
 
 
 # ---------------------------------------------------------------------------------------- publishing
@@ -290,7 +280,7 @@ def test_a_published_network_is_the_same_to_half_precision_with_all_that_it_take
 
 @pytest.mark.parametrize("arm", ["none", "random", "adversarial"])
 def test_the_published_networks_are_classifiers_of_cifar_100(arm):
-    classifier = load_classifier(f"run:{PRETRAINED / arm}")
+    classifier = networks.load_classifier(f"run:{PRETRAINED / arm}")
     assert (len(classifier.classes), classifier.size, classifier.label("orange")) == (100, 32, 53)
     images = torch.full((1, 3, 32, 32), 0.5, requires_grad=True)
     (gradient,) = torch.autograd.grad(classifier(images)[0, 53], images)
