@@ -87,9 +87,6 @@ def _blurred(images: Tensor, sigma: Tensor) -> Tensor:
     return torch.einsum("aij,avcjk,alk->avcil", matrix, images, matrix)
 
 
-# ------------------------------------------------------------------------------------- projected patterns
-
-
 def draw_patterns(count: int, size: int, draws: torch.Generator) -> Tensor:
     """(count, 3, size, size) linear light in [0, 1]: stripes, checkers, spots, halves and solid colors, each of two
     random colors, at a random angle, scale and position."""

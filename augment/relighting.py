@@ -106,8 +106,8 @@ class OperatorStack:
         slots, order = max(counts.tolist(), default=0), row.argsort(stable=True)
         rank = torch.arange(len(row), device=row.device) - (counts.cumsum(0) - counts)[row[order]]
         cell = row * slots + torch.empty_like(row).index_copy_(0, order, rank)
-        kept = lights.index_select(1, self._coefficients)
-        grid = kept.new_zeros(len(used) * slots, *kept.shape[1:]).index_copy(0, cell, kept)
+        nonzero = lights.index_select(1, self._coefficients)
+        grid = nonzero.new_zeros(len(used) * slots, *nonzero.shape[1:]).index_copy(0, cell, nonzero)
         everything = len(used) == len(self.transfer)
         transfer, albedo = (part if everything else part[used] for part in (self.transfer, self.albedo))
         radiance = apply_transfer(grid.unflatten(0, (len(used), slots)), transfer, albedo).flatten(0, 1)

@@ -96,7 +96,11 @@ class Scene:
             raise InputError(f"backgrounds has shape {tuple(self.backgrounds.shape)}: give (B, 3, {size}, {size})")
         if not (self.backgrounds.min() >= 0 and self.backgrounds.max() <= 1):
             raise InputError("backgrounds: give values in [0, 1]")
-        self.examples = [self._with_whole_object(example) for example in self.examples]
+        radii = [item.radius for item in self.objects]  # a camera's depth range holds the whole object
+        self.examples = [
+            replace(row, cameras=tuple(camera.seeing(radii[row.object]) for camera in row.cameras))
+            for row in self.examples
+        ]
         self.backgrounds = self.backgrounds.to(self.lights)
         self.lights = self.lights.expand(len(self.examples), *self.lights.shape[-2:])
         self.views = len(self.examples[0].cameras)  # per example
@@ -225,8 +229,3 @@ class Scene:
             behind = self.backgrounds[example.background].flatten(1).index_select(1, fragments.pixels)
             composite = radiance + background_term(coverage, behind, self.settings.encoding)
             yield Layer([image], fragments.pixels, composite[None])
-
-    def _with_whole_object(self, row: Example) -> Example:
-        """The row with cameras whose depth range holds the whole object."""
-        radius = self.objects[row.object].radius
-        return replace(row, cameras=tuple(camera.seeing(radius) for camera in row.cameras))

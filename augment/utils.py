@@ -25,9 +25,6 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-# ------------------------------------------------------------------------------------- random streams
-
-
 def stream_seed(*key: int | str) -> int:
     """A 63-bit seed from a key such as (run seed, epoch, "order"); different keys give independent streams."""
     words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in key]
@@ -37,9 +34,6 @@ def stream_seed(*key: int | str) -> int:
 def generator(*key: int | str) -> torch.Generator:
     """A CPU generator for the stream of this key."""
     return torch.Generator().manual_seed(stream_seed(*key))
-
-
-# ------------------------------------------------------------------------------------- memory
 
 
 @dataclass
@@ -99,9 +93,6 @@ def _free(device: torch.device) -> int | None:
     return min(free, limit - used)
 
 
-# ------------------------------------------------------------------------------------- progress and time
-
-
 def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterable[Item]:
     """The items, with a bar on a terminal after 5 seconds.
 
@@ -136,9 +127,6 @@ class Phases:
         return time.perf_counter()
 
 
-# ------------------------------------------------------------------------------------- a model's state
-
-
 @contextmanager
 def eval_mode(model: nn.Module) -> Iterator[None]:
     """Eval mode inside; each module's own mode restored after, since a frozen layer may differ from the whole."""
@@ -165,9 +153,6 @@ def as_found(model: nn.Module) -> Iterator[None]:
     finally:
         for parameter in trainable:
             parameter.requires_grad_(True)
-
-
-# ------------------------------------------------------------------------------------- processes
 
 
 def world_size() -> int:

@@ -143,17 +143,15 @@ def test_stacked_sparse_operators_give_the_images_and_gradients_of_each_operator
         images = shown.render(Conditions(light), rows)[:, 0]
         weights = torch.rand(images.shape, generator=draws)
         (gradient,) = torch.autograd.grad((images * weights).sum(), light)
-        for row, image, own, its, weight in zip(rows.tolist(), images, light, gradient, weights, strict=True):
-            item, camera = shown.objects[0], shown.examples[row].cameras[0]
-            single = build_operators(
-                item.mesh, [camera], shown.settings, shown.rasterizer, item.albedo_scale, shown.basis
-            )[0]
-            assert single.sparse is not None
-            alone = own.detach().requires_grad_(True)
-            expected = single.image(alone)
-            torch.testing.assert_close(image, expected, rtol=0, atol=1e-6)
-            (slope,) = torch.autograd.grad((expected * weight).sum(), alone)
-            torch.testing.assert_close(its, slope, rtol=1e-5, atol=1e-5)
+        item, scene_of = shown.objects[0], (shown.settings, shown.rasterizer)
+        cameras = [row.cameras[0] for row in shown.examples]
+        operators = build_operators(item.mesh, cameras, *scene_of, item.albedo_scale, shown.basis)
+        assert all(operator.sparse is not None for operator in operators)
+        alone = light.detach().requires_grad_(True)
+        expected = torch.stack([operators[row].image(alone[index]) for index, row in enumerate(rows.tolist())])
+        torch.testing.assert_close(images, expected, rtol=0, atol=1e-6)
+        (slopes,) = torch.autograd.grad((expected * weights).sum(), alone)
+        torch.testing.assert_close(gradient, slopes, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("shadows", [False, True])
