@@ -33,7 +33,11 @@ def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Se
     if textures is None:
         sources = mesh_textures(mesh, encoding, fragments.coverage) if mesh.packed_textures else []
     else:
-        sources = [_texture(texture) for texture in textures]
+        sources = []
+        for texture in textures:
+            require_bounded(texture=texture)
+            texels = texture.flatten(0, 1).T
+            sources.append(Texture(texture.shape[0], texture.shape[1], partial(torch.index_select, texels, 1)))
     if not sources:
         return albedo
     uvs = fragments.interpolate(torch.from_numpy(mesh.corner_uvs.take(faces, axis=0)).to(albedo)).T
@@ -46,11 +50,6 @@ def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Se
         value = bilinear(source, uvs.index_select(1, here))
         albedo = albedo.index_copy(1, here, albedo.index_select(1, here) * value)
     return albedo.T
-
-
-def _texture(linear: Tensor) -> Texture:
-    require_bounded(texture=linear)
-    return Texture(linear.shape[0], linear.shape[1], partial(torch.index_select, linear.flatten(0, 1).T, 1))
 
 
 def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:

@@ -170,7 +170,7 @@ def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Bas
     """
     parts = [(part, light[rows].detach().cpu().float()) for rows, part in parts_of(basis)]
     local = [(part, values) for part, values in parts if isinstance(part, LocalBasis)]
-    [sky] = [values / math.pi for part, values in parts if isinstance(part, Harmonics)] or [None]
+    sky = next((values / math.pi for part, values in parts if isinstance(part, Harmonics)), None)
     camera = OrthographicCamera(camera.polar, camera.azimuth, 2.0)
     return render(_ball(), camera, sky, size, 1.0, lights=local, encoding="srgb", rasterizer="numpy")[0]
 

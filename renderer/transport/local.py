@@ -112,11 +112,12 @@ class LocalLightView:
 
         positions: (L, 3) of lamps, None where the basis has them. Differentiable in all and in the vertices.
         """
-        surface, moved = self._surface, isinstance(basis, Lamps) and positions is not None
-        paths = None if moved else self._fixed.get(basis)
-        if paths is None:
-            others = [positions.cpu().double()] if moved else []
-            paths = unoccluded(self._rays, surface, basis.connect(surface.points, surface.normals, *others))
-            if not moved:
-                self._fixed[basis] = paths
+        surface = self._surface
+        if isinstance(basis, Lamps) and positions is not None:
+            paths = basis.connect(surface.points, surface.normals, positions.cpu().double())
+            paths = unoccluded(self._rays, surface, paths)
+        else:
+            if basis not in self._fixed:
+                self._fixed[basis] = unoccluded(self._rays, surface, basis.connect(surface.points, surface.normals))
+            paths = self._fixed[basis]
         return local_radiance(surface.fragments, albedo.cpu().double(), paths, light.cpu().double()).to(light)

@@ -16,7 +16,6 @@ from oracles import draw, patchwork, scipy_irradiance
 
 from renderer.albedo import surface_albedo
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.errors import InputError
 from renderer.fragments import Fragments, build_fragments
 from renderer.image import ImageSettings, background_term, clamped, tonemap
 from renderer.light.harmonics import MAX_DEGREE, nonzero_coefficients
@@ -58,12 +57,6 @@ def test_the_irradiance_of_short_and_of_zero_normals_is_finite_and_no_gradient_i
         lit = irradiance(normals, draw(49, 3).to(dtype))
         (gradient,) = torch.autograd.grad(lit.sum(), normals)
         assert lit.isfinite().all() and not gradient.isnan().any() and not gradient[-len(SPECIAL) :].any()
-
-
-@pytest.mark.parametrize("shape", [(10, 3), (49, 1), (49,), (3, 49)])
-def test_a_light_that_is_not_of_whole_bands_and_three_channels_is_refused(shape):
-    with pytest.raises(InputError, match="light"):
-        irradiance(draw(2, 3), torch.zeros(shape, dtype=torch.float64))
 
 
 def test_second_derivatives_are_refused_rather_than_wrong():
