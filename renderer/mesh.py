@@ -56,7 +56,8 @@ class Mesh:
             values = getattr(self, name)
             if values.shape != shape or values.dtype.kind not in kinds:
                 raise InputError(f"{name} must be numbers of shape {shape}, got {values.dtype} {values.shape}")
-        _require_indices(self.faces, len(self.vertices))
+        if count and not 0 <= self.faces.min() <= self.faces.max() < len(self.vertices):
+            raise InputError(f"faces name vertices that are not there: give indices from 0 to {len(self.vertices) - 1}")
 
     @staticmethod
     def plain(vertices: ArrayLike, faces: ArrayLike, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
@@ -64,13 +65,13 @@ class Mesh:
         try:
             vertices, faces = np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64)
             vertex_colors = np.broadcast_to(np.asarray(color, dtype=np.float32), vertices.shape)
-        except (TypeError, ValueError, OverflowError) as error:
+            corner_colors = vertex_colors.take(faces, axis=0, mode="clip")  # missing vertices are refused below
+        except (TypeError, ValueError, OverflowError, IndexError) as error:
             raise InputError(f"vertices, faces and color ({error}): give (V, 3), (F, 3) and (3)") from error
-        _require_indices(faces, len(vertices))
         return Mesh(
             vertices=vertices,
             faces=faces,
-            corner_colors=vertex_colors[faces],
+            corner_colors=corner_colors,
             corner_uvs=np.zeros((len(faces), 3, 2), dtype=np.float32),
             texture_ids=np.full(len(faces), -1, dtype=np.int32),
         )
@@ -123,11 +124,6 @@ def doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F, 3): normal to each face, outward for counter-clockwise ones, twice as long as the face has area."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return np.cross(b - a, c - a)
-
-
-def _require_indices(faces: np.ndarray, vertices: int) -> None:
-    if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
-        raise InputError(f"faces name vertices that are not there: give indices from 0 to {vertices - 1}")
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:

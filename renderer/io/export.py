@@ -1,6 +1,6 @@
 """Meshes as files: .glb with colors, textures, normals and cameras; .ply with colors and normals."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,14 +40,13 @@ def export_mesh(
     >>> export_mesh(apple, "apple.glb", cameras=cameras)
     >>> export_mesh(apple, "apple.ply", normals="flat")
     """
-    path = Path(path)
-    glb = partial(_glb, cameras=cameras, first=first)
-    writers: dict[str, Callable[[Mesh, np.ndarray], bytes]] = {".glb": glb, ".ply": _ply}
-    if path.suffix.lower() not in writers:
-        raise InputError(f"{path} cannot be written as a mesh: give a name that ends in {', '.join(writers)}")
+    path, shaded = Path(path), corner_normals(mesh, normals)
+    if path.suffix.lower() not in (".glb", ".ply"):
+        raise InputError(f"{path} cannot be written as a mesh: give a name that ends in .glb or .ply")
+    content = _glb(mesh, shaded, cameras, first) if path.suffix.lower() == ".glb" else _ply(mesh, shaded)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(writers[path.suffix.lower()](mesh, corner_normals(mesh, normals)))
+        path.write_bytes(content)
     except OSError as error:
         raise InputError(f"mesh {path} cannot be written: {error}") from error
 

@@ -55,15 +55,6 @@ def sliver(height: float, edge: float = 1.0, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(Rotation.random(rng=draws).apply(corners) + draws.uniform(-1, 1, 3))
 
 
-def test_face_normals_are_the_meshs_and_outward():
-    vertices, faces = shape("torus")
-    mesh = Mesh.plain(vertices.numpy(), faces.numpy())
-    np.testing.assert_allclose(face_normals(vertices, faces), mesh.face_normals(), rtol=0, atol=16 * EPS)
-    box = trimesh.creation.box()
-    outward = face_normals(torch.from_numpy(box.vertices.copy()), torch.from_numpy(box.faces.copy()))
-    np.testing.assert_array_equal(outward, np.round(box.triangles_center * 2.1))
-
-
 @pytest.mark.parametrize("function", [face_normals, vertex_normals])
 @pytest.mark.parametrize("name", ["icosahedron", "torus"])
 def test_derivatives_on_a_mesh_are_central_differences(function, name):

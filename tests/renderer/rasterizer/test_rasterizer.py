@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from renderer import rasterizer as rasterizers
 from renderer.errors import InputError
 from renderer.rasterizer import NAMES, SPAN, Rasterizer, choose, opengl
-from renderer.rasterizer import numpy as numpy_rasterizer
 
 needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
 needs_numba = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
@@ -188,15 +187,6 @@ def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides(name
     faces = np.concatenate([faces, np.roll(faces, 1, axis=1)[::-1]])
     ids = choose(name).rasterize(points, faces, 16)
     np.testing.assert_array_equal(ids[0], reference(points[0], faces, 16, closed=False))
-
-
-@pytest.mark.parametrize(("parts", "faces_at_a_time"), [(1, 100), (7, 3), (100, 1)])
-def test_the_numpy_blocks_do_not_change_the_image(monkeypatch, parts, faces_at_a_time):
-    points, faces = random_triangles(seed=4, count=40, reach=1.3)
-    at_once = choose("numpy").rasterize(points, faces, 16)
-    monkeypatch.setattr(numpy_rasterizer, "PARTS", parts)
-    monkeypatch.setattr(numpy_rasterizer, "FACES", faces_at_a_time)
-    np.testing.assert_array_equal(choose("numpy").rasterize(points, faces, 16), at_once)
 
 
 @needs_numba
