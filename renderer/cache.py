@@ -135,8 +135,8 @@ class OperatorCache(TensorCache):
         operators = dict(zip(missing, new, strict=True))
         self.views, self.built = self.views + len(keys), self.built + len(missing)
         for camera, operator in operators.items():
-            sparse = operator.sparse._asdict() if operator.sparse else {}
-            self.write(keys[camera], {name: getattr(operator, name) for name in TENSORS} | sparse)
+            added = operator.sparse._asdict() if operator.sparse else {}
+            self.write(keys[camera], {name: getattr(operator, name) for name in TENSORS} | added)
         for camera, tensors in files.items():
             if tensors is not None:
                 parts = [tensors.pop(name) for name in SparseTransfer._fields if name in tensors]

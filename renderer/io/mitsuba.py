@@ -172,11 +172,11 @@ def split_parts(mesh: Mesh, normals: np.ndarray, encoding: str) -> list[Part]:
     if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    corners = mesh.vertices[mesh.faces], normals, mesh.corner_uvs, colors
     parts = []
     for index in np.unique(mesh.texture_ids):
-        selected = mesh.texture_ids == index
-        parts.append(Part(*(values[selected] for values in corners), mesh.textures[index] if index >= 0 else None))
+        faces, texture = mesh.texture_ids == index, mesh.textures[index] if index >= 0 else None
+        corners = mesh.vertices[mesh.faces[faces]]
+        parts.append(Part(corners, normals[faces], mesh.corner_uvs[faces], colors[faces], texture))
     return parts
 
 
