@@ -52,6 +52,9 @@ def test_a_network_is_scored_on_photographs_in_folders_named_by_numbers_or_not_i
         logits = load_run(here / "1.10")(torch.from_numpy(image)[None] / 255)[0]
     log_odds = float(logits[2] - logits[:2].logsumexp(0))
     assert float(first[header.split(",").index("orange_log_odds")]) == pytest.approx(log_odds, abs=1e-4)
+    assert call(*EVALUATE, "run=null", "classifier=run:1.10", "out=classifier") == 0  # as any other network
+    tables = [(here / out / "predictions.csv").read_bytes() for out in ("1e3", "classifier")]
+    assert tables[0] == tables[1]
 
 
 WRONG = [
