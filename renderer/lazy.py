@@ -1,7 +1,10 @@
 """A package's names, each imported with its module when it is first used (PEP 562)."""
 
-from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
+from __future__ import annotations
+
+TYPE_CHECKING = False  # as type checkers know it; to import typing would take longer than all of this
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
 
 
 def attach(
@@ -17,6 +20,8 @@ def attach(
     def getattribute(name: str) -> object:
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        from importlib import import_module
+
         module = import_module(f"{package}.{home[name]}")
         return getattr(module, name, module)
 
