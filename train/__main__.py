@@ -38,7 +38,8 @@ SWEEP_FLAGS = {"--multirun", "-m"}
 def start() -> None:
     """Train what the command line asks for, in this process or in each that torchrun starts."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # or Hydra prints its errors itself, in several lines
-    threading.excepthook = _report_thread
+    # A full disk in TensorBoard's thread, which the main thread raises, too, is not reported twice.
+    threading.excepthook = lambda error: None if error.exc_type is OSError else threading.__excepthook__(error)
     with cli.handled_errors(), process_group():
         arguments = [NAMED_MODEL.sub("model.name=", argument) for argument in sys.argv[1:]]
         sys.argv[1:] = arguments = [as_override(argument) for argument in arguments]
@@ -54,12 +55,6 @@ def start() -> None:
             main()
         else:
             train(compose("train", overrides), overrides)
-
-
-def _report_thread(failure: threading.ExceptHookArgs) -> None:
-    """An error of a thread, but for a full disk in TensorBoard's, which the main thread raises, too."""
-    if not issubclass(failure.exc_type, OSError):
-        threading.__excepthook__(failure)
 
 
 @hydra.main(version_base="1.3", config_path="pkg://conf", config_name="train")

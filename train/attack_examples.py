@@ -32,9 +32,8 @@ class Side(NamedTuple):
     confidence: float
 
 
-def write_attack_examples(path: Path, attack_examples: AttackExamples, classes: Sequence[str]) -> None:
+def write_attack_examples(path: Path, shown: AttackExamples, classes: Sequence[str]) -> None:
     """Images as bytes in the safetensors format; labels and predictions in its metadata."""
-    shown = attack_examples
     labels = [classes[index] if index >= 0 else OTHER for index in shown.labels.tolist()]
     tensors, predictions = {}, {"label": labels}
     for name, images, lights, probabilities in [

@@ -50,11 +50,6 @@ def rounds_of_epoch(
     ]
 
 
-def batch_count(images: int, batch_size: int) -> int:
-    """Batches in a round."""
-    return math.ceil(images / batch_size)
-
-
 def with_room(split: Split, count: int) -> Split:
     """The split's images and, behind them, room for a round's renders."""
     room = split.images.new_zeros(count, *split.images.shape[1:]), split.labels.new_zeros(count)
@@ -81,7 +76,7 @@ def training_batches(
     """
     images, rows = split.images, now.rows
     order = rows[torch.randperm(len(rows), generator=generator(seed, now.number, "batches"))]
-    order = order[torch.arange(batch_count(len(rows), batch_size) * batch_size) % len(rows)].view(-1, batch_size)
+    order = order[torch.arange(math.ceil(len(rows) / batch_size) * batch_size) % len(rows)].view(-1, batch_size)
     shifts = torch.randint(-PADDING, PADDING + 1, (2, *order.shape), generator=generator(seed, now.number, "shifts"))
     if flips == "random":
         flipped = torch.randint(0, 2, order.shape, generator=generator(seed, now.number, "flips"), dtype=torch.bool)

@@ -19,7 +19,7 @@ from augment.utils import eval_mode, progress, stream_seed
 from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes, to_unit
 from train import checkpoint, console
-from train.batches import Round, batch_count, put_last, rounds_of_epoch, training_batches, with_room
+from train.batches import Round, put_last, rounds_of_epoch, training_batches, with_room
 from train.checkpoint import random_state, restore_random_state
 from train.data import Split
 from train.device import GraphedModel, MixedPrecision, compiled_pass, compiles
@@ -48,13 +48,6 @@ class EpochState:
         renders = {"images": to_bytes(self.renders.images), "labels": self.renders.labels}
         diagnostics = [dict(diagnostics) for diagnostics in self.diagnostics]
         return {**renders, "diagnostics": diagnostics, "sums": summed(self.sums.clone()), "step": self.step}
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any], device: torch.device) -> "EpochState":
-        diagnostics = state["diagnostics"]
-        renders = Renders(to_unit(state["images"]).to(device), state["labels"].to(device), diagnostics[-1])
-        sums = state["sums"] if utils.rank() == 0 else torch.zeros(2)
-        return cls(renders, sums.to(device), diagnostics, state["step"])
 
 
 class Trainer:
@@ -91,8 +84,10 @@ class Trainer:
 
         self.model, self.device = model, next(model.parameters()).device
         self.ema = MovingAverage(model, settings.ema_decay) if settings.ema_decay else None
+        self._trained = cast(MixedPrecision, self.ema.module) if self.ema else model  # the result of an epoch's steps
         mean = {"avg_fn": get_swa_avg_fn(), "use_buffers": True}  # Wortsman et al. 2022, "Model soups"
         self.soup = AveragedModel(model, **mean) if settings.soup else None
+        self.selected = cast(MixedPrecision, self.soup.module) if self.soup else self._trained
         self._initial = deepcopy(model.state_dict()) if settings.soup else None
         teacher = deepcopy(model).eval().requires_grad_(False) if settings.distillation else None
         replica = replicated(model)  # may replace layers, so the optimizer comes after it
@@ -104,15 +99,6 @@ class Trainer:
         self._augment = augmentation(settings.augmentation, model, self.seed)
         self.attacked: nn.Module = GraphedModel(model) if compiled else model
         self.validated: nn.Module = GraphedModel(self.selected) if compiled else self.selected
-
-    @property
-    def selected(self) -> MixedPrecision:
-        return cast(MixedPrecision, self.soup.module) if self.soup else self._trained
-
-    @property
-    def _trained(self) -> MixedPrecision:
-        """The result of the current epoch's steps."""
-        return cast(MixedPrecision, self.ema.module) if self.ema else self.model
 
     # --------------------------------------------------------------------------------- epochs and rounds
 
@@ -141,7 +127,7 @@ class Trainer:
         """
         settings, shown, every = self.settings, self.settings.images_per_epoch, self.service.settings.every
         rounds = rounds_of_epoch(images, len(self.service), self.seed, self.epoch, shown, every)
-        steps = [batch_count(len(part.rows), settings.batch_size) for part in rounds]
+        steps = [math.ceil(len(part.rows) / settings.batch_size) for part in rounds]
         total = sum(steps)
         if self._under_way is None:
             if self._initial:  # a soup's epochs all begin with it
@@ -288,8 +274,11 @@ class Trainer:
         self.model.precision = self._trained.precision = self.selected.precision = state["precision"]
         self.service.load_state_dict(state["service"])
         self._random_state = dict(state["random_state"])
-        if state["under_way"]:
-            self._under_way = EpochState.from_state_dict(state["under_way"], self.device)
+        if begun := state["under_way"]:
+            images, labels = to_unit(begun["images"]).to(self.device), begun["labels"].to(self.device)
+            renders = Renders(images, labels, begun["diagnostics"][-1])
+            sums = begun["sums"].to(self.device) * (utils.rank() == 0)
+            self._under_way = EpochState(renders, sums, begun["diagnostics"], begun["step"])
         self.epoch, self.history = state["epoch"], state["history"]
 
     def resume(self) -> None:

@@ -24,27 +24,13 @@ AUGMENTATIONS = ("none", *TRANSFORMS, "pgd")
 PGD_RADIUS, PGD_STEP, PGD_STEPS = 8 / 255, 4 / 255, 3  # in the L∞ norm; Madry et al. 2018 take 7 steps of 2/255
 LARGEST = {"epochs": 10**6, "images_per_epoch": 10**9, "batch_size": 10**6, "checkpoint_every": 10**6, "threads": 1024}
 
-# ------------------------------------------------------------------------------------- schedules
-
-
-def step(progress: float) -> float:
-    """×0.2 at 30, 60 and 80 % of the epochs (Zagoruyko and Komodakis 2016: 60, 120 and 160 of 200)."""
-    return 0.2 ** sum(progress >= milestone for milestone in (0.3, 0.6, 0.8))
-
-
-def cosine(progress: float) -> float:
-    """Half a cosine from 1 to 0."""
-    return (1 + math.cos(math.pi * progress)) / 2
-
-
-def one_cycle(progress: float) -> float:
-    """Linear from 0.1 to 1 over the first fifth, then linear to 0: the most from a few epochs."""
-    return 0.1 + 0.9 * progress / 0.2 if progress < 0.2 else (1 - progress) / 0.8
-
-
-SCHEDULES = {"step": step, "cosine": cosine, "one_cycle": one_cycle}
-
-# ------------------------------------------------------------------------------------- settings
+# Factors of the learning rate at a fraction of the training: ×0.2 at 30, 60 and 80 % (Zagoruyko and Komodakis 2016: at
+# epochs 60, 120 and 160 of 200); half a cosine; up over the first fifth and down, the most from a few epochs.
+SCHEDULES: dict[str, Callable[[float], float]] = {
+    "step": lambda done: 0.2 ** sum(done >= milestone for milestone in (0.3, 0.6, 0.8)),
+    "cosine": lambda done: (1 + math.cos(math.pi * done)) / 2,
+    "one_cycle": lambda done: 0.1 + 0.9 * done / 0.2 if done < 0.2 else (1 - done) / 0.8,
+}
 
 
 @dataclass
@@ -91,9 +77,6 @@ class TrainSettings:
             raise InputError(f"learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
 
 
-# ------------------------------------------------------------------------------------- loss and averaged weights
-
-
 def training_loss(model: nn.Module, settings: TrainSettings, label: int | None, teacher: nn.Module | None) -> Loss:
     """A function of uint8 images (B, 3, H, W), labels (B,) and which are renders, (B,) bool: the loss, and the number
     of correct predictions.
@@ -133,9 +116,6 @@ class MovingAverage(AveragedModel):
             if group := [pair for pair in pairs if pair[0].is_floating_point() == floating]:
                 self._average([average for average, _ in group], [latest for _, latest in group], None)
         self.n_averaged += 1
-
-
-# ------------------------------------------------------------------------------------- baseline augmentations
 
 
 def augmentation(name: str, model: nn.Module, seed: int) -> Augment:

@@ -42,10 +42,7 @@ Lights = Callable[[Tensor, torch.Generator], Tensor]
 
 
 def load_shapes(train: int, test: int, size: int, seed: int, cache: TensorCache | None = None) -> DataSet:
-    """That many training and test images of every class, in even light; whole instances (20 images) each.
-
-    The cache keeps the images, not the operators: every one of those is used for four images and never again.
-    """
+    """That many training and test images of every class, in even light; whole instances (20 images) each."""
     parts = {"train": train, "test": test}
     return DataSet(CLASSES, *(_render_split(part, count, size, seed, cache) for part, count in parts.items()))
 
@@ -93,14 +90,13 @@ def _render_split(part: str, per_class: int, size: int, seed: int, cache: Tensor
 
 
 def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Tensor:
-    """Images of every class, in order: uint8 (classes × per_class, 3, size, size). Held out, all classes have the same
-    draws of light and camera."""
+    """Images of every class, in order: uint8 (classes × per_class, 3, size, size)."""
     instances = math.ceil(per_class / (VIEWS * BACKGROUNDS))
     light = hard_light if part == HELD_OUT else even_light
     draws = seeds = generator(seed, part)
     images = []
     for name in CLASSES:
-        if part == HELD_OUT:
+        if part == HELD_OUT:  # all classes under the same lights before the same cameras
             draws, seeds = generator(seed, part), generator(seed, part, name)
         meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(instances))
         images.append(torch.cat([_portraits(mesh, light, settings, draws) for mesh in meshes])[:per_class])

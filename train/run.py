@@ -27,10 +27,8 @@ from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, keyed
 
-Scores = dict[str, float]
 
-
-def run(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Scores:
+def run(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> dict[str, float]:
     """Train one arm into `folder` and score it; the scores, which are in the folder's files, too.
 
     command: the one that was given, to be recorded.
@@ -38,7 +36,7 @@ def run(settings: ExperimentSettings, data: DataSet, folder: Path, command: str 
     return prepare(settings, data, folder, command)()
 
 
-def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Callable[[], Scores]:
+def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> Callable[[], dict]:
     """All of `run` that comes before the first epoch, where wrong input shows; returns a function for the rest."""
     for name, photographs in settings.evaluate.folders.items():
         require_outside(folder / name, photographs)
@@ -50,17 +48,16 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     trainer = build_trainer(settings, data, folder, device)
     _open_folder(trainer, settings, command)
 
-    def train_and_score() -> Scores:
+    def train_and_score() -> dict[str, float]:
         console.info(
             f"{len(train)} images, {len(data.classes)} classes; {device}, {trainer.model.precision}, "
             f"{torch.get_num_threads()} threads, {utils.world_size()} processes"
         )
         log = None if utils.rank() else RunLog(folder, trainer.history)
         trainer.fit(train.to(device), validation.to(device), log)
-        scores = _test_scores(trainer, data, device) | _photograph_scores(settings, trainer, data, device)
+        scores = _test_scores(trainer, data) | _photograph_scores(settings, trainer, data)
         if log:
             log.scalars(scores)
-            log.close()
         return scores
 
     return train_and_score
@@ -131,9 +128,6 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
     return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process)
 
 
-# ------------------------------------------------------------------------------------- the folder
-
-
 def _open_folder(trainer: Trainer, settings: ExperimentSettings, command: str) -> None:
     """Resume from the folder, or start in it; InputError rather than writing over another run."""
     folder = trainer.folder
@@ -149,12 +143,9 @@ def _open_folder(trainer: Trainer, settings: ExperimentSettings, command: str) -
         write_config(folder, settings, hardware=hardware, command=command)
 
 
-# ------------------------------------------------------------------------------------- scores
-
-
-def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[str, float]:
+def _test_scores(trainer: Trainer, data: DataSet) -> dict[str, float]:
     """The one look at the test set: the last epoch's network and the selected one, which stays loaded."""
-    test = data.test.to(device)
+    test = data.test.to(trainer.device)
     last = selected = evaluate(trainer.selected, test)["accuracy"]
     best = checkpoint.load(trainer.folder / checkpoint.BEST)
     if best["epoch"] != trainer.epoch:
@@ -164,14 +155,12 @@ def _test_scores(trainer: Trainer, data: DataSet, device: torch.device) -> dict[
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 
 
-def _photograph_scores(
-    settings: ExperimentSettings, trainer: Trainer, data: DataSet, device: torch.device
-) -> dict[str, float]:
+def _photograph_scores(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
     """The network's metrics on each folder of photographs, as NAME/METRIC; empty without one."""
     scores: dict[str, float | None] = {}
     for name, photographs in settings.evaluate.folders.items() if utils.rank() == 0 else ():
         inputs = trainer.selected, data.classes, photographs, settings.label
-        options = {"size": data.size, "skip_unreadable": settings.evaluate.skip_unreadable, "device": device}
+        options = {"size": data.size, "skip_unreadable": settings.evaluate.skip_unreadable, "device": trainer.device}
         summary = evaluate_photographs(*inputs, trainer.folder / name, **options)
         console.info("%s: %s", name, format_summary(summary))
         scores |= {f"{name}/{metric}": find_metric(summary, metric)["value"] for metric in ("top5", *METRICS)}

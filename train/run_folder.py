@@ -27,7 +27,6 @@ from train.checkpoint import write_whole
 from train.settings import ExperimentSettings, dotted, is_within
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
-LARGEST_FILE = 2**26  # bytes; a run writes about 300 per epoch
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; other phases are parts of these
 logging.raiseExceptions = False  # on a full disk train.log lacks lines, and only the run's own error is shown
 
@@ -95,8 +94,6 @@ def _text_of(path: Path) -> Iterator[str]:
     try:
         if not path.is_file():
             raise ValueError("there is no such file")
-        if path.stat().st_size > LARGEST_FILE:
-            raise ValueError(f"it is larger than {LARGEST_FILE} bytes")
         yield path.read_text(encoding="utf-8")
     except Exception as error:
         raise InputError(f"{path} is damaged or of another kind ({in_one_line(error)}): use another run") from error
@@ -239,7 +236,7 @@ class RunLog:
     def scalars(self, values: Mapping[str, float], epoch: int | None = None) -> None:
         """Log plain numbers; `group/name` keys become TensorBoard's groups. epoch: None for the final scores.
 
-        TensorBoard shows the final scores one step after the last epoch, where a resumed run replaces them.
+        TensorBoard shows the final scores, which end the log, one step after the last epoch.
         """
         line = values if epoch is None else {"epoch": epoch, **values}
         with open(self._metrics, "a") as file:
@@ -247,7 +244,7 @@ class RunLog:
         self._epochs = self._epochs if epoch is None else epoch
         for name, value in values.items():
             self._board.add_scalar(name, value, epoch or self._epochs + 1)
-        self._board.flush()
+        self._board.close() if epoch is None else self._board.flush()
 
     def renders(self, images: Tensor, epoch: int) -> None:
         """The epoch's renders (E, 3, H, W) in [0, 1] as a grid in TensorBoard and in renders/."""
@@ -263,7 +260,3 @@ class RunLog:
         """A few successful attacks of the epoch, before and after, in renders/."""
         self._renders.mkdir(exist_ok=True)
         write_attack_examples(self._renders / f"epoch_{epoch:03d}{SUFFIX}", attack_examples, classes)
-
-    def close(self) -> None:
-        """End TensorBoard's thread."""
-        self._board.close()

@@ -82,10 +82,8 @@ def made_up_run(tiny) -> Callable[..., Path]:
     def make(folder: Path, arm: str = "none", photographs: dict | None = None, *overrides: str) -> Path:
         write_config(folder, tiny(f"augment={arm}", "seed=0", *overrides))
         seconds = {"attack": 0.5, "attack_classifier": 0.25, "training": 3.0, "evaluation": 1.0, "input_output": 0.5}
-        lines = [
-            {"epoch": epoch, **{f"seconds/{phase}": epoch * value for phase, value in seconds.items()}}
-            for epoch in (1, 2)
-        ]
+        seconds = {f"seconds/{phase}": value for phase, value in seconds.items()}
+        lines = [{"epoch": epoch} | {name: epoch * value for name, value in seconds.items()} for epoch in (1, 2)]
         lines[0]["seconds/operators"] = 7.0
         lines.append({"test/accuracy": 0.76543, "test/accuracy_last": 0.75, "test/epoch": 2})
         (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))

@@ -115,9 +115,6 @@ def test_rounds_divide_the_epochs_images_and_each_has_all_renders():
     assert all(part == sorted(part) and part[-7:] == list(range(100, 107)) for part in rows)
     images = [row for part in rows for row in part[:-7]]
     assert len(set(images)) == 50 and max(images) < 100
-
-
-def test_an_epochs_images_are_drawn_anew_and_are_never_more_than_there_are():
     (first,), (second,) = (rounds_of_epoch(100, 0, 0, epoch, 50, None) for epoch in (0, 1))
     assert first.rows.tolist() != second.rows.tolist()
     for images_per_epoch in (5000, None):

@@ -11,7 +11,6 @@ from train.device import (
     MixedPrecision,
     choose_device,
     choose_precision,
-    compiled_pass,
     compiles,
     set_threads,
 )
@@ -133,16 +132,3 @@ def test_batches_of_any_size_pass_through_a_few_graphs_with_the_models_result_an
     graphed.train()(images)
     graphed.eval()(images[:1].expand(SIZES[-1] + 1, -1, -1, -1))
     assert recorded.sizes == [16, 32, 64]  # in training mode, and for larger batches, the model is used as it is
-
-
-@pytest.mark.slow
-def test_no_run_of_a_sweep_is_compiled_less_than_the_first(linear, monkeypatch):
-    """Torch would stop at a number of graphs, of all the runs of a process together."""
-    monkeypatch.setattr(device, "RECOMPILE_LIMIT", 2)
-    recorded = Recorded()
-    for _ in range(3):
-        compiled_pass(linear)  # as each run begins
-        graphed = GraphedModel(linear, recorded).eval()
-        for size in (16, 32):
-            graphed(torch.zeros(size, 3, 8, 8, dtype=torch.float64))
-    assert recorded.sizes == 3 * [16, 32]

@@ -2,14 +2,13 @@ import copy
 import itertools
 import math
 import signal
-from types import SimpleNamespace
 
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-from augment.service import Renders
+from augment.service import AugmentationService, AugmentationSettings
 from augment.utils import Phases
 from renderer.errors import InputError
 from train import checkpoint
@@ -17,29 +16,10 @@ from train.data import Split
 from train.device import MixedPrecision
 from train.loop import Trainer, evaluate
 from train.networks import WideResNet
-from train.recipe import TrainSettings, cosine
+from train.recipe import SCHEDULES, TrainSettings
 from train.run_folder import RunLog, read_metrics
 
 ARCHITECTURE = {"classes": ["fig", "lime", "pear"], "depth": 10, "width": 1, "dropout": 0.0}
-
-
-class NoRenders:
-    """Stands for the augmentation service."""
-
-    settings = SimpleNamespace(arm="none", every=None)
-    label, seed, phases = None, 0, Phases()
-
-    def __len__(self):
-        return 0
-
-    def regenerate(self, model, number):
-        return Renders(torch.zeros(0, 3, 1, 1), torch.zeros(0, dtype=torch.int64), {})
-
-    def state_dict(self):
-        return {}
-
-    def load_state_dict(self, state):
-        assert state == {}
 
 
 def noise(count: int) -> Split:
@@ -52,7 +32,8 @@ def make_trainer(folder, network: nn.Module | None = None, **settings) -> Traine
     torch.manual_seed(0)
     model = MixedPrecision(network or WideResNet(3, 10, 1, dropout=0.0), "float32")
     settings = TrainSettings(**{"epochs": 3, "batch_size": 16, "learning_rate": 0.05, "init_from": "base"} | settings)
-    return Trainer(settings, model, ARCHITECTURE, NoRenders(), folder)
+    no_renders = AugmentationService(AugmentationSettings(arm="none"), None, torch.zeros(0).long(), 0, Phases())
+    return Trainer(settings, model, ARCHITECTURE, no_renders, folder)
 
 
 def fit_noise(trainer: Trainer) -> list[dict]:
@@ -86,12 +67,12 @@ def test_an_epoch_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(
             for parameter, gradient, velocity in zip((weight, bias), gradients, velocities, strict=True):
                 gradient = gradient + 0.1 * parameter
                 velocity.mul_(0.9).add_(gradient)
-                parameter -= 0.5 * cosine(step / 2) * (gradient + 0.9 * velocity)
+                parameter -= 0.5 * SCHEDULES["cosine"](step / 2) * (gradient + 0.9 * velocity)
     torch.testing.assert_close(network[1].weight, weight)
     torch.testing.assert_close(network[1].bias, bias)
     (line,) = read_metrics(tmp_path)
     assert line["train/loss"] == pytest.approx(sum(losses) / 2)
-    assert line["train/learning_rate"] == pytest.approx(0.5 * cosine(1 / 2))
+    assert line["train/learning_rate"] == pytest.approx(0.5 * SCHEDULES["cosine"](1 / 2))
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -112,9 +93,7 @@ def test_evaluation_is_the_mean_over_all_images_in_eval_mode_and_leaves_the_mode
 def test_the_moving_average_follows_the_steps_and_is_validated_and_kept(tmp_path):
     """Weights and batch statistics alike."""
     trainer, states = make_trainer(tmp_path, epochs=2, ema_decay=0.8), []
-    trainer.optimizer.register_step_post_hook(
-        lambda *arguments: states.append(copy.deepcopy(trainer.model.state_dict()))
-    )
+    trainer.optimizer.register_step_post_hook(lambda *rest: states.append(copy.deepcopy(trainer.model.state_dict())))
     fit_noise(trainer)
     for name in ("network.head.weight", "network.norm.running_mean"):
         average = states[0][name]

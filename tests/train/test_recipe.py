@@ -14,12 +14,10 @@ from train.networks import WideResNet
 from train.recipe import (
     AUGMENTATIONS,
     PGD_RADIUS,
+    SCHEDULES,
     TRANSFORMS,
     TrainSettings,
     augmentation,
-    cosine,
-    one_cycle,
-    step,
     training_loss,
 )
 
@@ -45,7 +43,7 @@ def test_a_setting_out_of_range_is_named(name, value):
 
 @pytest.mark.parametrize("epochs", [10, 50, 150])
 def test_the_step_schedule_falls_to_a_fifth_at_30_60_and_80_percent_of_the_epochs(epochs):
-    rates = [step(epoch / epochs) for epoch in range(epochs)]
+    rates = [SCHEDULES["step"](epoch / epochs) for epoch in range(epochs)]
     parts = [3, 3, 2, 2]
     assert rates == [0.2**fall for fall, part in enumerate(parts) for _ in range(part * epochs // 10)]
 
@@ -56,42 +54,37 @@ PROGRESS = np.linspace(0, 1, 1001)
 @pytest.mark.parametrize(
     "schedule, expected",
     [
-        (cosine, np.cos(math.pi / 2 * PROGRESS) ** 2),  # half a cosine, by the half-angle formula
-        (one_cycle, np.interp(PROGRESS, [0, 0.2, 1], [0.1, 1, 0])),
+        ("cosine", np.cos(math.pi / 2 * PROGRESS) ** 2),  # half a cosine, by the half-angle formula
+        ("one_cycle", np.interp(PROGRESS, [0, 0.2, 1], [0.1, 1, 0])),
     ],
 )
 def test_a_continuous_schedule_is_its_closed_form(schedule, expected):
-    np.testing.assert_allclose([schedule(progress) for progress in PROGRESS], expected, atol=1e-12)
-
-
-def loss_of(model, *batch, label=None, teacher=None, **settings) -> tuple[torch.Tensor, torch.Tensor]:
-    return training_loss(model, TrainSettings(init_from="base", **settings), label, teacher)(*batch)
+    np.testing.assert_allclose([SCHEDULES[schedule](progress) for progress in PROGRESS], expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.1])
-def test_the_loss_is_the_mean_smoothed_cross_entropy_and_comes_with_the_number_of_hits(model, images, smoothing):
-    loss, hits = loss_of(model.eval(), images, LABELS, LABELS == 0, label_smoothing=smoothing)
+def test_the_loss_is_the_smoothed_cross_entropy_and_on_images_of_the_data_the_divergence_from_a_teacher(
+    model, images, smoothing
+):
+    """The teacher's probabilities q are a constant: Σ q log(q / p)."""
+    rendered, teacher = torch.arange(6) < 2, WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
+    settings = TrainSettings(init_from="base", label_smoothing=smoothing, distillation=4.0)
+    loss, hits = training_loss(model.eval(), settings, None, teacher)(images, LABELS, rendered)
     logits = model(images / 255)
-    uniform = -F.log_softmax(logits, 1).mean(1)
-    expected = (1 - smoothing) * F.cross_entropy(logits, LABELS) + smoothing * uniform.mean()
-    torch.testing.assert_close(loss, expected)
+    p, q = logits[2:].softmax(1), teacher(images[2:] / 255).softmax(1)
+    uniform, divergence = -F.log_softmax(logits, 1).mean(), (q * (q / p).log()).sum() / 6
+    cross_entropy = F.cross_entropy(logits, LABELS)
+    torch.testing.assert_close(loss, (1 - smoothing) * cross_entropy + smoothing * uniform + 4 * divergence)
     assert hits == (logits.argmax(1) == LABELS).sum()
 
 
 def test_the_ranking_is_added_by_its_weight(model, images):
     labels = LABELS - 1  # two of "anything but class 0"
-    alone, _ = loss_of(model.eval(), images, labels, labels == 0)
-    both, _ = loss_of(model, images, labels, labels == 0, label=1, ranking=4.0)
+    alone, both = (
+        training_loss(model.eval(), TrainSettings(ranking=weight), 1, None)(images, labels, labels == 0)[0]
+        for weight in (0.0, 4.0)
+    )
     torch.testing.assert_close(both, alone + 4 * ranking_loss(model(images / 255), labels, 1))
-
-
-def test_the_divergence_from_the_teacher_is_added_on_images_that_are_not_renders(model, images):
-    """The teacher's probabilities q are a constant: Σ q log(q / p)."""
-    rendered, teacher = torch.arange(6) < 2, WideResNet(4, 10, 1, dropout=0.0).eval().requires_grad_(False)
-    alone, _ = loss_of(model.eval(), images, LABELS, rendered)
-    both, _ = loss_of(model, images, LABELS, rendered, teacher=teacher, distillation=4.0)
-    p, q = (network(images[2:] / 255).softmax(1) for network in (model, teacher))
-    torch.testing.assert_close(both, alone + 4 * (q * (q / p).log()).sum() / 6)
 
 
 @pytest.mark.parametrize("name", AUGMENTATIONS)
