@@ -8,6 +8,7 @@ time, and processes may share the folder.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -72,13 +73,12 @@ RENDERER = source_key(Path(__file__).parent)  # on import, so that it is the cod
 class TensorCache:
     """Named tensors in files of a folder, under content keys.
 
-    folder: made when first written to; None: nothing is written. problem: why nothing can be written, or None; that
-    stops no run, since everything can be computed again.
+    folder: made when first written to; None: nothing is written. Where it cannot be written to, a warning is logged,
+    and the run goes on, since everything can be computed again.
     """
 
     def __init__(self, folder: Path | None = None):
-        self.folder = folder
-        self.problem: str | None = None
+        self.folder, self.writable = folder, folder is not None
 
     def read(self, key: str) -> dict[str, Tensor] | None:
         """The tensors that were written under the key; None where there are none, or where a bit has changed."""
@@ -91,7 +91,7 @@ class TensorCache:
 
     def write(self, key: str, tensors: Mapping[str, Tensor]) -> None:
         """Write CPU tensors. Another process sees the old file or the new one, and `read` passes over a torn one."""
-        if self.folder is None or self.problem:
+        if self.folder is None or not self.writable:
             return
         content = safetensors.torch.save(dict(tensors))
         try:
@@ -101,7 +101,8 @@ class TensorCache:
                 file.write_bytes(_checksum(key, content) + content)
                 os.replace(file, self.folder / key)
         except OSError as error:
-            self.problem = str(error)
+            logging.getLogger(__name__).warning("renders are not cached: %s", error)
+            self.writable = False
 
 
 def _checksum(key: str, content: bytes) -> bytes:
@@ -109,12 +110,7 @@ def _checksum(key: str, content: bytes) -> bytes:
 
 
 class OperatorCache(TensorCache):
-    """Transfer operators, a file per mesh and view: 5 views find those that a run with 10 has built.
-
-    views: how many were asked for; built: how many of them were computed.
-    """
-
-    views = built = 0
+    """Transfer operators, a file per mesh and view: 5 views find those that a run with 10 has built."""
 
     def operators(
         self,
@@ -133,7 +129,6 @@ class OperatorCache(TensorCache):
         missing = [camera for camera, tensors in files.items() if tensors is None]
         new = build_operators(mesh, missing, settings, rasterizer, albedo_scale, basis, dtype) if missing else []
         operators = dict(zip(missing, new, strict=True))
-        self.views, self.built = self.views + len(keys), self.built + len(missing)
         for camera, operator in operators.items():
             added = operator.sparse._asdict() if operator.sparse else {}
             self.write(keys[camera], {name: getattr(operator, name) for name in TENSORS} | added)
