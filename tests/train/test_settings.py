@@ -98,7 +98,7 @@ def test_a_wrong_setting_is_one_sentence_that_names_it(overrides, sentence):
         (["train.device=cuda:99"], "device=cuda:99 is not available here"),
         (["scene.light=graze"], "'graze' is not known"),
         (["label=ornage"], "'ornage' is not a class of the model: choose one, such as orange"),
-        (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab does not exist"),
+        (["evaluate.photos={lab: /no/such/lab}"], "/no/such/lab is not a folder"),
     ],
     ids=lambda given: given[-1] if isinstance(given, list) else "",
 )
