@@ -36,7 +36,6 @@ PLOT = {
     "legend.frameon": False,
     "legend.fontsize": 9,
 }
-ENDS = ("value", "low", "high")
 Line = tuple[Sequence[float], Sequence[float]]  # x and y
 
 
@@ -94,10 +93,10 @@ def bars(metrics: Mapping[str, Mapping[str, Mapping[str, float]]], title: str) -
     def draw(axes: "Axes") -> None:
         for row, by_arm in enumerate(metrics.values()):
             for index, (arm, metric) in enumerate(by_arm.items()):
-                place, (value, low, high) = row + 0.8 * (index + 0.5) / len(by_arm), map(metric.get, ENDS)
                 if metric:
+                    place, value, high = row + 0.8 * (index + 0.5) / len(by_arm), metric["value"], metric["high"]
                     axes.barh(place, value, 0.7 / len(by_arm), color=style(index)["color"], label=arm)
-                    axes.hlines(place, low, high, color=INK, linewidth=1)
+                    axes.hlines(place, metric["low"], high, color=INK, linewidth=1)
                     axes.annotate(f" {value:.2f}", (max(value, high), place), va="center")
         axes.set_yticks(np.arange(len(metrics)) + 0.4, [*metrics])
         axes.set_xlim(0, 1.15)

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean, stdev
@@ -52,6 +52,7 @@ class RunSummary:
 
 
 Arms = Mapping[str, Sequence[RunSummary]]
+Metric = Mapping[str, Any]  # its value and, where they are known, the ends of its interval, low and high
 
 
 def is_finished(folder: Path) -> bool:
@@ -131,12 +132,12 @@ def run_tables(arms: Arms) -> list[Table]:
 
     A row per run; below several seeds of an arm one with their mean ± standard deviation.
     """
-    heads = {arm: runs[0] for arm, runs in arms.items()}
+    heads, all_runs = {arm: runs[0] for arm, runs in arms.items()}, [run for runs in arms.values() for run in runs]
     header = ["test accuracy", "of the last epoch", "seconds per epoch"]
-    tables = [_run_table("", header, arms, _accuracy_and_time)]
-    for folder in sorted({name for runs in arms.values() for run in runs for name in run.photographs}):
-        titles = [metric_title(name) for name in METRICS]
-        tables.append(_run_table(folder, titles, arms, lambda run, f=folder: [run.metric(f, name) for name in METRICS]))
+    tables = [_run_table("", header, arms, {run.folder: _accuracy_and_time(run) for run in all_runs})]
+    for folder in sorted({name for run in all_runs for name in run.photographs}):
+        metrics = {run.folder: [run.metric(folder, name) for name in METRICS] for run in all_runs}
+        tables.append(_run_table(folder, [metric_title(name) for name in METRICS], arms, metrics))
     if varied := varied_settings([*heads.values()]):
         rows = [[arm, *(str(head.settings.get(key)) for key in varied)] for arm, head in heads.items()]
         tables.append(Table("settings in which the arms differ", ["augment", *varied], rows))
@@ -150,24 +151,23 @@ def seconds_table(arms: Arms) -> Table:
     return Table("seconds per epoch, and once for the operators", ["augment", *phases], rows)
 
 
-def _run_table(
-    title: str, header: Sequence[str], arms: Arms, metrics: Callable[[RunSummary], Sequence[Mapping[str, Any]]]
-) -> Table:
+def _run_table(title: str, header: Sequence[str], arms: Arms, metrics: Mapping[Path, Sequence[Metric]]) -> Table:
+    """metrics: by a run's folder, one per column."""
     rows = []
     for arm, runs in arms.items():
-        lines = [metrics(run) for run in runs]
+        lines = [metrics[run.folder] for run in runs]
         rows += [[arm, str(run.seed), *map(format_interval, line)] for run, line in zip(runs, lines, strict=True)]
         if len(runs) > 1:
             rows.append([arm, f"{len(runs)} seeds", *map(_spread, zip(*lines, strict=True))])
     return Table(title, ["augment", "seed", *header], rows)
 
 
-def _accuracy_and_time(run: RunSummary) -> list[dict[str, float]]:
+def _accuracy_and_time(run: RunSummary) -> list[Metric]:
     values = run.accuracy, run.scores.get("test/accuracy_last"), sum(run.seconds.get(phase, 0) for phase in PHASES)
     return [{"value": value} for value in values]
 
 
-def _spread(metrics: Sequence[Mapping[str, Any]]) -> str:
+def _spread(metrics: Sequence[Metric]) -> str:
     values = [metric["value"] for metric in metrics if metric.get("value") is not None]
     return f"{fmean(values):.3f} ± {stdev(values):.3f}" if len(values) == len(metrics) else "-"
 
