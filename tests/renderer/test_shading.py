@@ -24,7 +24,7 @@ from renderer.rasterizer import choose
 from renderer.shading import irradiance, radiance
 from renderer.transfer import build_operators
 
-EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")
 DEGREES = [0, 1, 2, 3, 6, 13, MAX_DEGREE]
 SPECIAL = [[0.0, 0.0, 1.0], [-0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [-1.0, -0.0, 0.0], [0.0, -1.0, -0.0], [1e-9, 0.0, 1.0]]

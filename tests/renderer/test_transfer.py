@@ -15,7 +15,7 @@ from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.transfer import build_operators
 
-EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
+EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")
 ABOVE = OrthographicCamera(0, 0, 2.0)  # right is +y, up is -x
 

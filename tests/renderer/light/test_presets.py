@@ -8,14 +8,7 @@ from oracles import random_directions
 from renderer.errors import InputError
 from renderer.light.environment import write_map
 from renderer.light.harmonics import basis, irradiance_basis, nonzero_coefficients
-from renderer.light.presets import (
-    PROBES,
-    ambient,
-    directional,
-    load_light,
-    perturb,
-    probe,
-)
+from renderer.light.presets import PROBES, ambient, directional, load_light, perturb, probe
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
