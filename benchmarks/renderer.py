@@ -19,21 +19,9 @@ from tempfile import TemporaryDirectory
 import torch
 from torch import Tensor
 
+from benchmarks import scene
 from benchmarks.common import Row, machine, medians, write_csv
-from benchmarks.scene import (
-    CAMERA,
-    MITSUBA_SAMPLES,
-    SAMPLES,
-    Converged,
-    Result,
-    Step,
-    View,
-    coefficients,
-    cut_irradiance,
-    ellipsoid,
-    mitsuba_steps,
-    whole_irradiance,
-)
+from benchmarks.scene import CAMERA, SAMPLES, Converged, Result, Step, View, coefficients
 from renderer import reference, shading
 from renderer.cache import OperatorCache
 from renderer.camera import orbit_cameras
@@ -140,8 +128,8 @@ def light_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:
     yield "operator", SAMPLES, DEGREE, by_operator, by_operator
     yield f"{AUTOGRAD}, visibility cached", 1, DEGREE, by_autograd, by_autograd
     if mitsuba:
-        step, _ = mitsuba_steps(view)
-        yield "Mitsuba 3", MITSUBA_SAMPLES, DEGREE, step, step
+        step, _ = scene.mitsuba_steps(view)
+        yield "Mitsuba 3", scene.MITSUBA_SAMPLES, DEGREE, step, step
 
 
 def vertex_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:
@@ -156,15 +144,15 @@ def vertex_gradients(view: View, mitsuba: bool) -> Iterator[Contender]:
             step = vertex_step(view, samples, light, shade, cached=True)
             yield f"{name}, visibility cached", samples, DEGREE, step, step
     if mitsuba:
-        _, step = mitsuba_steps(view)
-        yield "Mitsuba 3", MITSUBA_SAMPLES, DEGREE, step, step
+        _, step = scene.mitsuba_steps(view)
+        yield "Mitsuba 3", scene.MITSUBA_SAMPLES, DEGREE, step, step
 
 
 PANELS = {  # contenders, the reference's irradiance and gradient
-    "light step": (light_steps, whole_irradiance, "by_light"),
-    "building an operator": (builds, whole_irradiance, "by_light"),
-    "gradient by the light": (light_gradients, cut_irradiance, "by_light"),
-    "gradient by the vertices": (vertex_gradients, cut_irradiance, "by_vertices"),
+    "light step": (light_steps, scene.whole_irradiance, "by_light"),
+    "building an operator": (builds, scene.whole_irradiance, "by_light"),
+    "gradient by the light": (light_gradients, scene.cut_irradiance, "by_light"),
+    "gradient by the vertices": (vertex_gradients, scene.cut_irradiance, "by_vertices"),
 }
 
 
@@ -172,12 +160,8 @@ def measure(panel: str, view: View, options: argparse.Namespace) -> list[Row]:
     """A row per contender, marked where no other is as fast and as accurate, and better in one of the two."""
     contenders, irradiance, gradient = PANELS[panel]
     exact, rows, calls = Converged(view, irradiance), [], []
-    defaults = (
-        f"degree {DEGREE}, float32",
-        f"{SAMPLES}² samples, degree {DEGREE}",
-        "operator",
-        f"{ANALYTIC}, rasterized in every step",
-    )
+    defaults = {"operator", f"degree {DEGREE}, float32", f"{ANALYTIC}, rasterized in every step"}
+    defaults |= {f"{SAMPLES}² samples, degree {DEGREE}"}
     for setting, samples, degree, step, call in contenders(view, options.mitsuba):
         row = {"panel": f"{panel}, {view.size}²", "setting": setting, "time_ms": None}
         row |= {"degree": degree, "samples": samples**2, "size": view.size}
@@ -276,7 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's software OpenGL on the one thread, too
     print(machine(options.device))
-    mesh, panels, skipped = ellipsoid(options.subdivisions), [], []
+    mesh, panels, skipped = scene.ellipsoid(options.subdivisions), [], []
     for size in options.sizes:
         view = View(mesh, size, choose(options.rasterizer), options.device)
         panels += [measure(panel, view, options) for panel in PANELS]
