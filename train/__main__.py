@@ -105,7 +105,7 @@ def log_to(path: Path) -> None:
     """Log to the console and to a file, whose folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
-    handlers = [logging.StreamHandler(sys.stdout), file]
+    handlers: list[logging.Handler] = [logging.StreamHandler(sys.stdout), file]
     logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=handlers, force=True)
 
 

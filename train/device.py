@@ -85,9 +85,6 @@ class MixedPrecision(nn.Module):
             return self.network(images).float()
 
 
-# ------------------------------------------------------------------------------------- compiled passes on a GPU
-
-
 @functools.cache
 def compiles(choice: str, device: torch.device) -> bool:
     """Whether to compile.

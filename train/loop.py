@@ -91,8 +91,10 @@ class Trainer:
         self._initial = deepcopy(model.state_dict()) if settings.soup else None
         teacher = deepcopy(model).eval().requires_grad_(False) if settings.distillation else None
         replica = replicated(model)  # may replace layers, so the optimizer comes after it
-        options = {"weight_decay": settings.weight_decay, "nesterov": settings.momentum > 0, "fused": True}
-        self.optimizer = torch.optim.SGD(model.parameters(), settings.learning_rate, settings.momentum, **options)
+        options: dict[str, Any] = {"weight_decay": settings.weight_decay, "nesterov": settings.momentum > 0}
+        self.optimizer = torch.optim.SGD(
+            model.parameters(), settings.learning_rate, settings.momentum, fused=True, **options
+        )
         compiled = compiles(settings.compile, self.device)
         loss = training_loss(replica, settings, service.label, teacher)
         self._loss = compiled_pass(loss) if compiled else loss

@@ -18,8 +18,6 @@ from augment import utils
 BATCH_SYSTEM = getattr(signal, "SIGUSR2", None)  # submitit's, before a job's time is over; Windows has none
 SIGNALS = tuple(filter(None, (signal.SIGTERM, signal.SIGINT, BATCH_SYSTEM)))
 
-# ------------------------------------------------------------------------------------- processes
-
 
 @contextmanager
 def process_group() -> Iterator[None]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -63,9 +64,6 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     return train_and_score
 
 
-# ------------------------------------------------------------------------------------- data
-
-
 def load_data(settings: ExperimentSettings) -> DataSet:
     """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
     data, cache = settings.data, TensorCache(cache_folder(settings.renderer.cache))
@@ -92,9 +90,6 @@ def write_images(settings: ExperimentSettings, size: int) -> None:
         write_held_out(Path(data.images), size, data.seed, TensorCache(cache_folder(settings.renderer.cache)))
 
 
-# ------------------------------------------------------------------------------------- network and renders
-
-
 def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
     """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before."""
     precision = choose_precision(settings.train.precision, device)
@@ -119,7 +114,7 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
         for key, item in objects.items():
             if item.label != OTHER:
                 numbers[item.label] = class_index(data.classes, item.label, f"label of {key}")
-        options = {"scene": settings.scene, "renderer": settings.renderer, "device": device}
+        options: dict[str, Any] = {"scene": settings.scene, "renderer": settings.renderer, "device": device}
         with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
             scene = build_scene(list(objects.values()), data.size, settings.views, **options)
         console.info("rasterizer: %s", scene.rasterizer.description)
@@ -159,9 +154,10 @@ def _photograph_scores(settings: ExperimentSettings, trainer: Trainer, data: Dat
     """The network's metrics on each folder of photographs, as NAME/METRIC; empty without one."""
     scores: dict[str, float | None] = {}
     for name, photographs in settings.evaluate.folders.items() if utils.rank() == 0 else ():
-        inputs = trainer.selected, data.classes, photographs, settings.label
-        options = {"size": data.size, "skip_unreadable": settings.evaluate.skip_unreadable, "device": trainer.device}
-        summary = evaluate_photographs(*inputs, trainer.folder / name, **options)
+        out, skip = trainer.folder / name, settings.evaluate.skip_unreadable
+        summary = evaluate_photographs(
+            trainer.selected, data.classes, photographs, settings.label, out, data.size, skip, device=trainer.device
+        )
         console.info("%s: %s", name, format_summary(summary))
         scores |= {f"{name}/{metric}": find_metric(summary, metric)["value"] for metric in ("top5", *METRICS)}
     return {name: value for name, value in scores.items() if value is not None}
