@@ -206,8 +206,7 @@ class Trainer:
         if log and len(state.renders.labels):
             with self.phases("input_output"):
                 log.renders(state.renders.images, self.epoch)
-        rounds = state.diagnostics
-        diagnostics = {name: fmean(part[name] for part in rounds) for name in rounds[0]}
+        diagnostics = {name: fmean(part[name] for part in state.diagnostics) for name in state.diagnostics[0]}
         seconds = dict.fromkeys(PHASES, 0.0) | self.phases.take()  # one resumed after its last attack has no more
         rate = self.optimizer.param_groups[0]["lr"]
         trained = {"loss": loss_sum / images, "accuracy": hits / images, "learning_rate": rate}
