@@ -50,7 +50,8 @@ def set_deterministic(deterministic: bool) -> None:
     """Whether a GPU's results repeat bit for bit, at some cost in time; a CPU's always do."""
     if deterministic:
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS asks for it
-    torch.use_deterministic_algorithms(deterministic)
+    if deterministic != torch.are_deterministic_algorithms_enabled():  # asking torch imports its compiler: seconds
+        torch.use_deterministic_algorithms(deterministic)
     torch.backends.cudnn.benchmark = not deterministic
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import training
 from train.settings import ExperimentSettings, compose, read_settings
 
 ROOT = Path(__file__).parents[2]
@@ -56,8 +55,9 @@ def test_every_training_is_valid_and_ends_in_tables_of_all_its_runs(tmp_path, co
     assert (status, error) == (0, "")
     if command in ("cpu", "gpu"):
         benchmark, *calls = calls
-        options = training.parser().parse_args(benchmark[2:])
-        assert (options.data, options.device) == (Path("cifar100.npz"), {"cpu": "cpu", "gpu": "cuda"}[command])
+        assert benchmark[:3] == ["-m", "benchmarks.training", "speed"]
+        given = dict(zip(benchmark[3::2], benchmark[4::2], strict=True))
+        assert (given["--data"], given["--device"]) == ("cifar100.npz", {"cpu": "cpu", "gpu": "cuda"}[command])
     trained = [call for call in calls if call[:3] == ["-m", "train", "--multirun"]]
     assert [call[3] for call in trained] == [f"experiment={experiment}" for experiment in trainings]
     for call in trained:
