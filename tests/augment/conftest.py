@@ -32,7 +32,7 @@ def stone() -> Mesh:
     return corners
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_scene(stone) -> Callable[..., Scene]:
     """Three examples of two views each, in light and before backgrounds that nothing clamps. Keywords change that."""
 
@@ -57,7 +57,7 @@ def make_scene(stone) -> Callable[..., Scene]:
     return build
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_linear() -> Callable[..., nn.Module]:
     """A classifier whose logits are linear in the image: random weights (classes, 3·size²), a bias for class 0."""
 
@@ -74,7 +74,7 @@ def make_linear() -> Callable[..., nn.Module]:
     return build
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def by_color() -> augment.Classifier:
     """Orange is red, lime is green, sky is blue, night is dark."""
 
@@ -101,7 +101,7 @@ LOCAL = {
 }
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def attacked(by_color) -> Callable[..., augment.AttackResult]:
     """An attack on parameters by name, or with their steps, of an orange of 80 faces, until the classifier errs.
 

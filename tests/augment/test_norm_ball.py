@@ -35,7 +35,7 @@ def dual_norm(offset: Tensor, name: str) -> Tensor:
 @settings(max_examples=60, deadline=None)
 def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radius):
     """p is nearest to v exactly when it lies in the ball and (v - p)·(q - p) ≤ 0 for all of its points q; the largest
-    of these products is (v - p)·(c - p) + radius × the dual norm of v - p."""
+    of these products is (v - p)·(c - p) + radius × the dual norm of v - p. Points of the ball stay to the bit."""
     values, center = torch.from_numpy(pair).to(dtype)
     nearest = StepSettings(name, radius).project(values, center)
     assert nearest.dtype == dtype
@@ -44,15 +44,6 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
     assert (norm(inward, name) <= radius + rounding).all()
     products = (moved * inward).sum(1) + radius * dual_norm(moved, name)
     assert (products <= rounding * (1 + dual_norm(moved, name))).all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("name", NORMS)
-@given(pair=arrays(np.float64, (2, 4, 6), elements=COORDINATES), radius=RADII)
-@settings(max_examples=60, deadline=None)
-def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
-    values, center = torch.from_numpy(pair).to(dtype)
-    nearest = StepSettings(name, radius).project(values, center)
     inside = norm((values - center).double(), name) <= radius * (1 - 1e-6)  # clear of the rounding at the surface
     assert torch.equal(nearest[inside], values[inside])
     assert torch.equal(StepSettings(name, 0.0).project(values, center), center)
@@ -66,7 +57,7 @@ def test_points_of_the_ball_stay_to_the_bit(name, dtype, pair, radius):
     ends=arrays(np.float64, (2, 3), elements=st.one_of(st.floats(0, 2), st.just(np.inf))),
     radius=st.floats(0.01, 4),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_within_a_box_the_projection_is_the_nearest_point_of_what_it_shares_with_the_ball(
     name, dtype, pair, ends, radius
 ):
@@ -118,15 +109,6 @@ def test_draws_are_uniform_in_the_ball(name, dimensions):
     products = offset.T @ offset / DRAWS
     # The variance of a product or a square of two coordinates is at most 2 × variance².
     assert (products - variance * torch.eye(dimensions)).abs().max() < 5 * variance * math.sqrt(2 / DRAWS)
-
-
-@pytest.mark.parametrize("name", NORMS)
-def test_draws_repeat_with_the_generator_and_leave_the_global_one(name):
-    center, state = torch.zeros(5, 9), torch.random.get_rng_state()
-    first, again = (StepSettings(name, 1.0).sample(center, torch.Generator().manual_seed(3)) for _ in range(2))
-    assert torch.equal(first, again) and len(first.unique(dim=0)) == 5
-    assert torch.equal(torch.random.get_rng_state(), state)
-    assert torch.equal(StepSettings(name, 0.0).sample(center, torch.Generator()), center)
 
 
 @pytest.mark.parametrize(("scale", "tolerance"), [(1.0, EPS), (1e30, EPS), (1e-30, EPS), (1e-40, 1e-4)])

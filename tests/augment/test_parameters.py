@@ -174,16 +174,6 @@ def test_one_step_of_the_radius_along_the_sign_is_fgsm(make_scene, make_linear, 
     assert ((images - before).abs() > 0.99 * epsilon).double().mean() > 0.4
 
 
-@pytest.mark.parametrize(("steps", "reach"), [(2, 0.02), (9, 0.03)])
-def test_iterated_steps_on_pixels_stop_at_the_radius(make_scene, make_linear, steps, reach):
-    scene = make_scene(backgrounds=torch.ones(3, 3, 6, 6))
-    model, before = make_linear(2, bias=50.0), scene.render(scene.conditions(EVERY), EVERY)
-    problem = problem_of(scene, pixels=StepSettings("linf", 0.03, "sign", 0.01))
-    images = attack(model, problem, towards(problem), steps).images
-    downhill = (model[1].weight[1] - model[1].weight[0]).detach().sign().view(3, 6, 6)
-    torch.testing.assert_close(images, (before + reach * downhill).clamp(0, 1), rtol=0, atol=4 * EPS)
-
-
 def test_a_random_start_makes_it_projected_gradient_descent_within_the_same_ball(make_scene, make_linear):
     """Every restart ends in the corner that lies downhill of the middle, not of where it began."""
     scene = make_scene()
@@ -251,7 +241,7 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
         values=st.tuples(FINITE, FINITE, FINITE),
         radius=st.one_of(st.none(), st.floats(0, 4)),
     )
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=30, deadline=None)
     def check(start: tuple, values: tuple, radius: float | None):
         sky = PARAMETERS["skylight"](scene, sky_at(start, norm=norm, radius=radius))
         problem = AttackProblem(scene, [sky])
@@ -339,21 +329,6 @@ def test_the_light_of_the_lowest_cost_of_a_linear_classifier_is_reached(
     if target is not None:  # then the cost is the margin itself
         lowest = result.cost_before.double() - radius * reach
         torch.testing.assert_close(result.cost.double(), lowest, rtol=0, atol=4 * 50 * eps)
-
-
-@pytest.mark.parametrize("name", ["lighting", "skylight", "geometry", "albedo"])
-def test_views_that_share_what_is_attacked_add_their_gradients(make_scene, make_linear, name):
-    """A raw step with two views is the sum of the steps with either: of one light, sky, shape or paint."""
-
-    def moved(cameras: list) -> Tensor:
-        scene = make_scene(cameras=[cameras], backgrounds=torch.full((1, 3, 6, 6), 0.5))
-        problem = problem_of(scene, **{name: replace(free(name)[name], step="raw")})
-        result = attack(make_linear(5, bias=50.0), problem, towards(problem), steps=1)
-        return result.values - problem.start
-
-    both, front, side = moved([FRONT, SIDE]), moved([FRONT]), moved([SIDE])
-    assert (front != 0).any() and (side != 0).any()
-    torch.testing.assert_close(both, front + side, rtol=0, atol=64 * EPS)
 
 
 def test_a_deep_optical_illusion_shows_each_view_another_class(make_scene, make_linear):

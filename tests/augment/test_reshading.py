@@ -109,21 +109,6 @@ def test_colors_at_their_bounds_keep_their_gradient(make_scene, stone):
     torch.testing.assert_close(sums[2], sums[1], rtol=0, atol=ROUNDING)
 
 
-def test_a_camera_is_rasterized_once_and_moved_vertices_once_per_view(make_scene, rasterized):
-    """Three cameras in six views of three examples."""
-    scene = make_scene()
-    for _ in range(3):
-        scene.render(Conditions(own_lights(scene)), EVERY)
-    assert rasterized == [3]
-    for _ in range(3):
-        scene.render(replace(scene.conditions(EVERY), albedo=torch.zeros(3, 20, 3).double()), EVERY)
-    assert rasterized == [3] + [1] * 3
-    moved = replace(scene.conditions(EVERY[:2]), vertices=scene.vertices.expand(2, -1, -1))
-    for calls in (7, 11):
-        scene.render(moved, EVERY[:2])
-        assert rasterized == [3] + [1] * calls
-
-
 def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(make_scene, stone):
     scene = make_scene(mesh=replace(stone, vertices=stone.vertices + 10))
     for part, value in (

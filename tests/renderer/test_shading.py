@@ -22,7 +22,6 @@ from renderer.light.harmonics import MAX_DEGREE, nonzero_coefficients
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.shading import irradiance, radiance
-from renderer.transfer import build_operators
 
 EPS = torch.finfo(torch.float64).eps
 RASTERIZER = choose("numpy")
@@ -152,10 +151,9 @@ def slope(function, inputs, steps, length: float = 1e-5) -> torch.Tensor:
 
 @all_scenes
 @flat_and_smooth
-@pytest.mark.parametrize("encoding", ["linear", "srgb"])
-def test_derivatives_of_images_are_central_differences(scene, smooth, encoding):
+def test_derivatives_of_images_are_central_differences(scene, smooth):
     """By vertices, light and texels each alone, and by all of them at once."""
-    image = Image(scene, encoding, smooth)
+    image = Image(scene, "srgb" if smooth else "linear", smooth)
     inputs = image.inputs()
     upstream = draw(3, scene.size**2, seed=2)
     gradients = torch.autograd.grad(image(*inputs), inputs, upstream)
@@ -194,20 +192,6 @@ def test_gradients_are_exactly_zero_where_nothing_is_visible_or_clamped(scene, s
     for upstream in (background, at_an_end):
         gradients = torch.autograd.grad(values, inputs, upstream.double(), retain_graph=True)
         assert not any(gradient.any() for gradient in gradients)
-
-
-@all_scenes
-@flat_and_smooth
-def test_radiance_and_its_light_gradient_are_those_of_an_operator(scene, smooth):
-    settings = ImageSettings(scene.size, scene.samples, normals="smooth" if smooth else "flat")
-    [operator] = build_operators(scene.mesh, [scene.camera], settings, RASTERIZER, dtype=torch.float64)
-    light, albedo = draw(49, 3).requires_grad_(), surface_albedo(scene.mesh, scene.fragments, "linear").double()
-    lit = radiance(scene.fragments, scene.vertices(), light, albedo, scene.all_faces(smooth))
-    torch.testing.assert_close(lit, operator.radiance(light), rtol=0, atol=100 * EPS)
-    upstream = draw(*lit.shape, seed=1)
-    (by_light,) = torch.autograd.grad(lit, light, upstream)
-    expected = operator.light_gradient(upstream)
-    torch.testing.assert_close(by_light, expected, rtol=0, atol=64 * EPS * float(expected.abs().max()))
 
 
 def test_smooth_radiance_on_an_octahedron_is_that_of_the_direction_to_the_surface():

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,11 +51,16 @@ def adversary_of(done: augment.AttackResult) -> Adversary:
     return Adversary.of(done.problem.scene, 0, done.conditions, done.images_before[0], done.images[0])
 
 
-@pytest.mark.parametrize("encoding", ["linear", "srgb"])
 @pytest.mark.parametrize(
-    "kinds",
-    [{"lighting"}, {"geometry"}, {"albedo"}, {"pixels"}, set(PARAMETERS) - OTHER_LIGHTS],
-    ids=lambda kinds: "+".join(sorted(kinds)),
+    ("kinds", "encoding"),
+    [
+        ({"lighting"}, "linear"),
+        ({"geometry"}, "srgb"),
+        ({"albedo"}, "linear"),
+        ({"albedo"}, "srgb"),
+        (set(PARAMETERS) - OTHER_LIGHTS, "srgb"),
+    ],
+    ids=lambda value: "+".join(sorted(value)) if isinstance(value, set) else value,
 )
 def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, kinds, encoding):
     """And exactly but for rounding to float32 where no texture is painted."""
@@ -112,11 +118,12 @@ def test_exposure_albedo_scale_background_and_camera_are_kept(tmp_path, fov):
     torch.testing.assert_close(found.render(SOFTWARE), done.images[0], rtol=0, atol=1e-5)
 
 
-@pytest.fixture
-def folder(tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def undamaged(tmp_path_factory) -> Path:
     scene = augment.build_scene([("solid:orange", "orange")], 8, rasterizer="numpy")
-    write_adversary(adversary_of(attacked({"pixels"}, scene)), tmp_path)
-    return tmp_path
+    folder = tmp_path_factory.mktemp("adversary")
+    write_adversary(adversary_of(attacked({"pixels"}, scene)), folder)
+    return folder
 
 
 def described(**changes):
@@ -161,7 +168,8 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize(("damage", "message"), DAMAGES.values(), ids=DAMAGES)
-def test_a_damaged_folder_is_refused_in_one_sentence(folder, damage, message):
+def test_a_damaged_folder_is_refused_in_one_sentence(undamaged, tmp_path, damage, message):
+    folder = shutil.copytree(undamaged, tmp_path / "damaged")
     damage(folder)
     with pytest.raises(InputError, match=message) as refused:
         reload(folder)

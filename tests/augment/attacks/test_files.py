@@ -25,7 +25,7 @@ CLASSES = ("orange", "lime", "sky", "night")
 # ------------------------------------------------------------------------------------- numbers
 
 
-def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, tmp_path):
+def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, by_color, tmp_path):
     result = attacked("lighting", {"backgrounds": [0.4, 0.6]}, target="lime", max_steps=2)
     checks = augment.check(result)
     augment.save(result, tmp_path, checks)
@@ -42,17 +42,12 @@ def test_each_example_has_a_line_and_a_last_one_holds_the_checks(attacked, tmp_p
         assert line["clean_correct"] is (line["predicted_before"] == ["orange"])
         change = (result.descent.values[example] - result.problem.start[example]).abs().max().item()
         assert line["largest_change"] == {"lighting": change} and change > 0
-
-
-def test_every_line_has_the_predictions_of_every_version(attacked, by_color, tmp_path):
-    result = attacked("lighting", {"backgrounds": [0.4, 0.6]}, max_steps=2)
-    for example, line in enumerate(augment.save(result, tmp_path)):
         assert set(line["versions"]) == {"float", "8 bits", "JPEG 90", "reload"}
         rounded = (result.images[example] * 255).round() / 255
         predicted = CLASSES[by_color(rounded)[0].argmax()]
         differences = (rounded - result.images[example]).abs()
         assert line["versions"]["8 bits"] == {
-            "success": predicted != "orange",
+            "success": predicted == "lime",
             "predicted": [predicted],
             "confidence": [pytest.approx(by_color(rounded).softmax(1).max().item(), abs=1e-5)],
             "largest_difference": pytest.approx(differences.max().item(), abs=1e-7),
@@ -109,7 +104,7 @@ def test_the_meshs_file_has_the_normals_that_the_renderer_shades_with_and_the_vi
 # ------------------------------------------------------------------------------------- figure
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def result(attacked) -> AttackResult:
     """Two views, which share one light that is not attacked."""
     return attacked("geometry", {"views": 2, "shared": True}, force=True, max_steps=1)
@@ -129,10 +124,19 @@ def found(sheet: np.ndarray, image: torch.Tensor) -> list[tuple[int, int]]:
     """(row, column) of everywhere that an image (3, H, W), enlarged to at least SIDE, stands on the sheet."""
     pixels = (image * 255).round().byte().permute(1, 2, 0).numpy()
     scale = -(-SIDE // pixels.shape[1])
-    pixels = pixels.repeat(scale, axis=0).repeat(scale, axis=1)
-    height, width = pixels.shape[:2]
-    starts = np.argwhere((sheet[: 1 - height or None, : 1 - width or None] == pixels[0, 0]).all(axis=2))
-    return [(y, x) for y, x in starts.tolist() if np.array_equal(sheet[y : y + height, x : x + width], pixels)]
+    return positions(sheet, pixels.repeat(scale, axis=0).repeat(scale, axis=1))
+
+
+def positions(sheet: np.ndarray, part: np.ndarray) -> list[tuple[int, int]]:
+    """(row, column) of everywhere that a part (H, W, 3) stands on the sheet. Few windows have its diagonal."""
+    height, width, _ = part.shape
+    corners = sheet[: len(sheet) - height + 1, : sheet.shape[1] - width + 1]
+    rows, columns = np.nonzero((corners == part[0, 0]).all(axis=2))
+    for at in range(1, min(height, width)):
+        same = (sheet[rows + at, columns + at] == part[at, at]).all(axis=1)
+        rows, columns = rows[same], columns[same]
+    candidates = zip(rows.tolist(), columns.tolist(), strict=True)
+    return [(y, x) for y, x in candidates if np.array_equal(sheet[y : y + height, x : x + width], part)]
 
 
 @pytest.mark.parametrize("size", [32, 200])
@@ -156,7 +160,7 @@ def test_the_difference_is_gray_where_there_is_none_and_reaches_white_or_black(r
     sheet = drawn(replace(result, images_before=before, images=after))
     assert [column for image in expected for _, column in found(sheet, image / 255)] == [MARGIN + 2 * (SIDE + GAP)] * 2
     for text, color in (("largest 0.200", INK), ("largest 0.100", INK), ("shown 5 times", FAINT)):
-        assert contains(sheet, written(text, color))
+        assert positions(sheet, written(text, color))
 
 
 def written(text: str, color: str) -> np.ndarray:
@@ -168,16 +172,11 @@ def written(text: str, color: str) -> np.ndarray:
     return pixels[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
 
 
-def contains(sheet: np.ndarray, part: np.ndarray) -> bool:
-    windows = np.lib.stride_tricks.sliding_window_view(sheet, part.shape)[..., 0, :, :, :]
-    return bool((windows == part).all(axis=(-3, -2, -1)).any())
-
-
 def test_captions_are_the_predicted_class_and_the_right_one_where_it_is_another(result):
     logits = torch.tensor([[[0.123, 0.0004, 0.8766, 1e-6], [0.85, 0.1, 0.05, 1e-6]]]).log()
     below = drawn(replace(result, logits=logits))[MARGIN + TITLE_HEIGHT + SIDE :]
     for text, color in (("87.7% sky", INK), ("12.3% orange", FAINT), ("85.0% orange", INK)):
-        assert contains(below, written(text, color))
+        assert positions(below, written(text, color))
 
 
 def test_the_light_is_shown_where_the_attack_has_changed_it(attacked, result):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attacks.search import FOV, LIGHT_GRAY, _candidates, find_scene
+from augment.attacks.search import LIGHT_GRAY, _candidates, find_scene
 from augment.build import SceneSettings
 from augment.utils import generator
 
@@ -65,14 +65,6 @@ def test_cameras_of_a_wide_lens_are_drawn_from_where_all_of_the_mesh_lies_before
     assert len(drawn) == 49 and {candidate.fov for candidate in drawn} == {90}
     widths = [candidate.width for candidate in drawn]
     assert min(widths) >= 4 and max(widths) > 7
-
-
-def test_every_other_camera_has_perspective_and_a_gray_gives_way_to_a_light_one():
-    settings = SceneSettings()
-    first, lighter, *drawn = _candidates(settings, 5, torch.Generator().manual_seed(0))
-    assert first == settings and lighter == replace(settings, backgrounds=[LIGHT_GRAY])
-    assert [candidate.fov for candidate in drawn] == [FOV, FOV, None, None] * 2
-    assert [candidate.backgrounds for candidate in drawn] == [[0.5], [LIGHT_GRAY]] * 4
 
 
 def test_what_is_classified_correctly_before_light_gray_alone_is_found_there():

@@ -30,7 +30,7 @@ FAR = 2**24 - 1  # depth is a 24-bit key
 COMPILED = pytest.param("numba", marks=needs_numba)
 
 
-@pytest.fixture(params=["numpy", COMPILED, pytest.param("opengl", marks=needs_egl)])
+@pytest.fixture(scope="module", params=["numpy", COMPILED, pytest.param("opengl", marks=needs_egl)])
 def rasterizer(request) -> Rasterizer:
     return choose(request.param)
 
@@ -108,7 +108,7 @@ def reference(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bo
 @st.composite
 def scenes(draw) -> tuple[np.ndarray, np.ndarray, int]:
     """Few corners for many faces: shared edges, duplicates, no area, slivers; tiny, huge and off-screen faces."""
-    resolution = draw(st.sampled_from([1, 2, 7, 33]))
+    resolution = draw(st.sampled_from([1, 2, 7, 21]))
     center_or_border = st.integers(-resolution, 3 * resolution).map(lambda index: index / resolution - 1)
     a_little_off = st.integers(-3, 3).map(lambda steps: steps * SNAP / resolution)
     far_away = st.sampled_from([-1e300, -1e4, -20.0, 20.0, 1e4, 1e300])
@@ -168,25 +168,26 @@ def test_points_that_are_not_finite_are_refused(rasterizer, value):
         rasterizer.rasterize(points, faces, 4)
 
 
-on_the_cpu = pytest.mark.parametrize("name", ["numpy", COMPILED])
+ON_THE_CPU = ("numpy", "numba") if find_spec("numba") else ("numpy",)
 
 
-@on_the_cpu
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(scene=scenes(), closed=st.booleans())
-def test_the_cpu_equals_the_reference_on_any_triangles(name, scene, closed):
+def test_the_cpu_equals_the_reference_on_any_triangles(scene, closed):
     points, faces, resolution = scene
-    ids = Rasterizer(name, "").rasterize(points, faces, resolution, closed)
-    np.testing.assert_array_equal(ids[0], reference(points[0], faces, resolution, closed))
+    expected = reference(points[0], faces, resolution, closed)
+    for name in ON_THE_CPU:
+        ids = Rasterizer(name, "").rasterize(points, faces, resolution, closed)
+        np.testing.assert_array_equal(ids[0], expected)
 
 
-@on_the_cpu
-def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides(name):
+def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides():
     """Huge faces, whose edge functions have more than 53 bits, at a depth halfway between two keys."""
     points, faces = random_triangles(seed=5, count=40, reach=1e5, depth=0)
     faces = np.concatenate([faces, np.roll(faces, 1, axis=1)[::-1]])
-    ids = choose(name).rasterize(points, faces, 16)
-    np.testing.assert_array_equal(ids[0], reference(points[0], faces, 16, closed=False))
+    expected = reference(points[0], faces, 16, closed=False)
+    for name in ON_THE_CPU:
+        np.testing.assert_array_equal(choose(name).rasterize(points, faces, 16)[0], expected)
 
 
 @needs_numba
@@ -236,12 +237,11 @@ def test_opengl_and_numpy_agree_on_any_triangles(seed, count, resolution, lattic
 
 
 @needs_egl
-def test_torch_optimizers_work_after_opengl():
-    """They load Triton, whose LLVM must not meet Mesa's already there; in a process of its own, since that crashes."""
-    script = (
-        "from renderer import rasterizer; import torch; rasterizer.choose('opengl'); "
-        "torch.optim.SGD([torch.zeros(1, requires_grad=True)])"
-    )
+@pytest.mark.skipif(find_spec("triton") is None, reason="Triton is not installed")
+def test_triton_can_be_loaded_after_opengl():
+    """As by torch's optimizers. Its LLVM must not meet Mesa's already there: in a process of its own, which would
+    crash."""
+    script = "from renderer import rasterizer; rasterizer.choose('opengl'); import triton"
     subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[3])
 
 
