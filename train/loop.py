@@ -286,7 +286,7 @@ class Trainer:
         """Go on from the folder's newest whole checkpoint; InputError where it does not belong to this run."""
         state, problem = checkpoint.load_newest(self.folder)
         try:
-            if state["architecture"] != self.architecture:
+            if self.architecture | state["architecture"] != self.architecture:
                 raise ValueError("it has another architecture or other classes")
             self.load_state_dict(state)
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:

@@ -207,7 +207,9 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
     if weights is not None:
         raise InputError(f"weights={weights} is not for classifier=run:{run}, which has its own: leave it out")
     path, state = load_selected(Path(run))
-    shape = {key: value for key, value in state["architecture"].items() if key not in ("version", "encoding")}
+    shape = {
+        key: value for key, value in state["architecture"].items() if key not in ("version", "encoding", "validation")
+    }
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         raise InputError(

@@ -16,10 +16,10 @@ from renderer.cache import TensorCache, cache_folder
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE
 from train import checkpoint, console
-from train.data import DataSet, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
+from train.data import DataSet, Split, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
 from train.device import MixedPrecision, choose_device, choose_precision, set_deterministic, set_threads
 from train.loop import Trainer, evaluate
-from train.networks import build_network, describe, start_from
+from train.networks import build_network, describe, load_selected, start_from
 from train.photographs.folder import find_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
 from train.photographs.scoring import evaluate_photographs, format_summary
@@ -27,6 +27,8 @@ from train.processes import first_process_first
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, keyed
+
+VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
 
 
 def run(settings: ExperimentSettings, data: DataSet, folder: Path, command: str = "") -> dict[str, float]:
@@ -45,8 +47,9 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     device = choose_device(settings.train.device)
     set_threads(settings.train.threads)
     set_deterministic(settings.train.deterministic)
-    train, validation = stratified_split(data.train, settings.data.validation, seed=0)
-    trainer = build_trainer(settings, data, folder, device)
+    fraction, left_out = _validation(settings, data.train)
+    train, validation = stratified_split(data.train, fraction, seed=0)
+    trainer = build_trainer(settings, data, folder, device, left_out)
     _open_folder(trainer, settings, command)
 
     def train_and_score() -> dict[str, float]:
@@ -90,8 +93,39 @@ def write_images(settings: ExperimentSettings, size: int) -> None:
         write_held_out(Path(data.images), size, data.seed, TensorCache(cache_folder(settings.renderer.cache)))
 
 
-def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, device: torch.device) -> Trainer:
-    """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before."""
+def _validation(settings: ExperimentSettings, split: Split) -> tuple[float, dict[str, Any] | None]:
+    """The fraction of the training images to validate on, and what to store as the part that no weight learned from:
+    its fraction and seed, and a hash of the images. None where train.init_from does not know its own of these images.
+
+    Of one seed, a smaller part lies within a larger one. So a network's part is the smallest along its ancestors.
+    """
+    asked, base = settings.data.validation, settings.train.init_from
+    fraction = VALIDATION if asked is None else asked
+    own = {"fraction": fraction, "seed": 0, "images": checkpoint.content_hash([split.images, split.labels])}
+    if not base:
+        return fraction, own
+    stored = load_selected(Path(base))[1]["architecture"].get("validation")
+    known = stored.get("fraction") if isinstance(stored, dict) else None
+    if not isinstance(known, float) or own | {"fraction": known} != stored:
+        console.info("validation: %s does not say which of these images it learned from; perhaps these, too", base)
+        return fraction, None
+    fraction = known if asked is None else asked
+    if fraction > known:
+        console.info("validation: %s learned from part of it, having left out only data.validation=%s", base, known)
+    return fraction, own | {"fraction": min(fraction, known)}
+
+
+def build_trainer(
+    settings: ExperimentSettings,
+    data: DataSet,
+    folder: Path,
+    device: torch.device,
+    left_out: dict[str, Any] | None = None,
+) -> Trainer:
+    """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before.
+
+    left_out: the training images that validate it, to be stored with its architecture.
+    """
     precision = choose_precision(settings.train.precision, device)
     (mean, std), shape = channel_statistics(data.train.images), settings.model.shape
     torch.manual_seed(stream_seed(settings.seed, "weights"))
@@ -101,7 +135,7 @@ def build_trainer(settings: ExperimentSettings, data: DataSet, folder: Path, dev
         start_from(network, facts, Path(settings.train.init_from))
     service = build_service(settings, data, device)
     model = MixedPrecision(network.to(device), precision)
-    return Trainer(settings.train, model, describe(network, **facts), service, folder)
+    return Trainer(settings.train, model, describe(network, **facts, validation=left_out), service, folder)
 
 
 def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:

@@ -43,7 +43,7 @@ class DataSettings:
     """What the choices of conf/data set between them; see the loader of each."""
 
     name: str = "shapes"
-    validation: float = 0.1
+    validation: float | None = None
     path: str = ""
     size: int = 32
     test_fraction: float = 0.1

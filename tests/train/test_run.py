@@ -268,3 +268,28 @@ def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_th
     logits = network(data.test.images / 255)
     assert scores["test/accuracy"] == pytest.approx((logits.argmax(1) == data.test.labels).double().mean().item())
     assert network.classes == ("apple", "orange", "pear") and network.size == 16
+
+
+def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(tiny, finished, tmp_path, caplog):
+    """Of 20 images per class a tenth, which lies within a fifth, is left out by its base, and so by all after it."""
+    caplog.set_level("INFO", "train")
+    architecture = checkpoint.load(finished / checkpoint.BEST)["architecture"]
+    unknown = tmp_path / "unknown" / checkpoint.BEST
+    unknown.parent.mkdir()
+    weights = checkpoint.load(finished / checkpoint.BEST)
+    checkpoint.save(unknown, weights | {"architecture": {**architecture, "validation": None}})
+    base = tiny("train.epochs=1", "data.validation=0.05")
+    train(base, tmp_path / "base")
+    for name, init, asked, images, left_out, warned in [
+        ("as its base", tmp_path / "base", "null", 3, 0.05, False),
+        ("less", finished, "0.05", 3, 0.05, False),
+        ("more", tmp_path / "base", "0.2", 12, 0.05, True),
+        ("unknown", unknown.parent, "null", 6, None, True),
+    ]:
+        caplog.clear()
+        train(tiny("train.epochs=1", f"train.init_from={init}", f"data.validation={asked}"), tmp_path / name)
+        state = checkpoint.load(tmp_path / name / checkpoint.BEST)["architecture"]["validation"]
+        assert (state and state["fraction"]) == left_out
+        assert f"{60 - images} images, 3 classes" in caplog.text
+        assert sum(line.startswith("validation: ") for line in caplog.messages) == warned
+    assert load_run(tmp_path / "unknown").classes == ("apple", "orange", "pear")
