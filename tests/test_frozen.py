@@ -199,8 +199,10 @@ def test_weights_of_a_stopped_and_resumed_run(trained, call, monkeypatch, tmp_pa
 
 
 @pytest.fixture
-def trained(call, tmp_path_factory) -> Callable[[str], Path]:
+def trained(call, monkeypatch, tmp_path_factory) -> Callable[[str], Path]:
     """The folder of one of RUNS, which is made when a first test asks for it."""
+
+    monkeypatch.setattr("train.report.page.report_of", lambda folders, out: "no report")
 
     def run(name: str) -> Path:
         if name not in FOLDERS:

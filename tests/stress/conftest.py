@@ -79,10 +79,11 @@ def write_scene_files(folder: Path) -> None:
 
 
 def run_here(name: str, *arguments: str, folder: Path) -> int:
-    """`python -m train` or `python scripts/NAME.py` within this process, in a folder: the exit status."""
+    """`python -m train`, without its report, or `python scripts/NAME.py` in this process, in a folder: the status."""
     path = ROOT / "train" / "__main__.py" if name == "train" else ROOT / "scripts" / f"{name}.py"
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(sys, "argv", [str(path), *arguments])
+        patch.setattr("train.report.page.report_of", lambda folders, out: "no report")
         try:
             runpy.run_path(str(path), run_name="__main__")
         except SystemExit as stop:

@@ -2,6 +2,8 @@
 
 import json
 from collections.abc import Callable
+from copy import deepcopy
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -57,10 +59,11 @@ def photos(tmp_path_factory) -> Path:
 def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
     """The settings of the real configuration, small; arguments are further overrides."""
 
+    @cache  # composing takes half a second
     def read(*overrides: str) -> ExperimentSettings:
         return read_settings(ExperimentSettings, compose("train", [*TINY, f"data.path={tiny_npz}", *overrides]))
 
-    return read
+    return lambda *overrides: deepcopy(read(*overrides))
 
 
 @pytest.fixture(scope="session")

@@ -61,7 +61,7 @@ def test_a_class_whose_name_is_a_number_is_a_target():
     assert result.goal.target.tolist() == [[1]]
 
 
-def test_a_scene_is_searched_for_and_told_as_overrides():
+def test_a_scene_is_searched_for_and_given_as_overrides():
     """Of a classifier that knows oranges before light gray alone."""
 
     def before_light(images: Tensor) -> Tensor:

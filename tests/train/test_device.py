@@ -102,7 +102,7 @@ def linear() -> torch.nn.Module:
 
 
 @pytest.mark.parametrize("works", [True, False])
-def test_one_gpu_compiles_where_it_can_unless_told(monkeypatch, caplog, works):
+def test_one_gpu_compiles_where_it_can_unless_disabled(monkeypatch, caplog, works):
     def no_compiler(images):
         raise RuntimeError("Failed to find C compiler.")
 

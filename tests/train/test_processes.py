@@ -73,7 +73,8 @@ def runs(tiny, tmp_path_factory) -> Path:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    multiprocessing.set_forkserver_preload([__name__, "torch.utils.tensorboard", "torchvision.utils"])  # once for both
+    once_for_both = [__name__, "torch._dynamo", "torch.utils.tensorboard", "torchvision.utils"]
+    multiprocessing.set_forkserver_preload(once_for_both)
     multiprocessing.start_processes(one_of_two, (port, folder), nprocs=2, start_method="forkserver")
     state = checkpoint.load(folder / "mixed" / checkpoint.LAST)
     assert (state["epoch"], state["under_way"]["step"]) == (1, 2)

@@ -79,7 +79,7 @@ def test_a_signal_ends_the_run_after_its_step_and_resuming_ends_as_if_it_had_not
     train(settings, tmp_path / "whole")
     folder = tmp_path / "stopped"
     handlers = [signal.getsignal(name) for name in (signal.SIGTERM, signal.SIGINT)]
-    for round_number, step, done in [(1, 2, (0, 4)), (2, 1, (1, None)), (4, 1, (1, 3)), (6, 2, (2, 2))]:
+    for round_number, step, done in [(1, 2, (0, 4)), (2, 1, (1, None)), (4, 1, (1, 3))]:
         with pytest.raises(Interrupted) as stopped:
             train_with_signal(settings, folder, round_number, step, number)
         assert (stopped.value.code, stopped.value.signal) == (128 + number, number.name)
@@ -160,9 +160,6 @@ def test_a_full_disk_is_one_error_wherever_it_is_met_and_the_run_can_go_on(tiny,
     assert one_sentence(full.value).endswith(" cannot be written (No space left on device): make room and start again")
     train(settings, tmp_path)
     assert len(read_metrics(tmp_path)) == 2
-
-
-# ---------------------------------------------------------------------------------------- rounds and starts
 
 
 # ---------------------------------------------------------------------------------------- arms

@@ -19,6 +19,12 @@ from train.tables import fraction
 from .conftest import FRUIT, FRUIT_CLASSES
 
 
+@pytest.fixture(autouse=True)
+def no_figure(monkeypatch) -> None:
+    """roc.png is drawn for the one test that opens it."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_: None)
+
+
 def score(rows: list[tuple[str, str]]) -> dict[str, object]:
     """The metrics of photographs from their names and their classes in order, by counting and by comparing all pairs.
 
@@ -218,7 +224,8 @@ def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both
         assert curve == sorted(curve, key=lambda point: -point[2]) and curve[-1][2] == -np.inf
 
 
-def test_a_folder_without_negatives_has_an_empty_table_and_figure(known_model, tmp_path):
+def test_a_folder_without_negatives_has_an_empty_table_and_figure(known_model, tmp_path, monkeypatch):
+    monkeypatch.undo()
     evaluate_photographs(*known_model(["a.png"], [[1, 0]], ["orange", "pear"]), "orange", tmp_path)
     assert (tmp_path / "roc.csv").read_text() == "source,false_positive_rate,recall,threshold\n"
     with Image.open(tmp_path / "roc.png") as image:

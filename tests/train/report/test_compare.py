@@ -23,8 +23,10 @@ def prediction(index: int, label: str, source: str | None, score: float) -> Pred
 
 
 @pytest.fixture
-def scored_run(tmp_path, made_up_run):
+def scored_run(tmp_path, made_up_run, monkeypatch):
     """Makes a finished run with scores: by source, those of oranges and of other things."""
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **options: None)  # no test looks at figures
 
     def make(arm: str, scores: dict[str | None, tuple], *overrides: str, name: str = "photographs") -> Path:
         kinds = [
