@@ -6,11 +6,13 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from ipaddress import ip_address
 from pathlib import Path
 
 import pytest
 import torch
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 
 from renderer.rasterizer import Rasterizer
 
@@ -40,6 +42,22 @@ def cache_home(tmp_path_factory) -> Iterator[None]:
     """Not the user's; commands that tests start inherit it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("caches")))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def parsed_once() -> Iterator[None]:
+    """Hydra parses each file of conf/ once, and not again at every composition."""
+    load, configs = ImportlibResourcesConfigSource.load_config, {}
+
+    def load_once(self, config_path):
+        key = self.path, config_path
+        if key not in configs:
+            configs[key] = load(self, config_path)
+        return deepcopy(configs[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ImportlibResourcesConfigSource, "load_config", load_once)
         yield
 
 

@@ -70,8 +70,6 @@ QUICK, MANY = 8, 100  # examples; a command takes longer: a fifth of them
 SLOW_COMMANDS = [file for file in COMMANDS if COMMANDS[file] == RESUME]  # they train
 
 
-# ---------------------------------------------------------------------------------------- damages at random
-
 NUMBER = re.compile(rb"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 TOKENS = (b"nan", b"inf", b"-1", b"0", b"1e300", b"1e-300", b"9" * 19, b"9" * 400, b"word", b"[]", b"null", b"")
 OTHER = (b"", np.random.default_rng(0).bytes(1000), b"<html>404</html>\n", b"[" * 10**5, b"1", b"[]", b"{}")
@@ -141,9 +139,6 @@ def damages(file: str, good: bytes) -> st.SearchStrategy[bytes]:
     if file.endswith(".npz"):
         return bytes_changed(good) | arrays_changed(good)
     return bytes_changed(good) | checkpoint_changed(good) if file.endswith(".pt") else bytes_changed(good)
-
-
-# ---------------------------------------------------------------------------------------- reading
 
 
 @pytest.fixture(autouse=True)
@@ -224,9 +219,6 @@ def test_a_damaged_file_is_used_or_refused_in_one_sentence_that_names_it(corpus,
         outcome(file, lambda path: path.write_bytes(content))
 
     used_or_refused()
-
-
-# ---------------------------------------------------------------------------------------- forgeries
 
 
 def pickled_code(path: Path) -> None:
@@ -331,8 +323,8 @@ def test_what_is_no_file_is_refused(outcome, file, instead):
 
 
 def test_renders_beyond_the_memory_are_refused_before_any_is_made(data, capfd, tmp_path, monkeypatch):
-    monkeypatch.setattr(utils, "_free", lambda device: 2**30)
-    settings = [word.replace("examples=4", "examples=200000") for word in TRAINING]
+    monkeypatch.setattr(utils, "_free", lambda device: 10**8)
+    settings = [word.replace("examples=4", "examples=20000") for word in TRAINING]
     assert run_here("train", f"run={tmp_path}/run", *settings, folder=data) == 2
     errors = capfd.readouterr().err
-    assert re.fullmatch(r"error: scene: 200000 renders of 16 pixels per side .* and 1\.0 GB are free: .*\n", errors)
+    assert re.fullmatch(r"error: scene: 20000 renders of 16 pixels per side .* and 0\.1 GB are free: .*\n", errors)

@@ -76,9 +76,6 @@ def test_a_scene_is_searched_for_and_given_as_overrides():
         attacked("scene.search=0", classifier=classifier)
 
 
-# ------------------------------------------------------------------------------------- bad input
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -112,9 +109,6 @@ def test_a_mesh_may_name_its_own_class():
     item = read_object({"mesh": "solid:orange:0", "label": "lime", "albedo_scale": 2.0}, "orange", 0)
     assert (item.mesh, item.label, item.albedo_scale) == ("solid:orange:0", "lime", 2.0)
     assert read_object("solid:orange:0", "sky", 0).label == "sky"
-
-
-# ------------------------------------------------------------------------------------- text
 
 
 def test_success_is_printed_of_clean_correct_examples_and_of_their_views():

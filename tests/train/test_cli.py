@@ -93,9 +93,6 @@ def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
     assert "start a sweep with python -m train --multirun" in capsys.readouterr().err
 
 
-# ------------------------------------------------------------------------------------ errors and interrupts
-
-
 def test_an_error_of_the_program_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError), cli.handled_errors():
         raise ZeroDivisionError
@@ -162,9 +159,6 @@ def test_a_closed_output_pipe_ends_a_command_silently(call, capsys, monkeypatch,
 )
 def test_an_error_is_one_sentence_where_the_user_can_fix_it(error, sentence):
     assert one_sentence(error).startswith(sentence) and "\n" not in one_sentence(error)
-
-
-# ------------------------------------------------------------------------------------ outputs
 
 
 def test_trying_an_output_leaves_nothing_behind(tmp_path, monkeypatch):

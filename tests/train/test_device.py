@@ -5,15 +5,7 @@ import torch
 
 from renderer.errors import InputError
 from train import device
-from train.device import (
-    SIZES,
-    GraphedModel,
-    MixedPrecision,
-    choose_device,
-    choose_precision,
-    compiles,
-    set_threads,
-)
+from train.device import SIZES, GraphedModel, MixedPrecision, choose_device, choose_precision, compiles, set_threads
 from train.networks import WideResNet
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda")
@@ -47,9 +39,6 @@ def test_threads_are_no_more_than_the_containers_quota_of_cores(tmp_path, monkey
         torch.set_num_threads(before)
 
 
-# ------------------------------------------------------------------------------------- precision
-
-
 @pytest.mark.parametrize("supported, expected", [(True, "bfloat16"), (False, "float32")])
 @pytest.mark.parametrize(
     "where, machine, rule",
@@ -79,9 +68,6 @@ def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
     assert not torch.equal(logits, exact)
     assert (logits - exact).norm() / exact.norm() < 0.05  # bfloat16 has 8 bits, over a dozen layers
     assert (torch.rand(8, 8) @ torch.rand(8, 8)).dtype == torch.float32  # autocast ends with the forward pass
-
-
-# ------------------------------------------------------------------------------------- compiled passes
 
 
 class Recorded:

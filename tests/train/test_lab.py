@@ -30,9 +30,6 @@ def coarse_patterns():
         yield
 
 
-# ------------------------------------------------------------------------------------- the folder
-
-
 def settings(out: Path, **changes) -> LabSettings:
     small = {"setups": 4, "patterns": ["stripes", "half"], "size": 8, "spp": 4, "bounces": 2}
     return LabSettings(**{"out": str(out), "meshes": MESHES, **small, **changes})
@@ -129,8 +126,6 @@ def test_environments_stand_beside_patterns_and_name_the_source(tmp_path):
     assert {row["source_tag"] for row in rows(tmp_path / "lab")} == {"noon", "solid"}
 
 
-# ------------------------------------------------------------------------------------- patterns and shots
-
 each_seed = pytest.mark.parametrize("seed", range(3))
 
 
@@ -175,8 +170,6 @@ def test_shots_differ_and_stay_within_their_ranges(shots):
         assert shot.rotation[2, 2] >= 0.5 - 1e-9  # tilted by at most 60 degrees
         assert shot.ambient.max() <= 0.06 and shot.table.max() <= 0.16
 
-
-# ------------------------------------------------------------------------------------- photographs
 
 # The light comes from the table and the surroundings without bounces.
 

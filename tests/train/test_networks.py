@@ -64,9 +64,6 @@ def write(folder: Path, network: nn.Module, description: dict | None = None, **c
     return folder
 
 
-# ---------------------------------------------------------------------------------------- WideResNet
-
-
 @pytest.mark.parametrize(
     "classes, depth, width, published", [(10, 40, 4, "8.9"), (10, 28, 10, "36.5"), (100, 16, 4, "2.77202")]
 )
@@ -115,9 +112,6 @@ def test_the_forward_pass_is_the_published_block_by_block():
     torch.testing.assert_close(network(images), logits)
 
 
-# ---------------------------------------------------------------------------------------- dropout
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_values_are_dropped_or_scaled_so_that_their_mean_stays(layout, dtype):
@@ -150,9 +144,6 @@ def test_the_gradient_passes_where_values_do_and_nothing_is_drawn_in_eval_mode_o
     assert torch.equal(torch.get_rng_state(), state)
 
 
-# ---------------------------------------------------------------------------------------- building
-
-
 def test_a_torchvision_network_is_torchvisions_own_after_normalization():
     torch.manual_seed(0)
     built = build_network(CLASSES, 32, "torchvision:resnet18", MEAN, STD)
@@ -166,10 +157,7 @@ def test_a_torchvision_network_is_torchvisions_own_after_normalization():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "size"),
-    [("vit_b_32", 64), ("inception_v3", 96), ("googlenet", 64)],
-)
+@pytest.mark.parametrize(("name", "size"), [("vit_b_32", 64), ("inception_v3", 96), ("googlenet", 64)])
 def test_every_family_of_torchvision_gives_logits_in_training_too(name, size):
     network = build_network(CLASSES, size, f"torchvision:{name}").train()
     assert network(torch.rand(2, 3, size, size)).shape == (2, 3)
@@ -196,9 +184,6 @@ def test_an_impossible_architecture_names_its_key(settings):
     ((key, value),) = settings.items()
     with pytest.raises(InputError, match=f"model.{key}={value}"):
         WideResNet(10, **settings)
-
-
-# ---------------------------------------------------------------------------------------- loading
 
 
 @pytest.mark.parametrize("file", ["", BEST, PUBLISHED], ids=["folder", "checkpoint", "published"])
@@ -241,9 +226,6 @@ def test_a_description_that_does_not_fit_the_weights_is_refused_in_one_sentence(
             load_run(tmp_path / name)
 
 
-# ---------------------------------------------------------------------------------------- starting from another run's
-
-
 def test_a_network_starts_with_the_weights_and_the_normalization_of_another(network, tmp_path):
     fresh = WideResNet(3, 10, 1, 0.3, mean=(0.5, 0.5, 0.5))
     networks.start_from(fresh, description_of(fresh, dropout=0.3), write(tmp_path, network))
@@ -252,17 +234,13 @@ def test_a_network_starts_with_the_weights_and_the_normalization_of_another(netw
 
 
 @pytest.mark.parametrize(
-    "change, fault",
-    [({"classes": ["pear", "apple", "orange"]}, "other classes"), ({"depth": 16}, "depth 10, not 16")],
+    "change, fault", [({"classes": ["pear", "apple", "orange"]}, "other classes"), ({"depth": 16}, "depth 10, not 16")]
 )
 def test_a_start_that_contradicts_the_run_is_one_sentence(network, tmp_path, change, fault):
     with pytest.raises(
         InputError, match=f"train.init_from={tmp_path} was trained with {fault}: give this run the same"
     ):
         networks.start_from(network, {**description_of(network), **change}, write(tmp_path, network))
-
-
-# ---------------------------------------------------------------------------------------- publishing
 
 
 def test_a_published_network_is_the_same_to_half_precision_with_all_that_it_takes_to_use_it(network, tmp_path):

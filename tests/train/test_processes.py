@@ -133,9 +133,6 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
     assert [line.get("epoch") for line in read_metrics(folder)] == [*range(1, 21), None]
 
 
-# ---------------------------------------------------------------------------------------- signals
-
-
 @pytest.mark.parametrize(
     "ended, expected", [("asked", Interrupted), ("unasked", KeyboardInterrupt), ("by an error", ZeroDivisionError)]
 )

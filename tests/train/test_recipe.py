@@ -11,15 +11,7 @@ from augment.losses import ranking_loss
 from renderer.errors import InputError
 from renderer.image import to_unit
 from train.networks import WideResNet
-from train.recipe import (
-    AUGMENTATIONS,
-    PGD_RADIUS,
-    SCHEDULES,
-    TRANSFORMS,
-    TrainSettings,
-    augmentation,
-    training_loss,
-)
+from train.recipe import AUGMENTATIONS, PGD_RADIUS, SCHEDULES, TRANSFORMS, TrainSettings, augmentation, training_loss
 
 LABELS = torch.tensor([0, 1, 2, 3, 0, 1])
 

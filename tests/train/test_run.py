@@ -63,9 +63,6 @@ def regenerated(monkeypatch) -> list:
     return renders
 
 
-# ---------------------------------------------------------------------------------------- resuming
-
-
 @pytest.mark.parametrize(
     "number, average", [(signal.SIGTERM, "train.ema_decay=0.8"), (signal.SIGINT, "train.soup=true")], ids=str
 )
@@ -139,9 +136,6 @@ def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(tiny, fin
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
 
 
-# ---------------------------------------------------------------------------------------- full disks
-
-
 @pytest.mark.parametrize(
     "writer",
     [
@@ -160,9 +154,6 @@ def test_a_full_disk_is_one_error_wherever_it_is_met_and_the_run_can_go_on(tiny,
     assert one_sentence(full.value).endswith(" cannot be written (No space left on device): make room and start again")
     train(settings, tmp_path)
     assert len(read_metrics(tmp_path)) == 2
-
-
-# ---------------------------------------------------------------------------------------- arms
 
 
 def test_no_examples_and_no_augmentation_train_the_same_weights(tiny, tmp_path):
@@ -203,9 +194,6 @@ def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
         assert renders.labels.tolist() == [label for label in expected for _ in range(4)]
     assert len(torch.cat([renders.images for renders in regenerated]).unique(dim=0)) == 4 * len(expected) * rounds
     assert np.isfinite(read_metrics(tmp_path)[0]["train/loss"])
-
-
-# ---------------------------------------------------------------------------------------- what a run leaves
 
 
 def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(finished):

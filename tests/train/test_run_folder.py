@@ -24,8 +24,6 @@ from train.run_folder import (
 )
 from train.settings import ExperimentSettings, read_settings
 
-# ------------------------------------------------------------------------------------ config.yaml
-
 
 def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny, tmp_path):
     settings = tiny("train.learning_rate=3e-7", "label=pear", "+data.images=null", "scene.lamps={power: 3}")
@@ -56,9 +54,6 @@ def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
     (tmp_path / file).write_text(content)
     with pytest.raises(InputError, match=rf"^{tmp_path / file} is damaged [^\n]*$"):
         read_config(tmp_path / file) if file == CONFIG else read_metrics(tmp_path)
-
-
-# ------------------------------------------------------------------------------------ resuming
 
 
 def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
@@ -92,9 +87,6 @@ def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
     file.write_bytes(b"another")
     with pytest.raises(InputError, match=rf"{file.parent}\S* has changed since {folder} began: put it back"):
         require_same_run(folder, settings)
-
-
-# ------------------------------------------------------------------------------------ metrics
 
 
 def test_a_last_line_that_was_cut_short_is_skipped(tmp_path):

@@ -47,9 +47,6 @@ def test_training_takes_the_parameters_of_the_attack_command_and_the_lighting_by
     assert parameters("attack@augment.attack=[geometry,lighting]") == attack
 
 
-# ------------------------------------------------------------------------------------ refusals
-
-
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
@@ -107,9 +104,6 @@ def test_wrong_input_is_one_sentence_before_anything_is_written(tiny, tmp_path, 
         settings = tiny(*overrides)
         prepare(settings, load_data(settings), tmp_path / "run")
     assert "\n" not in str(refusal.value) and not (tmp_path / "run").exists()
-
-
-# ------------------------------------------------------------------------------------ names on the command line
 
 
 @given(st.text())
