@@ -19,7 +19,6 @@ from augment.attacks.norm_ball import StepSettings
 from augment.attacks.parameters import PARAMETERS, AttackProblem, SkylightSettings
 from augment.scene import Conditions, Scene
 from renderer.camera import orbit_cameras
-from renderer.errors import InputError
 from renderer.light.environment import read_map, to_map, write_map
 from renderer.light.harmonics import nonzero_coefficients, project
 from renderer.light.nonnegative import TOLERANCE
@@ -113,8 +112,11 @@ def differences(function: Callable[[Tensor], Tensor], at: Tensor, directions: Te
     return (4 * central(2e-4) - central(4e-4)) / 3
 
 
-@pytest.mark.parametrize("encoding", ["linear", "srgb"])
-@pytest.mark.parametrize("names", COMBINATIONS, ids="+".join)
+@pytest.mark.parametrize(
+    ("names", "encoding"),
+    [*((names, "srgb") for names in COMBINATIONS), (COMBINATIONS[-1], "linear")],
+    ids=lambda value: value if isinstance(value, str) else "+".join(value),
+)
 def test_gradients_are_central_differences(make_scene, fixed_visibility, names, encoding):
     """Away from the start, with two views that share the values; by each value, or along eight mixtures of several
     parameters'. The differences leave a fourth power of h = 2e-4, times fifth derivatives, and rounding over h."""
@@ -204,7 +206,7 @@ def test_nonnegative_light_is_the_nearest_within_the_ball(make_scene, norm):
     reach = nearest - light.start
     assert torch.all((reach.norm(dim=1) if norm == "l2" else reach.abs().amax(1)) <= light.settings.radius * (1 + 1e-9))
     torch.testing.assert_close(light.domain(nearest), nearest, rtol=0, atol=TOLERANCE)
-    others = [light.sample(draws, EVERY) for _ in range(5)] + [light.start, light.start + reach / 2]
+    others = [light.sample(draws, EVERY) for _ in range(2)] + [light.start, light.start + reach / 2]
     for other in others:
         product = ((values - nearest) * (other - nearest)).sum(1)
         assert (product <= 1e-3 * offset.norm(dim=1) * (other - nearest).norm(dim=1)).all()
@@ -216,7 +218,7 @@ def test_a_descent_in_nonnegative_light_ends_in_light_that_an_environment_map_ho
     scene = ringing(make_scene())
     light = PARAMETERS["lighting"](scene, StepSettings(step_size=0.5), nonnegative=True)
     problem = AttackProblem(scene, [light])
-    result = attack(make_linear(2, bias=50.0), problem, towards(problem), steps=6)
+    result = attack(make_linear(2, bias=50.0), problem, towards(problem), steps=4)
     assert (result.values - problem.start).norm(dim=1).min() > 1
     written = []
     for light in result.values:
@@ -263,12 +265,6 @@ def test_a_sky_never_leaves_its_domain_nor_its_ball(make_scene, norm, dtype):
             torch.testing.assert_close(projected, nearest, rtol=0, atol=0)
 
     check()
-
-
-@pytest.mark.parametrize("start", [(-0.1, 0, 3), (1.6, 0, 3), (1, 0, 1.9), (1, 0, 10.1), (1, math.nan, 3)])
-def test_a_sky_that_starts_outside_its_domain_is_refused(make_scene, start):
-    with pytest.raises(InputError, match=r"zenith=|turbidity=|azimuth holds"):
-        PARAMETERS["skylight"](make_scene(), sky_at(start))
 
 
 def light_slope(scene: Scene, weight: Tensor) -> Tensor:

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from augment.scene import Conditions, Scene
-from renderer.errors import InputError
 from renderer.image import ENCODINGS, decode, encode
 from renderer.rasterizer import choose
 from renderer.transfer import build_operators
@@ -121,10 +120,3 @@ def test_a_mesh_outside_the_image_leaves_the_backgrounds_and_a_gradient_of_zero(
         behind = scene.backgrounds[:, None].expand_as(images)
         torch.testing.assert_close(images.detach(), behind, rtol=0, atol=0)
         assert not torch.autograd.grad(images.sum(), values)[0].any()
-
-
-@pytest.mark.parametrize(("part", "items"), [("light", 49), ("vertices", 12), ("albedo", 20)])
-def test_a_condition_that_is_not_finite_is_refused_by_name(make_scene, part, items):
-    scene, broken = make_scene(), torch.full((3, items, 3), float("nan"), dtype=torch.float64)
-    with pytest.raises(InputError, match=f"{part}s? holds NaN"):
-        scene.render(replace(scene.conditions(EVERY), **{part: broken}), EVERY)

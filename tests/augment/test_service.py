@@ -238,12 +238,8 @@ def test_hard_negatives_are_attacked_towards_the_label_and_the_label_away_from_i
     rises = torch.where(labels == 0, before - after, after - before)
     assert (rises >= -1e-5).all() and (rises[labels == 0] > 0).any() and (rises[labels != 0] > 0).any()
     assert torch.equal(renders.labels, other)
-
-
-def test_an_attack_on_a_hard_negative_with_a_class_succeeds_only_as_the_label(serve, labels, model):
-    renders = serve(label=0).regenerate(model, 0)
-    predicted = logits_of(model, renders.images).argmax(1)
-    success = torch.where(labels == 0, predicted != 0, predicted == 0)
+    renders = serve(label=0).regenerate(model, 0)  # tables with their class succeed as plates alone
+    success = (logits_of(model, renders.images).argmax(1) == 0) == (labels != 0)
     assert renders.diagnostics["attack_success"] == pytest.approx(success.double().mean())
 
 

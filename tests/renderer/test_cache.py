@@ -76,15 +76,6 @@ def test_without_a_folder_every_run_builds_and_a_view_asked_for_twice_is_built_o
     assert rasterized == [1, 1] and not list(tmp_path.iterdir())
 
 
-def test_orbits_share_the_views_that_they_have_in_common(tmp_path, rasterized):
-    """Every other view of 10 is one of 5; the order is that of the cameras."""
-    ten, five = (
-        OperatorCache(tmp_path).operators(PLATE, orbit_cameras(views, 2.0), SETTINGS, RASTERIZER) for views in (10, 5)
-    )
-    assert rasterized == [10] and same(five, ten[::2])
-    assert same(ten, build_operators(PLATE, orbit_cameras(10, 2.0), SETTINGS, RASTERIZER))
-
-
 def changed(array: np.ndarray, index: tuple, by: float) -> np.ndarray:
     array = array.copy()
     array[index] += by

@@ -112,14 +112,3 @@ def test_a_closed_mesh_that_the_near_plane_cuts_open_shows_its_inside():
     inside = fragments_of(mesh, settings, camera, closed=True)
     assert (inside.facing == -1).any()
     assert_same(inside, fragments_of(mesh, settings, camera))
-
-
-@pytest.mark.parametrize("closed", [False, True])
-def test_a_mesh_outside_the_image_has_no_fragments(closed):
-    vertices, faces = dented_sphere()
-    fragments = fragments_of((9 + vertices, faces), ImageSettings(4, 2), OrthographicCamera(0, 0, 2.0), closed)
-    shapes = {name: tuple(value.shape) for name, value in vars(fragments).items() if isinstance(value, torch.Tensor)}
-    assert {shape[0] for shape in shapes.values()} == {0}
-    assert fragments.barycentric.shape == (0, 3) and fragments.positions().shape == (0, 2)
-    pixel, face, albedo = fragments.merge(torch.zeros(0, 3))
-    assert (len(pixel), len(face), albedo.shape) == (0, 0, (0, 3))

@@ -149,11 +149,9 @@ def announced(folder: Path) -> None:
 DAMAGES = {
     "no description": (lambda folder: (folder / DESCRIPTION).unlink(), "does not exist: give a folder that an attack"),
     "no JSON": (lambda folder: (folder / DESCRIPTION).write_text("{"), "does not describe an adversary"),
-    "another key": (described(image={"size": 8, "color": 1}), "does not describe an adversary"),
     "another size": (described(image={"size": 9}), "has shape"),
     "a flat camera": (described(cameras=[{"polar": 0, "azimuth": 0, "width": 0}]), "width=0"),
     "no faces of its own": (described(own_faces=0), "own_faces=0 must be at least 1"),
-    "black": (described(albedo_scale=0), "albedo_scale=0.0 must be at least"),
     "no mesh": (lambda folder: (folder / "mesh.glb").unlink(), "mesh.glb does not exist"),
     "a list for a background": (described(background=[1]), r"adversary\.json: background=\[1\]: give gray values"),
     "a camera within the mesh": (

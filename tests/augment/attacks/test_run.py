@@ -80,8 +80,7 @@ def test_the_final_images_have_the_shadows_of_the_final_shape_and_colors(by_colo
     assert line["versions"]["reload"]["largest_difference"] < 0.1 / 255
 
 
-@pytest.mark.parametrize("nonnegative", [True, False])
-@pytest.mark.parametrize("parameter", ["geometry", "albedo"])
+@pytest.mark.parametrize(("parameter", "nonnegative"), [("geometry", True), ("albedo", False)])
 def test_the_light_can_be_emitted_whatever_is_attacked_unless_negative_light_is_allowed(
     attacked, parameter, nonnegative, tmp_path
 ):

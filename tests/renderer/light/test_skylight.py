@@ -149,7 +149,6 @@ def test_gradients_are_those_of_finite_differences(sky):
     [
         ((0.5, 0.0, 1.99), "turbidity=1.99 is outside the sky model's domain: give 2 to 10"),
         ((-0.01, 0.0, 3.0), "zenith=-0.01 is outside the sky model's domain: give 0 to π/2, with the sun above"),
-        ((1.6, 0.0, 3.0), "zenith=1.6 is"),
         ((math.nan, 0.0, 3.0), "zenith=nan is"),
         ((0.5, math.nan, 3.0), "azimuth holds NaN"),
     ],

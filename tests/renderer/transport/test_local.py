@@ -84,7 +84,7 @@ def test_images_are_mitsubas_and_gradients_their_adjoint(solid, basis, tmp_path,
     draws = torch.Generator().manual_seed(1)
     light = 2 * torch.rand(basis.size, 3, generator=draws, dtype=torch.float64)
     built = operator(solid(), basis)
-    monkeypatch.setattr(mitsuba, "SAMPLES", 1024)
+    monkeypatch.setattr(mitsuba, "SAMPLES", 1024 if getattr(basis, "radius", 0) else 256)
     ours, theirs = canvas(built, light), mitsuba_image(tmp_path, solid(), basis, light)
     error = np.abs(ours - theirs)
     assert theirs.max() > 0.1 and (theirs.max(axis=2) == 0).mean() > 0.1
@@ -148,7 +148,7 @@ def test_derivatives_by_positions_and_powers_are_finite_differences_where_no_sha
 
 @pytest.mark.parametrize(("basis", "normals"), [(PROJECTOR, "flat"), (LAMPS, "smooth"), (DISCS, "flat")])
 def test_derivatives_by_vertices_and_albedo_are_finite_differences_at_fixed_visibility(basis, normals):
-    mesh, settings = ball(0), ImageSettings(5, 2, normals=normals)
+    mesh, settings = ball(0), ImageSettings(4, 2, normals=normals)
     (view,) = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"), closed=True)
     powers = torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     rays = Rays(mesh)
