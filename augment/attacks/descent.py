@@ -77,9 +77,10 @@ class Problem(Protocol):
 class DescentResult:
     """The end of a descent, per example; all tensors lie on the values' device.
 
-    values, images: of the success of lowest cost or, without a success, of the last step that was kept. steps: number
-    of steps. success_at: the first step that was a success (meaningless without one); with a margin, descent goes on
-    from there. cost_before, cost: equation 1. predicted: classes. zero_gradient: the first gradient was exactly zero.
+    values, images: of the step that reached the margin, else of the success of lowest cost, else of the last step that
+    was accepted. steps: number of steps. success_at: the first step that was a success (meaningless without one); with
+    a margin, descent goes on from there. cost_before, cost: equation 1. predicted: classes. zero_gradient: the first
+    gradient was exactly zero.
     """
 
     values: Float[Tensor, "E D"]
@@ -160,8 +161,9 @@ def _descend_once(
     values = start.detach().clone()
     active = torch.arange(len(values), device=values.device)
     steps, success_at, success = torch.zeros_like(active), torch.zeros_like(active), torch.zeros_like(active).bool()
-    lowest, length = values.new_full((len(values),), torch.inf), values.new_ones(len(values), 1)
-    candidate, position, slope = values.clone(), values.clone(), torch.zeros_like(values)
+    kept_cost, position_cost = values.new_full((2, len(values)), torch.inf)
+    candidate, position, position_gradient = values.clone(), values.clone(), torch.zeros_like(values)
+    length = values.new_ones(len(values), 1)
     predicted, batch_size = torch.zeros_like(goal.source), BatchSize(settings.batch_size)
     with as_found(model):
         for step in range(settings.max_steps + 1):
@@ -178,23 +180,26 @@ def _descend_once(
                 zero_gradient = gradient.abs().amax(1) == 0
             done = reached & (gap >= settings.margin)
             success_at[active[reached & ~success[active]]] = step
-            fell = cost < lowest[active]
-            taken = done | fell if settings.shorten else torch.ones_like(done)
-            best = done | torch.where(success[active], reached & fell, reached | taken)
-            rows = torch.nonzero(best).squeeze(1)
-            improved = active[rows]
-            values[improved], images[improved] = candidate[improved], rendered.detach()[rows]
-            lowest[improved], predicted[improved], success[improved] = cost[rows], classes[rows], reached[rows]
-            position[active[taken]], slope[active[taken]] = candidate[active[taken]], gradient[taken]
-            length[active[~taken]] /= 2
+            # The next step starts from an accepted one; with `shorten`, from none that raised the cost.
+            accepted = done | (cost < position_cost[active]) if settings.shorten else torch.ones_like(done)
+            moved = active[accepted]
+            position[moved], position_gradient[moved] = candidate[moved], gradient[accepted]
+            position_cost[moved] = cost[accepted]
+            length[active[~accepted]] /= 2
+            # Kept is what would be returned if this step were the last one.
+            better = torch.where(success[active], reached & (cost < kept_cost[active]), reached | accepted)
+            rows = torch.nonzero(done | better).squeeze(1)
+            kept = active[rows]
+            values[kept], images[kept], kept_cost[kept] = candidate[kept], rendered.detach()[rows], cost[rows]
+            predicted[kept], success[kept] = classes[rows], reached[rows]
             active = active[~done]
             if step == settings.max_steps or not len(active):
                 break
-            moved = position[active] - length[active] * problem.step(slope[active])
-            candidate[active] = problem.project(moved, examples[active])
+            stepped = position[active] - length[active] * problem.step(position_gradient[active])
+            candidate[active] = problem.project(stepped, examples[active])
             steps[active] += 1
     return DescentResult(
-        values, images, steps, success_before, success, success_at, cost_before, lowest, predicted, zero_gradient
+        values, images, steps, success_before, success, success_at, cost_before, kept_cost, predicted, zero_gradient
     )
 
 

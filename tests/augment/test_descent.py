@@ -224,6 +224,26 @@ def test_a_step_that_succeeds_is_kept_whatever_its_cost():
     )
 
 
+def test_after_a_success_of_higher_cost_steps_are_still_compared_with_where_they_start_from():
+    """From 1, at a confidence of 0.4: -1/2 succeeds at 0.45, short of the margin; 1/4 has 0.42, which is no fall."""
+
+    class Ridge(Detour):
+        def forward(self, images: Tensor) -> Tensor:
+            on_ridge = (images.flatten(1) > 0) & (images.flatten(1) < 0.5)
+            return torch.where(on_ridge, torch.tensor([0.42, 0.41, 0.17]).double().log(), super().forward(images))
+
+    class Recorded(Axis):
+        def render(self, values: Tensor, examples: Tensor) -> Tensor:
+            rendered.append(values.item())
+            return super().render(values, examples)
+
+    rendered: list[float] = []
+    start = torch.ones(1, 1, dtype=torch.float64)
+    result = attack(Ridge(), Recorded(start), torch.zeros(1, dtype=torch.int64), steps=3, shorten=True, margin=1.0)
+    assert rendered == [1, -0.5, 0.25, 0.625]
+    assert result.success.tolist() == [True] and result.values.tolist() == [[0.625]]  # of lower cost
+
+
 @pytest.mark.parametrize("step", STEPS)
 def test_a_zero_gradient_leaves_the_values_and_is_reported(step):
     """The second example's image is clamped all over."""
