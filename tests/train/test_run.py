@@ -71,7 +71,7 @@ def test_a_signal_ends_the_run_after_its_step_and_resuming_ends_as_if_it_had_not
 ):
     """Bit for bit, within a round and at its end: 40 of 54 images an epoch, in rounds of 16, 16 and 8, each with 4
     renders (2, 2 and 1 steps); with lights that continue from round to round, dropout, and a teacher's predictions."""
-    rounds = ("augment.every=16", "train.images_per_epoch=40", "train.resume=true")
+    rounds = ("train.epochs=2", "augment.every=16", "train.images_per_epoch=40", "train.resume=true")
     settings = tiny(*rounds, f"train.init_from={finished}", "train.distillation=2", average)
     train(settings, tmp_path / "whole")
     folder = tmp_path / "stopped"
@@ -86,7 +86,7 @@ def test_a_signal_ends_the_run_after_its_step_and_resuming_ends_as_if_it_had_not
     torch.manual_seed(17)
     train(settings, folder)
     assert weights(folder) == weights(tmp_path / "whole") and metrics(folder) == metrics(tmp_path / "whole")
-    images = [(path / "renders" / "epoch_003.png").read_bytes() for path in (folder, tmp_path / "whole")]
+    images = [(path / "renders" / "epoch_002.png").read_bytes() for path in (folder, tmp_path / "whole")]
     assert images[0] == images[1]
 
 
