@@ -19,7 +19,7 @@ NORMALS = ("flat", "smooth")
 MOST_BOUNCES = 100
 LARGEST_SIZE = 4096  # pixels per side
 MOST_SAMPLES = 2**15  # in a row of an image: a billion in all of it
-FINEST = 64  # samples per pixel side: the share of a pixel that is covered is told to 1/4096
+FINEST = 64  # samples per pixel side: coverage is resolved to 1/4096
 
 
 @dataclass(frozen=True)

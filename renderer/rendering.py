@@ -1,4 +1,4 @@
-"""Meshes to images in one call: `render` by all that can be differentiated, `precompute_transfer` for many lights."""
+"""Meshes to images in one call: `render`, differentiable, and `precompute_transfer` for images under many lights."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def render(
     for each. vertices: in place of the mesh's. albedo: linear, in place of the mesh's colors per face, or of its only
     texture. albedo_scale multiplies the albedo. samples: per pixel side. encoding: linear or srgb. normals: flat or
     smooth. shadows: that the mesh casts on itself. bounces: of light between its surfaces, shadows included.
-    rasterizer: auto, opengl, numba or numpy. The gradient by the vertices keeps which face covers each sample, and the
-    one by vertices and albedo keeps shadows and bounces of environment light.
+    rasterizer: auto, opengl, numba or numpy. Gradients by vertices hold visibility constant; those by vertices and
+    albedo also hold shadows and bounces of environment light constant.
     InputError: NaN, shapes that do not fit, unknown choices.
 
     >>> light = renderer.load_light("grace").requires_grad_()

@@ -1,7 +1,8 @@
 """Checkpoints: written atomically with a hash of their content, read without pickle.
 
-A file holds a dictionary of plain values and tensors: `model` (the network's state) and `architecture` (what rebuilds
-it, with its VERSION), in best.pt; and in last.pt what `train.loop.Trainer.state_dict` adds to go on with a run.
+A file holds a dictionary of plain values and tensors. best.pt has `model`, the network's state dict; `architecture`,
+what rebuilds it: version, classes, size, encoding, mean, std and the network's settings (`train.networks.describe`);
+and the `epoch`. last.pt adds what a run needs to go on: `train.loop.Trainer.state_dict`.
 """
 
 import hashlib

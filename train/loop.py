@@ -250,7 +250,7 @@ class Trainer:
         return {"architecture": self.architecture, "epoch": self.epoch, "seed": self.seed, "arm": arm}
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a run needs to go on as if it had never ended. bfloat16 needs no loss scaler."""
+        """All that a run needs to go on as if it had never ended; bfloat16 needs no GradScaler."""
         return {
             **self._description(),
             "model": self.model.network.state_dict(),

@@ -35,8 +35,8 @@ class AttackSettings:
     and try half its length, since the gradient of geometry holds visibility fixed. restarts: further starts, drawn from
     the norm-balls, for examples without success. margin: stop an example once its logits lead by this margin, in every
     view. rounded: the classifier gets images of 8 bits. eot: descend on the mean over random transformations.
-    allow_negative: any coefficients of light; otherwise only light that something can emit (of harmonics: radiance
-    nowhere negative), whatever is attacked, beginning with the nearest such light to the scene's.
+    allow_negative: any coefficients of light. If False, the light is first projected to the nearest one that something
+    can emit (of harmonics: radiance nowhere negative) and stays there, whatever is attacked.
     batch_size: images per pass through the classifier, fewer where memory runs out.
     """
 

@@ -1,7 +1,8 @@
 """Bases of light. An image is linear in the coefficients of a light of fixed position, so each basis has operators.
 
-A new basis of lights in the scene is a frozen dataclass of `LocalBasis` (as `light.local.Lamps`); it needs no
-registration.
+Environment light has one basis, `Harmonics`. Lights within the scene are frozen dataclasses of `LocalBasis`: see
+`Lamps` and `Projector` in light/local.py. `renderer.render` takes a new one as it is; to configure and to attack it,
+add it to augment/build.py and augment/attacks/parameters.py.
 """
 
 from abc import ABC, abstractmethod

@@ -60,7 +60,7 @@ def replicate_difference(one: np.ndarray, other: np.ndarray, paired: bool) -> np
     return sum(group.mean(axis=0) for group in drawn)
 
 
-def rank(positives: np.ndarray, negatives: np.ndarray) -> np.ndarray:
+def auc_and_recalls(positives: np.ndarray, negatives: np.ndarray) -> np.ndarray:
     """RANKED, (4, ...), of scores (..., n) of positives and (..., m) of negatives.
 
     AUC is the probability that a positive scores above a negative, a tie counting half (Mann and Whitney 1947). Recall
@@ -100,7 +100,7 @@ def roc_metrics(positives: Scores, negatives: Scores) -> dict[str, Any]:
     bars: list[float | None] = [None] * len(RATES)
     if len(positives) and len(negatives):
         groups = np.asarray(positives), np.asarray(negatives)
-        pairs = zip(rank(*groups), bootstrap(rank, *groups), strict=True)
+        pairs = zip(auc_and_recalls(*groups), bootstrap(auc_and_recalls, *groups), strict=True)
         results = [{"value": float(value), **interval(replicates)} for value, replicates in pairs]
         bars = [float(bar) for bar in thresholds(groups[1])]
     auc, *recalls = results
@@ -167,7 +167,7 @@ def replicate_metrics(group: Pool, label: str) -> dict[str, np.ndarray]:
     counted = {name: bootstrap(lambda drawn: drawn.mean(axis=-1), values) for name, values in outcomes.items()}
     if not all(map(len, group.scores)):
         return counted
-    return counted | dict(zip(RANKED, bootstrap(rank, *group.scores), strict=True))
+    return counted | dict(zip(RANKED, bootstrap(auc_and_recalls, *group.scores), strict=True))
 
 
 def find_metric(summary: dict[str, Any], name: str) -> dict[str, Any]:

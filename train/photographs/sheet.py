@@ -11,7 +11,7 @@ import torch
 from PIL import Image, ImageOps
 
 from renderer.io.tiles import PAPER, Tile, draw_grid
-from train.photographs.metrics import RATES, rank, roc_curve
+from train.photographs.metrics import RATES, auc_and_recalls, roc_curve
 from train.photographs.predictions import Prediction
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def draw_roc(
     for rate in map(float, RATES):
         axes.axvline(rate, color="0.6", linewidth=1, linestyle=":")
     for name, pairs in scores.items():
-        areas = [rank(*pair)[0] for pair in pairs]
+        areas = [auc_and_recalls(*pair)[0] for pair in pairs]
         for number, pair in enumerate(pairs):
             rates, recalls, _ = roc_curve(*pair)
             title = None if number else f"{name}: AUC {np.mean(areas):.3f}"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from train.photographs.metrics import rank
+from train.photographs.metrics import auc_and_recalls
 from train.photographs.sheet import Pair, draw_roc
 
 if TYPE_CHECKING:
@@ -83,7 +83,9 @@ def roc(arms: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     if not any(known.values()):
         return None
     styles = {arm: style(index) for index, arm in enumerate(arms)}
-    areas = [f"{arm} {np.mean([rank(*pair)[0] for pair in pairs]):.3f}" for arm, pairs in known.items() if pairs]
+    areas = [
+        f"{arm} {np.mean([auc_and_recalls(*pair)[0] for pair in pairs]):.3f}" for arm, pairs in known.items() if pairs
+    ]
     return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", f"ROC; AUC: {', '.join(areas)}")
 
 

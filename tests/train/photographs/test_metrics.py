@@ -6,7 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import bootstrap, mannwhitneyu
 
-from train.photographs.metrics import RATES, REPLICATES, rank, replicate_difference, roc_curve, roc_metrics, thresholds
+from train.photographs.metrics import (
+    RATES,
+    REPLICATES,
+    auc_and_recalls,
+    replicate_difference,
+    roc_curve,
+    roc_metrics,
+    thresholds,
+)
 
 SCORES = st.lists(st.integers(-4, 4).map(float), min_size=1, max_size=30)  # of few values, so that ties are common
 
@@ -24,7 +32,7 @@ def brute_force_recall(positives: list[float], negatives: list[float], rate: str
 def test_auc_is_the_mann_whitney_statistic_and_recall_that_at_the_lowest_threshold_within_a_rate(positives, negatives):
     """Ties count half in the AUC."""
     statistic = mannwhitneyu(positives, negatives, method="asymptotic").statistic
-    auc, *recalls = rank(np.array(positives), np.array(negatives))
+    auc, *recalls = auc_and_recalls(np.array(positives), np.array(negatives))
     assert auc == pytest.approx(statistic / (len(positives) * len(negatives)), rel=0, abs=1e-12)
     bars = thresholds(np.array(negatives))
     for rate, recall, threshold in zip(RATES, recalls, bars, strict=True):
