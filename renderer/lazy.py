@@ -13,11 +13,15 @@ def attach(
     """`__getattr__`, `__dir__` and `__all__` of a package whose names come from modules below it.
 
     A module's own name stands for the module, unless it has such an attribute. No other name may be that of a module
-    directly in the package, which importing the module would put in its place.
+    directly in the package, which importing the module would put in its place. `__version__` is the installation's.
     """
     home = {name: module for module, names in modules.items() for name in names}
 
     def getattribute(name: str) -> object:
+        if name == "__version__":
+            from importlib.metadata import version
+
+            return version("parametric-norm-balls")
         if name not in home:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         from importlib import import_module

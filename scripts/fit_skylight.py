@@ -138,4 +138,4 @@ def quadrature_around_sun(zenith: float, azimuth: float, nodes: int) -> tuple[np
 
 
 if __name__ == "__main__":
-    cli.script(main, Settings)
+    cli.command(__file__, __doc__, main, Settings)

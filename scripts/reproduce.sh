@@ -14,7 +14,7 @@ Further settings of conf/train.yaml go to every training run. From the environme
   MESHES    scene.meshes, a list
   PHOTOS    a folder of photographs to score the networks on
   EXCLUDE   their sources that averages leave out; default []
-  LAB       harden, best: a folder that scripts/lab.py wrote
+  LAB       harden, best: a folder that pnb-lab wrote
   BASE      harden, best: the network to begin with; default pretrained/none
   DISTANCE  harden: L2 norm of the fourth arm's random perturbations, that of the adversarial ones; default 0.6
   RUNS      where the runs go; default runs/reproduce
@@ -33,7 +33,7 @@ sweep() {
 tables() {
     local experiment=$1 photographs=$2 exclude=$3 folders=("$runs/$1"/*/)
     printf '\n## experiment=%s: %s\n\n' "$experiment" "$photographs"
-    "$python" scripts/compare_runs.py "runs=[$(IFS=, && echo "${folders[*]%/}")]" "photographs=$photographs" \
+    "$python" -m train.commands.compare "runs=[$(IFS=, && echo "${folders[*]%/}")]" "photographs=$photographs" \
         "exclude=$exclude"
 }
 

@@ -63,11 +63,12 @@ def parsed_once() -> Iterator[None]:
 
 @pytest.fixture
 def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
-    """`python scripts/NAME.py`, or `python -m train`, within this process, from another folder: the exit status."""
+    """`python -m train`, or one of train.commands, within this process, from another folder: the exit status."""
     handlers = logging.root.handlers[:]
 
     def command(name: str, *arguments: str) -> int:
-        path = ROOT / "train" / "__main__.py" if name == "train" else ROOT / "scripts" / f"{name}.py"
+        folder = ROOT / ("scripts" if name == "fit_skylight" else "train/commands")
+        path = ROOT / "train" / "__main__.py" if name == "train" else folder / f"{name}.py"
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [str(path), *arguments])
         try:

@@ -27,6 +27,12 @@ def test_all_public_names_exist_and_have_docstrings(package):
         assert PathFinder.find_spec(f"{package}.{name}", module.__path__) is None
 
 
+@pytest.mark.parametrize("package", [*PACKAGES, "train"])
+def test_the_version_is_that_of_the_installation(monkeypatch, package):
+    monkeypatch.setattr("importlib.metadata.version", {"parametric-norm-balls": "1.2.3"}.get)
+    assert importlib.import_module(package).__version__ == "1.2.3"
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_an_unknown_name_raises_attribute_error(package):
     with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'rendr'"):

@@ -1,4 +1,4 @@
-"""`python -m train`: train an arm, score it, and print the table. See conf/train.yaml for every setting."""
+"""Train a network with and without renders, and score it: pnb-train train.epochs=10 scene.views=5"""
 
 import logging
 import os
@@ -21,6 +21,7 @@ from omegaconf import DictConfig
 from augment import utils
 from renderer.errors import InputError
 from train import console
+from train.command_help import format_help
 from train.errors import writable_file, writable_folder
 from train.processes import Interrupted, broadcast, first_process_first, process_group
 from train.report.page import report_of
@@ -46,10 +47,10 @@ def start() -> None:
         flags = {argument for argument in arguments if argument.startswith("-")}
         overrides = [argument for argument in arguments if argument not in flags]
         if flags and "TORCHELASTIC_RUN_ID" in os.environ:
-            raise InputError(
-                "torchrun trains one run in several processes: start a sweep with python -m train --multirun"
-            )
-        if flags & SWEEP_FLAGS:
+            raise InputError("torchrun trains one run in several processes: start a sweep with pnb-train --multirun")
+        if flags & cli.HELP:
+            print(format_help("train", str(__doc__), ExperimentSettings, compose("train", overrides)))
+        elif flags & SWEEP_FLAGS:
             sweep(main, overrides)
         elif flags:
             main()

@@ -30,7 +30,7 @@ from train.device import choose_device
 from train.errors import writable_folder
 from train.networks import load_classifier
 from train.run_folder import sole_writer, write_config
-from train.settings import LARGEST_SEED, keyed, read_object
+from train.settings import LARGEST_SEED, keyed, program, read_object
 from train.tables import aligned, format_fraction, fraction
 
 TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
@@ -167,7 +167,7 @@ def run(settings: AttackExperimentSettings) -> None:
         if sweeps:
             write_sweeps(sweeps, {name: steps.norm for name, steps in settings.attack.parameters.items()}, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
-        write_config(out, settings, command=shlex.join(["python", "scripts/attack.py", *sys.argv[1:]]))
+        write_config(out, settings, command=shlex.join([*program("train.commands.attack"), *sys.argv[1:]]))
 
 
 def attacks(

@@ -1,4 +1,4 @@
-"""How commands start: Ctrl-C in one line, errors in one sentence with exit status 2, a script's settings.
+"""How commands start: Ctrl-C in one line, errors in one sentence with exit status 2, settings, --help.
 
 Commands import this module before all others, which take seconds to import; no other module imports it.
 """
@@ -14,6 +14,8 @@ from typing import Any
 
 USER_ERROR = 2
 INTERRUPTED = "ended by SIGINT"
+HELP = {"-h", "--help"}
+PREFIX = "pnb-"  # of the installed commands
 _started = False  # whether a command runs, after all imports
 _interrupted = False
 
@@ -32,6 +34,22 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's b
     signal.signal(signal.SIGINT, _interrupt)
 
 
+def _complete() -> None:
+    """Let Hydra complete words for a shell, and end: the imports that follow take longer than anyone waits at a key."""
+    import conf
+
+    name = Path(sys.argv[0]).stem.removeprefix(PREFIX)
+    if (Path(conf.__path__[0]) / f"{name}.yaml").exists():
+        import hydra
+
+        hydra.main(version_base="1.3", config_path="pkg://conf", config_name=name)(lambda config: None)()
+        sys.exit()
+
+
+if sys.argv[1:2] in (["-sc"], ["--shell-completion"]):
+    _complete()
+
+
 @contextmanager
 def handled_errors() -> Iterator[None]:
     """Print what the user can fix as one line, without a traceback, and exit with status 2.
@@ -43,6 +61,10 @@ def handled_errors() -> Iterator[None]:
     from train.errors import one_sentence
 
     _started, _interrupted = True, False
+    if Path(sys.argv[0]).stem.startswith(PREFIX):
+        os.environ["PYTHONSAFEPATH"] = (
+            "1"  # in further processes `import train` is not a train.py of the current folder
+        )
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
@@ -63,27 +85,33 @@ def handled_errors() -> Iterator[None]:
         sys.exit(USER_ERROR)
 
 
-def script(function: Callable[[Any], object], settings: type, arguments: Sequence[str] | None = None) -> None:
-    """Run a script of scripts/ with the settings on its command line, or in other arguments.
+def command(
+    file: str,
+    about: str | None,
+    function: Callable[[Any], object],
+    settings: type,
+    arguments: Sequence[str] | None = None,
+) -> None:
+    """Run the command of a module, whose file and docstring these are, with the settings on its command line, or in
+    other arguments.
 
     Their defaults are in conf/NAME.yaml or, without such a file, in the dataclass.
     """
     with handled_errors():
         from hydra.core.config_store import ConfigStore
-        from omegaconf import OmegaConf
 
-        import conf
         from renderer.errors import InputError
+        from train.command_help import CONF, format_help
         from train.settings import compose, read_settings
 
-        name, arguments = Path(sys.argv[0]).stem, sys.argv[1:] if arguments is None else arguments
-        if not (Path(conf.__path__[0]) / f"{name}.yaml").exists():
+        name, arguments = Path(file).stem, sys.argv[1:] if arguments is None else arguments
+        if not (CONF / f"{name}.yaml").exists():
             ConfigStore.instance().store(name, settings)
-        flags = [argument for argument in arguments if argument.startswith("-")]
-        if unknown := [flag for flag in flags if flag not in ("-h", "--help")]:
+        flags = {argument for argument in arguments if argument.startswith("-")}
+        if unknown := sorted(flags - HELP):
             raise InputError(f"{unknown[0]} is not an option: give settings as key=value; --help shows them")
         config = compose(name, [argument for argument in arguments if argument not in flags])
         if flags:
-            print(f"{sys.modules['__main__'].__doc__}\nSettings, as key=value:\n\n{OmegaConf.to_yaml(config)}", end="")
+            print(format_help(name, str(about), settings, config))
         else:
             function(read_settings(settings, config))

@@ -271,10 +271,10 @@ def _object(module: Any, parts: Sequence[Part], shot: Shot) -> list[Any]:
 
 @dataclass
 class LabSettings:
-    """The settings of scripts/lab.py. A mesh is a file, `solid:NAME:SEED` or a mapping with the keys of ObjectSettings,
+    """The settings of pnb-lab. A mesh is a file, `solid:NAME:SEED` or a mapping with the keys of ObjectSettings,
     whose label is a class, or other_NAME if the network lacks it."""
 
-    out: str = MISSING  # a new folder, for photos= of scripts/evaluate_photos.py
+    out: str = MISSING  # a new folder, for photos= of pnb-evaluate
     label: str = "orange"  # the class under study: one of its objects and one other stand in each setup
     meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])
     setups: int = 180  # draws of light, camera and pose; two photographs each

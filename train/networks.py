@@ -237,10 +237,17 @@ def _of_one_architecture(path: Path) -> Iterator[None]:
 
 def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     """The file of a run's selected network, best.pt or model.safetensors or such a file itself, and its content."""
-    path = next((file for file in (run, run / BEST, run / PUBLISHED) if file.is_file()), None)
+    found = published(run)
+    path = next((file for file in (found, found / BEST, found / PUBLISHED) if file.is_file()), None)
     if path is None:
-        raise InputError(f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that `python -m train` wrote")
+        raise InputError(f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that pnb-train wrote")
     return path, _load_published(path) if path.suffix == ".safetensors" else load(path)
+
+
+def published(run: Path) -> Path:
+    """The path, or where there is none the file or folder below pretrained/ of the installation or the clone."""
+    homes = (Path(__file__).parent, Path(__file__).parents[1]) if run.parts[:1] == ("pretrained",) else ()
+    return next((path for path in (run, *(home / run for home in homes)) if path.exists()), run)
 
 
 def start_from(network: nn.Module, description: Mapping[str, Any], run: Path) -> None:

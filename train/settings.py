@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -195,17 +196,27 @@ def as_override(argument: str) -> str:
     return argument if as_given else f"{key}={quoted(value)}"
 
 
+def program(module: str) -> list[str]:
+    """The words that start a module of commands as this process was started: `pnb-NAME`, or `python -m`; for several
+    processes by torchrun."""
+    installed, count = sys.flags.safe_path or Path(sys.argv[0]).stem.startswith("pnb-"), world_size()
+    words = [f"pnb-{module.rpartition('.')[2]}"] if installed else ["-m", module]
+    if count > 1:
+        return ["torchrun", f"--nproc_per_node={count}", *(["--no-python"] if installed else []), *words]
+    return words if installed else ["python", *words]
+
+
 def given_command(overrides: Sequence[str]) -> str:
-    """`python -m train`, or torchrun's, with these overrides but without the run's folder."""
-    count = world_size()
-    command = ["torchrun", f"--nproc_per_node={count}", "-m", "train"] if count > 1 else ["python", "-m", "train"]
-    return shlex.join([*command, *(text for text in overrides if not text.startswith(("run=", "train.resume=")))])
+    """The command of a training run, with these overrides but without the run's folder."""
+    return shlex.join(
+        [*program("train"), *(text for text in overrides if not text.startswith(("run=", "train.resume=")))]
+    )
 
 
 def compose(command: str, overrides: Sequence[str] = ()) -> DictConfig:
     """The configuration of a command under overrides; InputError with the text of Hydra, which names the override."""
     singleton = GlobalHydra.instance()
-    running, singleton.hydra = singleton.hydra, None  # that of `python -m train`
+    running, singleton.hydra = singleton.hydra, None  # that of `pnb-train`
     try:
         with initialize_config_module("conf", version_base="1.3"):
             return hydra.compose(command, [as_override(override) for override in overrides])

@@ -1,4 +1,4 @@
-"""Sweeps, `python -m train --multirun`: a folder per run, named by its overrides; finished runs are not repeated.
+"""Sweeps, `pnb-train --multirun`: a folder per run, named by its overrides; finished runs are not repeated.
 
 Hydra's launchers start the runs, in this process or in others; their results are read from their folders.
 """

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A picture of each kind of attack, by scripts/attack.py in the paper's manner: any light, an end where the network errs,
+# A picture of each kind of attack, by pnb-attack in the paper's manner: any light, an end where the network errs,
 # no shadows. The captions hold the network's answers.
 #   OUT=gallery ORANGE=orange_sketchfab.glb benchmarks/paper/gallery.sh [key=value ...]
 # In the root of the clone. Further settings of conf/attack.yaml go to every attack; PYTHON is python by default.
@@ -9,7 +9,7 @@ picture() {
     local name=$1 folder
     shift
     folder=$(mktemp -d)
-    "${PYTHON:-python}" scripts/attack.py "out=$folder/out" attack.allow_negative=true attack.margin=0 attack.rounded=false \
+    "${PYTHON:-python}" -m train.commands.attack "out=$folder/out" attack.allow_negative=true attack.margin=0 attack.rounded=false \
         attack.max_steps=100 attack.checks=false attack.verify=null renderer.shadows=false "$@"
     cp "$folder"/out/0_*/example_000.png "$OUT/gallery_$name.png"
     rm -r "$folder"

@@ -4,7 +4,7 @@ python -m benchmarks.paper.survival --out survival.jsonl --meshes orange_studio.
     '{mesh: banana.glb, label: banana}' '{mesh: "solid:cup:3", label: coffee mug}'
 python -m benchmarks.paper.table survival.jsonl
 
-Each is found and rendered anew by scripts/attack.py; --overrides are its own, such as renderer.shadows=false to
+Each is found and rendered anew by pnb-attack; --overrides are its own, such as renderer.shadows=false to
 count how many lights that were found without shadows succeed where Mitsuba casts them.
 """
 
@@ -26,9 +26,16 @@ ROOT = Path(__file__).parents[2]
 
 
 def run_attack(overrides: Sequence[str], threads: int) -> Row:
-    """The numbers of one example that scripts/attack.py attacks, {"refusal": its sentence} where it ended in one."""
+    """The numbers of one example that pnb-attack attacks, {"refusal": its sentence} where it ended in one."""
     with TemporaryDirectory() as folder:
-        command = [sys.executable, "scripts/attack.py", f"out={folder}/out", "attack.checks=false", *overrides]
+        command = [
+            sys.executable,
+            "-m",
+            "train.commands.attack",
+            f"out={folder}/out",
+            "attack.checks=false",
+            *overrides,
+        ]
         environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(threads)}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode == 2:
@@ -42,9 +49,9 @@ def run_attack(overrides: Sequence[str], threads: int) -> Row:
 def main(argv: Sequence[str] | None = None) -> None:
     options = common.parser("survival", __doc__)
     options.add_argument("--examples", type=int, default=2, help="of each mesh and attack, at equal azimuths")
-    options.add_argument("--attacks", nargs="+", default=ATTACKS, help="as attack= of scripts/attack.py")
+    options.add_argument("--attacks", nargs="+", default=ATTACKS, help="as attack= of pnb-attack")
     options.add_argument("--verify", default="reload+mitsuba", help="renderers of the files")
-    options.add_argument("--overrides", nargs="*", default=[], help="of scripts/attack.py: attack.max_steps=10")
+    options.add_argument("--overrides", nargs="*", default=[], help="of pnb-attack: attack.max_steps=10")
     args = options.parse_args(argv)
     common.begin(args)
     chosen = [f"classifier={args.classifier}", f"scene.light={args.light}", f"attack.verify={args.verify}"]

@@ -79,8 +79,8 @@ def write_scene_files(folder: Path) -> None:
 
 
 def run_here(name: str, *arguments: str, folder: Path) -> int:
-    """`python -m train`, without its report, or `python scripts/NAME.py` in this process, in a folder: the status."""
-    path = ROOT / "train" / "__main__.py" if name == "train" else ROOT / "scripts" / f"{name}.py"
+    """`python -m train`, or one of train.commands, without its report, in this process, in a folder: the status."""
+    path = ROOT / "train" / ("__main__.py" if name == "train" else f"commands/{name}.py")
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(sys, "argv", [str(path), *arguments])
         patch.setattr("train.report.page.report_of", lambda folders, out: "no report")
@@ -94,12 +94,12 @@ def run_here(name: str, *arguments: str, folder: Path) -> int:
 def start_command(
     *arguments: str, folder: Path, limit: Callable[[], object] = lambda: None, **environment: str
 ) -> Process:
-    """`python` with these arguments in a process of its own, in a folder; the words of scripts/ are the project's.
+    """`python` with these arguments in a process of its own, in a folder.
 
     limit: is called in the process before Python starts.
     """
     return subprocess.Popen(
-        [sys.executable, *(str(ROOT / word) if word.startswith("scripts/") else word for word in arguments)],
+        [sys.executable, *arguments],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | environment,
         stdout=subprocess.PIPE,

@@ -45,13 +45,13 @@ READERS: dict[str, Callable[[Path], Any]] = {  # the library's, by the file that
     "data.npz": lambda path: load_npz(str(path)),
     "images/apple/0.png": lambda path: load_folder(str(path.parents[1]), 16, 0.3),
 }
-PHOTOGRAPHS = ("evaluate_photos", "photos=photographs", "run=finished", "out=out", "device=cpu", "precision=float32")
+PHOTOGRAPHS = ("evaluate", "photos=photographs", "run=finished", "out=out", "device=cpu", "precision=float32")
 ATTACK = (
     *("attack", "classifier=run:finished", "scene.meshes=[mesh.obj]", "out=out", "device=cpu", "attack.max_steps=1"),
     *("attack.force=true", "attack.checks=false", *RENDERER),
 )
 RESUME = ("train", "run=finished", *TRAINING, "train.epochs=3", "train.resume=true")
-COMPARE = ("compare_runs", "runs=[finished]")
+COMPARE = ("compare", "runs=[finished]")
 COMMANDS: dict[str, tuple[str, ...]] = {  # that read the file
     "finished/best.pt": PHOTOGRAPHS,
     "published/model.safetensors": tuple(word.replace("run=finished", "run=published") for word in PHOTOGRAPHS),

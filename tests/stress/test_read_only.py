@@ -35,8 +35,8 @@ def call(*command: str, folder: Path) -> tuple[int, str]:
     "command, reported",
     [
         ((*TRAIN, "run=../locked/run"), "run=../locked/run cannot be written to (Permission denied)"),
-        (("scripts/export_light.py", "light=grace", "out=../locked/a.hdr"), "out=../locked/a.hdr cannot be written"),
-        (("scripts/lab.py", "out=../locked"), "out=../locked cannot be written to (Permission denied)"),
+        (("-m", "train.commands.light", "light=grace", "out=../locked/a.hdr"), "out=../locked/a.hdr cannot be written"),
+        (("-m", "train.commands.lab", "out=../locked"), "out=../locked cannot be written to (Permission denied)"),
     ],
     ids=["run", "file", "folder"],
 )

@@ -90,7 +90,7 @@ def test_two_commands_do_not_train_in_one_folder(call, capsys, tmp_path, tiny_np
 def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
     assert call("train", "--multirun", "seed=0,1") == cli.USER_ERROR
-    assert "start a sweep with python -m train --multirun" in capsys.readouterr().err
+    assert "start a sweep with pnb-train --multirun" in capsys.readouterr().err
 
 
 def test_an_error_of_the_program_keeps_its_traceback():
@@ -127,7 +127,7 @@ runpy.run_path(sys.argv[1], run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("path", ["train/__main__.py", "scripts/attack.py"])
+@pytest.mark.parametrize("path", ["train/__main__.py", "train/commands/attack.py"])
 def test_an_interrupt_while_torch_is_imported_is_one_line(path):
     command = [sys.executable, "-c", INTERRUPTED, str(ROOT / path)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT)
@@ -139,7 +139,7 @@ def test_a_closed_output_pipe_ends_a_command_silently(call, capsys, monkeypatch,
     os.close(read)
     with monkeypatch.context() as patch, open(write, "w") as output:
         patch.setattr(sys, "stdout", output)
-        assert call("export_light", "light=grace", "height=4", "out=a.hdr") == 128 + signal.SIGPIPE
+        assert call("light", "light=grace", "height=4", "out=a.hdr") == 128 + signal.SIGPIPE
         print("what Python may still hold at its end", flush=True)
     assert capsys.readouterr().err == "" and (tmp_path / "a.hdr").is_file()
 

@@ -256,6 +256,15 @@ def test_a_published_network_is_the_same_to_half_precision_with_all_that_it_take
         assert ((half.double() - value.double()).abs() <= bound).all(), name
 
 
+def test_a_published_network_is_found_from_any_folder_unless_that_has_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = [networks.load_run(name).name for name in ("pretrained/none", "pretrained/none/model.safetensors")]
+    assert names == ["run:pretrained/none", "run:pretrained/none/model.safetensors"]
+    (tmp_path / "pretrained" / "none").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"run=pretrained/none holds neither best\.pt nor model\.safetensors"):
+        networks.load_run("pretrained/none")
+
+
 @pytest.mark.parametrize("arm", ["none", "random", "adversarial"])
 def test_the_published_networks_are_classifiers_of_cifar_100(arm):
     classifier = networks.load_classifier(f"run:{PRETRAINED / arm}")

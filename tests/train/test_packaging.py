@@ -9,11 +9,16 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("renderer", "augment", "train", "conf")
+TINY = (
+    *("data.train_per_class=4", "data.test_per_class=2", "data.validation=0.5", "compare=[]", "augment=none"),
+    *("data.images=null", "evaluate.photos=null", "train.epochs=1", "model.depth=10", "model.width=1"),
+)
 
 
 def sources() -> set[str]:
@@ -26,7 +31,7 @@ def sources() -> set[str]:
 def test_every_folder_of_modules_is_a_package_that_is_installed():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     with_modules = {Path(name).parent.as_posix().replace("/", ".") for name in sources() if name.endswith(".py")}
-    assert set(settings["packages"]) == with_modules
+    assert set(settings["packages"]) == with_modules | {"train.pretrained"}
 
 
 def dependencies() -> list[Requirement]:
@@ -52,12 +57,12 @@ def test_dependencies_have_permissive_licenses(name):
 
 
 @pytest.mark.slow
-def test_an_installation_holds_every_file_and_runs_from_any_folder(tmp_path):
+def test_an_installation_holds_every_file_and_runs_from_any_folder_also_beside_other_code_of_its_names(tmp_path):
     """Built from a copy, so that nothing is left in the repository."""
     if importlib.util.find_spec("setuptools") is None:
         pytest.skip("setuptools is not installed")
     copy, target = tmp_path / "copy", tmp_path / "target"
-    for name in PACKAGES:
+    for name in (*PACKAGES, "pretrained"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
     for path in [*ROOT.glob("README*"), *ROOT.glob("LICENSE*"), ROOT / "pyproject.toml"]:
         shutil.copy(path, copy)
@@ -65,7 +70,19 @@ def test_an_installation_holds_every_file_and_runs_from_any_folder(tmp_path):
     subprocess.run([sys.executable, "-m", "pip", "install", *options, copy], check=True)
     assert sources() <= {path.relative_to(target).as_posix() for path in target.rglob("*.*")}
     environment = os.environ | {"PYTHONPATH": str(target)}
-    command = [sys.executable, "-m", "train", "--help"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "experiment: best, cpu, demo, fast" in done.stdout and "learning_rate" in done.stdout
+    user = tmp_path / "user"
+    (user / "conf").mkdir(parents=True)
+    for name in ("train.py", "conf/__init__.py", "renderer.py", "augment.py"):
+        (user / name).write_text("raise SystemExit('not this')")
+    small = ["attack.max_steps=1", "attack.checks=false", "attack.force=true", "renderer.shadows=false", "out=out"]
+    for name, *arguments in [
+        *([path.name, "--help"] for path in sorted((target / "bin").glob("pnb-*"))),
+        ["pnb-attack", "classifier=run:pretrained/none", *small],
+        ["pnb-train", "--multirun", "launcher=joblib", "seed=0,1", *TINY],
+    ]:
+        done = subprocess.run(
+            [target / "bin" / name, *arguments], cwd=user, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        assert name in done.stdout or "--help" not in arguments
+    assert yaml.safe_load((user / "out" / "config.yaml").read_text())["command"].startswith("pnb-attack ")

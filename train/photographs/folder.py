@@ -22,7 +22,7 @@ SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".bmp", ".tif", "
 MACS = "__MACOSX"  # macOS puts this folder into archives
 FOREIGN = "other_"  # starts the name of a folder whose class the model lacks
 TABLE = "photos.csv"
-DESCRIPTION = "lab.json"  # of a folder that scripts/lab.py made
+DESCRIPTION = "lab.json"  # of a folder that pnb-lab made
 SEPARATOR = ";"  # between the sources in a cell of hard_negatives
 SKIP = ", or set skip_unreadable=true (evaluate.skip_unreadable=true in training) to skip them"
 

@@ -69,8 +69,7 @@ def require_comparable(arms: Evaluations, photographs: str) -> None:
         if [item.photograph for item in other.predictions] != images or other.run.label != first.run.label:
             raise InputError(
                 f"{other.run.folder / photographs} has other photographs or sources than "
-                f"{first.run.folder / photographs}: score both networks on the same folder with "
-                "scripts/evaluate_photos.py"
+                f"{first.run.folder / photographs}: score both on one folder with pnb-evaluate"
             )
 
 

@@ -80,7 +80,7 @@ def summarize(folder: Path) -> RunSummary:
         return RunSummary(folder, config, arm, label, seed, epochs, scores, accuracy, seconds, settings, photographs)
     except Exception as error:  # entries may be missing or of any type
         raise InputError(
-            f"{folder}: {CONFIG}, {METRICS_FILE} or a {SUMMARY} is not as `python -m train` wrote it "
+            f"{folder}: {CONFIG}, {METRICS_FILE} or a {SUMMARY} is not as `pnb-train` wrote it "
             f"({type(error).__name__}: {in_one_line(error)}): use another run"
         ) from error
 

@@ -157,7 +157,7 @@ def test_a_map_with_few_texels_or_another_aspect_ratio_is_refused(tmp_path, size
 def test_the_script_writes_the_map_of_a_probe_and_reports_its_negative_fraction(tmp_path, call, capsys, suffix, fate):
     out = tmp_path / f"grace{suffix}"
     radiance = to_map(probe("grace"), 32)
-    assert call("export_light", "light=grace", f"out={out}", "height=32") == 0
+    assert call("light", "light=grace", f"out={out}", "height=32") == 0
     output = capsys.readouterr().out
     assert output.startswith(f"{out}: 64 × 32 texels, radiance {radiance.min():.3g} to {radiance.max():.3g}; ")
     assert output.endswith(f"{negative_fraction(radiance):.2%} of it is negative and {fate}\n")

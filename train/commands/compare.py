@@ -1,4 +1,4 @@
-"""Markdown tables of finished runs, side by side: python scripts/compare_runs.py 'runs=[runs/a,runs/b]'"""
+"""Markdown tables of finished runs, side by side: pnb-compare 'runs=[runs/a,runs/b]'"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,5 +31,9 @@ def main(settings: Settings) -> None:
     print(format_comparison(runs, settings.exclude, settings.photographs))
 
 
+def start() -> None:
+    cli.command(__file__, __doc__, main, Settings)
+
+
 if __name__ == "__main__":
-    cli.script(main, Settings)
+    start()

@@ -1,4 +1,4 @@
-"""Write a light as an environment map for other software: python scripts/export_light.py light=grace out=grace.hdr"""
+"""Write a light as an environment map for other software: pnb-light light=grace out=grace.hdr"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,5 +39,9 @@ def main(settings: Settings) -> None:
     )
 
 
+def start() -> None:
+    cli.command(__file__, __doc__, main, Settings)
+
+
 if __name__ == "__main__":
-    cli.script(main, Settings)
+    start()

@@ -5,8 +5,8 @@ import pytest
 from safetensors import safe_open
 
 from renderer.errors import InputError
-from scripts.publish import Settings, main
 from train import checkpoint
+from train.commands.publish import Settings, main
 from train.networks import PUBLISHED, load_run
 
 

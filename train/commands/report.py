@@ -1,4 +1,4 @@
-"""A page of runs, sweeps and attacks: python scripts/report.py runs/sweep"""
+"""A page of runs, sweeps and attacks: pnb-report runs/sweep"""
 
 import os
 import sys
@@ -38,5 +38,9 @@ def as_overrides(arguments: list[str]) -> list[str]:
     return [*rest, f"runs=[{','.join(map(quoted, folders))}]"] if folders else rest
 
 
+def start() -> None:
+    cli.command(__file__, __doc__, main, Settings, as_overrides(sys.argv[1:]))
+
+
 if __name__ == "__main__":
-    cli.script(main, Settings, as_overrides(sys.argv[1:]))
+    start()

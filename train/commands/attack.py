@@ -1,4 +1,4 @@
-"""Attack a classifier through a mesh's light, shape, color or pixels: python scripts/attack.py attack=lighting ..."""
+"""Attack a classifier through a mesh's light, shape, color or pixels: pnb-attack attack=lighting"""
 
 import re
 import sys
@@ -16,5 +16,9 @@ def as_overrides(arguments: list[str]) -> list[str]:
     return [*parameters, *(["attack=[]"] if "reload" in keys and "attack" not in keys else [])]
 
 
+def start() -> None:
+    cli.command(__file__, __doc__, run, AttackExperimentSettings, as_overrides(sys.argv[1:]))
+
+
 if __name__ == "__main__":
-    cli.script(run, AttackExperimentSettings, as_overrides(sys.argv[1:]))
+    start()

@@ -1,6 +1,6 @@
-"""Score a network on a folder of photographs: python scripts/evaluate_photos.py run=... photos=...
+"""Score a network on a folder of photographs: pnb-evaluate run=pretrained/best photos=photos
 
-classifier= takes any other network, by a name that scripts/attack.py knows.
+classifier= takes any other network, by a name that pnb-attack knows.
 """
 
 from dataclasses import dataclass
@@ -61,5 +61,9 @@ def main(settings: Settings) -> None:
     print(f"{format_summary(summary)}\n\ntable, scores and image: {out}")
 
 
+def start() -> None:
+    cli.command(__file__, __doc__, main, Settings)
+
+
 if __name__ == "__main__":
-    cli.script(main, Settings)
+    start()

@@ -14,7 +14,7 @@ from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
 
 USER_ERROR = 2
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SMALL = [
     f"classifier=run:{ROOT / 'pretrained' / 'none'}", "attack.force=true", "attack.max_steps=2", "device=cpu",
     "renderer.rasterizer=numpy", "renderer.cache=null", "renderer.shadows=false", "attack.allow_negative=true",
@@ -23,7 +23,7 @@ SMALL = [
 
 @pytest.fixture
 def run(call) -> Callable[..., int]:
-    """`python scripts/attack.py` with small settings: the exit status."""
+    """`pnb-attack` with small settings: the exit status."""
     return partial(call, "attack", "out=out", *SMALL)
 
 
@@ -52,7 +52,9 @@ def test_one_parameter_and_several_at_once_run_and_write_what_they_promise(run, 
     assert 0 <= last["checks"]["random_search"] <= 1 and last["checks"]["cost_fell"] == 1
     config = OmegaConf.load(tmp_path / "out" / "config.yaml")
     assert set(config.attack) >= set(names.split("+"))
-    assert config.command == shlex.join(["python", "scripts/attack.py", "out=out", *SMALL, f"attack={parameters}"])
+    assert config.command == shlex.join(
+        ["python", "-m", "train.commands.attack", "out=out", *SMALL, f"attack={parameters}"]
+    )
 
 
 def example_is_physical(folder: Path) -> bool:

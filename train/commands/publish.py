@@ -1,4 +1,4 @@
-"""Write a run's network as half-precision safetensors: python scripts/publish.py run=runs/a out=pretrained/a
+"""Write a run's network as half-precision safetensors: pnb-publish run=runs/a out=published/a
 
 The file's metadata holds the run's settings and scores as JSON.
 """
@@ -51,5 +51,9 @@ def without_folders(value: Any) -> Any:
     return value
 
 
+def start() -> None:
+    cli.command(__file__, __doc__, main, Settings)
+
+
 if __name__ == "__main__":
-    cli.script(main, Settings)
+    start()

@@ -1,4 +1,4 @@
-"""The scripts' settings and outputs."""
+"""The commands' settings and outputs."""
 
 import json
 from pathlib import Path
@@ -33,8 +33,8 @@ def here(tmp_path) -> Path:
     return tmp_path
 
 
-EVALUATE = ["evaluate_photos", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
-EXPORT = ["export_light", "light=grace", "height=4"]
+EVALUATE = ["evaluate", "run=1.10", "photos=2024", "device=cpu", "precision=float32"]
+EXPORT = ["light", "light=grace", "height=4"]
 
 
 def test_a_network_is_scored_on_photographs_in_folders_named_by_numbers_or_not_in_utf_8(call, here, capsys):
@@ -65,10 +65,10 @@ WRONG = [
     ([*EVALUATE, "run=null", "classifier=python:nowhere:build"], "classifier=python:nowhere:build"),
     ([*EVALUATE, "weights=b"], "weights=b is not for classifier=run:1.10"),
     ([*EVALUATE, "out=file"], "out=file cannot be written to (Not a directory): choose another folder"),
-    (["compare_runs"], "runs is not set: give runs=..."),
-    (["compare_runs", "runs=[a,b,./a]"], "runs names a twice"),
-    (["compare_runs", "runs=[2024]"], "2024 holds no finished run"),
-    (["compare_runs", "--multirun"], "--multirun is not an option"),
+    (["compare"], "runs is not set: give runs=..."),
+    (["compare", "runs=[a,b,./a]"], "runs names a twice"),
+    (["compare", "runs=[2024]"], "2024 holds no finished run"),
+    (["compare", "--multirun"], "--multirun is not an option"),
     ([*EXPORT, "out=a.jpg"], "out: "),
     (["publish", "run=1.10", "out=file/out"], "out=file/out cannot be written to"),
     (["fit_skylight", "out=2024"], "out=2024 cannot be written (it is not a regular file): choose another file"),
@@ -94,9 +94,9 @@ def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
 
 
 def test_a_light_is_not_written_over_itself(call, here, capsys):
-    assert call("export_light", "light=grace", "height=8", "out=a.npy") == 0
+    assert call("light", "light=grace", "height=8", "out=a.npy") == 0
     (here / "b.npy").symlink_to("a.npy")
     whole = (here / "a.npy").read_bytes()
-    assert call("export_light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
+    assert call("light", "light=a.npy", "height=8", "out=b.npy") == USER_ERROR
     assert capsys.readouterr().err.startswith("error: out=b.npy is the light itself, which would be lost")
     assert (here / "a.npy").read_bytes() == whole

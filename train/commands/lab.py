@@ -1,4 +1,4 @@
-"""Path-trace photographs of oranges and hard negatives under a projector: python scripts/lab.py out=lab"""
+"""Path-trace photographs of oranges and hard negatives under a projector: pnb-lab out=lab"""
 
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
@@ -10,5 +10,9 @@ def main(settings: LabSettings) -> None:
     print(f"{settings.out}: {count} photographs under {settings.setups} setups")
 
 
+def start() -> None:
+    cli.command(__file__, __doc__, main, LabSettings)
+
+
 if __name__ == "__main__":
-    cli.script(main, LabSettings)
+    start()

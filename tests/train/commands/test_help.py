@@ -1,0 +1,60 @@
+"""--help, shell completion and the words that start an installed command."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from train import settings
+from train.settings import compose, dotted, given_command
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.mark.parametrize("name", ["train", "attack"])
+def test_help_shows_each_setting_with_its_comment_and_the_choices_that_apply(call, capsys, name):
+    assert call(name, "--help") == 0
+    printed = capsys.readouterr().out
+    assert f"pnb-{name} " in printed.splitlines()[0] and str(ROOT / "conf" / f"{name}.yaml") in printed
+    shown = set(re.findall(r"^  ([\w.]+)=", printed, re.M))
+    assert {key for key, _ in dotted(OmegaConf.to_container(compose(name)))} <= shown
+    text = (ROOT / "conf" / f"{name}.yaml").read_text().partition("\nhydra:")[0]
+    comments = re.findall(r"^ *\w+:.* # (.*)$", text, re.M)
+    assert len(comments) > 15 and all(f"  # {comment}\n" in printed for comment in comments)
+    assert "\n  renderer.shadows=" in printed and "of a mesh on itself" in printed  # of a group's file
+    assert ("experiment=best" in printed, "\n  attack=lighting" in printed) == (name == "train", name == "attack")
+
+
+def test_help_of_a_command_without_a_file_shows_the_comments_of_its_settings(call, capsys):
+    assert call("light", "-h") == 0
+    assert re.search(r"^  height=256 +# rows; there are twice as many columns$", capsys.readouterr().out, re.M)
+
+
+def test_a_shell_completes_an_installed_command_beside_a_train_py_of_the_user(tmp_path):
+    program = tmp_path / "bin" / "pnb-train"
+    program.parent.mkdir()
+    program.write_text("from train.__main__ import start\nstart()")
+    (tmp_path / "train.py").write_text("raise SystemExit('not this')")
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "COMP_LINE": "pnb-train experiment=b"}
+    command = [sys.executable, program, "-sc", "query=bash"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("experiment=best\n", "")
+
+
+@pytest.mark.parametrize(
+    ("started", "processes", "words"),
+    [
+        ("/bin/pnb-train", 1, "pnb-train seed=1"),
+        ("/bin/pnb-train", 2, "torchrun --nproc_per_node=2 --no-python pnb-train seed=1"),
+        ("/clone/train/__main__.py", 1, "python -m train seed=1"),
+        ("/clone/train/__main__.py", 2, "torchrun --nproc_per_node=2 -m train seed=1"),
+    ],
+)
+def test_the_command_of_a_run_starts_as_the_run_did(monkeypatch, started, processes, words):
+    monkeypatch.setattr(sys, "argv", [started])
+    monkeypatch.setattr(settings, "world_size", lambda: processes)
+    assert given_command(["seed=1", "run=a", "train.resume=true"]) == words
