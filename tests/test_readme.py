@@ -1,4 +1,4 @@
-"""The Python of the README and the guide, block by block, in a folder that holds what it reads."""
+"""The Python of the README, the guide and pretrained/, block by block, in a folder that holds what it reads."""
 
 import re
 from pathlib import Path
@@ -6,11 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 import trimesh
+from PIL import Image
 from torch import nn
 from torch.utils.data import Dataset
 
+import renderer
+from renderer.image import to_bytes
+
 ROOT = Path(__file__).parents[1]
-PAGES = ("README.md", "docs/guide.md")
+PAGES = ("README.md", "docs/guide.md", "pretrained/README.md")
 BLOCKS = {
     heading: "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     for page in PAGES
@@ -34,13 +38,21 @@ def run(heading: str, **names) -> dict[str, object]:
 
 
 def test_every_block_of_python_is_run_here():
-    assert BLOCKS.keys() == {"Attack a classifier", "Render", "Your own training loop"}
+    assert BLOCKS.keys() == {"Attack a classifier", "Render", "Your own training loop", "Load"}
 
 
 def test_render_block_has_a_gradient_by_light():
     names = run("Render")
     assert names["images"].shape == (10, 3, 224, 224)
     assert names["light"].grad.any()
+
+
+def test_load_block_recognizes_an_orange(folder):
+    image = renderer.render(
+        renderer.solid("orange", 0), renderer.orbit_cameras(1, width=2.4), renderer.load_light("grace"), 96
+    )
+    Image.fromarray(to_bytes(image[0]).permute(1, 2, 0).numpy()).save(folder / "orange.jpg")
+    assert run("Load")["predicted"] == "orange"
 
 
 class Brightness(nn.Module):

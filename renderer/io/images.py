@@ -13,7 +13,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 DECODED_SIZES = 16  # a JPEG is decoded no smaller than this multiple of the final size
 
 
-def read_image(path: Path, size: int) -> Tensor:
+def read_image(path: str | Path, size: int) -> Tensor:
     """`read_square` as (3, size, size) float32 in [0, 1]. InputError where the file cannot be read."""
     require_file(path, "give an image file")
     try:

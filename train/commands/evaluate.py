@@ -41,7 +41,7 @@ class Settings:
 def main(settings: Settings) -> None:
     device = choose_device(settings.device)
     if settings.run is None:
-        network = load_classifier(settings.classifier, settings.weights)
+        network = load_classifier(str(settings.classifier), settings.weights)
     else:
         network = load_run(settings.run, settings.weights, settings.model)
     network.label(settings.label)  # or InputError that names the network
