@@ -24,8 +24,9 @@ from train import console
 from train.command_help import format_help
 from train.errors import writable_file, writable_folder
 from train.processes import Interrupted, broadcast, first_process_first, process_group
+from train.report.compare import format_table
 from train.report.page import report_of
-from train.report.summary import format_table, summarize
+from train.report.summary import summarize
 from train.run import load_data, prepare, write_images
 from train.run_folder import sole_writer
 from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, read_settings

@@ -28,6 +28,7 @@ from train.recipe import SCHEDULES, MovingAverage, TrainSettings, augmentation, 
 from train.run_folder import PHASES, RunLog
 
 EVALUATION_BATCH = 512  # images at a time
+SHOWN = ("attack_success_before", "attack_success", "steps")  # of each round's diagnostics in metrics.jsonl
 
 
 @dataclass
@@ -211,15 +212,17 @@ class Trainer:
         rate = self.optimizer.param_groups[0]["lr"]
         trained = {"loss": loss_sum / images, "accuracy": hits / images, "learning_rate": rate}
         groups = {"train": trained, "validation": validated, "augment": diagnostics, "seconds": seconds}
+        for number, part in enumerate(state.diagnostics if len(state.diagnostics) > 1 else [], 1):
+            groups[f"round_{number}"] = {name: part[name] for name in SHOWN if name in part}
         metrics = {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
         self.history.append({"epoch": self.epoch, **metrics})
         if log:
             log.scalars(metrics, self.epoch)
-        success = diagnostics.get("attack_success")
+        success, correct = attack_success(diagnostics), 1 - diagnostics.get("attack_success_before", 1)
         console.info(
             f"epoch {self.epoch}/{self.settings.epochs}  train loss {trained['loss']:.3f} accuracy "
             f"{trained['accuracy']:.3f}  validation accuracy {validated['accuracy']:.3f}"
-            f"{'' if success is None else f'  attack success {success:.2f}'}"
+            f"{'' if success is None else f'  attack success {success:.2f} of the {correct:.0%} clean-correct'}"
             f"  {sum(seconds[name] for name in PHASES):.0f} s (attack {seconds['attack']:.1f} s)"
         )
 
@@ -299,6 +302,12 @@ class Trainer:
             (self.folder / checkpoint.LAST).unlink(missing_ok=True)  # or it would take the place of the whole one
         steps = self._under_way.step if self._under_way else 0
         console.info("resumed %s after epoch %d and %d steps", self.folder, self.epoch, steps)
+
+
+def attack_success(diagnostics: Mapping[str, float], prefix: str = "") -> float | None:
+    """The fraction of the examples that are correct before the attack on which it succeeds; None without any."""
+    before = diagnostics.get(f"{prefix}attack_success_before", 1.0)
+    return (diagnostics[f"{prefix}attack_success"] - before) / (1 - before) if before < 1 else None
 
 
 @torch.no_grad()

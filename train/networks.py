@@ -279,9 +279,9 @@ def publish(path: Path, state: Mapping[str, Any], **facts: object) -> None:
 def _load_published(path: Path) -> dict[str, Any]:
     try:
         with safe_open(path, "pt") as file:
-            architecture = json.loads(file.metadata()["architecture"])
+            facts = {name: json.loads(text) for name, text in file.metadata().items()}
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except Exception as error:  # safetensors and JSON raise many kinds for a damaged or foreign file
         raise InputError(f"checkpoint {path} is damaged or lacks its architecture; use another one") from error
     weights = {name: value.float() if value.is_floating_point() else value for name, value in weights.items()}
-    return checked({"model": weights, "architecture": architecture}, path)
+    return checked({**facts, "model": weights}, path)

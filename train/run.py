@@ -12,20 +12,21 @@ from augment.classifiers.adapter import class_index
 from augment.losses import complementary_label
 from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed
-from renderer.cache import TensorCache, cache_folder
+from renderer.cache import TensorCache, cache_folder, content_key
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE
 from train import checkpoint, console
 from train.data import DataSet, Split, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
 from train.device import MixedPrecision, choose_device, choose_precision, set_deterministic, set_threads
 from train.loop import Trainer, evaluate
-from train.networks import build_network, describe, load_selected, start_from
+from train.networks import PYTHON, build_network, describe, load_run, load_selected, start_from
 from train.photographs.folder import find_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
+from train.photographs.predictions import compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
 from train.rendered_shapes import load_shapes, write_held_out
-from train.run_folder import RunLog, require_same_run, write_config
+from train.run_folder import BEFORE, RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, keyed
 
 VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
@@ -57,9 +58,10 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
             f"{len(train)} images, {len(data.classes)} classes; {device}, {trainer.model.precision}, "
             f"{torch.get_num_threads()} threads, {utils.world_size()} processes"
         )
+        before = {} if utils.rank() else _scores_before(settings, trainer, data)
         log = None if utils.rank() else RunLog(folder, trainer.history)
         trainer.fit(train.to(device), validation.to(device), log)
-        scores = _test_scores(trainer, data) | _photograph_scores(settings, trainer, data)
+        scores = before | _test_scores(trainer, data) | _photograph_scores(settings, trainer, data)
         if log:
             log.scalars(scores)
         return scores
@@ -170,6 +172,35 @@ def _open_folder(trainer: Trainer, settings: ExperimentSettings, command: str) -
     if utils.rank() == 0:
         hardware = {"device": str(trainer.device), "precision": trainer.model.precision}
         write_config(folder, settings, hardware=hardware, command=command)
+
+
+def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
+    """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs.
+
+    Its predictions are cached under a hash of weights and images, for all runs that begin with it.
+    """
+    if not settings.train.init_from:
+        return {}
+    name, device = settings.model.name, trainer.device
+    base = load_run(settings.train.init_from, model=name)
+    model = MixedPrecision(base.to(device), trainer.model.precision).eval()
+    cache = TensorCache(None if name.startswith(PYTHON) else cache_folder(settings.renderer.cache))
+    key = checkpoint.content_hash([torch.__version__, str(model), model.precision, str(device), model.state_dict()])
+
+    def predict(images: torch.Tensor) -> torch.Tensor:
+        batch = content_key(key, images.cpu().numpy())
+        if (stored := cache.read(batch)) is None:
+            stored = {"logits": model(images).cpu().contiguous()}
+            cache.write(batch, stored)
+        return stored["logits"]
+
+    logits = compute_logits(predict, data.test.images, len(data.classes), device)
+    accuracy = (logits.argmax(1) == data.test.labels).float().mean().item()
+    console.info("before: %s has test accuracy %.4f", settings.train.init_from, accuracy)
+    for name, photographs in settings.evaluate.folders.items():
+        out, skip = trainer.folder / BEFORE / name, settings.evaluate.skip_unreadable
+        evaluate_photographs(predict, data.classes, photographs, settings.label, out, data.size, skip, device=device)
+    return {"test/accuracy_before": accuracy}
 
 
 def _test_scores(trainer: Trainer, data: DataSet) -> dict[str, float]:

@@ -27,6 +27,7 @@ from train.checkpoint import write_whole
 from train.settings import ExperimentSettings, dotted, is_within
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
+BEFORE = "before"  # sub-folder with the scores of the network that the run began with
 PHASES = ("attack", "training", "evaluation", "input_output")  # of an epoch; other phases are parts of these
 logging.raiseExceptions = False  # on a full disk train.log lacks lines, and only the run's own error is shown
 

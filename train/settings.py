@@ -30,7 +30,7 @@ from train.recipe import TrainSettings
 Settings = TypeVar("Settings")
 OTHER = "other"  # in place of the class of a hard negative that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
-RESERVED = ("renders", "rendered_images", "test")  # other sub-folders and scores of a run
+RESERVED = ("renders", "rendered_images", "test", "before")  # other sub-folders and scores of a run
 SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, LARGEST_SEED = 10**6, 2**63 - 1
 TEXTS = {  # keys whose values are names or paths, also where they look like numbers

@@ -21,8 +21,9 @@ from omegaconf import DictConfig, OmegaConf
 from renderer.errors import InputError
 from train import checkpoint, console
 from train.errors import one_sentence, writable_folder
+from train.report.compare import format_table
 from train.report.page import report_of
-from train.report.summary import format_table, is_finished, summarize
+from train.report.summary import is_finished, summarize
 from train.run import load_data, run, write_images
 from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
 from train.settings import ExperimentSettings, compose, given_command, read_settings

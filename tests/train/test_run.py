@@ -17,6 +17,7 @@ from train import checkpoint, loop
 from train.errors import one_sentence
 from train.networks import load_run
 from train.processes import Interrupted
+from train.report.summary import summarize
 from train.run import load_data, prepare, run
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings
@@ -278,3 +279,18 @@ def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(ti
         assert f"{60 - images} images, 3 classes" in caplog.text
         assert sum(line.startswith("validation: ") for line in caplog.messages) == warned
     assert load_run(tmp_path / "unknown").classes == ("apple", "orange", "pear")
+
+
+def test_the_network_begun_with_is_scored_on_the_same_images_and_computed_once(tiny, finished, photos, tmp_path):
+    cache = tmp_path / "cache"
+    keys = "train.epochs=1", "augment=none", f"renderer.cache={cache}", f"train.init_from={finished}"
+    settings, written = tiny(*keys, f"evaluate.photos={photos}"), []
+    for name in ("first", "second"):
+        scores = train(settings, tmp_path / name)
+        assert scores["test/accuracy_before"] == pytest.approx(read_metrics(finished)[-1]["test/accuracy"])
+        for file in ("predictions.csv", "summary.json"):
+            base, before = (folder / "photographs" / file for folder in (finished, tmp_path / name / "before"))
+            assert base.read_text() == before.read_text()
+        written.append({path.name: path.stat().st_ino for path in cache.iterdir()})
+    assert written[0] == written[1] and len(written[0]) == 2  # of the test set and of the photographs
+    assert summarize(tmp_path / "first").before.accuracy == scores["test/accuracy_before"]

@@ -1,5 +1,6 @@
 """Score a model on a folder of photographs: recall and false positives of one class, in files and as text."""
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Sequence
@@ -44,6 +45,7 @@ def evaluate_photographs(
     Written into `out`: predictions.csv, a row per photograph; contact_sheet.png; roc.csv and roc.png, the ROC curves
     overall and of each source that has positives and negatives; and summary.json, which is also returned:
 
+    - images: a hash of `label` and the photographs, equal where the metrics of two networks can be compared;
     - n: photographs, positives, negatives, unreadable, left_out; label; size; unreadable, left_out: their paths;
     - recall, top5: of the photographs of class `label`, and their most common wrong classes, most_common_wrong;
     - false_positive_rate: the fraction of all others that are predicted as `label`;
@@ -61,6 +63,9 @@ def evaluate_photographs(
     predictions = predict(photographs, logits, classes, label)
     pools = pool_by_source(predictions, label)
     others = [str(path) for path in left_out(folder)]
+    images_hash = hashlib.sha256(label.encode())
+    for photograph in photographs:
+        images_hash.update(repr(photograph).encode() + (folder / photograph.path).read_bytes())
 
     labels = sorted({item.photograph.label for item in predictions})
     by_class = {name: [item for item in predictions if item.photograph.label == name] for name in labels}
@@ -72,6 +77,7 @@ def evaluate_photographs(
     summary = {
         "label": label,
         "size": size,
+        "images": images_hash.hexdigest(),
         **metrics,
         "n": {
             "photographs": len(predictions),

@@ -5,22 +5,37 @@ import re
 import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime
 from itertools import islice
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from omegaconf import OmegaConf
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from renderer.errors import InputError
 from train.attack_examples import SUFFIX, Side, read_attack_examples
 from train.errors import one_sentence
-from train.photographs.metrics import OVERALL, metric_title
+from train.loop import attack_success
+from train.photographs.metrics import METRICS, OVERALL, find_metric, metric_title
 from train.photographs.sheet import evenly
 from train.report import compare, plots
 from train.report.plots import Picture
-from train.report.summary import Arms, AttackSummary, Findings, RunSummary, arms_of, find, run_tables, seconds_table
-from train.run_folder import CONFIG, read_config
+from train.report.summary import (
+    Arms,
+    AttackSummary,
+    Findings,
+    RunSummary,
+    arms_of,
+    by_images,
+    find,
+    pairs_of,
+    run_table,
+    run_tables,
+    seconds_table,
+)
+from train.run_folder import BEFORE, CONFIG, read_config
 from train.tables import as_text
 
 PAGE = "report.html"
@@ -32,9 +47,8 @@ HEADLINE = "recall_at/0.10"  # of METRICS, in the first sentence
 CURVES = {
     "train/accuracy": "training accuracy",
     "validation/accuracy": "validation accuracy",
-    "augment/attack_success": "attack success rate",
-    "augment/steps": "steps of the attack",
 }
+ROUNDS = "attack success on clean-correct renders"
 
 
 def write_report(folders: Sequence[Path], out: Path) -> Path:
@@ -47,7 +61,7 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     findings = find(folders)
     arms = arms_of(findings.runs)
     drawn = {name: runs[:MOST_SEEDS] for name, runs in islice(arms.items(), MOST_ARMS)}
-    folders_scored = sorted({name for group in drawn.values() for run in group for name in run.photographs})
+    photographs = [_photographs(title, group) for title, group in by_images(drawn).items()]
     loader = PackageLoader("train.report", ".")
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -56,14 +70,15 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     page = environment.get_template("page.html.jinja").render(
         arms=arms,
         findings=findings,
-        lead=_attack_sentence(findings.attacks),
-        tables=run_tables(arms),
+        **_about(folders, arms, findings),
+        lead=[*_accuracy_sentences(arms), _attack_sentence(findings.attacks)],
+        tables=[table for table in run_tables(arms, photographs=False) if table.rows],
         unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in findings.unfinished],
         curves=_curves(drawn, findings),
         seconds=seconds_table(drawn),
-        photographs=[_photographs(drawn, name) for name in folders_scored],
-        renders={arm: _renders(group[0]) for arm, group in drawn.items()},
-        examples={arm: _attack_examples(group[0]) for arm, group in drawn.items()},
+        photographs=photographs,
+        renders={arm: _renders(group[0]) for arm, group in drawn.items() if group[0].epochs},
+        examples={arm: _attack_examples(group[0]) for arm, group in drawn.items() if group[0].epochs},
         attacks=[_attack(attack) for attack in findings.attacks[:MOST_ATTACKS]],
         further=findings.attacks[MOST_ATTACKS:],
     )
@@ -93,7 +108,23 @@ def _curves(arms: Arms, findings: Findings) -> list[Picture]:
             for arm, seeds in known.items()
         }
         pictures.append(plots.curves(series, title))
+    rounds = {arm: [[*enumerate(_attacks_by_round(lines), 1)] for lines in seeds] for arm, seeds in epochs.items()}
+    known = {
+        arm: [([n for n, value in line if value is not None], [v for _, v in line if v is not None]) for line in lines]
+        for arm, lines in rounds.items()
+    }
+    pictures.append(plots.curves(known, ROUNDS, "round of renders"))
     return [picture for picture in pictures if picture]
+
+
+def _attacks_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | None]:
+    """The attack's success in each round of renders of a run, or in each epoch of one with a round per epoch."""
+    rates = []
+    for line in epochs:
+        rounds = sorted({int(name[6 : name.index("/")]) for name in line if name.startswith("round_")})
+        for prefix in [f"round_{number}/" for number in rounds] or ["augment/"]:
+            rates.append(attack_success(line, prefix))
+    return rates
 
 
 def _first_middle_last(run: RunSummary, suffix: str) -> list[tuple[int, Path]]:
@@ -122,58 +153,87 @@ def _attack_examples(run: RunSummary) -> dict[int, list[Picture]]:
 
 def _side(label: str, when: str, side: Side) -> Picture:
     image, sphere = (Image.fromarray(pixels.permute(1, 2, 0).numpy()) for pixels in (side.image, side.sphere))
-    pair = Image.new("RGB", (plots.SMALL + sphere.width, plots.SMALL), "white")
+    pair = Image.new("RGBA", (plots.SMALL + plots.GAP + sphere.width, plots.SMALL))  # transparent, also around the ball
     pair.paste(image.resize((plots.SMALL, plots.SMALL), Image.Resampling.NEAREST))
-    pair.paste(sphere, (plots.SMALL, (plots.SMALL - sphere.height) // 2))
+    ball = Image.new("L", (4 * sphere.width, 4 * sphere.height))
+    ImageDraw.Draw(ball).ellipse((0, 0, *ball.size), 255)
+    place = plots.SMALL + plots.GAP, (plots.SMALL - sphere.height) // 2
+    pair.paste(sphere, place, ball.resize(sphere.size, Image.Resampling.BOX))
     predicted = f"{side.confidence:.0%} {side.predicted}"
     return plots.encoded(pair, f"{label} {when}: {predicted}; a ball in its light", f"{when}: {predicted}")
 
 
-def _photographs(arms: Arms, name: str) -> dict[str, Any]:
-    """What the page shows of the photographs `name`: plots, tables, and the contact sheet of each arm's first run."""
-    runs = {arm: [run for run in group if name in run.photographs] for arm, group in arms.items()}
-    first = next(run for group in runs.values() for run in group)
-    rendered = OmegaConf.select(first.config, "data.images")
-    images = "held-out renders" if rendered and OmegaConf.select(first.config, "evaluate.photos") == rendered else name
-    metrics = {
-        metric_title(metric): {
-            arm: compare.mean_metric(run.metric(name, metric) for run in group) for arm, group in runs.items()
-        }
-        for metric in ("recall", "false_positive_rate", "auc")
+def _about(folders: Sequence[Path], arms: Arms, findings: Findings) -> dict[str, str]:
+    """The page's title, of what it is, and where and when that was made."""
+    labels = " and ".join(dict.fromkeys(group[0].label for group in arms.values() if group[0].label))
+    paths = [item.folder for part in (findings.runs, findings.attacks) for item in part]
+    last = max((file.stat().st_mtime for path in paths for file in path.iterdir() if file.name != PAGE), default=None)
+    names = [arm for arm, group in arms.items() if group[0].arm != BEFORE]
+    subject = f"{labels}: {', '.join(names)}" if arms else "Attacks" if findings.attacks else "Unfinished runs"
+    date = f"{datetime.fromtimestamp(last):%Y-%m-%d %H:%M}" if last else ""
+    return {"title": subject, "place": ", ".join(map(str, folders)), "date": date}
+
+
+def _accuracy_sentences(arms: Arms) -> list[str]:
+    """How the test accuracy of each arm compares with that of the network that it began with."""
+    sentences = []
+    for arm, group in arms.items():
+        known = [(run.accuracy, run.before.accuracy) for run in group if run.before]
+        if known and all(value is not None for pair in known for value in pair):
+            after, before = (fmean(pair[side] for pair in known) for side in (0, 1))
+            verb = "rose" if after > before else "fell" if after < before else "stayed"
+            sentences.append(f"{arm}: test accuracy {verb} from {before:.1%} to {after:.1%}.")
+    return sentences
+
+
+def _photographs(title: str, group: Mapping[str, Sequence[tuple[RunSummary, str]]]) -> dict[str, Any]:
+    """What the page shows of the scores on the same images: plots, tables, and a contact sheet of each arm."""
+    scored = {
+        arm: [(run.seed, [run.metric(name, metric) for metric in METRICS]) for run, name in runs]
+        for arm, runs in group.items()
     }
-    sheets = {arm: group[0].folder / name / "contact_sheet.png" for arm, group in runs.items() if group}
     content: dict[str, Any] = {
-        "name": images,
-        "bars": plots.bars(metrics, f"{first.label} on {images}"),
-        "sheets": {arm: plots.from_file(path, f"{name}, predictions of {arm}", SHEET) for arm, path in sheets.items()},
+        "name": title,
+        "sheets": {
+            arm: plots.from_file(run.folder / name / "contact_sheet.png", f"predictions of {arm} on {title}", SHEET)
+            for arm, ((run, name), *_) in group.items()
+        },
         "roc": None,
-        "tables": [],
-        "sentence": "",
+        "tables": [run_table("", [*map(metric_title, METRICS)], scored)],
+        "sentences": [],
     }
     try:
-        evaluations = {arm: [compare.read_evaluation(run, name) for run in group] for arm, group in runs.items()}
-        scores = {arm: [run.pools[OVERALL].scores for run in group] for arm, group in evaluations.items()}
-        evaluations = {arm: group for arm, group in evaluations.items() if group}
-        content |= {"roc": plots.roc(scores, first.label), "tables": [compare.source_table(evaluations, "all")]}
-        compare.require_comparable(evaluations, name)
-        content["tables"] += compare.difference_tables(evaluations, "all")
-        content["sentence"] = _difference_sentence(evaluations, images)
+        evaluations = compare.read_evaluations(group)
+        if not evaluations:
+            return content
+        scores = {arm: [run.pools[OVERALL].scores for run in runs] for arm, runs in evaluations.items()}
+        content["roc"] = plots.roc(scores, next(iter(evaluations.values()))[0].label)
+        content["sentences"] = _difference_sentences(evaluations, title)
+        sources = len(next(iter(evaluations.values()))[0].pools) > 1
+        content["tables"].append(compare.overall_differences(evaluations))
+        if sources:
+            content["tables"].append(compare.source_table(evaluations))
     except InputError as error:
-        content["sentence"] = str(error)
+        content["sentences"] = [str(error)]
     return content
 
 
-def _difference_sentence(arms: compare.Evaluations, images: str) -> str:
-    """The last arm against the first in recall at a fixed false positive rate."""
-    pairs = [*arms.items()]
-    (reference, base), (arm, group) = pairs[0], pairs[-1]
-    result = compare.difference(group, base, OVERALL, HEADLINE)
-    if arm == reference or not result:
-        return ""
-    unsure = "" if result["low"] > 0 or result["high"] < 0 else ", so that no difference is shown"
-    return (
-        f"{arm} minus {reference}, {metric_title(HEADLINE)} on {images}: {compare.format_difference(result)}{unsure}."
-    )
+def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
+    """How far recall at a fixed false positive rate is from that of the arm that an arm is compared with."""
+    sentences = []
+    for arm, base in pairs_of({arm: [evaluation.run for evaluation in group] for arm, group in arms.items()}):
+        result = compare.difference(arms[arm], arms[base], OVERALL, HEADLINE)
+        if result:
+            means = [
+                fmean(find_metric(run.metrics[OVERALL], HEADLINE)["value"] for run in arms[a]) for a in (base, arm)
+            ]
+            surely = result["low"] > 0 or result["high"] < 0
+            sentences.append(
+                f"{images}: {metric_title(HEADLINE)} is {means[0]:.2f} with {base} and {means[1]:.2f} with {arm}. "
+                f"The difference is {compare.format_difference(result)}"
+                f"{'' if surely else ', so that no difference is shown'}."
+            )
+    return sentences
 
 
 def _attack_sentence(attacks: Sequence[AttackSummary]) -> str:
@@ -199,5 +259,5 @@ def _attack(attack: AttackSummary) -> dict[str, Any]:
     config: Mapping[str, Any] = {}
     with suppress(InputError):
         config = read_config(attack.folder.parent / CONFIG)
-    checks = {name: value for name, value in attack.checks.items() if not isinstance(value, dict)}
+    checks = {name.replace("_", " "): value for name, value in attack.checks.items() if not isinstance(value, dict)}
     return {"folder": attack.folder, "images": images, "rows": attack.rows, "checks": checks, "config": config}

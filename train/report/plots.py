@@ -22,6 +22,7 @@ LINES, MARKERS = ("--", "-", ":", "-."), "osD^vP"
 SIZE = (4.4, 3.3)  # inches
 WIDTH = 440  # CSS pixels
 SMALL = 96  # pixels per side of small images
+GAP = 8  # pixels between an image and the ball in its light
 INK = "#123456"  # replaced by the ink of the reader's color scheme
 STYLE = "<style>svg{color:#1a1a1a}@media (prefers-color-scheme:dark){svg{color:#e4e4e4}}</style>"
 PLOT = {
@@ -60,8 +61,8 @@ def style(index: int) -> dict[str, Any]:
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
-def curves(arms: Mapping[str, Sequence[Line]], title: str) -> Picture | None:
-    """A line over the epochs per seed, in the color of its arm; None where no line has two points that differ."""
+def curves(arms: Mapping[str, Sequence[Line]], title: str, x_title: str = "epoch") -> Picture | None:
+    """A line per seed in the color of its arm, over epochs or rounds; None where no line has two points that differ."""
     if not any(len(set(y)) > 1 for lines in arms.values() for _, y in lines):
         return None
 
@@ -70,11 +71,11 @@ def curves(arms: Mapping[str, Sequence[Line]], title: str) -> Picture | None:
             for number, (x, y) in enumerate(line for line in lines if len(line[0]) > 1):
                 marker = MARKERS[index % len(MARKERS)] if len(x) < 30 else None
                 axes.plot(x, y, marker=marker, ms=4, label=None if number else arm, **style(index))
-        axes.set(xlabel="epoch")
+        axes.set(xlabel=x_title)
         axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
     ends = [f"{arm} {np.mean(last):.2f}" for arm, lines in arms.items() if (last := [y[-1] for _, y in lines if y])]
-    return _plot(draw, title, f"{title} by epoch, at the end: {', '.join(ends)}")
+    return _plot(draw, title, f"{title} by {x_title}, at the end: {', '.join(ends)}")
 
 
 def roc(arms: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
@@ -87,28 +88,6 @@ def roc(arms: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
         f"{arm} {np.mean([auc_and_recalls(*pair)[0] for pair in pairs]):.3f}" for arm, pairs in known.items() if pairs
     ]
     return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", f"ROC; AUC: {', '.join(areas)}")
-
-
-def bars(metrics: Mapping[str, Mapping[str, Mapping[str, float]]], title: str) -> Picture:
-    """Bars with intervals, a row per metric and a bar per arm: {value, low, high}, or {} where it is unknown."""
-
-    def draw(axes: "Axes") -> None:
-        for row, by_arm in enumerate(metrics.values()):
-            for index, (arm, metric) in enumerate(by_arm.items()):
-                if metric:
-                    place, value, high = row + 0.8 * (index + 0.5) / len(by_arm), metric["value"], metric["high"]
-                    axes.barh(place, value, 0.7 / len(by_arm), color=style(index)["color"], label=arm)
-                    axes.hlines(place, metric["low"], high, color=INK, linewidth=1)
-                    axes.annotate(f" {value:.2f}", (max(value, high), place), va="center")
-        axes.set_yticks(np.arange(len(metrics)) + 0.4, [*metrics])
-        axes.set_xlim(0, 1.15)
-        axes.invert_yaxis()
-
-    texts = []
-    for name, by_arm in metrics.items():
-        values = [f"{arm} {metric['value']:.2f}" for arm, metric in by_arm.items() if metric]
-        texts.append(f"{name}: {', '.join(values) or '-'}")
-    return _plot(draw, title, f"{title}. {'; '.join(texts)}")
 
 
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
@@ -134,7 +113,8 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
 def encoded(image: Image.Image, alt: str, caption: str = "") -> Picture:
     """As PNG if it is small, else as JPEG."""
     file, small = io.BytesIO(), max(image.size) <= 2 * SMALL
-    image.convert("RGB").save(file, "PNG" if small else "JPEG", optimize=True, quality=82)
+    shown = image if small else image.convert("RGB")
+    shown.save(file, "PNG" if small else "JPEG", optimize=True, quality=82)
     return Picture(file.getvalue(), "png" if small else "jpeg", alt, image.width, caption)
 
 

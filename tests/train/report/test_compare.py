@@ -1,5 +1,6 @@
 import re
 from pathlib import Path, PurePosixPath
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from renderer.errors import InputError
 from train.photographs.folder import Photograph
 from train.photographs.metrics import compute_metrics, pool
 from train.photographs.predictions import Prediction, write_predictions
-from train.report.compare import format_comparison
+from train.report.compare import format_comparison, format_table
 from train.report.page import write_report
 from train.report.summary import summarize
 
@@ -36,7 +37,8 @@ def scored_run(tmp_path, made_up_run, monkeypatch):
             for score in group
         ]
         predictions = [prediction(index, *kind) for index, kind in enumerate(kinds)]
-        summaries = {name: compute_metrics(pool(predictions, "orange"), "orange")}
+        images = {"images": str([item.photograph for item in predictions]), "label": "orange"}
+        summaries = {name: compute_metrics(pool(predictions, "orange"), "orange") | images}
         folder = made_up_run(tmp_path / f"{len(list(tmp_path.iterdir()))}", arm, summaries, *overrides)
         write_predictions(folder / name / "predictions.csv", predictions, "orange")
         return folder
@@ -48,6 +50,7 @@ def compare(read_markdown, folders: list[Path], exclude=(), **keys) -> dict[str,
     return read_markdown(format_comparison([summarize(folder) for folder in folders], exclude, **keys))
 
 
+ARMS = ["random", "adversarial"]
 STUDIO_AND_WEB = {"studio": ([1, 1, 1, 1], []), "web": ([1, -1, -1, -1, -1], [-2, 3]), None: ([1, -1], [])}
 
 
@@ -63,8 +66,8 @@ def test_a_comparison_shows_every_source_and_pools_all_but_some(scored_run, made
     # the studio has nothing to rank oranges against
     assert [row[2] for row in values] == ["0.500", "0.714", "-", "-", "0.500", "0.800"]
     assert "adversarial minus none (1 and 1 seeds)" in tables
-    seconds = tables["seconds per epoch, and once for the operators"]
-    assert seconds[1] == ["none", "0.75", "4.50", "1.50", "0.75", "0.38", "7.00"]
+    seconds = tables["seconds per epoch"]
+    assert seconds[1] == ["none", "7.50", "0.75", "4.50", "1.50", "0.75", "0.38", "7.00"]
 
 
 def test_another_folder_of_photographs_is_compared_by_its_name(scored_run, read_markdown):
@@ -77,11 +80,53 @@ def test_another_folder_of_photographs_is_compared_by_its_name(scored_run, read_
         compare(read_markdown, folders, ["stdio"], photographs="lab")
 
 
-def test_a_report_of_runs_scored_on_different_photographs_shows_each_and_says_so(scored_run, tmp_path):
-    runs = [scored_run("none", STUDIO_AND_WEB), scored_run("random", {**STUDIO_AND_WEB, "web": ([1], [0])})]
+def test_only_scores_on_the_same_images_share_a_table_plot_or_sentence(scored_run, tmp_path, read_markdown):
+    """Two arms on four images, and a third network on two others in a sub-folder of the same name."""
+    runs = [scored_run(arm, {"web": ([1, -1], scores)}) for arm, scores in [("none", [0, 2]), ("random", [0, -2])]]
+    runs.append(scored_run("adversarial", {"web": ([1], [0])}))
     text = write_report(runs, tmp_path / "out").read_text()
-    assert f"{runs[1]}/photographs has other photographs or sources than {runs[0]}/photographs" in text
-    assert re.search(r'alt="ROC; AUC: none 0\.\d+, random 0\.\d+"', text)
+    assert re.findall(r'alt="ROC; AUC: ([^"]*)"', text) == ["none 0.250, random 0.750", "adversarial 1.000"]
+    assert re.findall(r"(\w+) minus (\w+)", text) == [("random", "none")]
+    assert (
+        len(re.findall(r"<p>photographs, 2 of orange and 2 of other things: .* with none and .* with random", text))
+        == 1
+    )
+    tables = read_markdown(format_table([summarize(folder) for folder in runs]))
+    arms = {title: [row[0] for row in table[1:]] for title, table in tables.items() if title.startswith("photographs")}
+    assert list(arms.values()) == [["none", "random"], ["adversarial"]]
+
+
+def test_a_hardened_network_is_compared_with_the_one_it_began_with_and_with_others_from_there(
+    scored_run, tmp_path, read_markdown
+):
+    """The first network is scored by each run that begins with it, and once by scripts/evaluate_photos.py."""
+    start, scores = (
+        "train.init_from=base",
+        [([1, -1, -1, -1], [0, 2]), ([1, 1, -1, -1], [0, 2]), ([1, 1, 1, 1], [0, 2])],
+    )
+    base = scored_run("none", {"web": scores[0]}) / "photographs"
+    folders = [
+        scored_run(arm, {"web": pair}, start) for arm, pair in zip(("random", "adversarial"), scores[1:], strict=True)
+    ]
+    for folder in folders:
+        copytree(base, folder / "before" / "photographs")
+        lines = (
+            (folder / "metrics.jsonl").read_text().replace('"test/epoch"', '"test/accuracy_before": 0.5, "test/epoch"')
+        )
+        (folder / "metrics.jsonl").write_text(lines)
+    tables = compare(read_markdown, folders)
+    assert [row[:3] for row in tables[""][1:]] == [["before", "", "0.500"], *([a, "0", "0.765"] for a in ARMS)]
+    found = {
+        title.partition(" (")[0]: table[1][1].partition(" ")[0] for title, table in tables.items() if "minus" in title
+    }
+    assert found == {
+        "random minus before": "+0.250", "adversarial minus before": "+0.750", "adversarial minus random": "+0.500",
+    }  # fmt: skip
+    text = write_report(folders, tmp_path / "out").read_text()
+    assert "random: test accuracy rose from 50.0% to 76.5%" in text and "with before and" in text
+    copytree(base, alone := tmp_path / "scores" / "base")
+    tables = compare(read_markdown, [alone, folders[1]])
+    assert tables["adversarial minus scores/base (1 and 1 seeds, paired)"][1][1].startswith("+0.750")
 
 
 def test_a_report_leads_with_the_difference_of_arms_and_their_mean_scores(scored_run, tmp_path):
@@ -94,9 +139,9 @@ def test_a_report_leads_with_the_difference_of_arms_and_their_mean_scores(scored
     ]
     text = write_report(folders, tmp_path / "out").read_text()
     assert re.search(
-        r"<p>random minus none, recall at 10% FPR on photographs: [+-]0\.000 \[.*, so that no difference", text
+        r"is \d\.\d+ with none and \d\.\d+ with random. The difference is [+-]0\.000 \[.*, so that no", text
     )
-    assert 'alt="orange on photographs. recall: none 0.50, random 0.50; FPR: none 0.50, random 0.50; AUC: none ' in text
+    assert "<td>0.500 ± 0.354</td>" in text
 
 
 def test_runs_scored_on_different_photographs_are_refused_by_name(scored_run, read_markdown):

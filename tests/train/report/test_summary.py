@@ -3,7 +3,8 @@ import json
 import pytest
 
 from renderer.errors import InputError
-from train.report.summary import format_table, read_attack, summarize
+from train.report.compare import format_table
+from train.report.summary import read_attack, summarize
 from train.tables import format_interval, fraction
 
 
@@ -20,7 +21,12 @@ def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_
     settings = {2: ["seed=0"], 4: ["seed=1"], 9: ["seed=2"], 5: ["seed=0", "train.epochs=9"]}
     runs = []
     for hits, overrides in settings.items():
-        summary = {"recall": fraction(hits, 10), "false_positive_rate": fraction(1, 10)}
+        summary = {
+            "images": "same",
+            "label": "orange",
+            "recall": fraction(hits, 10),
+            "false_positive_rate": fraction(1, 10),
+        }
         runs.append(summarize(made_up_run(tmp_path / str(hits), "random", {"lab": summary}, *overrides)))
     tables = read_markdown(format_table(runs))
     first, second = "random, train.epochs=3", "random, train.epochs=9"
