@@ -122,7 +122,7 @@ def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(run_swee
     printed = capsys.readouterr().out
     assert all(f"finished before: {folder}\n" in printed for folder in folders)
     assert [row[:2] for row in rows(printed)] == [
-        ["augment", "seed"], ["none", "0"], ["none", "1"], ["none", "2 seeds"]
+        ["network", "seed"], ["none", "0"], ["none", "1"], ["none", "2 seeds"]
     ]  # fmt: skip
 
 
@@ -230,7 +230,7 @@ def test_joblib_trains_runs_in_parallel_processes(tiny_npz, folder_of, tmp_path)
     assert sweep_process(tmp_path / "sweep", *overrides).wait(300) == 1
     printed = (tmp_path / "output.txt").read_text()
     good, bad = (folder_of(tmp_path / "sweep", f"train.learning_rate={rate}") for rate in ("0.05", "-1"))
-    assert [row[0] for row in rows(printed)] == ["augment", "none"] and "Traceback" not in printed
+    assert [row[0] for row in rows(printed)] == ["network", "none"] and "Traceback" not in printed
     assert f"{bad}: failed: {(bad / FAILURE).read_text()}" in printed
     log = (good / "train.log").read_text().splitlines()
     assert [line.removeprefix("#0 ") for line in printed.splitlines() if line.startswith("#0 ")] == log

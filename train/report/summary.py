@@ -14,7 +14,7 @@ from augment.attacks.files import LINES
 from augment.service import ARMS
 from renderer.errors import InputError, in_one_line
 from train import checkpoint
-from train.networks import PUBLISHED, load_selected
+from train.networks import PUBLISHED, load_selected, published
 from train.photographs.metrics import METRICS, find_metric, metric_title
 from train.photographs.scoring import SUMMARY
 from train.run_folder import (
@@ -79,6 +79,7 @@ def summarize(folder: Path) -> RunSummary:
 
     InputError for a folder without one, or where a file lacks an entry of the tables.
     """
+    folder = published(folder)
     if not any((is_finished(folder), (folder / SUMMARY).is_file(), (folder / PUBLISHED).is_file())):
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")
     whole = folder.absolute()
