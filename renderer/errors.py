@@ -40,7 +40,7 @@ def as_device(device: torch.device | str) -> torch.device:
         raise InputError(f"device={device} is not available here: use cpu, or cuda where there is a GPU") from error
 
 
-def require_file(path: Path, advice: str) -> None:
+def require_file(path: str | Path, advice: str) -> None:
     """InputError naming a path that is not a regular file: a pipe would block."""
     if not os.path.isfile(path):  # False, too, for an invalid name or a folder without permission
         raise InputError(f"{path} {'is not a regular file' if os.path.exists(path) else 'does not exist'}: {advice}")

@@ -23,7 +23,7 @@ def read_image(path: str | Path, size: int) -> Tensor:
     return torch.from_numpy(np.array(square)).permute(2, 0, 1) / 255
 
 
-def read_square(path: Path, size: int) -> np.ndarray:
+def read_square(path: str | Path, size: int) -> np.ndarray:
     """The center square of an image as (size, size, 3) uint8. Raises whatever Pillow does at a broken file."""
     with Image.open(path) as image:
         # A large JPEG is decoded at 1/2, 1/4 or 1/8 of its size, several times faster.

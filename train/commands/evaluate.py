@@ -47,17 +47,9 @@ def main(settings: Settings) -> None:
     network.label(settings.label)  # or InputError that names the network
     model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
+    photos, label, skip = Path(settings.photos), settings.label, settings.skip_unreadable
     with sole_writer("out", out):
-        summary = evaluate_photographs(
-            model,
-            network.classes,
-            Path(settings.photos),
-            settings.label,
-            out,
-            size=network.size,
-            skip_unreadable=settings.skip_unreadable,
-            device=device,
-        )
+        summary = evaluate_photographs(model, network.classes, photos, label, out, network.size, skip, device)
     print(f"{format_summary(summary)}\n\ntable, scores and image: {out}")
 
 
