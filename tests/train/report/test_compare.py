@@ -99,7 +99,7 @@ def test_only_scores_on_the_same_images_share_a_table_plot_or_sentence(scored_ru
 def test_a_hardened_network_is_compared_with_the_one_it_began_with_and_with_others_from_there(
     scored_run, tmp_path, read_markdown
 ):
-    """The first network is scored by each run that begins with it, and once by scripts/evaluate_photos.py."""
+    """The first network is scored by each run that begins with it, and once by pnb-evaluate."""
     start, scores = (
         "train.init_from=base",
         [([1, -1, -1, -1], [0, 2]), ([1, 1, -1, -1], [0, 2]), ([1, 1, 1, 1], [0, 2])],
