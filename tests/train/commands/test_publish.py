@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 from shutil import copytree
 
 import pytest
@@ -7,7 +8,8 @@ from safetensors import safe_open
 from renderer.errors import InputError
 from train import checkpoint
 from train.commands.publish import Settings, main
-from train.networks import PUBLISHED, load_run
+from train.networks import PUBLISHED, load_run, load_selected
+from train.report.summary import summarize
 
 
 def test_a_published_network_loads_and_its_file_holds_settings_and_scores_without_paths(finished, tmp_path):
@@ -21,6 +23,8 @@ def test_a_published_network_loads_and_its_file_holds_settings_and_scores_withou
     assert metadata["settings"]["data.path"] == "tiny.npz" and metadata["settings"]["train.epochs"] == 3
     summary = json.loads((finished / "photographs" / "summary.json").read_text())
     assert metadata["scores"]["photographs"]["auc"] == summary["auc"]
+    scored, run = summarize(out), summarize(finished)
+    assert (scored.accuracy, scored.photographs) == (run.accuracy, run.photographs)
     assert str(finished.parent) not in str(metadata) and str(tmp_path) not in str(metadata)
 
 
@@ -31,3 +35,11 @@ def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
     with pytest.raises(InputError, match=r"best\.pt is from another architecture"):
         main(Settings(str(run), str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["none", "random", "adversarial", "best"])
+def test_each_pretrained_network_says_what_it_left_out_and_has_scores_on_one_set_of_photographs(name):
+    architecture = load_selected(Path("pretrained", name))[1]["architecture"]
+    assert architecture["validation"]["fraction"] == 0.02
+    images = {summarize(Path("pretrained", other)).photographs["photographs"]["images"] for other in ("none", name)}
+    assert len(images) == 1
