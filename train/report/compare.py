@@ -83,7 +83,7 @@ def source_table(arms: Evaluations, pooled: str | None = None) -> Table:
         for arm, group in arms.items():
             results = [run.metrics.get(source, {}) for run in group]
             means = (mean_metric(find_metric(result, name) for result in results) for name in METRICS)
-            rows.append([source or pooled, arm, *map(format_interval, means)])
+            rows.append([source or str(pooled), arm, *map(format_interval, means)])
     return Table("by source", ["source", "network", *map(metric_title, METRICS)], rows)
 
 

@@ -109,11 +109,11 @@ def _curves(arms: Arms, findings: Findings) -> list[Picture]:
         }
         pictures.append(plots.curves(series, title))
     rounds = {arm: [[*enumerate(_attacks_by_round(lines), 1)] for lines in seeds] for arm, seeds in epochs.items()}
-    known = {
+    rates = {
         arm: [([n for n, value in line if value is not None], [v for _, v in line if v is not None]) for line in lines]
         for arm, lines in rounds.items()
     }
-    pictures.append(plots.curves(known, ROUNDS, "round of renders"))
+    pictures.append(plots.curves(rates, ROUNDS, "round of renders"))
     return [picture for picture in pictures if picture]
 
 
@@ -178,9 +178,9 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
     """How the test accuracy of each arm compares with that of the network that it began with."""
     sentences = []
     for arm, group in arms.items():
-        known = [(run.accuracy, run.before.accuracy) for run in group if run.before]
-        if known and all(value is not None for pair in known for value in pair):
-            after, before = (fmean(pair[side] for pair in known) for side in (0, 1))
+        bases = [run.before.accuracy for run in group if run.before and run.before.accuracy is not None]
+        if bases:
+            after, before = fmean(run.scores["test/accuracy"] for run in group), fmean(bases)
             verb = "rose" if after > before else "fell" if after < before else "stayed"
             sentences.append(f"{arm}: test accuracy {verb} from {before:.1%} to {after:.1%}.")
     return sentences

@@ -245,7 +245,7 @@ def seconds_table(arms: Arms) -> Table:
 
 
 def run_table(
-    title: str, header: Sequence[str], arms: Mapping[str, Sequence[tuple[int | None, list[Metric]]]]
+    title: str, header: Sequence[str], arms: Mapping[str, Sequence[tuple[int | None, Sequence[Metric]]]]
 ) -> Table:
     """arms: by name, the seed of each run and its metrics, one per column."""
     rows = []
