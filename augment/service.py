@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from augment import utils
 from augment.attacks.attack import AttackSettings, logits_of
@@ -137,12 +138,26 @@ class AttackExamples:
         return len(self.labels)
 
 
+class Label(Tensor):
+    """A label (), which PyTorch's DataLoader puts into a batch with numbers, too."""
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # results are plain tensors
+
+
+def _collate_labels(batch: Sequence[Any], *, collate_fn_map: Any = None) -> Tensor:
+    return torch.tensor([int(label) for label in batch])
+
+
+default_collate_fn_map[Label] = _collate_labels  # of batches that begin with a render
+
+
 @dataclass(frozen=True)
-class Renders(Dataset[tuple[Tensor, int]]):
+class Renders(Dataset[tuple[Tensor, Tensor]]):
     """Labeled examples: images in [0, 1], labels, and diagnostics as plain numbers.
 
     attack_examples: a few successful ones with what they were before the attack; None where that is not known.
-    As a data set, it holds pairs of an image on the CPU and its label as a number, so that `data + renders` is both.
+    As a data set, it holds pairs of an image on the CPU and its label, so that `data + renders` is both, whether the
+    labels of `data` are numbers or tensors.
     """
 
     images: Float[Tensor, "E 3 H W"]
@@ -153,8 +168,8 @@ class Renders(Dataset[tuple[Tensor, int]]):
     def __len__(self) -> int:
         return len(self.labels)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, int]:
-        return self.images[index].cpu(), int(self.labels[index])
+    def __getitem__(self, index: int) -> tuple[Tensor, Label]:
+        return self.images[index].cpu(), self.labels[index].cpu().as_subclass(Label)
 
 
 @dataclass(eq=False, repr=False)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,12 +26,11 @@ from augment.scene import Scene
 from augment.utils import generator
 from renderer.camera import MOST_VIEWS
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.rasterizer import choose
 from train.device import choose_device
 from train.errors import writable_folder
 from train.networks import load_classifier
 from train.run_folder import sole_writer, write_config
-from train.settings import LARGEST_SEED, keyed, program, read_object
+from train.settings import LARGEST_SEED, chosen_rasterizer, keyed, program, read_object
 from train.tables import aligned, format_fraction, fraction
 
 TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
@@ -140,7 +140,7 @@ def run(settings: AttackExperimentSettings) -> None:
     device = choose_device(settings.device)
     classifier = load_classifier(settings.classifier, settings.weights).to(device)
     if adversary is not None:
-        images = adversary.render(choose(settings.renderer.rasterizer)).to(device)
+        images = adversary.render(chosen_rasterizer(settings.renderer)).to(device)
         logits = logits_of(settings.attack.preprocessed_model(classifier), images[None], len(images))[0]
         print(format_reloaded(adversary, images, logits, classifier.classes))
         if not settings.attack.parameters:
@@ -182,7 +182,7 @@ def attacks(
     if adversary is not None:
         if adversary.pixels is not None:
             raise InputError(f"reload={settings.reload}: no attack goes on from changed pixels: leave attack= out")
-        scene = adversary.scene(choose(settings.renderer.rasterizer), device)
+        scene = adversary.scene(chosen_rasterizer(settings.renderer), device)
         name = adversary.shown.name
         yield name, settings.scene, attack(classifier, scene, target, settings.attack, seed=seed, force=True)
         return
@@ -192,7 +192,11 @@ def attacks(
         if settings.scene.search and not force:
             draws = generator(seed, named.mesh, "search")
             chosen = find_scene(classifier, chosen, settings.attack, build, chosen.search, draws)
-        result = attack(classifier, build(chosen), target, settings.attack, seed=seed, force=force)
+        attacked = build(chosen)
+        try:
+            result = attack(classifier, attacked, target, settings.attack, seed=seed, force=force)
+        except InputError as error:  # which names arguments of Python
+            raise InputError(re.sub(r"(force|shared)=True", r"attack.\1=true", str(error))) from error
         yield named.mesh, chosen, result
 
 
@@ -205,9 +209,10 @@ def build_attacked(
 ) -> Scene:
     """Views × backgrounds at `size` pixels per side, as an example each, or where views share what is attacked, an
     example per background."""
+    options: dict[str, Any] = {"scene": scene, "renderer": settings.renderer, "device": device}
+    options["rasterizer"] = chosen_rasterizer(settings.renderer)
     with keyed("scene", vars(scene)):
-        shared, renderer = settings.attack.shared, settings.renderer
-        return build_scene([item], size, scene.views, shared=shared, scene=scene, renderer=renderer, device=device)
+        return build_scene([item], size, scene.views, shared=settings.attack.shared, **options)
 
 
 def load_others(settings: AttackExperimentSettings, attacked: Classifier, device: torch.device) -> dict[str, Any]:

@@ -235,10 +235,15 @@ def _of_one_architecture(path: Path) -> Iterator[None]:
         ) from error
 
 
-def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
-    """The file of a run's selected network, best.pt or model.safetensors or such a file itself, and its content."""
+def selected_file(run: Path) -> Path | None:
+    """The file of a run's selected network, best.pt or model.safetensors or such a file itself; None without one."""
     found = published(run)
-    path = next((file for file in (found, found / BEST, found / PUBLISHED) if file.is_file()), None)
+    return next((file for file in (found, found / BEST, found / PUBLISHED) if file.is_file()), None)
+
+
+def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
+    """The file of a run's selected network, and its content."""
+    path = selected_file(run)
     if path is None:
         raise InputError(f"run={run} holds neither {BEST} nor {PUBLISHED}: give a folder that pnb-train wrote")
     return path, _load_published(path) if path.suffix == ".safetensors" else load(path)

@@ -27,7 +27,7 @@ from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
 from train.rendered_shapes import load_shapes, write_held_out
 from train.run_folder import BEFORE, RunLog, require_same_run, write_config
-from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, keyed
+from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
 VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
 
@@ -150,10 +150,11 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
         for key, item in objects.items():
             if item.label != OTHER:
                 numbers[item.label] = class_index(data.classes, item.label, f"label of {key}")
-        options: dict[str, Any] = {"scene": settings.scene, "renderer": settings.renderer, "device": device}
+        rasterizer = chosen_rasterizer(settings.renderer)
+        console.info("rasterizer: %s", rasterizer.description)
+        options: dict[str, Any] = {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}
         with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
-            scene = build_scene(list(objects.values()), data.size, settings.views, **options)
-        console.info("rasterizer: %s", scene.rasterizer.description)
+            scene = build_scene(list(objects.values()), data.size, settings.views, **options, device=device)
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
         ranked = label if settings.scene.hard_negatives else None
     return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process)

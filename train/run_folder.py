@@ -24,6 +24,7 @@ from renderer.errors import InputError, in_one_line
 from renderer.image import to_bytes
 from train.attack_examples import SUFFIX, write_attack_examples
 from train.checkpoint import write_whole
+from train.networks import selected_file
 from train.settings import ExperimentSettings, dotted, is_within
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
@@ -37,7 +38,7 @@ CIRCUMSTANCES = (
     *("renderer.cache", "train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )
 INPUTS = (
-    *("data.path", "augment.vary.environments"),
+    *("data.path", "augment.vary.environments", "train.init_from"),
     *("scene.meshes", "scene.hard_negatives", "scene.backgrounds", "scene.light"),
 )
 
@@ -190,7 +191,8 @@ def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool 
 
 
 def fingerprints(settings: Any) -> dict[str, str]:
-    """SHA-256 of every file, and of the names and sizes in every folder, that INPUTS name, by path."""
+    """SHA-256 of every file that INPUTS name, of the network in a run's folder, and of the names and sizes in every
+    other folder, by path."""
     by_key = dict(dotted(asdict(settings)))
     paths = {path for key in INPUTS for path in _paths(by_key.get(key)) if os.path.exists(path)}
     return {path: _fingerprint(Path(path)) for path in sorted(paths)}
@@ -209,6 +211,7 @@ def _paths(value: Any) -> Iterator[str]:
 
 
 def _fingerprint(path: Path) -> str:
+    path = selected_file(path) or path
     if path.is_dir():
         files = [file for file in path.rglob("*") if file.is_file()]
         sizes = sorted((str(file.relative_to(path)), file.stat().st_size) for file in files)

@@ -23,6 +23,7 @@ from augment.service import AugmentationSettings
 from augment.utils import world_size
 from renderer.errors import InputError, in_one_line, require_range
 from renderer.image import LARGEST_SIZE
+from renderer.rasterizer import Rasterizer, choose
 from train.errors import one_sentence
 from train.networks import WIDERESNET
 from train.recipe import TrainSettings
@@ -289,6 +290,12 @@ def keyed(key: str, names: Collection[str] = ()) -> Iterator[None]:
         if name in names:
             key, message = _join(key, name), message.removeprefix(f"{name}: ")
         raise InputError(f"{key}: {message}") from error
+
+
+def chosen_rasterizer(settings: RendererSettings) -> Rasterizer:
+    """The rasterizer of the settings; InputError naming the key where it does not start."""
+    with keyed("renderer.rasterizer"):
+        return choose(settings.rasterizer)
 
 
 def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -216,7 +216,7 @@ def target_labels(
     if len(names) != views:
         raise InputError(
             f"target={names} names {len(names)} classes for {views} views that share what is attacked: give one class "
-            "per view, and shared=true"
+            "per view, and shared=True"
         )
     labels = torch.tensor([classifier.label(name) for name in names], device=logits.device).expand(len(logits), views)
     if torch.eq(labels, source).any():
@@ -260,5 +260,5 @@ def require_clean_correct(scene: Scene, logits: Tensor, labels: Tensor, classifi
         most_probable = ", ".join(f"{name} {p:.1%}" for name, p in zip(names, confidence.tolist(), strict=True))
         raise NotCleanCorrectError(
             f"{len(wrong)} of {logits[..., 0].numel()} images of {item.name} are not classified as {item.label!r} "
-            f"before any attack (the first: {most_probable}): change the scene, or set force=true"
+            f"before any attack (the first: {most_probable}): change the scene, or set force=True"
         )

@@ -1,7 +1,9 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import ConcatDataset, DataLoader
 
@@ -9,7 +11,13 @@ from augment.attacks.norm_ball import StepSettings
 from augment.build import build_scene
 from augment.losses import complementary_label
 from augment.scene import Conditions, Scene
-from augment.service import AugmentationService, AugmentationSettings, RandomLightSettings, TrainingAttackSettings
+from augment.service import (
+    AugmentationService,
+    AugmentationSettings,
+    RandomLightSettings,
+    Renders,
+    TrainingAttackSettings,
+)
 from augment.utils import Phases
 from augment.variation import VariationSettings
 from renderer.errors import InputError
@@ -227,6 +235,18 @@ def test_a_service_works_in_any_loop_and_its_renders_are_a_data_set(model, monke
     resumed.load_state_dict(service.state_dict())
     assert torch.equal(resumed.regenerate(model, 1).images, service.regenerate(model, 1).images)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", [int, np.int64, torch.tensor], ids=["number", "NumPy", "tensor"])
+@pytest.mark.parametrize("renders_first", [True, False])
+def test_a_data_set_with_labels_of_any_kind_goes_into_batches_with_renders(kind, renders_first):
+    data, renders = [(torch.zeros(3, 8, 8), kind(1))] * 5, Renders(torch.ones(3, 3, 8, 8), torch.tensor([2, 3, 4]), {})
+    both = ConcatDataset([renders, data] if renders_first else [data, renders])
+    batches = list(DataLoader(both, batch_size=4))
+    labels = torch.cat([labels for _, labels in batches])
+    assert labels.tolist() == ([2, 3, 4] + [1] * 5 if renders_first else [1] * 5 + [2, 3, 4])
+    assert labels.dtype == torch.int64 and {type(labels) for _, labels in batches} == {torch.Tensor}
+    F.cross_entropy(torch.rand(8, 5), labels)
 
 
 def test_hard_negatives_are_attacked_towards_the_label_and_the_label_away_from_it(serve, scene, model, labels):

@@ -1,6 +1,7 @@
 """The attack command: from its configuration to scenes, and its text."""
 
 import math
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -12,7 +13,9 @@ from augment.classifiers import Classifier
 from renderer.camera import orbit_cameras
 from renderer.errors import InputError
 from renderer.light.presets import probe
+from renderer.rasterizer import opengl
 from train.attack import AttackExperimentSettings, attacks, format_attack, overrides
+from train.run import load_data, prepare
 from train.settings import compose, read_object, read_settings
 
 CLASSES = ("orange", "lime", "sky")
@@ -72,8 +75,21 @@ def test_a_scene_is_searched_for_and_given_as_overrides():
     ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
     assert name == "solid:orange:0" and result.clean_correct.all()
     assert overrides(scene, settings.scene) == "'scene.backgrounds=[0.9]'"
-    with pytest.raises(InputError, match=r"1 of 1 images of solid:orange:0 are .* before any attack"):
+    with pytest.raises(
+        InputError, match=r"1 of 1 images of solid:orange:0 are .* before any attack .* attack.force=true"
+    ):
         attacked("scene.search=0", classifier=classifier)
+
+
+def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, tiny, tmp_path):
+    monkeypatch.setattr(opengl, "device", Mock(side_effect=InputError("no EGL device")))
+    settings = tiny("renderer.rasterizer=opengl")
+    for command in (
+        lambda: attacked("renderer.rasterizer=opengl"),
+        lambda: prepare(settings, load_data(settings), tmp_path),
+    ):
+        with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
+            command()
 
 
 @pytest.mark.parametrize(

@@ -73,12 +73,14 @@ def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
         "scene.light={}",
         "scene.backgrounds=[0.5,{}]",
         "augment.vary.environments=[{}]",
+        "train.init_from={}",
+        "train.init_from={0.parent}",
         "data.path={}",
         "data.path={0.parent}",
     ],
 )
 def test_an_input_that_changed_is_refused_by_name(tiny, tmp_path, override):
-    file, folder = tmp_path / "inputs" / "input.bin", tmp_path / "run"
+    file, folder = tmp_path / "inputs" / "best.pt", tmp_path / "run"
     file.parent.mkdir()
     file.write_bytes(b"one")
     settings = tiny(override.format(file), "augment.examples=null", "scene.views=1")
