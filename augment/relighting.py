@@ -1,6 +1,6 @@
 """Images of objects in other light: stacked transfer operators, and nothing is rasterized again."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -159,15 +159,19 @@ class Relighting:
     @property
     def stacks(self) -> list[OperatorStack]:
         """All stacks, built where they are missing."""
-        return [self._stack(index)[0] for index in progress(range(self._count), "views")]
+        self._require(range(self._count))
+        return [self._stack(index)[0] for index in range(self._count)]
 
     def layers(self, light: Tensor, images: Tensor) -> Iterator[Layer]:
         """The layers of images (A,), each in its light (A, size, 3); differentiable in the light."""
         if self._count == 1:
+            self._require([0])
             yield self._layer(0, None, light, images)
             return
         stack = self._operator[images] // self._per_stack
-        for index in stack.unique().tolist():
+        indices = stack.unique().tolist()
+        self._require(indices)
+        for index in indices:
             rows = torch.nonzero(stack == index).squeeze(1)
             yield self._layer(index, rows.tolist(), light[rows], images[rows])
 
@@ -175,6 +179,12 @@ class Relighting:
         stack, rank, behind = self._stack(index)
         images = rank[images]
         return Layer(rows, stack.pixels, stack.radiance(light, images) + behind[images])
+
+    def _require(self, indices: Iterable[int]) -> None:
+        """Build the stacks that are missing."""
+        if missing := [index for index in indices if index not in self._stacks]:
+            for index in progress(missing, "rendering views"):
+                self._stack(index)
 
     def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         if index not in self._stacks:

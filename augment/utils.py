@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from threading import Timer
 from typing import TypeVar
 
 import numpy as np
@@ -21,6 +22,7 @@ from tqdm import tqdm
 from renderer.errors import InputError, is_out_of_memory
 
 MEMORY, GROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")  # of Linux, and of a container (cgroup v2)
+PATIENCE = 5.0  # seconds without a word
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -93,12 +95,29 @@ def _free(device: torch.device) -> int | None:
     return min(free, limit - used)
 
 
-def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterable[Item]:
-    """The items, with a bar on a terminal after 5 seconds.
+def progress(items: Iterable[Item], description: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
+    """The items; after 5 seconds, with a bar on a terminal, or else a line, by the first process.
 
     total: their number, where they have no length. done: how many came before.
     """
-    return tqdm(items, description, total, leave=False, delay=5, disable=not sys.stderr.isatty(), initial=done)
+    terminal, first = sys.stderr.isatty(), rank() == 0
+    bar = tqdm(items, description, total, leave=False, delay=PATIENCE, disable=not (terminal and first), initial=done)
+
+    def show() -> None:  # also before the first item is done
+        if terminal:
+            bar.delay = 0
+            bar.refresh()
+        else:
+            print(f"{description} ...", file=sys.stderr, flush=True)
+
+    timer = Timer(PATIENCE, show)
+    timer.daemon = True
+    if first:
+        timer.start()
+    try:
+        yield from bar
+    finally:
+        timer.cancel()
 
 
 class Phases:

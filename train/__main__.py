@@ -28,11 +28,12 @@ from train.report.compare import format_table
 from train.report.page import report_of
 from train.report.summary import summarize
 from train.run import load_data, prepare, write_images
-from train.run_folder import sole_writer
-from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, read_settings
+from train.run_folder import resumed, sole_writer
+from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, program, read_settings
 from train.sweep import run_in_sweep, sweep
 
 NAMED_MODEL = re.compile(r"^model=(?!\{)")  # short for model.name=
+CHOICE = re.compile(r"^\+?(experiment|augment|data|launcher|\w+@[\w.]+)=")  # of a file of conf/
 LOG = "train.log"
 SWEEP_FLAGS = {"--multirun", "-m"}
 
@@ -76,13 +77,15 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     run, first, command = broadcast(str(config.run)), utils.rank() == 0, given_command(overrides)
     folder = Path(run).absolute()
     config.run = str(folder)
+    if config.train.resume and not any(map(CHOICE.match, overrides)):  # which stand for all of a command
+        config, command = resumed(config, overrides)
     settings = read_settings(ExperimentSettings, config)
     if first:
         log_to(writable_file(writable_folder(run, "run") / LOG, "run"))
     arms = {}
     for arm in settings.compare:
         with keyed("compare"):
-            arms[folder / arm] = replace(settings, augment=replace(settings.augment, arm=arm))
+            arms[folder / arm] = replace(settings, compare=[], augment=replace(settings.augment, arm=arm))
     arms[folder] = settings
     data = load_data(settings)
     with sole_writer("run", *arms) if first else nullcontext():
@@ -95,8 +98,8 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
             try:
                 train_and_score()
             except Interrupted as stop:
-                again = f"{command} {shlex.quote(f'run={folder}')} train.resume=true"
-                console.info("ended by %s; to go on: %s", stop.signal, again)
+                again = [*program("train", as_called=True), f"run={folder}", "train.resume=true"]
+                console.info("ended by %s; to go on: %s", stop.signal, shlex.join(again))
                 raise
         if first:
             console.info("\n%s", format_table([summarize(path) for path in arms]))

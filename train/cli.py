@@ -6,12 +6,14 @@ Commands import this module before all others, which take seconds to import; no 
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: threads that wait do not spin on a busy machine
 USER_ERROR = 2
 INTERRUPTED = "ended by SIGINT"
 HELP = {"-h", "--help"}
@@ -30,6 +32,10 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+_loading = threading.Timer(5, print, ["loading PyTorch and other libraries ..."], {"file": sys.stderr, "flush": True})
+if "torch" not in sys.modules:
+    _loading.daemon = True
+    _loading.start()
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's background jobs ignore SIGINT
     signal.signal(signal.SIGINT, _interrupt)
 
@@ -65,6 +71,7 @@ def handled_errors() -> Iterator[None]:
         os.environ["PYTHONSAFEPATH"] = (
             "1"  # in further processes `import train` is not a train.py of the current folder
         )
+    _loading.cancel()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

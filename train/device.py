@@ -3,18 +3,24 @@
 import functools
 import os
 import platform
+import time
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from augment import utils
+from augment.utils import eval_mode
 from renderer.errors import InputError, as_device, require_choice
 from train import console
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
+THREADS = torch.get_num_threads()  # before any run sets its own
+TRIAL, CLEARLY = 1.0, 1.25  # seconds of a trial of threads; the ratio of seconds at which more threads are taken
+_CHOSEN: dict[str, int] = {}  # threads, by what they were tried with
 PRECISIONS = ("auto", "bfloat16", "float32")
 COMPILE = ("auto", "always", "never")
 SIZES = (16, 32, 64, 128, 512)  # of a batch in eval mode: attacks, whose examples leave on success, and validation
@@ -33,17 +39,47 @@ def choose_device(name: str) -> torch.device:
     return as_device(name)
 
 
-def set_threads(threads: int | None) -> None:
-    """Threads of an operation on the CPU; None leaves torch's choice, but no more than a container's quota of cores.
-
-    torch counts the machine's cores, and threads above the quota wait for each other.
-    """
+def most_threads() -> int:
+    """Threads for all cores: torch's number at the start (OMP_NUM_THREADS sets it), but no more than a container's
+    quota of cores, above which threads wait for each other."""
     try:
         quota, period = QUOTA.read_text().split()
         cores = max(1, int(quota) // int(period))
     except (OSError, ValueError):  # no such file (it is Linux's, cgroup v2), or "max 100000"
         cores = os.cpu_count() or 1
-    torch.set_num_threads(threads or min(torch.get_num_threads(), cores))
+    return min(THREADS, cores)
+
+
+def choose_threads(network: nn.Module, images: Tensor) -> int:
+    """1 or all threads, whichever takes the network over a part of images (N, 3, H, W) in less time: where others use
+    the cores, too, threads wait for each other, and all of them can be slower than one.
+
+    Takes about a second. One, unless all are clearly faster; the same again for the same network and images, so that
+    arms that are compared agree. All for a GPU, and for processes that torchrun starts, which it gives one each. The
+    network and the random state are left as they were.
+    """
+    most, before, parameters = most_threads(), torch.get_num_threads(), list(network.parameters())
+    key = f"{network} {tuple(images.shape)}"
+    if most == 1 or utils.world_size() > 1 or parameters[0].is_cuda or key in _CHOSEN:
+        return _CHOSEN.get(key, most)
+    parameters = [parameter for parameter in parameters if parameter.requires_grad]
+
+    def seconds(threads: int, count: int) -> float:
+        torch.set_num_threads(threads)
+        start = time.perf_counter()
+        torch.autograd.grad(network(images[:count]).sum(), parameters, allow_unused=True)
+        return time.perf_counter() - start
+
+    with eval_mode(network), torch.random.fork_rng(devices=[]), torch.enable_grad():
+        seconds(most, 1)  # which starts the threads
+        count = max(1, int(TRIAL / 10 / seconds(1, 1)))
+        passes: dict[int, list[float]] = {1: [], most: []}
+        while (total := sum(map(sum, passes.values()))) < TRIAL or (len(passes[most]) < 3 and total < 4 * TRIAL):
+            for threads, times in passes.items():
+                times.append(seconds(threads, count))
+    torch.set_num_threads(before)
+    _CHOSEN[key] = most if median(passes[1]) > CLEARLY * median(passes[most]) else 1
+    return _CHOSEN[key]
 
 
 def set_deterministic(deterministic: bool) -> None:

@@ -320,7 +320,7 @@ def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
     loss_sum, hits = totals = torch.zeros(2, device=split.images.device)
     batches = zip(*(part[shard].split(EVALUATION_BATCH) for part in (split.images, split.labels)), strict=True)
     with eval_mode(model):
-        for images, labels in batches:
+        for images, labels in progress(batches, f"{len(split)} images", math.ceil(len(split) / EVALUATION_BATCH)):
             logits = model(to_unit(images))
             loss_sum += F.cross_entropy(logits, labels, reduction="sum")
             hits += (logits.argmax(1) == labels).sum()

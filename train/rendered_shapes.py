@@ -20,7 +20,7 @@ import augment
 from augment.backgrounds import load_backgrounds
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
-from augment.utils import generator
+from augment.utils import generator, progress
 from renderer.cache import RENDERER, TensorCache, content_key, source_key
 from renderer.camera import OrthographicCamera
 from renderer.image import ImageSettings, to_bytes
@@ -54,7 +54,8 @@ def write_held_out(folder: Path, size: int, seed: int, cache: TensorCache | None
     with open(folder / "photos.csv", "w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["path", "source_tag", "light"])
-        for number, (image, label) in enumerate(zip(split.images, split.labels, strict=True)):
+        pairs = zip(split.images, split.labels, strict=True)
+        for number, (image, label) in enumerate(progress(pairs, "writing images", len(split))):
             path = Path(CLASSES[label]) / f"rendered_{number:04d}.png"
             (folder / path).parent.mkdir(exist_ok=True)
             Image.fromarray(image.permute(1, 2, 0).numpy()).save(folder / path)
@@ -95,7 +96,7 @@ def _render(part: str, per_class: int, seed: int, settings: ImageSettings) -> Te
     light = hard_light if part == HELD_OUT else even_light
     draws = seeds = generator(seed, part)
     images = []
-    for name in CLASSES:
+    for name in progress(CLASSES, f"{part} images"):
         if part == HELD_OUT:  # all classes under the same lights before the same cameras
             draws, seeds = generator(seed, part), generator(seed, part, name)
         meshes = (solid(name, int(torch.randint(2**31, (1,), generator=seeds))) for _ in range(instances))

@@ -14,10 +14,10 @@ from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed
 from renderer.cache import TensorCache, cache_folder, content_key
 from renderer.errors import InputError, require_choice, require_range
-from renderer.image import LARGEST_SIZE
+from renderer.image import LARGEST_SIZE, to_unit
 from train import checkpoint, console
 from train.data import DataSet, Split, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
-from train.device import MixedPrecision, choose_device, choose_precision, set_deterministic, set_threads
+from train.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
 from train.loop import Trainer, evaluate
 from train.networks import PYTHON, build_network, describe, load_run, load_selected, start_from
 from train.photographs.folder import find_photographs, require_outside
@@ -26,7 +26,7 @@ from train.photographs.predictions import compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
 from train.rendered_shapes import load_shapes, write_held_out
-from train.run_folder import BEFORE, RunLog, require_same_run, write_config
+from train.run_folder import BEFORE, RunLog, recorded_threads, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
 VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
@@ -46,17 +46,18 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
         require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)
     device = choose_device(settings.train.device)
-    set_threads(settings.train.threads)
     set_deterministic(settings.train.deterministic)
     fraction, left_out = _validation(settings, data.train)
     train, validation = stratified_split(data.train, fraction, seed=0)
     trainer = build_trainer(settings, data, folder, device, left_out)
+    threads = torch.get_num_threads()
     _open_folder(trainer, settings, command)
 
     def train_and_score() -> dict[str, float]:
+        torch.set_num_threads(threads)  # of this run, after others were prepared
         console.info(
             f"{len(train)} images, {len(data.classes)} classes; {device}, {trainer.model.precision}, "
-            f"{torch.get_num_threads()} threads, {utils.world_size()} processes"
+            f"{threads} threads, {utils.world_size()} processes"
         )
         before = {} if utils.rank() else _scores_before(settings, trainer, data)
         log = None if utils.rank() else RunLog(folder, trainer.history)
@@ -135,8 +136,10 @@ def build_trainer(
     facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
     if settings.train.init_from:
         start_from(network, facts, Path(settings.train.init_from))
-    service = build_service(settings, data, device)
     model = MixedPrecision(network.to(device), precision)
+    batch = to_unit(data.train.images[: settings.train.batch_size])
+    torch.set_num_threads(settings.train.threads or recorded_threads(folder) or choose_threads(model, batch))
+    service = build_service(settings, data, device)
     return Trainer(settings.train, model, describe(network, **facts, validation=left_out), service, folder)
 
 
@@ -171,7 +174,8 @@ def _open_folder(trainer: Trainer, settings: ExperimentSettings, command: str) -
     elif settings.train.resume:
         console.info("nothing to resume in %s; starting at epoch 1", folder)
     if utils.rank() == 0:
-        hardware = {"device": str(trainer.device), "precision": trainer.model.precision}
+        threads = torch.get_num_threads()
+        hardware = {"device": str(trainer.device), "precision": trainer.model.precision, "threads": threads}
         write_config(folder, settings, hardware=hardware, command=command)
 
 

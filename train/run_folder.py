@@ -5,9 +5,10 @@ import json
 import logging
 import os
 import platform
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import torch
 import yaml
 from filelock import FileLock, Timeout
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from torch import Tensor
@@ -163,13 +165,43 @@ def _object(text: str) -> dict[str, Any]:
 def decisive_settings(settings: ExperimentSettings | DictConfig) -> dict[str, object]:
     """The settings that decide a run's result, by dotted key; paths inside the run's own folder begin with `<run>`."""
     plain: Any = OmegaConf.to_container(settings) if isinstance(settings, DictConfig) else asdict(settings)
-    run = str(plain.get("run"))
+    moved = _moved(plain, str(plain.get("run")), "<run>")
+    return {key: value for key, value in dotted(moved) if not is_within(key, CIRCUMSTANCES)}
 
-    def relative(value: object) -> object:
-        inside = isinstance(value, str) and f"{value}/".startswith(f"{run}/")
-        return f"<run>{str(value).removeprefix(run)}" if inside else value
 
-    return {key: relative(value) for key, value in dotted(plain) if not is_within(key, CIRCUMSTANCES)}
+def _moved(value: Any, folder: str, to: str) -> Any:
+    """A setting, or nested ones, whose paths in a folder lie in another one instead."""
+    if isinstance(value, dict):
+        return {key: _moved(item, folder, to) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_moved(item, folder, to) for item in value]
+    inside = isinstance(value, str) and f"{value}/".startswith(f"{folder}/")
+    return to + value.removeprefix(folder) if inside else value
+
+
+def recorded_threads(folder: Path) -> int | None:
+    """The number of threads of the folder's run, on which its last bits depend; None where it holds none."""
+    config = read_config(folder / CONFIG) if (folder / CONFIG).is_file() else DictConfig({})
+    threads = OmegaConf.select(config, "hardware.threads")
+    return threads if isinstance(threads, int) and threads > 0 else None
+
+
+def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:
+    """The configuration of the run in the folder `config.run`, under a command's overrides, whose values `config` has;
+    and the command that began it. InputError where the folder holds no training run."""
+    folder = Path(config.run).absolute()
+    saved: Any = OmegaConf.to_container(read_config(folder / CONFIG)) if (folder / CONFIG).is_file() else {}
+    if not isinstance(saved.get("train"), dict) or not isinstance(saved.get("run"), str):
+        raise InputError(f"run={config.run} holds no run to resume: give the folder of one, or leave train.resume out")
+    settings = {item.name: saved[item.name] for item in fields(ExperimentSettings) if item.name in saved}
+    if Path(saved["run"]) not in folder.parents:  # of an arm, whose settings name the folder of the whole run
+        settings = _moved(settings, saved["run"], str(folder))
+    merged = OmegaConf.create(settings)
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        if (key := override.key_or_group) != "run":
+            OmegaConf.update(merged, key, OmegaConf.select(config, key), merge=False, force_add=True)
+    added = [text for text in overrides if not text.startswith(("run=", "train.resume="))]
+    return merged, shlex.join(dict.fromkeys([*shlex.split(str(saved.get("command", ""))), *added]))
 
 
 def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool = False) -> None:

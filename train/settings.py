@@ -197,14 +197,17 @@ def as_override(argument: str) -> str:
     return argument if as_given else f"{key}={quoted(value)}"
 
 
-def program(module: str) -> list[str]:
+def program(module: str, as_called: bool = False) -> list[str]:
     """The words that start a module of commands as this process was started: `pnb-NAME`, or `python -m`; for several
-    processes by torchrun."""
-    installed, count = sys.flags.safe_path or Path(sys.argv[0]).stem.startswith("pnb-"), world_size()
-    words = [f"pnb-{module.rpartition('.')[2]}"] if installed else ["-m", module]
+    processes by torchrun. as_called: with the same interpreter or installed command, wherever it is on this machine."""
+    called, count = Path(sys.argv[0]), world_size()
+    installed, name = sys.flags.safe_path or called.stem.startswith("pnb-"), f"pnb-{module.rpartition('.')[2]}"
+    python = [sys.executable] if as_called else ["python"]
+    words = [str(called) if as_called and called.stem == name else name] if installed else ["-m", module]
     if count > 1:
-        return ["torchrun", f"--nproc_per_node={count}", *(["--no-python"] if installed else []), *words]
-    return words if installed else ["python", *words]
+        torchrun = [*python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
+        return [*torchrun, f"--nproc_per_node={count}", *(["--no-python"] if installed else []), *words]
+    return words if installed else [*python, *words]
 
 
 def given_command(overrides: Sequence[str]) -> str:

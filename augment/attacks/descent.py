@@ -126,7 +126,7 @@ def descend(
     def run(rows: Tensor, begin: Tensor) -> DescentResult:
         return _descend_once(model, problem, examples[rows], begin[rows], goal.of(rows), settings, expectation, phases)
 
-    for rows in progress(rounds, "attack") if len(rounds) > 1 else rounds:
+    for rows in progress(rounds, "groups of examples") if len(rounds) > 1 else rounds:
         best = run(rows, start)
         for restart in restarts:
             left = torch.nonzero(~best.success).squeeze(1)
@@ -166,7 +166,7 @@ def _descend_once(
     length = values.new_ones(len(values), 1)
     predicted, batch_size = torch.zeros_like(goal.source), BatchSize(settings.batch_size)
     with as_found(model):
-        for step in range(settings.max_steps + 1):
+        for step in progress(range(settings.max_steps + 1), "attack"):
             chosen, active_goal = candidate[active].requires_grad_(True), goal.of(active)
             rendered = problem.render(chosen, examples[active])
             with phases("attack_classifier"):

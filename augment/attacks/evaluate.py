@@ -78,7 +78,7 @@ def random_search(result: AttackResult) -> Tensor:
 def _success_by_draws(result: AttackResult, success: Tensor, draw: Callable[[], Tensor]) -> Tensor:
     """`success` (E,), or whether any of as many draws (E, D) as the attack had steps is one."""
     success = success.clone()
-    for _ in range(result.settings.max_steps):
+    for _ in progress(range(result.settings.max_steps), "random search"):
         left = torch.nonzero(~success).squeeze(1)
         if not len(left):
             break
@@ -211,7 +211,8 @@ def transfer(
     def logits(adversaries: Sequence[Adversary], classifier: Classifier) -> Tensor:
         if not adversaries:
             return torch.empty(0, scene.views, len(classifier.classes))
-        images = torch.stack([adversary.render(scene.rasterizer) for adversary in adversaries]).to(result.images)
+        renders = [adversary.render(scene.rasterizer) for adversary in progress(adversaries, "transfer")]
+        images = torch.stack(renders).to(result.images)
         model, batch_size = result.settings.preprocessed_model(classifier), result.settings.batch_size
         return logits_of(model, images, batch_size).cpu()
 

@@ -13,6 +13,7 @@ from augment.attacks.attack import AttackSettings, logits_of
 from augment.build import SceneSettings
 from augment.classifiers import Classifier
 from augment.scene import Scene
+from augment.utils import progress
 from renderer.light.presets import PROBES, UNIFORM, load_light
 
 POLAR, WIDTH = (20.0, 100.0), (1.8, 3.5)  # degrees and world units, from which cameras are drawn
@@ -42,7 +43,7 @@ def find_scene(
     if _confidence(build(settings), attack, classifier).item() > 0:
         return settings
     highest, chosen = 0.0, settings
-    for candidate in _candidates(settings, cameras, draws):
+    for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
         confidence, lit = _best_light(build(candidate), candidate, attack, classifier)
         if confidence > highest:
             highest, chosen = confidence, lit

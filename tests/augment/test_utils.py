@@ -1,5 +1,8 @@
+import io
 import itertools
 import logging
+import sys
+import time
 from dataclasses import fields
 
 import pytest
@@ -10,10 +13,34 @@ from augment import utils
 from augment.attacks.attack import AttackSettings
 from augment.attacks.descent import DescentResult, Goal, descend
 from augment.build import build_scene
-from augment.utils import generator, require_memory, stream_seed
+from augment.utils import generator, progress, require_memory, stream_seed
 from renderer.errors import InputError
 
 ERRORS = [torch.OutOfMemoryError("CUDA out of memory"), MemoryError(), RuntimeError("can't allocate memory: you tried")]
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+@pytest.mark.parametrize("seconds, ends", [(0.3, True), (0.3, False), (0.0, True)])
+def test_progress_is_shown_after_a_while_even_before_the_first_item_is_done(monkeypatch, stream, seconds, ends):
+    """And leaves nothing on a terminal, also where the loop ends early."""
+    monkeypatch.setattr(utils, "PATIENCE", 0.1)
+    monkeypatch.setattr(sys, "stderr", stream())
+    done = []
+    for item in progress([1, 2], "attack"):
+        time.sleep(seconds)
+        done.append((item, "attack" in sys.stderr.getvalue()))
+        if not ends:
+            break
+    assert done == [(item, seconds > 0) for item in ([1, 2] if ends else [1])]
+    if stream is io.StringIO:
+        assert sys.stderr.getvalue() == ("attack ...\n" if seconds else "")
+    else:
+        assert sys.stderr.getvalue().rpartition("\r")[2].strip() == ""
 
 
 class Small(nn.Module):

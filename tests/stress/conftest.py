@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import runpy
 import signal
 import subprocess
@@ -110,12 +111,12 @@ def start_command(
 
 
 def end(process: Process) -> tuple[int, str, str]:
-    """Status, output and errors, once it has ended by itself."""
+    """Status, output and errors, without what took long, once it has ended by itself."""
     try:
         output, errors = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
-    return process.returncode, output, errors
+    return process.returncode, output, re.sub(r".* \.\.\.\n", "", errors)
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,8 @@ from train.settings import ExperimentSettings, compose, read_settings
 CLASSES = ["apple", "orange", "pear"]
 TINY = [
     "data=npz", "model.depth=10", "model.width=1", "model.dropout=0.3", "train.epochs=3", "train.batch_size=16",
-    "train.learning_rate=0.05", "train.precision=float32", "train.device=cpu", "evaluate.photos=null",
+    "train.learning_rate=0.05", "train.precision=float32", "train.device=cpu", "train.threads=1",
+    "evaluate.photos=null",
     "seed=7",  # the attack then moves the lights in every epoch
     "augment.examples=4", "augment.warm_start=true", "augment.attack.max_steps=3", "augment.attack.step_size=0.3",
     "scene.backgrounds=[0.2,0.8]", "renderer.rasterizer=numpy", "renderer.samples=2",

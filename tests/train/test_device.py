@@ -1,11 +1,21 @@
 import os
+from copy import deepcopy
 
 import pytest
 import torch
 
 from renderer.errors import InputError
 from train import device
-from train.device import SIZES, GraphedModel, MixedPrecision, choose_device, choose_precision, compiles, set_threads
+from train.device import (
+    SIZES,
+    GraphedModel,
+    MixedPrecision,
+    choose_device,
+    choose_precision,
+    choose_threads,
+    compiles,
+    most_threads,
+)
 from train.networks import WideResNet
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda")
@@ -29,14 +39,33 @@ def test_threads_are_no_more_than_the_containers_quota_of_cores(tmp_path, monkey
         (tmp_path / "cpu.max").write_text(quota)
     monkeypatch.setattr(device, "QUOTA", tmp_path / "cpu.max")
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    before = torch.get_num_threads()
-    try:
-        for present, asked, expected in [(8, None, cores), (8, 5, 5), (1, None, 1)]:
-            torch.set_num_threads(present)
-            set_threads(asked)
-            assert torch.get_num_threads() == expected
-    finally:
-        torch.set_num_threads(before)
+    for at_start, expected in [(8, cores), (1, 1)]:
+        monkeypatch.setattr(device, "THREADS", at_start)
+        assert most_threads() == expected
+
+
+@pytest.mark.parametrize("seconds, expected", [(0.3, 4), (0.7, 4), (0.9, 1), (1.1, 1), (7.0, 1)])
+def test_all_cores_are_taken_where_they_are_clearly_faster_than_one(monkeypatch, network, seconds, expected):
+    """seconds: of four threads, for what one thread does in a second."""
+    now, before = [0.0], torch.get_num_threads()
+    monkeypatch.setattr(device.time, "perf_counter", lambda: now[0])
+
+    class Timed(torch.nn.Sequential):
+        def forward(self, images):
+            now[0] += 0.01 * len(images) * {1: 1.0, 4: seconds}[torch.get_num_threads()]
+            return super().forward(images)
+
+    timed, images = Timed(network, torch.nn.BatchNorm1d(3), torch.nn.Dropout()).train(), torch.rand(32, 3, 8, 8)
+    monkeypatch.setattr(device, "_CHOSEN", {})
+    monkeypatch.setattr(device, "most_threads", lambda: 4)
+    state, random = deepcopy(timed.state_dict()), torch.get_rng_state()
+    assert choose_threads(timed, images) == expected
+    assert now[0] < 4  # a second, or three passes of each
+    seconds = 1 / seconds
+    assert choose_threads(timed, images) == expected  # as for an arm beside it
+    torch.testing.assert_close(timed.state_dict(), state, rtol=0, atol=0)
+    assert timed.training and all(parameter.grad is None for parameter in timed.parameters())
+    assert torch.equal(torch.get_rng_state(), random) and torch.get_num_threads() == before
 
 
 @pytest.mark.parametrize("supported, expected", [(True, "bfloat16"), (False, "float32")])

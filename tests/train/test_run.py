@@ -137,6 +137,21 @@ def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(tiny, fin
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
 
 
+def test_the_threads_that_were_chosen_are_recorded_and_those_of_a_resumed_run(tiny, tmp_path, monkeypatch):
+    before, counts = torch.get_num_threads(), []
+    try:
+        for epochs, faster, asked in [(1, 2, "null"), (2, 1, "null"), (3, 1, "3")]:
+            monkeypatch.setattr("train.run.choose_threads", Mock(return_value=faster))
+            settings = tiny("augment=none", f"train.epochs={epochs}", f"train.threads={asked}", "train.resume=true")
+            train_and_score = prepare(settings, load_data(settings), tmp_path)
+            torch.set_num_threads(before)  # as another arm's may be
+            train_and_score()
+            counts.append((torch.get_num_threads(), OmegaConf.load(tmp_path / "config.yaml").hardware.threads))
+    finally:
+        torch.set_num_threads(before)
+    assert counts == [(2, 2), (2, 2), (3, 3)]
+
+
 @pytest.mark.parametrize(
     "writer",
     [
@@ -199,7 +214,7 @@ def test_meshes_and_hard_negatives_are_rendered_with_their_own_labels(
 
 def test_a_run_folder_holds_configuration_metrics_networks_renders_and_scores(finished):
     config = OmegaConf.load(finished / "config.yaml")
-    assert config.hardware == {"device": "cpu", "precision": "float32"}
+    assert config.hardware == {"device": "cpu", "precision": "float32", "threads": 1}
     assert set(config.versions) == {"python", "torch", "torchvision", "numpy"}
     last, best = (torch.load(finished / name, weights_only=True) for name in ("last.pt", "best.pt"))
     assert (last["epoch"], last["seed"], last["arm"], last["precision"]) == (3, 7, "adversarial", "float32")
