@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 
 from augment import utils
 from renderer.errors import InputError
-from train import console
+from train import checkpoint, console
 from train.command_help import format_help
 from train.errors import writable_file, writable_folder
 from train.processes import Interrupted, broadcast, first_process_first, process_group
@@ -28,7 +28,7 @@ from train.report.compare import format_table
 from train.report.page import report_of
 from train.report.summary import summarize
 from train.run import load_data, prepare, write_images
-from train.run_folder import resumed, sole_writer
+from train.run_folder import require_same_run, resumed, sole_writer
 from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, program, read_settings
 from train.sweep import run_in_sweep, sweep
 
@@ -80,13 +80,16 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
     if config.train.resume and not any(map(CHOICE.match, overrides)):  # which stand for all of a command
         config, command = resumed(config, overrides)
     settings = read_settings(ExperimentSettings, config)
-    if first:
-        log_to(writable_file(writable_folder(run, "run") / LOG, "run"))
     arms = {}
     for arm in settings.compare:
         with keyed("compare"):
             arms[folder / arm] = replace(settings, compare=[], augment=replace(settings.augment, arm=arm))
     arms[folder] = settings
+    for path, arm in arms.items():
+        if settings.train.resume and checkpoint.exists(path):
+            require_same_run(path, arm)  # before anything is written
+    if first:
+        log_to(writable_file(writable_folder(run, "run") / LOG, "run"))
     data = load_data(settings)
     with sole_writer("run", *arms) if first else nullcontext():
         with first_process_first():

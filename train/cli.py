@@ -67,10 +67,8 @@ def handled_errors() -> Iterator[None]:
     from train.errors import one_sentence
 
     _started, _interrupted = True, False
-    if Path(sys.argv[0]).stem.startswith(PREFIX):
-        os.environ["PYTHONSAFEPATH"] = (
-            "1"  # in further processes `import train` is not a train.py of the current folder
-        )
+    if Path(sys.argv[0]).stem.startswith(PREFIX):  # in further processes, train is no train.py of the current folder
+        os.environ["PYTHONSAFEPATH"] = "1"
     _loading.cancel()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):

@@ -51,12 +51,11 @@ def most_threads() -> int:
 
 
 def choose_threads(network: nn.Module, images: Tensor) -> int:
-    """1 or all threads, whichever takes the network over a part of images (N, 3, H, W) in less time: where others use
-    the cores, too, threads wait for each other, and all of them can be slower than one.
+    """1, or all threads where they take the network over a part of images (N, 3, H, W) in clearly less time: on cores
+    that others use, too, threads wait for each other.
 
-    Takes about a second. One, unless all are clearly faster; the same again for the same network and images, so that
-    arms that are compared agree. All for a GPU, and for processes that torchrun starts, which it gives one each. The
-    network and the random state are left as they were.
+    Takes about a second, once for a network and images, so that arms agree. All threads for a GPU and for torchrun's
+    processes, which have one each. The network and the random state are left as they were.
     """
     most, before, parameters = most_threads(), torch.get_num_threads(), list(network.parameters())
     key = f"{network} {tuple(images.shape)}"

@@ -22,7 +22,8 @@ from train.run_folder import locked
 ROOT = Path(__file__).parents[2]
 SMALL = [
     "model.depth=10", "model.width=1", "train.epochs=1", "train.precision=float32", "augment.examples=4",
-    "augment.attack.max_steps=2", "scene.backgrounds=[0,1]", "renderer.rasterizer=numpy", "renderer.samples=2", "train.threads=1",
+    "augment.attack.max_steps=2", "scene.backgrounds=[0,1]", "renderer.rasterizer=numpy", "renderer.samples=2",
+    "train.threads=1",
 ]  # fmt: skip
 
 
@@ -101,8 +102,9 @@ def stopped(call, capsys, tmp_path, tiny_npz, photos) -> Path:
     data = ["data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", "compare=[none]", "seed=3"]
     with pytest.MonkeyPatch.context() as patch:
 
-        def save_and_stop(*arguments, save=torch.save):
-            save(*arguments)
+        def save_and_stop(*arguments):
+            patch.undo()
+            torch.save(*arguments)
             signal.raise_signal(signal.SIGTERM)
 
         patch.setattr(torch, "save", save_and_stop)
@@ -115,14 +117,14 @@ def stopped(call, capsys, tmp_path, tiny_npz, photos) -> Path:
 def test_a_run_is_resumed_by_its_folder_alone(call, tmp_path, stopped):
     """Its arms, too, to the weights of a run that was not stopped; with further overrides, which are recorded."""
     before = yaml.safe_load((stopped / "config.yaml").read_text())
-    assert call("train", f"run={stopped}", "train.resume=true", "train.epochs=3") == 0
+    assert call("train", f"run={stopped}", "train.resume=true", "train.checkpoint_every=2") == 0
     config = yaml.safe_load((stopped / "config.yaml").read_text())
-    assert config["command"] == f"{before['command']} train.epochs=3" and config["run"] == str(stopped)
+    assert config["command"] == f"{before['command']} train.checkpoint_every=2" and config["run"] == str(stopped)
     begun, whole = shlex.split(config["command"])[3:], tmp_path / "whole"
     assert call("train", f"run={whole}", *begun) == 0
     for arm in (".", "none"):
         states = [torch.load(run / arm / LAST, weights_only=True) for run in (stopped, whole)]
-        assert states[0]["epoch"] == 3 and checkpoint.content_hash(states[0]["model"]) == checkpoint.content_hash(
+        assert states[0]["epoch"] == 2 and checkpoint.content_hash(states[0]["model"]) == checkpoint.content_hash(
             states[1]["model"]
         )
         assert (stopped / arm / "photographs" / "summary.json").is_file()
@@ -154,9 +156,11 @@ def test_nothing_is_written_to_a_folder_that_holds_no_run(call, capsys, tmp_path
 
 
 def test_a_run_is_resumed_with_no_other_settings_that_decide_its_result(call, capsys, stopped):
-    for override, key in (("seed=4", "seed=3, not 4"), ("augment=random", "was trained with augment.arm=adversarial")):
+    files = {path: path.stat().st_mtime_ns for path in stopped.rglob("*")}
+    for override, key in (("seed=4", "seed=3, not 4"), ("augment=random", "was trained with ")):
         assert call("train", f"run={stopped}", "train.resume=true", override) == cli.USER_ERROR
         assert key in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in stopped.rglob("*")} == files
 
 
 def test_an_error_of_the_program_keeps_its_traceback():
