@@ -155,10 +155,10 @@ def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(mi, solid, v
 def test_shadows_and_bounces_are_mitsubas_within_its_noise(mi, solid, view, bounces, monkeypatch):
     """With rays enough for a quadrature of 0.5 % of the brightest, root mean square, and 0.1 % on average."""
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
-    theirs, noise = mitsuba_image(mi, solid(), VIEWS[view], 20, 128, bounces)
+    theirs, noise = mitsuba_image(mi, solid(), VIEWS[view], 32, 128, bounces)
     inside, brightest = theirs[..., 3] == 1, theirs[..., :3].max()
     ours, less = (
-        our_image(solid(), VIEWS[view], 20, 8, **options)
+        our_image(solid(), VIEWS[view], 32, 8, **options)
         for options in (({"bounces": bounces}, {"shadows": True}) if bounces else ({"shadows": True}, {}))
     )
     error, without, noise = (values[inside, :3] / brightest for values in (ours - theirs, less - theirs, noise))
