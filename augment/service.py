@@ -141,7 +141,7 @@ class AttackExamples:
 class Label(Tensor):
     """A label (), which PyTorch's DataLoader puts into a batch with numbers, too."""
 
-    __torch_function__ = torch._C._disabled_torch_function_impl  # results are plain tensors
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]  # results are plain
 
 
 def _collate_labels(batch: Sequence[Any], *, collate_fn_map: Any = None) -> Tensor:

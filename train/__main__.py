@@ -85,9 +85,9 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         with keyed("compare"):
             arms[folder / arm] = replace(settings, compare=[], augment=replace(settings.augment, arm=arm))
     arms[folder] = settings
-    for path, arm in arms.items():
+    for path, arm_settings in arms.items():
         if settings.train.resume and checkpoint.exists(path):
-            require_same_run(path, arm)  # before anything is written
+            require_same_run(path, arm_settings)  # before anything is written
     if first:
         log_to(writable_file(writable_folder(run, "run") / LOG, "run"))
     data = load_data(settings)
