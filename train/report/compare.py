@@ -123,14 +123,15 @@ def read_evaluations(group: Mapping[str, Sequence[tuple[RunSummary, str]]], excl
     return {arm: evaluations for arm, evaluations in arms.items() if evaluations}
 
 
-def difference_tables(arms: Evaluations, pooled: str) -> list[Table]:
-    """A table for each pair of `pairs_of`: the difference by source and metric. pooled: OVERALL's name."""
+def difference_tables(arms: Evaluations, pooled: str, sources: Sequence[str] | None = None) -> list[Table]:
+    """A table for each pair of `pairs_of`: the difference by source and metric. pooled: OVERALL's name. sources: None
+    for all."""
     tables = []
     for arm, base in pairs_of({arm: [evaluation.run for evaluation in group] for arm, group in arms.items()}):
         group, reference = arms[arm], arms[base]
         rows = [
             [source or pooled, *(format_difference(difference(group, reference, source, name)) for name in METRICS)]
-            for source in reference[0].pools
+            for source in (reference[0].pools if sources is None else sources)
         ]
         paired = ", paired" if _seeds(group) == _seeds(reference) else ""
         title = f"{arm} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
@@ -140,7 +141,7 @@ def difference_tables(arms: Evaluations, pooled: str) -> list[Table]:
 
 def overall_differences(arms: Evaluations) -> Table:
     """The rows for all images of `difference_tables`."""
-    tables = difference_tables(arms, "all")
+    tables = difference_tables(arms, "all", [OVERALL])
     rows = [[table.title, *table.rows[0][1:]] for table in tables]
     return Table("differences on the same images", ["networks", *map(metric_title, METRICS)], rows)
 
@@ -162,7 +163,8 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photog
     InputError as of `read_evaluation`, for runs whose sub-folders are of different images or classes, and for a
     sub-folder (but the usual one) that no run has.
     """
-    arms, tables = arms_of(runs), run_tables(arms_of(runs))
+    arms = arms_of(runs)
+    tables = run_tables(arms)
     groups = [
         group
         for group in by_images(arms).values()

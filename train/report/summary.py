@@ -80,14 +80,15 @@ def summarize(folder: Path) -> RunSummary:
     InputError for a folder without one, or where a file lacks an entry of the tables.
     """
     folder = published(folder)
-    if not any((is_finished(folder), (folder / SUMMARY).is_file(), (folder / PUBLISHED).is_file())):
+    finished, scored = is_finished(folder), (folder / SUMMARY).is_file()
+    if not (finished or scored or (folder / PUBLISHED).is_file()):
         raise InputError(f"{folder} holds no finished run: let it finish, or resume it with train.resume=true")
     whole = folder.absolute()
     name = str(Path(*whole.parts[-2:]))
     try:
-        if is_finished(folder):
+        if finished:
             return _read_run(folder)
-        if (folder / SUMMARY).is_file():
+        if scored:
             return _network(
                 whole.parent, name, {whole.name: read_json(folder / SUMMARY)}, None, {"network": str(whole)}
             )
