@@ -4,8 +4,10 @@ The model is that of `renderer.light.skylight`, and its coefficients are integra
 """
 
 import math
+import sys
 from dataclasses import dataclass
 
+sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
 import numpy as np
@@ -42,6 +44,7 @@ class Settings:
     out: str = "renderer/light/skylight_fit.safetensors"  # the file that the renderer reads
 
 
+@cli.command()
 def main(settings: Settings) -> None:
     out = writable_file(settings.out, "out")
     if out.suffix != ".safetensors":  # or a mistaken name would cost another file
@@ -73,7 +76,8 @@ def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
     """The largest error of a fit on random skies, relative to the L2 norm of a sky's coefficients by quadrature."""
     suns = rng.uniform([ZENITH[0], 0, TURBIDITY[0]], [ZENITH[1], 2 * math.pi, TURBIDITY[1]], (skies, 3))
     exact = np.stack([coefficients_by_quadrature(*sun) for sun in suns])
-    errors = coefficients(*torch.from_numpy(suns.T), fit).numpy() - exact
+    zenith, azimuth, turbidity = torch.from_numpy(suns.T)
+    errors = coefficients(zenith, azimuth, turbidity, fit).numpy() - exact
     return float((np.linalg.norm(errors, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))).max())
 
 
@@ -138,4 +142,4 @@ def quadrature_around_sun(zenith: float, azimuth: float, nodes: int) -> tuple[np
 
 
 if __name__ == "__main__":
-    cli.command(__file__, __doc__, main, Settings)
+    main()

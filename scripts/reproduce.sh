@@ -33,7 +33,7 @@ sweep() {
 tables() {
     local experiment=$1 photographs=$2 exclude=$3 folders=("$runs/$1"/*/)
     printf '\n## experiment=%s: %s\n\n' "$experiment" "$photographs"
-    "$python" -m train.commands.compare "runs=[$(IFS=, && echo "${folders[*]%/}")]" "photographs=$photographs" \
+    "$python" scripts/compare.py "runs=[$(IFS=, && echo "${folders[*]%/}")]" "photographs=$photographs" \
         "exclude=$exclude"
 }
 

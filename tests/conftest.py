@@ -63,12 +63,11 @@ def parsed_once() -> Iterator[None]:
 
 @pytest.fixture
 def call(monkeypatch, tmp_path) -> Iterator[Callable[..., int]]:
-    """`python -m train`, or one of train.commands, within this process, from another folder: the exit status."""
+    """`python -m train`, or a script, within this process, from another folder: the exit status."""
     handlers = logging.root.handlers[:]
 
     def command(name: str, *arguments: str) -> int:
-        folder = ROOT / ("scripts" if name == "fit_skylight" else "train/commands")
-        path = ROOT / "train" / "__main__.py" if name == "train" else folder / f"{name}.py"
+        path = ROOT / ("train/__main__.py" if name == "train" else f"scripts/{name}.py")
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [str(path), *arguments])
         try:

@@ -167,7 +167,7 @@ def run(settings: AttackExperimentSettings) -> None:
         if sweeps:
             write_sweeps(sweeps, {name: steps.norm for name, steps in settings.attack.parameters.items()}, out)
             print(f"success against radius: {out / TABLE} and {out / FIGURE}")
-        write_config(out, settings, command=shlex.join([*program("train.commands.attack"), *sys.argv[1:]]))
+        write_config(out, settings, command=shlex.join([*program("attack"), *sys.argv[1:]]))
 
 
 def attacks(

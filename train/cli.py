@@ -7,11 +7,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: threads that wait do not spin on a busy machine
 USER_ERROR = 2
@@ -90,33 +90,36 @@ def handled_errors() -> Iterator[None]:
         sys.exit(USER_ERROR)
 
 
-def command(
-    file: str,
-    about: str | None,
-    function: Callable[[Any], object],
-    settings: type,
-    arguments: Sequence[str] | None = None,
-) -> None:
-    """Run the command of a module, whose file and docstring these are, with the settings on its command line, or in
-    other arguments.
+def command(as_overrides: Callable[[list[str]], list[str]] = list) -> Callable[..., Callable[[], None]]:
+    """Decorator of a script's `main(settings)`, which then takes its settings from the command line.
 
-    Their defaults are in conf/NAME.yaml or, without such a file, in the dataclass.
+    Their defaults are in conf/SCRIPT.yaml or, without such a file, in the dataclass that annotates them.
+    as_overrides: puts the command line into Hydra's form.
     """
-    with handled_errors():
-        from hydra.core.config_store import ConfigStore
 
-        from renderer.errors import InputError
-        from train.command_help import CONF, format_help
-        from train.settings import compose, read_settings
+    def decorate(main: Callable[..., object]) -> Callable[[], None]:
+        @wraps(main)
+        def start() -> None:
+            with handled_errors():
+                from hydra.core.config_store import ConfigStore
 
-        name, arguments = Path(file).stem, sys.argv[1:] if arguments is None else arguments
-        if not (CONF / f"{name}.yaml").exists():
-            ConfigStore.instance().store(name, settings)
-        flags = {argument for argument in arguments if argument.startswith("-")}
-        if unknown := sorted(flags - HELP):
-            raise InputError(f"{unknown[0]} is not an option: give settings as key=value; --help shows them")
-        config = compose(name, [argument for argument in arguments if argument not in flags])
-        if flags:
-            print(format_help(name, str(about), settings, config))
-        else:
-            function(read_settings(settings, config))
+                from renderer.errors import InputError
+                from train.command_help import CONF, format_help
+                from train.settings import compose, read_settings
+
+                name, settings = Path(main.__globals__["__file__"]).stem, main.__annotations__["settings"]
+                if not (CONF / f"{name}.yaml").exists():
+                    ConfigStore.instance().store(name, settings)
+                arguments = as_overrides(sys.argv[1:])
+                flags = {argument for argument in arguments if argument.startswith("-")}
+                if unknown := sorted(flags - HELP):
+                    raise InputError(f"{unknown[0]} is not an option: give settings as key=value; --help shows them")
+                config = compose(name, [argument for argument in arguments if argument not in flags])
+                if flags:
+                    print(format_help(name, main.__globals__["__doc__"], settings, config))
+                else:
+                    main(read_settings(settings, config))
+
+        return start
+
+    return decorate

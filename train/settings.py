@@ -197,13 +197,16 @@ def as_override(argument: str) -> str:
     return argument if as_given else f"{key}={quoted(value)}"
 
 
-def program(module: str, as_called: bool = False) -> list[str]:
-    """The words that start a module of commands as this process was started: `pnb-NAME`, or `python -m`; for several
-    processes by torchrun. as_called: with the same interpreter or installed command, wherever it is on this machine."""
+def program(name: str, as_called: bool = False) -> list[str]:
+    """The words that start a command as this process was started: `pnb-NAME`, or `python` with a clone's file; for
+    several processes by torchrun. as_called: with this machine's path of the interpreter or installed command."""
     called, count = Path(sys.argv[0]), world_size()
-    installed, name = sys.flags.safe_path or called.stem.startswith("pnb-"), f"pnb-{module.rpartition('.')[2]}"
+    installed, command = sys.flags.safe_path or called.stem.startswith("pnb-"), f"pnb-{name}"
     python = [sys.executable] if as_called else ["python"]
-    words = [str(called) if as_called and called.stem == name else name] if installed else ["-m", module]
+    if installed:
+        words = [str(called) if as_called and called.stem == command else command]
+    else:
+        words = ["-m", "train"] if name == "train" else [f"scripts/{name}.py"]
     if count > 1:
         torchrun = [*python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]
         return [*torchrun, f"--nproc_per_node={count}", *(["--no-python"] if installed else []), *words]

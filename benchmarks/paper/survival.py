@@ -28,9 +28,8 @@ ROOT = Path(__file__).parents[2]
 def run_attack(overrides: Sequence[str], threads: int) -> Row:
     """The numbers of one example that pnb-attack attacks, {"refusal": its sentence} where it ended in one."""
     with TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "train.commands.attack"]
-        command += [f"out={folder}/out", "attack.checks=false", *overrides]
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(threads)}
+        command = [sys.executable, "scripts/attack.py", f"out={folder}/out", "attack.checks=false", *overrides]
+        environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode == 2:
             return {"refusal": done.stderr.strip().splitlines()[-1]}

@@ -67,7 +67,7 @@ def test_every_training_is_valid_and_ends_in_tables_of_all_its_runs(tmp_path, co
         assert (run.data.path, run.train.checkpoint_every) == ("cifar100.npz", 5)
         assert run.scene.meshes == ["a.glb", {"mesh": "b.glb", "albedo_scale": 3.0}]
         assert [*run.evaluate.folders] == sorted({*scores, "photographs"}, reverse=True)
-    compared = [call for call in calls if call[:2] == ["-m", "train.commands.compare"]]
-    assert [call[3] for call in compared] == [f"photographs={name}" for name in scores]
+    compared = [call for call in calls if call[0] == "scripts/compare.py"]
+    assert [call[2] for call in compared] == [f"photographs={name}" for name in scores]
     for call in compared:
-        assert re.fullmatch(r"runs=\[runs/(\w+)/augment-none\+seed-0,runs/\1/augment-none\+seed-1\]", call[2])
+        assert re.fullmatch(r"runs=\[runs/(\w+)/augment-none\+seed-0,runs/\1/augment-none\+seed-1\]", call[1])

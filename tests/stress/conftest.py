@@ -80,8 +80,8 @@ def write_scene_files(folder: Path) -> None:
 
 
 def run_here(name: str, *arguments: str, folder: Path) -> int:
-    """`python -m train`, or one of train.commands, without its report, in this process, in a folder: the status."""
-    path = ROOT / "train" / ("__main__.py" if name == "train" else f"commands/{name}.py")
+    """`python -m train`, or a script, without its report, in this process, in a folder: the status."""
+    path = ROOT / ("train/__main__.py" if name == "train" else f"scripts/{name}.py")
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(sys, "argv", [str(path), *arguments])
         patch.setattr("train.report.page.report_of", lambda folders, out: "no report")

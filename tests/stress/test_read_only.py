@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from .conftest import TRAINING, end, start_command
+from .conftest import ROOT, TRAINING, end, start_command
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1  # of Linux's prctl
+LIGHT, LAB = (str(ROOT / "scripts" / name) for name in ("light.py", "lab.py"))
 TRAIN = ("-m", "train", "train.epochs=1", *TRAINING)
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="root may write everywhere")]
@@ -35,8 +36,8 @@ def call(*command: str, folder: Path) -> tuple[int, str]:
     "command, reported",
     [
         ((*TRAIN, "run=../locked/run"), "run=../locked/run cannot be written to (Permission denied)"),
-        (("-m", "train.commands.light", "light=grace", "out=../locked/a.hdr"), "out=../locked/a.hdr cannot be written"),
-        (("-m", "train.commands.lab", "out=../locked"), "out=../locked cannot be written to (Permission denied)"),
+        ((LIGHT, "light=grace", "out=../locked/a.hdr"), "out=../locked/a.hdr cannot be written"),
+        ((LAB, "out=../locked"), "out=../locked cannot be written to (Permission denied)"),
     ],
     ids=["run", "file", "folder"],
 )

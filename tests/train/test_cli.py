@@ -213,7 +213,7 @@ def test_slow_imports_are_announced_and_threads_that_wait_do_not_spin():
     assert done.stderr.startswith("loading ") and done.stderr.count("\n") == 1 and done.stdout == "PASSIVE\n"
 
 
-@pytest.mark.parametrize("path", ["train/__main__.py", "train/commands/attack.py"])
+@pytest.mark.parametrize("path", ["train/__main__.py", "scripts/attack.py"])
 def test_an_interrupt_while_torch_is_imported_is_one_line(path):
     command = [sys.executable, "-c", INTERRUPTED, str(ROOT / path)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT)

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("renderer", "augment", "train", "conf")
+PACKAGES = ("renderer", "augment", "train", "conf", "scripts")
 TINY = (
     *("data.train_per_class=4", "data.test_per_class=2", "data.validation=0.5", "compare=[]", "augment=none"),
     *("data.images=null", "evaluate.photos=null", "train.epochs=1", "model.depth=10", "model.width=1"),
@@ -22,10 +22,10 @@ TINY = (
 
 
 def sources() -> set[str]:
-    """Every file that an installation needs, relative to the repository."""
+    """Every file that an installation holds, relative to it."""
     kinds = ("*.py", "*.yaml", "*.jinja", "*.safetensors")
     files = [path for name in PACKAGES for kind in kinds for path in (ROOT / name).rglob(kind)]
-    return {path.relative_to(ROOT).as_posix() for path in files}
+    return {re.sub("^scripts/", "pnb_scripts/", path.relative_to(ROOT).as_posix()) for path in files}
 
 
 def test_every_folder_of_modules_is_a_package_that_is_installed():
@@ -71,8 +71,8 @@ def test_an_installation_holds_every_file_and_runs_from_any_folder_also_beside_o
     assert sources() <= {path.relative_to(target).as_posix() for path in target.rglob("*.*")}
     environment = os.environ | {"PYTHONPATH": str(target)}
     user = tmp_path / "user"
-    (user / "conf").mkdir(parents=True)
-    for name in ("train.py", "conf/__init__.py", "renderer.py", "augment.py"):
+    for name in ("train.py", "conf/__init__.py", "renderer.py", "augment.py", "scripts/__init__.py"):
+        (user / name).parent.mkdir(parents=True, exist_ok=True)
         (user / name).write_text("raise SystemExit('not this')")
     small = ["attack.max_steps=1", "attack.checks=false", "attack.force=true", "renderer.shadows=false", "out=out"]
     for name, *arguments in [

@@ -52,9 +52,7 @@ def test_one_parameter_and_several_at_once_run_and_write_what_they_promise(run, 
     assert 0 <= last["checks"]["random_search"] <= 1 and last["checks"]["cost_fell"] == 1
     config = OmegaConf.load(tmp_path / "out" / "config.yaml")
     assert set(config.attack) >= set(names.split("+"))
-    assert config.command == shlex.join(
-        ["python", "-m", "train.commands.attack", "out=out", *SMALL, f"attack={parameters}"]
-    )
+    assert config.command == shlex.join(["python", "scripts/attack.py", "out=out", *SMALL, f"attack={parameters}"])
 
 
 def example_is_physical(folder: Path) -> bool:

@@ -34,15 +34,22 @@ def test_help_of_a_command_without_a_file_shows_the_comments_of_its_settings(cal
     assert re.search(r"^  height=256 +# rows; there are twice as many columns$", capsys.readouterr().out, re.M)
 
 
-def test_a_shell_completes_an_installed_command_beside_a_train_py_of_the_user(tmp_path):
-    program = tmp_path / "bin" / "pnb-train"
-    program.parent.mkdir()
-    program.write_text("from train.__main__ import start\nstart()")
+@pytest.mark.parametrize(
+    ("program", "path", "word", "completed"),
+    [
+        ("bin/pnb-train", str(ROOT), "experiment=b", "experiment=best"),
+        (ROOT / "scripts/attack.py", "", "rel", "reload="),
+    ],
+    ids=["installed", "clone"],
+)
+def test_a_shell_completes_a_command_beside_a_train_py_of_the_user(tmp_path, program, path, word, completed):
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "pnb-train").write_text("from train.__main__ import start\nstart()")
     (tmp_path / "train.py").write_text("raise SystemExit('not this')")
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "COMP_LINE": "pnb-train experiment=b"}
-    command = [sys.executable, program, "-sc", "query=bash"]
+    environment = os.environ | {"PYTHONPATH": path, "COMP_LINE": f"{program} {word}"}
+    command = [sys.executable, tmp_path / program, "-sc", "query=bash"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("experiment=best\n", "")
+    assert (done.stdout, done.stderr) == (f"{completed}\n", "")
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,15 @@ import pytest
 from safetensors import safe_open
 
 from renderer.errors import InputError
+from scripts.publish import Settings, main
 from train import checkpoint
-from train.commands.publish import Settings, main
 from train.networks import PUBLISHED, load_run, load_selected
 from train.report.summary import summarize
 
 
 def test_a_published_network_loads_and_its_file_holds_settings_and_scores_without_paths(finished, tmp_path):
     out = tmp_path / "pretrained" / "tiny"
-    main(Settings(str(finished), str(out)))
+    main.__wrapped__(Settings(str(finished), str(out)))
     assert [path.name for path in out.iterdir()] == [PUBLISHED]
     network = load_run(out)
     assert network.classes == ("apple", "orange", "pear") and network.function.head.in_features == 64
@@ -33,7 +33,7 @@ def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):
     state = checkpoint.load(run / checkpoint.BEST)
     checkpoint.save(run / checkpoint.BEST, state | {"architecture": state["architecture"] | {"width": "wide"}})
     with pytest.raises(InputError, match=r"best\.pt is from another architecture"):
-        main(Settings(str(run), str(tmp_path / "out")))
+        main.__wrapped__(Settings(str(run), str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()
 
 

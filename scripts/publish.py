@@ -3,10 +3,12 @@
 The file's metadata holds the run's settings and scores as JSON.
 """
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
 from omegaconf import MISSING
@@ -23,6 +25,19 @@ class Settings:
     out: str = MISSING  # the folder of the weights
 
 
+def without_folders(value: Any) -> Any:
+    """Settings with the names of files in place of their paths, which are of this machine alone."""
+    match value:
+        case dict():
+            return {key: without_folders(item) for key, item in value.items()}
+        case list():
+            return [without_folders(item) for item in value]
+        case str() if value.startswith("/"):
+            return Path(value).name
+    return value
+
+
+@cli.command()
 def main(settings: Settings) -> None:
     out, run = writable_folder(settings.out, "out"), summarize(Path(settings.run))
     state = checkpoint.load(run.folder / checkpoint.BEST)
@@ -39,21 +54,5 @@ def main(settings: Settings) -> None:
     print(f"published in {settings.out}")
 
 
-def without_folders(value: Any) -> Any:
-    """Settings with the names of files in place of their paths, which are of this machine alone."""
-    match value:
-        case dict():
-            return {key: without_folders(item) for key, item in value.items()}
-        case list():
-            return [without_folders(item) for item in value]
-        case str() if value.startswith("/"):
-            return Path(value).name
-    return value
-
-
-def start() -> None:
-    cli.command(__file__, __doc__, main, Settings)
-
-
 if __name__ == "__main__":
-    start()
+    main()

@@ -3,6 +3,7 @@
 import re
 import sys
 
+sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
 from train.attack import AttackExperimentSettings, run
@@ -16,9 +17,10 @@ def as_overrides(arguments: list[str]) -> list[str]:
     return [*parameters, *(["attack=[]"] if "reload" in keys and "attack" not in keys else [])]
 
 
-def start() -> None:
-    cli.command(__file__, __doc__, run, AttackExperimentSettings, as_overrides(sys.argv[1:]))
+@cli.command(as_overrides)
+def main(settings: AttackExperimentSettings) -> None:
+    run(settings)
 
 
 if __name__ == "__main__":
-    start()
+    main()

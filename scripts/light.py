@@ -1,8 +1,10 @@
 """Write a light as an environment map for other software: pnb-light light=grace out=grace.hdr"""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
 from omegaconf import MISSING
@@ -24,6 +26,7 @@ class Settings:
         require_range("height", self.height, 1, 8192)  # a map of that height takes 3 GB
 
 
+@cli.command()
 def main(settings: Settings) -> None:
     light, out = load_light(settings.light), writable_file(settings.out, "out")
     with keyed("out"):
@@ -39,9 +42,5 @@ def main(settings: Settings) -> None:
     )
 
 
-def start() -> None:
-    cli.command(__file__, __doc__, main, Settings)
-
-
 if __name__ == "__main__":
-    start()
+    main()

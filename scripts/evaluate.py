@@ -3,9 +3,11 @@
 classifier= takes any other network, by a name that pnb-attack knows.
 """
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
 from omegaconf import MISSING
@@ -38,6 +40,7 @@ class Settings:
             raise InputError(f"model={self.model} is for run=FOLDER: leave it out, since a classifier has its own")
 
 
+@cli.command()
 def main(settings: Settings) -> None:
     device = choose_device(settings.device)
     if settings.run is None:
@@ -53,9 +56,5 @@ def main(settings: Settings) -> None:
     print(f"{format_summary(summary)}\n\ntable, scores and image: {out}")
 
 
-def start() -> None:
-    cli.command(__file__, __doc__, main, Settings)
-
-
 if __name__ == "__main__":
-    start()
+    main()

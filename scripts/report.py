@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
 from omegaconf import MISSING
@@ -25,12 +26,6 @@ class Settings:
             raise InputError("runs is empty: give the folders of runs, sweeps or attacks")
 
 
-def main(settings: Settings) -> None:
-    out = settings.out or os.path.commonpath([Path(run).absolute() for run in settings.runs])
-    page = write_report([Path(run) for run in settings.runs], writable_folder(out, "out"))
-    print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
-
-
 def as_overrides(arguments: list[str]) -> list[str]:
     """Folders without a key are `runs`."""
     folders = [text for text in arguments if text[:1] not in ("-", "") and (os.path.exists(text) or "=" not in text)]
@@ -38,9 +33,12 @@ def as_overrides(arguments: list[str]) -> list[str]:
     return [*rest, f"runs=[{','.join(map(quoted, folders))}]"] if folders else rest
 
 
-def start() -> None:
-    cli.command(__file__, __doc__, main, Settings, as_overrides(sys.argv[1:]))
+@cli.command(as_overrides)
+def main(settings: Settings) -> None:
+    out = settings.out or os.path.commonpath([Path(run).absolute() for run in settings.runs])
+    page = write_report([Path(run) for run in settings.runs], writable_folder(out, "out"))
+    print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
 
 
 if __name__ == "__main__":
-    start()
+    main()

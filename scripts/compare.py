@@ -1,8 +1,10 @@
 """Markdown tables of finished runs, side by side: pnb-compare 'runs=[runs/a,runs/b]'"""
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from train import cli  # isort: skip (first, since the others take seconds to import)
 
 from omegaconf import MISSING
@@ -26,14 +28,11 @@ class Settings:
             raise InputError(f"runs names {repeated[0]} twice, as if it were another seed: name each run once")
 
 
+@cli.command()
 def main(settings: Settings) -> None:
     runs = [summarize(Path(run)) for run in settings.runs]
     print(format_comparison(runs, settings.exclude, settings.photographs))
 
 
-def start() -> None:
-    cli.command(__file__, __doc__, main, Settings)
-
-
 if __name__ == "__main__":
-    start()
+    main()

@@ -1,1 +1,0 @@
-"""The installed commands beside `pnb-train`: `pnb-NAME`, or `python -m train.commands.NAME` in a clone."""
