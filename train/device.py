@@ -4,7 +4,6 @@ import functools
 import os
 import platform
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -19,7 +18,8 @@ from train import console
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
 THREADS = torch.get_num_threads()  # before any run sets its own
-TRIAL, CLEARLY = 1.0, 1.25  # seconds of a trial of threads; the ratio of seconds at which more threads are taken
+PASS, PASSES = 0.08, 5  # seconds of a pass by one thread, and passes of each, in a trial of threads
+CLEARLY = 1.25  # the ratio of seconds at which more threads are taken
 _CHOSEN: dict[str, int] = {}  # threads, by what they were tried with
 PRECISIONS = ("auto", "bfloat16", "float32")
 COMPILE = ("auto", "always", "never")
@@ -71,13 +71,10 @@ def choose_threads(network: nn.Module, images: Tensor) -> int:
 
     with eval_mode(network), torch.random.fork_rng(devices=[]), torch.enable_grad():
         seconds(most, 1)  # which starts the threads
-        count = max(1, int(TRIAL / 10 / seconds(1, 1)))
-        passes: dict[int, list[float]] = {1: [], most: []}
-        while (total := sum(map(sum, passes.values()))) < TRIAL or (len(passes[most]) < 3 and total < 4 * TRIAL):
-            for threads, times in passes.items():
-                times.append(seconds(threads, count))
+        count = max(1, int(PASS / seconds(1, 1)))
+        alone, together = zip(*((seconds(1, count), seconds(most, count)) for _ in range(PASSES)), strict=True)
     torch.set_num_threads(before)
-    _CHOSEN[key] = most if median(passes[1]) > CLEARLY * median(passes[most]) else 1
+    _CHOSEN[key] = most if median(alone) > CLEARLY * median(together) else 1
     return _CHOSEN[key]
 
 
@@ -139,12 +136,6 @@ def compiles(choice: str, device: torch.device) -> bool:
         console.warning("compile: torch.compile fails here, so training is slower: %s", reason)
         return False
     return True
-
-
-def compiled_pass(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A training pass as CUDA graphs. Forgets earlier graphs, since torch limits those of all runs of a process."""
-    torch.compiler.reset()
-    return torch.compile(function, mode="reduce-overhead", dynamic=False)
 
 
 class GraphedModel(nn.Module):

@@ -12,6 +12,7 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -150,23 +151,18 @@ def draw_shots(
     dimmest, brightest = brightness
     kinds = [*families, *environments]
     per_kind = setups // len(kinds)
-    for kind in kinds:
-        for index in range(per_kind):
-            rng = np.random.default_rng(stream_seed(seed, "shot", kind, index))
-            radiance = dimmest * (brightest / dimmest) ** ((index + rng.uniform()) / per_kind)
-            if kind not in environments:
-                yield _draw_shot(kind, radiance, rng)
-                continue
-            shot, sky = _draw_shot("solid", radiance, rng), environments[kind]
-            turned = np.roll(sky, rng.integers(sky.shape[1]), axis=1)
-            yield replace(shot, family=kind, environment=(radiance / _on_white(sky) * turned).astype(np.float32))
-
-
-def _on_white(environment: np.ndarray) -> float:
-    """The mean radiance of a white surface that faces up; turning the environment about the vertical leaves it."""
-    directions, solid_angles = equirectangular(*environment.shape[:2])
-    cosines = directions[..., 2].clamp(min=0) * solid_angles
-    return float((cosines[..., None] * torch.from_numpy(environment)).sum((0, 1)).mean()) / math.pi
+    for kind, index in product(kinds, range(per_kind)):
+        rng = np.random.default_rng(stream_seed(seed, "shot", kind, index))
+        radiance = dimmest * (brightest / dimmest) ** ((index + rng.uniform()) / per_kind)
+        if kind not in environments:
+            yield _draw_shot(kind, radiance, rng)
+            continue
+        shot, sky = _draw_shot("solid", radiance, rng), environments[kind]
+        directions, solid_angles = equirectangular(*sky.shape[:2])
+        cosines = directions[..., 2].clamp(min=0) * solid_angles
+        on_white = float((cosines[..., None] * torch.from_numpy(sky)).sum((0, 1)).mean()) / math.pi  # and facing up
+        turned = np.roll(sky, rng.integers(sky.shape[1]), axis=1)
+        yield replace(shot, family=kind, environment=(radiance / on_white * turned).astype(np.float32))
 
 
 def _draw_shot(family: str, brightness: float, rng: np.random.Generator) -> Shot:

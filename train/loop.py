@@ -22,7 +22,7 @@ from train import checkpoint, console
 from train.batches import Round, put_last, rounds_of_epoch, training_batches, with_room
 from train.checkpoint import random_state, restore_random_state
 from train.data import Split
-from train.device import GraphedModel, MixedPrecision, compiled_pass, compiles
+from train.device import GraphedModel, MixedPrecision, compiles
 from train.processes import Interruption, replicated, summed
 from train.recipe import SCHEDULES, MovingAverage, TrainSettings, augmentation, training_loss
 from train.run_folder import PHASES, RunLog
@@ -54,8 +54,8 @@ class EpochState:
 class Trainer:
     """One run's network, optimizer, augmentation service and folder. `fit` trains; `resume` goes on with the folder.
 
-    attacked: the network that renders are made against. selected: the network that is validated and kept, which is the
-    soup or the moving average where there is one; validated: the same, perhaps as CUDA graphs.
+    model: the network that is trained. initial: a copy as the run began, where that was with another's weights. ema,
+    soup: its averages, if any. selected: the network that is validated and kept: the soup, the average or the model.
     """
 
     def __init__(
@@ -66,8 +66,8 @@ class Trainer:
         service: AugmentationService,
         folder: Path,
     ):
-        """model: as the run begins; it is the teacher of a distillation, and each epoch of a soup begins with it.
-        architecture: what rebuilds the network from a checkpoint, classes included.
+        """architecture: what rebuilds the network from a checkpoint, classes included. The model as it begins is the
+        teacher of a distillation, and each epoch of a soup begins with it.
 
         InputError where the processes cannot share a batch equally, or for a ranking without hard negatives.
         """
@@ -84,26 +84,26 @@ class Trainer:
         self._best: dict[str, Any] | None = None  # selected, but not written yet
 
         self.model, self.device = model, next(model.parameters()).device
+        self.initial = deepcopy(model).eval().requires_grad_(False) if settings.init_from else None
         self.ema = MovingAverage(model, settings.ema_decay) if settings.ema_decay else None
-        self._trained = cast(MixedPrecision, self.ema.module) if self.ema else model  # the result of an epoch's steps
         mean = {"avg_fn": get_swa_avg_fn(), "use_buffers": True}  # Wortsman et al. 2022, "Model soups"
         self.soup = AveragedModel(model, **mean) if settings.soup else None
-        self.selected = cast(MixedPrecision, self.soup.module) if self.soup else self._trained
-        self._initial = deepcopy(model.state_dict()) if settings.soup else None
-        teacher = deepcopy(model).eval().requires_grad_(False) if settings.distillation else None
+        average = self.soup or self.ema
+        self.selected = cast(MixedPrecision, average.module) if average else model
         replica = replicated(model)  # may replace layers, so the optimizer comes after it
         options: dict[str, Any] = {"weight_decay": settings.weight_decay, "nesterov": settings.momentum > 0}
         self.optimizer = torch.optim.SGD(
             model.parameters(), settings.learning_rate, settings.momentum, fused=True, **options
         )
         compiled = compiles(settings.compile, self.device)
-        loss = training_loss(replica, settings, service.label, teacher)
-        self._loss = compiled_pass(loss) if compiled else loss
+        teacher = self.initial if settings.distillation else None
+        self._loss = training_loss(replica, settings, service.label, teacher)
+        if compiled:
+            torch.compiler.reset()  # since torch limits the graphs of all runs of a process
+            self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
         self._augment = augmentation(settings.augmentation, model, self.seed)
-        self.attacked: nn.Module = GraphedModel(model) if compiled else model
-        self.validated: nn.Module = GraphedModel(self.selected) if compiled else self.selected
-
-    # --------------------------------------------------------------------------------- epochs and rounds
+        self._attacked: nn.Module = GraphedModel(model) if compiled else model
+        self._validated: nn.Module = GraphedModel(self.selected) if compiled else self.selected
 
     def fit(self, train: Split, validation: Split, log: RunLog | None) -> None:
         """Train to the last epoch; best.pt holds the network of the best validation, or a soup's last.
@@ -133,8 +133,8 @@ class Trainer:
         steps = [math.ceil(len(part.rows) / settings.batch_size) for part in rounds]
         total = sum(steps)
         if self._under_way is None:
-            if self._initial:  # a soup's epochs all begin with it
-                self.model.load_state_dict(self._initial)
+            if self.soup and self.initial:
+                self.model.load_state_dict(self.initial.state_dict())
                 self.optimizer.state.clear()
                 if self.ema:
                     self.ema.n_averaged.zero_()
@@ -163,7 +163,7 @@ class Trainer:
         """Renders made against the current weights."""
         torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
         with self.phases("attack"):
-            renders = self.service.regenerate(self.attacked, now.number)
+            renders = self.service.regenerate(self._attacked, now.number)
         if log and renders.attack_examples:
             with self.phases("input_output"):  # now, since a run that is resumed within the epoch makes no others
                 log.attack_examples(renders.attack_examples, self.architecture["classes"], self.epoch + 1)
@@ -195,9 +195,9 @@ class Trainer:
         images = state.step * self.settings.batch_size
         loss_sum, hits = summed(state.sums).tolist()
         if self.soup:
-            self.soup.update_parameters(self._trained)
+            self.soup.update_parameters(self.ema.module if self.ema else self.model)
         with self.phases("evaluation"):
-            validated = evaluate(self.validated, validation)
+            validated = evaluate(self._validated, validation)
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         before = [line["validation/accuracy"] for line in self.history]
@@ -232,8 +232,6 @@ class Trainer:
         if not (math.isfinite(loss) and torch.stack([value.isfinite().all() for value in weights]).all()):
             rates = f"train.learning_rate={settings.learning_rate} with train.weight_decay={settings.weight_decay}"
             raise InputError(f"{rates} made the loss or weights NaN or infinite in epoch {epoch}: set lower ones")
-
-    # --------------------------------------------------------------------------------- checkpoints
 
     def _save(self) -> None:
         """Write last.pt, keeping the one before, and best.pt where there is a better network, by the first process."""
@@ -275,7 +273,8 @@ class Trainer:
             self.ema.load_state_dict(state["ema"])
         if self.soup:
             self.soup.load_state_dict(state["soup"])
-        self.model.precision = self._trained.precision = self.selected.precision = state["precision"]
+        for network in filter(None, (self.model, self.initial, self.selected)):
+            network.precision = state["precision"]
         self.service.load_state_dict(state["service"])
         self._random_state = dict(state["random_state"])
         if begun := state["under_way"]:

@@ -255,17 +255,16 @@ def published(run: Path) -> Path:
     return next((path for path in (run, *(home / run for home in homes)) if path.exists()), run)
 
 
-def start_from(network: nn.Module, description: Mapping[str, Any], run: Path) -> None:
-    """Give the network the weights and the normalization of another run's, which `load_selected` finds.
+def start_from(network: nn.Module, description: Mapping[str, Any], path: Path, state: Mapping[str, Any]) -> None:
+    """Give the network the weights and the normalization of another run's, which `load_selected` found.
 
     description: the network's (see `describe`). InputError where the other has other classes, another size or shape.
     """
-    path, state = load_selected(run)
     stored, description = ({"name": WIDERESNET, **facts} for facts in (state["architecture"], description))
     for key in SHAPE:
         if stored.get(key, description.get(key)) != description.get(key):
             other = "other classes" if key == "classes" else f"{key} {stored[key]}, not {description[key]}"
-            raise InputError(f"train.init_from={run} was trained with {other}: give this run the same")
+            raise InputError(f"train.init_from={path} was trained with {other}: give this run the same")
     with _of_one_architecture(path):
         network.load_state_dict(state["model"])
 

@@ -57,11 +57,6 @@ def broadcast(value: str) -> str:
     return values[0]
 
 
-def any_process(flag: bool) -> bool:
-    """Whether the flag is set in any process."""
-    return bool(summed(torch.tensor(float(flag))))  # on the CPU, so that no device has to catch up
-
-
 def summed(values: Tensor) -> Tensor:
     """The sum over all processes, in place."""
     if utils.world_size() > 1:
@@ -116,8 +111,8 @@ class Interruption:
             signal.raise_signal(self._number)
 
     def requested(self) -> bool:
-        """Whether to stop now; the same in all processes of a run."""
-        return any_process(self._number is not None)
+        """Whether to stop now, since any process of the run got a signal."""
+        return bool(summed(torch.tensor(float(self._number is not None))))  # on the CPU: no device has to catch up
 
     def stop(self) -> None:
         """Raise `Interrupted`, after a batch system's own handler, which may queue the job again and exit."""

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 
 from augment import utils
 from augment.build import build_scene
@@ -12,21 +13,20 @@ from augment.classifiers.adapter import class_index
 from augment.losses import complementary_label
 from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed
-from renderer.cache import TensorCache, cache_folder, content_key
+from renderer.cache import TensorCache, cache_folder
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE, to_unit
 from train import checkpoint, console
 from train.data import DataSet, Split, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
 from train.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
 from train.loop import Trainer, evaluate
-from train.networks import PYTHON, build_network, describe, load_run, load_selected, start_from
+from train.networks import build_network, describe, load_selected, start_from
 from train.photographs.folder import find_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
-from train.photographs.predictions import compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
 from train.rendered_shapes import load_shapes, write_held_out
-from train.run_folder import BEFORE, RunLog, recorded_threads, require_same_run, write_config
+from train.run_folder import BEFORE, RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
 VALIDATION = 0.1  # of every class's images, where neither data.validation nor the network begun with says
@@ -45,24 +45,41 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
     for name, photographs in settings.evaluate.folders.items():
         require_outside(folder / name, photographs)
         find_photographs(photographs, data.classes, settings.label)
-    device = choose_device(settings.train.device)
     set_deterministic(settings.train.deterministic)
-    fraction, left_out = _validation(settings, data.train)
+    threads, begun = settings.train.threads, checkpoint.exists(folder)
+    if begun and not settings.train.resume:
+        raise InputError(f"run={folder} holds a run already: set train.resume=true to go on, or choose another run")
+    if begun:
+        recorded = OmegaConf.select(require_same_run(folder, settings), "hardware.threads")
+        threads = threads or (recorded if isinstance(recorded, int) and recorded > 0 else None)
+    base = load_selected(Path(settings.train.init_from)) if settings.train.init_from else None
+    fraction, left_out = _validation(settings, data.train, base)
     train, validation = stratified_split(data.train, fraction, seed=0)
-    trainer = build_trainer(settings, data, folder, device, left_out)
+    trainer = build_trainer(settings, data, folder, base, left_out, threads)
     threads = torch.get_num_threads()
-    _open_folder(trainer, settings, command)
+    if begun:
+        trainer.resume()
+    elif settings.train.resume:
+        console.info("nothing to resume in %s; starting at epoch 1", folder)
+    if utils.rank() == 0:
+        hardware = {"device": str(trainer.device), "precision": trainer.model.precision, "threads": threads}
+        write_config(folder, settings, hardware=hardware, command=command)
 
     def train_and_score() -> dict[str, float]:
         torch.set_num_threads(threads)  # of this run, after others were prepared
         console.info(
-            f"{len(train)} images, {len(data.classes)} classes; {device}, {trainer.model.precision}, "
+            f"{len(train)} images, {len(data.classes)} classes; {trainer.device}, {trainer.model.precision}, "
             f"{threads} threads, {utils.world_size()} processes"
         )
-        before = {} if utils.rank() else _scores_before(settings, trainer, data)
+        before = _scores_before(settings, trainer, data)
         log = None if utils.rank() else RunLog(folder, trainer.history)
-        trainer.fit(train.to(device), validation.to(device), log)
-        scores = before | _test_scores(trainer, data) | _photograph_scores(settings, trainer, data)
+        trainer.fit(train.to(trainer.device), validation.to(trainer.device), log)
+        scores = before | _test_scores(trainer, data)
+        summaries = _score_photographs(settings, trainer.selected, data, folder, trainer.device)
+        for name, summary in summaries.items():
+            console.info("%s: %s", name, format_summary(summary))
+            metrics = {metric: find_metric(summary, metric)["value"] for metric in ("top5", *METRICS)}
+            scores |= {f"{name}/{metric}": value for metric, value in metrics.items() if value is not None}
         if log:
             log.scalars(scores)
         return scores
@@ -96,25 +113,27 @@ def write_images(settings: ExperimentSettings, size: int) -> None:
         write_held_out(Path(data.images), size, data.seed, TensorCache(cache_folder(settings.renderer.cache)))
 
 
-def _validation(settings: ExperimentSettings, split: Split) -> tuple[float, dict[str, Any] | None]:
+def _validation(
+    settings: ExperimentSettings, split: Split, base: tuple[Path, dict[str, Any]] | None
+) -> tuple[float, dict[str, Any] | None]:
     """The fraction of the training images to validate on, and what to store as the part that no weight learned from:
-    its fraction and seed, and a hash of the images. None where train.init_from does not know its own of these images.
+    its fraction and seed, and a hash of the images. None where `base`, the network begun with, does not know its own.
 
     Of one seed, a smaller part lies within a larger one. So a network's part is the smallest along its ancestors.
     """
-    asked, base = settings.data.validation, settings.train.init_from
+    asked, init_from = settings.data.validation, settings.train.init_from
     fraction = VALIDATION if asked is None else asked
-    own = {"fraction": fraction, "seed": 0, "images": checkpoint.content_hash([split.images, split.labels])}
-    if not base:
+    own = {"fraction": fraction, "seed": 0, "images": split.content_hash}
+    if base is None:
         return fraction, own
-    stored = load_selected(Path(base))[1]["architecture"].get("validation")
+    stored = base[1]["architecture"].get("validation")
     known = stored.get("fraction") if isinstance(stored, dict) else None
     if not isinstance(known, float) or own | {"fraction": known} != stored:
-        console.info("validation: %s does not say which of these images it learned from; perhaps these, too", base)
+        console.info("validation: %s does not say which of these images it learned from; perhaps these, too", init_from)
         return fraction, None
     fraction = known if asked is None else asked
     if fraction > known:
-        console.info("validation: %s learned from part of it, having left out only data.validation=%s", base, known)
+        console.info("validation: %s learned from part of it: it left out only data.validation=%s", init_from, known)
     return fraction, own | {"fraction": min(fraction, known)}
 
 
@@ -122,23 +141,26 @@ def build_trainer(
     settings: ExperimentSettings,
     data: DataSet,
     folder: Path,
-    device: torch.device,
-    left_out: dict[str, Any] | None = None,
+    base: tuple[Path, dict[str, Any]] | None,
+    left_out: dict[str, Any] | None,
+    threads: int | None,
 ) -> Trainer:
     """The run's network, optimizer and scene, ready for `Trainer.fit`; nothing is written before.
 
-    left_out: the training images that validate it, to be stored with its architecture.
+    base: the network to begin with, as `load_selected` gives it. left_out: the training images that validate it, to be
+    stored with its architecture. threads: None where a trial is to choose.
     """
+    device, shape = choose_device(settings.train.device), settings.model.shape
     precision = choose_precision(settings.train.precision, device)
-    (mean, std), shape = channel_statistics(data.train.images), settings.model.shape
+    mean, std = channel_statistics(data.train.images)
     torch.manual_seed(stream_seed(settings.seed, "weights"))
     network = build_network(data.classes, data.size, mean=mean, std=std, **shape)
     facts = {"classes": list(data.classes), "size": data.size, "encoding": settings.renderer.encoding, **shape}
-    if settings.train.init_from:
-        start_from(network, facts, Path(settings.train.init_from))
+    if base:
+        start_from(network, facts, *base)
     model = MixedPrecision(network.to(device), precision)
     batch = to_unit(data.train.images[: settings.train.batch_size])
-    torch.set_num_threads(settings.train.threads or recorded_threads(folder) or choose_threads(model, batch))
+    torch.set_num_threads(threads or choose_threads(model, batch))
     service = build_service(settings, data, device)
     return Trainer(settings.train, model, describe(network, **facts, validation=left_out), service, folder)
 
@@ -163,48 +185,13 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
     return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process)
 
 
-def _open_folder(trainer: Trainer, settings: ExperimentSettings, command: str) -> None:
-    """Resume from the folder, or start in it; InputError rather than writing over another run."""
-    folder = trainer.folder
-    if checkpoint.exists(folder):
-        if not settings.train.resume:
-            raise InputError(f"run={folder} holds a run already: set train.resume=true to go on, or choose another run")
-        require_same_run(folder, settings)
-        trainer.resume()
-    elif settings.train.resume:
-        console.info("nothing to resume in %s; starting at epoch 1", folder)
-    if utils.rank() == 0:
-        threads = torch.get_num_threads()
-        hardware = {"device": str(trainer.device), "precision": trainer.model.precision, "threads": threads}
-        write_config(folder, settings, hardware=hardware, command=command)
-
-
 def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
-    """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs.
-
-    Its predictions are cached under a hash of weights and images, for all runs that begin with it.
-    """
-    if not settings.train.init_from:
+    """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs."""
+    if not trainer.initial:
         return {}
-    name, device = settings.model.name, trainer.device
-    base = load_run(settings.train.init_from, model=name)
-    model = MixedPrecision(base.to(device), trainer.model.precision).eval()
-    cache = TensorCache(None if name.startswith(PYTHON) else cache_folder(settings.renderer.cache))
-    key = checkpoint.content_hash([torch.__version__, str(model), model.precision, str(device), model.state_dict()])
-
-    def predict(images: torch.Tensor) -> torch.Tensor:
-        batch = content_key(key, images.cpu().numpy())
-        if (stored := cache.read(batch)) is None:
-            stored = {"logits": model(images).cpu().contiguous()}
-            cache.write(batch, stored)
-        return stored["logits"]
-
-    logits = compute_logits(predict, data.test.images, len(data.classes), device)
-    accuracy = (logits.argmax(1) == data.test.labels).float().mean().item()
+    accuracy = evaluate(trainer.initial, data.test.to(trainer.device))["accuracy"]
     console.info("before: %s has test accuracy %.4f", settings.train.init_from, accuracy)
-    for name, photographs in settings.evaluate.folders.items():
-        out, skip = trainer.folder / BEFORE / name, settings.evaluate.skip_unreadable
-        evaluate_photographs(predict, data.classes, photographs, settings.label, out, data.size, skip, device=device)
+    _score_photographs(settings, trainer.initial, data, trainer.folder / BEFORE, trainer.device)
     return {"test/accuracy_before": accuracy}
 
 
@@ -220,14 +207,16 @@ def _test_scores(trainer: Trainer, data: DataSet) -> dict[str, float]:
     return {"test/accuracy": selected, "test/accuracy_last": last, "test/epoch": best["epoch"]}
 
 
-def _photograph_scores(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
-    """The network's metrics on each folder of photographs, as NAME/METRIC; empty without one."""
-    scores: dict[str, float | None] = {}
-    for name, photographs in settings.evaluate.folders.items() if utils.rank() == 0 else ():
-        out, skip = trainer.folder / name, settings.evaluate.skip_unreadable
-        summary = evaluate_photographs(
-            trainer.selected, data.classes, photographs, settings.label, out, data.size, skip, device=trainer.device
-        )
-        console.info("%s: %s", name, format_summary(summary))
-        scores |= {f"{name}/{metric}": find_metric(summary, metric)["value"] for metric in ("top5", *METRICS)}
-    return {name: value for name, value in scores.items() if value is not None}
+def _score_photographs(
+    settings: ExperimentSettings, model: MixedPrecision, data: DataSet, folder: Path, device: torch.device
+) -> dict[str, Any]:
+    """Score a model on each folder of photographs, in a sub-folder of its name; the summaries by name.
+
+    The first process does so alone; the others get {}.
+    """
+    label, skip = settings.label, settings.evaluate.skip_unreadable
+    return {
+        name: evaluate_photographs(model, data.classes, photographs, label, folder / name, data.size, skip, device)
+        for name, photographs in settings.evaluate.folders.items()
+        if utils.rank() == 0
+    }

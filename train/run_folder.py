@@ -27,7 +27,7 @@ from renderer.image import to_bytes
 from train.attack_examples import SUFFIX, write_attack_examples
 from train.checkpoint import write_whole
 from train.networks import selected_file
-from train.settings import ExperimentSettings, dotted, is_within
+from train.settings import ExperimentSettings, dotted
 
 CONFIG, METRICS, LOCK, FAILURE = "config.yaml", "metrics.jsonl", ".lock", "failed.txt"
 BEFORE = "before"  # sub-folder with the scores of the network that the run began with
@@ -166,7 +166,8 @@ def decisive_settings(settings: ExperimentSettings | DictConfig) -> dict[str, ob
     """The settings that decide a run's result, by dotted key; paths inside the run's own folder begin with `<run>`."""
     plain: Any = OmegaConf.to_container(settings) if isinstance(settings, DictConfig) else asdict(settings)
     moved = _moved(plain, str(plain.get("run")), "<run>")
-    return {key: value for key, value in dotted(moved) if not is_within(key, CIRCUMSTANCES)}
+    circumstances = tuple(f"{key}." for key in CIRCUMSTANCES)
+    return {key: value for key, value in dotted(moved) if not f"{key}.".startswith(circumstances)}
 
 
 def _moved(value: Any, folder: str, to: str) -> Any:
@@ -177,13 +178,6 @@ def _moved(value: Any, folder: str, to: str) -> Any:
         return [_moved(item, folder, to) for item in value]
     inside = isinstance(value, str) and f"{value}/".startswith(f"{folder}/")
     return to + value.removeprefix(folder) if inside else value
-
-
-def recorded_threads(folder: Path) -> int | None:
-    """The number of threads of the folder's run, on which its last bits depend; None where it holds none."""
-    config = read_config(folder / CONFIG) if (folder / CONFIG).is_file() else DictConfig({})
-    threads = OmegaConf.select(config, "hardware.threads")
-    return threads if isinstance(threads, int) and threads > 0 else None
 
 
 def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, str]:
@@ -204,8 +198,8 @@ def resumed(config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, s
     return merged, shlex.join(dict.fromkeys([*shlex.split(str(saved.get("command", ""))), *added]))
 
 
-def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool = False) -> None:
-    """InputError where the run in the folder has other decisive settings or input files than those asked for.
+def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool = False) -> DictConfig:
+    """The configuration of the run in the folder; InputError where its decisive settings or input files are others.
 
     A run that goes on may get more epochs and another evaluation, unless it is finished.
     """
@@ -220,26 +214,24 @@ def require_same_run(folder: Path, settings: ExperimentSettings, finished: bool 
     for path, fingerprint in fingerprints(settings).items():
         if hashes.get(path, fingerprint) != fingerprint:
             raise InputError(f"{path} has changed since {folder} began: put it back, or start in {elsewhere}")
+    return config
 
 
 def fingerprints(settings: Any) -> dict[str, str]:
     """SHA-256 of every file that INPUTS name, of the network in a run's folder, and of the names and sizes in every
     other folder, by path."""
     by_key = dict(dotted(asdict(settings)))
-    paths = {path for key in INPUTS for path in _paths(by_key.get(key)) if os.path.exists(path)}
-    return {path: _fingerprint(Path(path)) for path in sorted(paths)}
+    paths = _texts([by_key.get(key) for key in INPUTS])
+    return {path: _fingerprint(Path(path)) for path in sorted(paths) if os.path.exists(path)}
 
 
-def _paths(value: Any) -> Iterator[str]:
+def _texts(value: Any) -> set[str]:
     """The texts in a setting that may be paths; of a mapping, its mesh and those of its props."""
-    match value:
-        case str():
-            yield value
-        case list():
-            for item in value:
-                yield from _paths(item)
-        case dict():
-            yield from _paths([value.get("mesh"), value.get("props")])
+    if isinstance(value, dict):
+        value = [value.get("mesh"), value.get("props")]
+    if isinstance(value, list):
+        return set().union(*map(_texts, value))
+    return {value} if isinstance(value, str) else set()
 
 
 def _fingerprint(path: Path) -> str:

@@ -311,8 +311,3 @@ def dotted(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield from dotted(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
-
-
-def is_within(key: str, groups: Collection[str]) -> bool:
-    """Whether a dotted key is one of the groups, or within one."""
-    return any(key == group or key.startswith(f"{group}.") for group in groups)

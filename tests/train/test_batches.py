@@ -22,12 +22,6 @@ def numbered(images: torch.Tensor) -> Split:
     return Split(images, torch.arange(len(images)))
 
 
-def epoch_of(count: int, batch_size: int = 7) -> list[tuple[torch.Tensor, ...]]:
-    """Batches of plain images, each of its own value, which is its label too."""
-    images = torch.arange(count).view(-1, 1, 1, 1).expand(-1, 3, 8, 8).to(torch.uint8)
-    return list(training_batches(numbered(images), batch_size, 0, epoch_round(count, 0)))
-
-
 @pytest.mark.parametrize("shape", [(5, 5), (6, 11)])
 @pytest.mark.parametrize("flipped", [False, True])
 def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, flipped):
@@ -70,14 +64,15 @@ def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch():
 
 
 def test_each_epoch_shows_every_image_once_with_its_own_label_and_fills_the_last_batch_with_the_first():
-    epoch = epoch_of(100)
+    plain = numbered(torch.arange(100, dtype=torch.uint8).view(-1, 1, 1, 1).expand(-1, 3, 8, 8))
+    epoch = list(training_batches(plain, 7, 0, epoch_round(100, 0)))
     assert [len(labels) for _, labels, _ in epoch] == [7] * 15
     order = torch.cat([labels for _, labels, _ in epoch]).tolist()
     assert sorted(order[:100]) == list(range(100)) and order[100:] == order[:5]
     for images, labels, _ in epoch:
         assert images.dtype == torch.uint8 and images.shape == (len(labels), 3, 8, 8)
         assert torch.equal(images, labels.to(torch.uint8).view(-1, 1, 1, 1).expand_as(images))
-    ((_, labels, _),) = epoch_of(3)  # fewer images than a batch fill it several times
+    ((_, labels, _),) = training_batches(plain[:3], 7, 0, epoch_round(3, 0))  # a batch has every image several times
     assert len(labels) == 7 and labels[:3].tolist() == labels[3:6].tolist() and labels[6] == labels[0]
 
 

@@ -140,9 +140,9 @@ def test_a_run_is_neither_written_over_nor_resumed_with_other_settings(tiny, fin
 def test_the_threads_that_were_chosen_are_recorded_and_those_of_a_resumed_run(tiny, tmp_path, monkeypatch):
     before, counts = torch.get_num_threads(), []
     try:
-        for epochs, faster, asked in [(1, 2, "null"), (2, 1, "null"), (3, 1, "3")]:
+        for faster, asked in [(2, "null"), (1, "null"), (1, "3")]:
             monkeypatch.setattr("train.run.choose_threads", Mock(return_value=faster))
-            settings = tiny("augment=none", f"train.epochs={epochs}", f"train.threads={asked}", "train.resume=true")
+            settings = tiny("augment=none", "train.epochs=1", f"train.threads={asked}", "train.resume=true")
             train_and_score = prepare(settings, load_data(settings), tmp_path)
             torch.set_num_threads(before)  # as another arm's may be
             train_and_score()
@@ -274,18 +274,15 @@ def test_the_selected_network_is_the_best_on_validation_and_scored_once_after_th
 def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(tiny, finished, tmp_path, caplog):
     """Of 20 images per class a tenth, which lies within a fifth, is left out by its base, and so by all after it."""
     caplog.set_level("INFO", "train")
-    architecture = checkpoint.load(finished / checkpoint.BEST)["architecture"]
-    unknown = tmp_path / "unknown" / checkpoint.BEST
-    unknown.parent.mkdir()
-    weights = checkpoint.load(finished / checkpoint.BEST)
-    checkpoint.save(unknown, weights | {"architecture": {**architecture, "validation": None}})
-    base = tiny("train.epochs=1", "data.validation=0.05")
-    train(base, tmp_path / "base")
+    stored = checkpoint.load(finished / checkpoint.BEST)
+    unknown = tmp_path / "unknown.pt"
+    checkpoint.save(unknown, stored | {"architecture": {**stored["architecture"], "validation": None}})
+    train(tiny("train.epochs=1", "data.validation=0.05"), tmp_path / "base")
     for name, init, asked, images, left_out, warned in [
         ("as its base", tmp_path / "base", "null", 3, 0.05, False),
         ("less", finished, "0.05", 3, 0.05, False),
         ("more", tmp_path / "base", "0.2", 12, 0.05, True),
-        ("unknown", unknown.parent, "null", 6, None, True),
+        ("unknown", unknown, "null", 6, None, True),
     ]:
         caplog.clear()
         train(tiny("train.epochs=1", f"train.init_from={init}", f"data.validation={asked}"), tmp_path / name)
@@ -293,19 +290,14 @@ def test_a_network_is_validated_on_images_that_the_one_it_began_with_left_out(ti
         assert (state and state["fraction"]) == left_out
         assert f"{60 - images} images, 3 classes" in caplog.text
         assert sum(line.startswith("validation: ") for line in caplog.messages) == warned
-    assert load_run(tmp_path / "unknown").classes == ("apple", "orange", "pear")
+    assert load_run(unknown).classes == ("apple", "orange", "pear")
 
 
-def test_the_network_begun_with_is_scored_on_the_same_images_and_computed_once(tiny, finished, photos, tmp_path):
-    cache = tmp_path / "cache"
-    keys = "train.epochs=1", "augment=none", f"renderer.cache={cache}", f"train.init_from={finished}"
-    settings, written = tiny(*keys, f"evaluate.photos={photos}"), []
-    for name in ("first", "second"):
-        scores = train(settings, tmp_path / name)
-        assert scores["test/accuracy_before"] == pytest.approx(read_metrics(finished)[-1]["test/accuracy"])
-        for file in ("predictions.csv", "summary.json"):
-            base, before = (folder / "photographs" / file for folder in (finished, tmp_path / name / "before"))
-            assert base.read_text() == before.read_text()
-        written.append({path.name: path.stat().st_ino for path in cache.iterdir()})
-    assert written[0] == written[1] and len(written[0]) == 2  # of the test set and of the photographs
-    assert summarize(tmp_path / "first").before.accuracy == scores["test/accuracy_before"]
+def test_the_network_begun_with_is_scored_on_the_same_images(tiny, finished, photos, tmp_path):
+    keys = "train.epochs=1", "augment=none", f"train.init_from={finished}", f"evaluate.photos={photos}"
+    scores = train(tiny(*keys), tmp_path)
+    assert scores["test/accuracy_before"] == pytest.approx(read_metrics(finished)[-1]["test/accuracy"])
+    for file in ("predictions.csv", "summary.json"):
+        base, before = (folder / "photographs" / file for folder in (finished, tmp_path / "before"))
+        assert base.read_text() == before.read_text()
+    assert summarize(tmp_path).before.accuracy == scores["test/accuracy_before"]

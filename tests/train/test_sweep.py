@@ -69,12 +69,6 @@ def swept(run_sweep, tmp_path_factory) -> Path:
     return folder
 
 
-def rows(text: str) -> list[list[str]]:
-    """The rows of the Markdown tables in it, as lists of texts, without their rules."""
-    lines = [line for line in text.splitlines() if line.startswith("|") and not line.startswith("| --")]
-    return [[part.strip() for part in line.strip("|").split("|")] for line in lines]
-
-
 def require_same_weights(*folders: Path) -> None:
     first, second = (torch.load(folder / LAST, weights_only=True)["model"] for folder in folders)
     assert all(torch.equal(first[name], second[name]) for name in first)
@@ -109,7 +103,9 @@ def test_different_runs_have_different_names_that_file_systems_and_command_lines
         assert override.value() == f"runs/sweep/{name}"
 
 
-def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(run_sweep, folder_of, swept, capsys):
+def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(
+    run_sweep, folder_of, swept, capsys, read_markdown
+):
     folders = [folder_of(swept, f"seed={seed}") for seed in (0, 1)]
 
     def files():
@@ -121,9 +117,8 @@ def test_a_second_call_trains_nothing_again_and_shows_the_finished_runs(run_swee
     assert files() == before
     printed = capsys.readouterr().out
     assert all(f"finished before: {folder}\n" in printed for folder in folders)
-    assert [row[:2] for row in rows(printed)] == [
-        ["network", "seed"], ["none", "0"], ["none", "1"], ["none", "2 seeds"]
-    ]  # fmt: skip
+    (table,) = read_markdown(printed).values()
+    assert [row[:2] for row in table] == [["network", "seed"], ["none", "0"], ["none", "1"], ["none", "2 seeds"]]
 
 
 def test_a_signal_stops_the_sweep_and_a_second_call_ends_as_if_there_had_been_none(
@@ -224,13 +219,14 @@ def sweep_process(folder: Path, *overrides: str) -> subprocess.Popen:
 
 
 @pytest.mark.slow
-def test_joblib_trains_runs_in_parallel_processes(tiny_npz, folder_of, tmp_path):
+def test_joblib_trains_runs_in_parallel_processes(tiny_npz, folder_of, tmp_path, read_markdown):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     overrides = [f"data.path={tiny_npz}", "train.learning_rate=0.05,-1", "launcher=joblib", "hydra.launcher.n_jobs=2"]
     assert sweep_process(tmp_path / "sweep", *overrides).wait(300) == 1
     printed = (tmp_path / "output.txt").read_text()
     good, bad = (folder_of(tmp_path / "sweep", f"train.learning_rate={rate}") for rate in ("0.05", "-1"))
-    assert [row[0] for row in rows(printed)] == ["network", "none"] and "Traceback" not in printed
+    (table,) = read_markdown(printed).values()
+    assert [row[0] for row in table] == ["network", "none"] and "Traceback" not in printed
     assert f"{bad}: failed: {(bad / FAILURE).read_text()}" in printed
     log = (good / "train.log").read_text().splitlines()
     assert [line.removeprefix("#0 ") for line in printed.splitlines() if line.startswith("#0 ")] == log
