@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
 
 from renderer.rasterizer import Rasterizer
 
@@ -48,7 +49,9 @@ def cache_home(tmp_path_factory) -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def parsed_once() -> Iterator[None]:
     """Hydra parses each file of conf/ once, and not again at every composition."""
-    load, configs = ImportlibResourcesConfigSource.load_config, {}
+    Plugins.instance()  # which defines the class of these sources anew
+    source = SourcesRegistry.instance().resolve("pkg")
+    load, configs = source.load_config, {}
 
     def load_once(self, config_path):
         key = self.path, config_path
@@ -57,7 +60,7 @@ def parsed_once() -> Iterator[None]:
         return deepcopy(configs[key])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ImportlibResourcesConfigSource, "load_config", load_once)
+        patch.setattr(source, "load_config", load_once)
         yield
 
 

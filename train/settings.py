@@ -5,7 +5,9 @@ import shlex
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast, get_type_hints
 
@@ -239,7 +241,7 @@ def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Se
     InputError names the key that is unknown, unset, of the wrong type or, by the dataclass's own check, out of range.
     """
     try:
-        merged: Any = OmegaConf.merge(OmegaConf.structured(kind), config)
+        merged: Any = OmegaConf.merge(_schema(kind), config)
         if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
             raise InputError(f"{_join(key, min(unset))} is not set: give {_join(key, min(unset))}=...")
         _check(merged, key)
@@ -248,6 +250,11 @@ def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Se
         name = _wrong_key(kind, config) or getattr(error, "full_key", None) or ""
         reason = str(getattr(error, "msg", error)).splitlines()[0]
         raise InputError(f"{_join(key, name)}: {reason}".removeprefix(": ")) from error
+
+
+@cache  # since OmegaConf takes as long to make it as to read a configuration into it
+def _schema(kind: type) -> DictConfig:
+    return OmegaConf.structured(kind)
 
 
 def _check(node: DictConfig, key: str) -> None:
@@ -268,7 +275,7 @@ def _check(node: DictConfig, key: str) -> None:
 
 def _wrong_key(kind: type, config: DictConfig) -> str:
     """The key of the first value that is wrong by itself, which OmegaConf names for most values alone; "" for none."""
-    settings, plain = OmegaConf.structured(kind), cast(dict[str, Any], OmegaConf.to_container(config))
+    settings, plain = deepcopy(_schema(kind)), cast(dict[str, Any], OmegaConf.to_container(config))
     for name, value in dotted(plain):
         try:
             OmegaConf.update(settings, name, value)
