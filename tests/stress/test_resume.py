@@ -103,8 +103,9 @@ def test_a_run_ended_by_signals_at_random_moments_is_resumed_to_the_same_end(
             time.sleep(rng.uniform(0, EPOCH))
             process.send_signal(number)
         status, output, errors = end(process)
+        assert errors == "" or not training
         if training and signals in ENDED and status:
-            assert (status, errors) == (128 + number, "") and "train.resume=true" in output
+            assert status == 128 + number and "train.resume=true" in output
     assert_resumed(run)
 
 

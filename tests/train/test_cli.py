@@ -27,23 +27,28 @@ SMALL = [
 ]  # fmt: skip
 
 
-def test_a_command_trains_every_arm_and_ends_with_their_table(tmp_path, tiny_npz, photos):
+@pytest.fixture
+def no_report(monkeypatch) -> None:
+    """Several trainings of a test write no pages, whose plots take longer."""
+    monkeypatch.setattr("train.report.page.report_of", lambda folders, out: "no report")
+
+
+def test_a_command_trains_every_arm_and_ends_with_their_table(call, capsys, tmp_path, tiny_npz, photos):
     """From another folder than the repository's, in the background of a shell, which ignores SIGINT."""
     overrides = ["run=here", "data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", "compare=[none]"]
-    command = [sys.executable, "-m", "train", *overrides, *SMALL]
-    done = subprocess.run(
-        ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", *command],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
-    assert (done.returncode, re.sub(r".* \.\.\.\n", "", done.stderr)) == (0, "")  # but for what took long
-    rows = [line.split("|")[1].strip() for line in done.stdout.splitlines() if line.startswith("|")]
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert call("train", *overrides, *SMALL) == 0
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+    printed = capsys.readouterr()
+    assert re.sub(r".* \.\.\.\n", "", printed.err) == ""  # but for what took long
+    rows = [line.split("|")[1].strip() for line in printed.out.splitlines() if line.startswith("|")]
     assert [row for row in rows if row in ("none", "adversarial")] == ["none", "adversarial"] * 2
     for folder in (tmp_path / "here", tmp_path / "here" / "none"):
         assert (folder / LAST).is_file() and (folder / "photographs" / "contact_sheet.png").is_file()
-    assert (tmp_path / "here" / "train.log").read_text() == done.stdout
+    assert (tmp_path / "here" / "train.log").read_text() == printed.out
     config = yaml.safe_load((tmp_path / "here" / "config.yaml").read_text())
     assert shlex.split(config["command"]) == ["python", "-m", "train", *overrides[1:], *SMALL]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["here"]
@@ -96,7 +101,7 @@ def test_torchrun_starts_no_sweep(call, capsys, monkeypatch):
 
 
 @pytest.fixture
-def stopped(call, capsys, tmp_path, tiny_npz, photos) -> Path:
+def stopped(call, capsys, no_report, tmp_path, tiny_npz, photos) -> Path:
     """A run of two arms with options of its own that SIGTERM ended, and that was then moved."""
     folder = tmp_path / "begun"
     data = ["data=npz", f"data.path={tiny_npz}", f"evaluate.photos={photos}", "compare=[none]", "seed=3"]
@@ -198,10 +203,11 @@ runpy.run_path(sys.argv[1], run_name="__main__")
 
 
 SLOW_IMPORTS = """
-import os, threading, time
+import os, sys, threading, time, types
 Timer = threading.Timer
 threading.Timer = lambda seconds, *rest: Timer(seconds / 50, *rest)
 from train import cli
+sys.modules["train.errors"] = types.SimpleNamespace(one_sentence=None)  # not PyTorch, which takes seconds indeed
 time.sleep(0.3)
 with cli.handled_errors():
     print(os.environ["OMP_WAIT_POLICY"])
