@@ -61,8 +61,12 @@ def format_fraction(result: Mapping[str, Any]) -> str:
     return "{hits} of {n} [{low:.0%}, {high:.0%}]".format(**result) if result["n"] else "-"
 
 
-def format_interval(metric: Mapping[str, Any]) -> str:
-    """A metric's value [low, high], or the value alone without an interval; "-" where it is unknown or absent."""
+def format_interval(metric: Mapping[str, Any], sign: str = "") -> str:
+    """A metric's value [low, high], or the value alone without an interval; "-" where it is unknown or absent.
+
+    sign: "+" to show that of positive numbers, too.
+    """
     if metric.get("value") is None:
         return "-"
-    return ("{value:.3f} [{low:.3f}, {high:.3f}]" if "low" in metric else "{value:.3f}").format(**metric)
+    value, *ends = (f"{metric[name]:{sign}.3f}" for name in ("value", "low", "high") if name in metric)
+    return f"{value} [{', '.join(ends)}]" if ends else value

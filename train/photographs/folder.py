@@ -71,9 +71,8 @@ def find_photographs(folder: Path, classes: Sequence[str], label: str) -> list[P
         if len(unknown) == len(rows):
             raise InputError(f"{fault}; give paths such as {paths[0]}")
         console.warning(fault)
-    labels = [path.parts[0] if has_class_folders else label for path in paths]
     photographs = [
-        Photograph(path, name, *rows.get(path, (None, ()))) for path, name in zip(paths, labels, strict=True)
+        Photograph(path, path.parts[0] if has_class_folders else label, *rows.get(path, (None, ()))) for path in paths
     ]
     sources = {item.source for item in photographs}
     if missing := {name for item in photographs for name in item.hard_negatives} - sources:

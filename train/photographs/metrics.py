@@ -1,9 +1,9 @@
 """The metrics of an evaluation, with 95 % intervals: recall, false positive rate, AUC, recall at fixed FPR."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import reduce
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -110,11 +110,12 @@ def roc_metrics(positives: Scores, negatives: Scores) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Pool:
-    """Predictions that are scored together: of the class under study, and of everything else.
+    """Predictions that are scored together: of the class under study, `label`, and of everything else.
 
     ranked: the negatives of the ROC curve, with the named hard negatives of other sources.
     """
 
+    label: str
     positives: Sequence[Prediction]
     negatives: Sequence[Prediction]
     ranked: Sequence[Prediction]
@@ -124,20 +125,36 @@ class Pool:
         """The log-odds of the positives, and of the negatives that they are ranked against."""
         return np.array([item.log_odds for item in self.positives]), np.array([item.log_odds for item in self.ranked])
 
-    def outcomes(self, label: str) -> dict[str, list[bool]]:
+    @property
+    def outcomes(self) -> dict[str, list[bool]]:
         """Whether each image counts in recall, top5 and false_positive_rate."""
         ranks = [item.true_rank or np.inf for item in self.positives]
         return {
             "recall": [rank == 1 for rank in ranks],
             "top5": [rank <= 5 for rank in ranks],
-            "false_positive_rate": [item.predicted == label for item in self.negatives],
+            "false_positive_rate": [item.predicted == self.label for item in self.negatives],
         }
+
+    @cached_property
+    def metrics(self) -> dict[str, Any]:
+        """recall, top5 and false_positive_rate, as `fraction` returns them, and auc and recall_at of `roc_metrics`."""
+        counted = {name: fraction(sum(values), len(values)) for name, values in self.outcomes.items()}
+        return counted | roc_metrics(*self.scores)
+
+    @cached_property
+    def replicates(self) -> dict[str, np.ndarray]:
+        """METRICS and top5 in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown."""
+        outcomes = {name: np.array(values) for name, values in self.outcomes.items() if values}
+        counted = {name: bootstrap(lambda drawn: drawn.mean(axis=-1), values) for name, values in outcomes.items()}
+        if not all(map(len, self.scores)):
+            return counted
+        return counted | dict(zip(RANKED, bootstrap(auc_and_recalls, *self.scores), strict=True))
 
 
 def pool(predictions: Sequence[Prediction], label: str) -> Pool:
     """All predictions, the positives ranked against all negatives."""
     negatives = [item for item in predictions if item.photograph.label != label]
-    return Pool([item for item in predictions if item.photograph.label == label], negatives, negatives)
+    return Pool(label, [item for item in predictions if item.photograph.label == label], negatives, negatives)
 
 
 def pool_by_source(predictions: Sequence[Prediction], label: str, exclude: Sequence[str] = ()) -> dict[str, Pool]:
@@ -151,23 +168,8 @@ def pool_by_source(predictions: Sequence[Prediction], label: str, exclude: Seque
         group = pool([item for item in predictions if item.photograph.source == source], label)
         named = {name for item in group.positives for name in item.photograph.hard_negatives} - {source}
         others = pool([item for item in predictions if item.photograph.source in named], label).negatives
-        pools[source] = Pool(group.positives, group.negatives, [*group.negatives, *others])
+        pools[source] = replace(group, ranked=[*group.negatives, *others])
     return pools
-
-
-def compute_metrics(group: Pool, label: str) -> dict[str, Any]:
-    """recall, top5 and false_positive_rate, as `fraction` returns them, and auc and recall_at of `roc_metrics`."""
-    counted = {name: fraction(sum(values), len(values)) for name, values in group.outcomes(label).items()}
-    return counted | roc_metrics(*group.scores)
-
-
-def replicate_metrics(group: Pool, label: str) -> dict[str, np.ndarray]:
-    """METRICS and top5 in the bootstrap's replicates, (REPLICATES,) each, without those that are unknown."""
-    outcomes = {name: np.array(values) for name, values in group.outcomes(label).items() if values}
-    counted = {name: bootstrap(lambda drawn: drawn.mean(axis=-1), values) for name, values in outcomes.items()}
-    if not all(map(len, group.scores)):
-        return counted
-    return counted | dict(zip(RANKED, bootstrap(auc_and_recalls, *group.scores), strict=True))
 
 
 def find_metric(summary: dict[str, Any], name: str) -> dict[str, Any]:

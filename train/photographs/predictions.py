@@ -65,19 +65,13 @@ def predict(
     ranks, studied = (order.argsort(dim=1) + 1).tolist(), classes.index(label)
     odds = log_odds(logits.double(), studied).tolist()
     predictions = []
-    for row, photograph in enumerate(photographs):
-        best, true = int(order[row, 0]), classes.index(photograph.label) if photograph.label in classes else None
-        prediction = Prediction(
-            photograph,
-            predicted=classes[best],
-            probability=probabilities[row][best],
-            true_probability=None if true is None else probabilities[row][true],
-            true_rank=None if true is None else ranks[row][true],
-            label_probability=probabilities[row][studied],
-            label_rank=ranks[row][studied],
-            log_odds=odds[row],
-        )
-        predictions.append(prediction)
+    for photograph, by_class, places, score in zip(photographs, probabilities, ranks, odds, strict=True):
+        best, true = places.index(1), (None, None)
+        if photograph.label in classes:
+            index = classes.index(photograph.label)
+            true = by_class[index], places[index]
+        row = classes[best], by_class[best], *true, by_class[studied], places[studied], score
+        predictions.append(Prediction(photograph, *row))
     return predictions
 
 

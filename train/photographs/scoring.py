@@ -10,14 +10,7 @@ from typing import Any
 import torch
 
 from train.photographs.folder import find_photographs, left_out, load_photographs, require_outside
-from train.photographs.metrics import (
-    OVERALL,
-    RANKED,
-    compute_metrics,
-    find_metric,
-    metric_title,
-    pool_by_source,
-)
+from train.photographs.metrics import OVERALL, RANKED, find_metric, metric_title, pool_by_source
 from train.photographs.predictions import PREDICTIONS, Model, Prediction, compute_logits, predict, write_predictions
 from train.photographs.sheet import contact_sheet, write_roc
 from train.tables import aligned, format_fraction, format_interval, fraction
@@ -69,16 +62,12 @@ def evaluate_photographs(
 
     labels = sorted({item.photograph.label for item in predictions})
     by_class = {name: [item for item in predictions if item.photograph.label == name] for name in labels}
-    by_source = {
-        source: {"n": len(group.positives) + len(group.negatives), **compute_metrics(group, label)}
-        for source, group in pools.items()
-    }
-    whole, metrics = pools[OVERALL], by_source.pop(OVERALL)
+    whole = pools.pop(OVERALL)
     summary = {
         "label": label,
         "size": size,
         "images": images_hash.hexdigest(),
-        **metrics,
+        **whole.metrics,
         "n": {
             "photographs": len(predictions),
             "positives": len(whole.positives),
@@ -87,7 +76,10 @@ def evaluate_photographs(
             "left_out": len(others),
         },
         "most_common_wrong": _most_common_wrong(whole.positives),
-        "by_source": by_source,
+        "by_source": {
+            source: {"n": len(group.positives) + len(group.negatives), **group.metrics}
+            for source, group in pools.items()
+        },
         "by_class": {name: _class_metrics(group, label) for name, group in by_class.items()},
         "unreadable": unreadable,
         "left_out": others,
@@ -98,7 +90,8 @@ def evaluate_photographs(
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
     (out / SUMMARY).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
     contact_sheet(predictions, images, label).save(out / "contact_sheet.png")
-    write_roc(out, {source: group.scores for source, group in pools.items() if all(map(len, group.scores))}, label)
+    curves = {source: group.scores for source, group in {OVERALL: whole, **pools}.items()}
+    write_roc(out, {source: scores for source, scores in curves.items() if all(map(len, scores))}, label)
     return summary
 
 

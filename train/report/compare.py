@@ -1,72 +1,54 @@
 """Finished runs side by side: metrics on photographs by source, and differences with intervals."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from renderer.errors import InputError
-from train.photographs.metrics import (
-    METRICS,
-    OVERALL,
-    Pool,
-    compute_metrics,
-    find_metric,
-    interval,
-    metric_title,
-    pool_by_source,
-    replicate_difference,
-    replicate_metrics,
-)
-from train.photographs.predictions import PREDICTIONS, Prediction, read_predictions
-from train.report.summary import RunSummary, arms_of, by_images, pairs_of, run_tables, seconds_table
+from train.photographs import metrics
+from train.photographs.metrics import METRICS, OVERALL, Pool, find_metric, metric_title
+from train.photographs.predictions import PREDICTIONS, read_predictions
+from train.report.summary import INITIAL, RunSummary, Scored, arms_of, by_images, run_tables, seconds_table
 from train.settings import PHOTOGRAPHS
 from train.tables import Table, format_interval
 
+TITLES = [metric_title(name) for name in METRICS]
 
-@dataclass(frozen=True)
-class Evaluation:
-    """A run's predictions and their pools by source; OVERALL, the first, lacks excluded sources."""
+
+class Evaluation(NamedTuple):
+    """Pools of a run's predictions by source; OVERALL, the first, lacks excluded sources."""
 
     run: RunSummary
-    predictions: list[Prediction]
     pools: dict[str, Pool]
-    label: str
-
-    @cached_property
-    def metrics(self) -> dict[str, dict[str, Any]]:
-        """By source, as `compute_metrics` returns them."""
-        return {source: compute_metrics(group, self.label) for source, group in self.pools.items()}
-
-    @cached_property
-    def replicates(self) -> dict[str, dict[str, np.ndarray]]:
-        """By source, as `replicate_metrics` returns them."""
-        return {source: replicate_metrics(group, self.label) for source, group in self.pools.items()}
 
 
-Evaluations = Mapping[str, Sequence[Evaluation]]  # by arm
+Evaluations = Mapping[str, Sequence[Evaluation]]  # by arm, in the order of their seeds
 
 
-def read_evaluation(run: RunSummary, photographs: str, exclude: Sequence[str] = ()) -> Evaluation:
-    """The evaluation in the sub-folder `photographs` of a run; exclude: sources to leave out of OVERALL.
+def read_evaluations(group: Scored, exclude: Sequence[str] = ()) -> Evaluations:
+    """The evaluations of arms on the same images, of `by_images`, where they are more than published scores.
 
-    InputError as of `read_predictions`, and for a source that does not exist.
+    exclude: sources to leave out of OVERALL. InputError as of `read_predictions`, and for a source that does not exist.
     """
-    label = run.photographs[photographs]["label"]
-    predictions = read_predictions(run.folder / photographs / PREDICTIONS, label)
-    pools = pool_by_source(predictions, label, exclude)
-    if unknown := set(exclude).difference(pools):
-        names = ", ".join(filter(None, pools))
-        raise InputError(f"exclude: no photograph is of source {min(unknown)!r}; the sources are {names}")
-    return Evaluation(run, predictions, pools, label)
+    arms: dict[str, list[Evaluation]] = {}
+    for arm, scored in group.items():
+        for run, name in sorted(scored, key=lambda pair: pair[0].seed or 0):
+            path, label = run.folder / name / PREDICTIONS, run.photographs[name]["label"]
+            if path.is_file():
+                pools = metrics.pool_by_source(read_predictions(path, label), label, exclude)
+                arms.setdefault(arm, []).append(Evaluation(run, pools))
+                if unknown := set(exclude).difference(pools):
+                    names = ", ".join(filter(None, pools))
+                    raise InputError(f"exclude: no photograph is of source {min(unknown)!r}; the sources are {names}")
+    return arms
 
 
-def mean_metric(metrics: Iterable[Mapping[str, Any]]) -> Mapping[str, Any]:
+def mean_metric(group: Sequence[Evaluation], source: str, name: str) -> Mapping[str, Any]:
     """A metric of an arm: of one seed with its 95 % interval, of several the mean, the lowest and the highest."""
-    known = [metric for metric in metrics if metric.get("value") is not None]
+    results = [find_metric(run.pools[source].metrics, name) for run in group if source in run.pools]
+    known = [metric for metric in results if metric.get("value") is not None]
     values = [metric["value"] for metric in known]
     if len(known) < 2:
         return known[0] if known else {}
@@ -81,61 +63,53 @@ def source_table(arms: Evaluations, pooled: str | None = None) -> Table:
     rows: list[list[str]] = []
     for source in sources:
         for arm, group in arms.items():
-            results = [run.metrics.get(source, {}) for run in group]
-            means = (mean_metric(find_metric(result, name) for result in results) for name in METRICS)
-            rows.append([source or str(pooled), arm, *map(format_interval, means)])
-    return Table("by source", ["source", "network", *map(metric_title, METRICS)], rows)
+            means = (format_interval(mean_metric(group, source, name)) for name in METRICS)
+            rows.append([source or str(pooled), arm, *means])
+    return Table("by source", ["source", "network", *TITLES], rows)
+
+
+def pairs_of(arms: Evaluations) -> list[tuple[str, str]]:
+    """Which arms to compare: each with the network that it began with, and with the first arm beside those networks."""
+    heads = {arm: group[0].run for arm, group in arms.items()}
+    given = [arm for arm, run in heads.items() if run.arm != INITIAL]
+    starts = {arm: run.before.settings for arm, run in heads.items() if run.before}
+    pairs = [(arm, base) for arm, start in starts.items() for base in arms if heads[base].settings == start]
+    return pairs + [(arm, given[0]) for arm in given[1:]]
 
 
 def difference(group: Sequence[Evaluation], reference: Sequence[Evaluation], source: str, name: str) -> dict[str, Any]:
-    """How far the mean of a metric over a group's seeds is from that over the reference's: value, low and high.
+    """How far the mean of a metric over a group's seeds is from that over the reference's: value, low, high, means.
 
     The interval is a 95 % bootstrap interval over images, of which each replicate has the same ones for all runs, and
     over seeds, which are drawn in pairs if both groups have the same. Few seeds say little about their spread: with n,
     the bootstrap underestimates the variance by 1/n, and with one it finds none. Empty where a run lacks the metric.
     """
-    groups = [sorted(runs, key=lambda evaluation: evaluation.run.seed or 0) for runs in (group, reference)]
-    if any(name not in evaluation.replicates[source] for runs in groups for evaluation in runs):
+    pools = [[evaluation.pools[source] for evaluation in evaluations] for evaluations in (group, reference)]
+    if any(name not in pool.replicates for pool in (*pools[0], *pools[1])):
         return {}
-    values = [fmean(find_metric(run.metrics[source], name)["value"] for run in runs) for runs in groups]
-    replicates = [np.stack([run.replicates[source][name] for run in runs]) for runs in groups]
-    differences = replicate_difference(replicates[0], replicates[1], paired=_seeds(group) == _seeds(reference))
-    return {"value": values[0] - values[1], **interval(differences)}
+    value, base = (fmean(find_metric(pool.metrics, name)["value"] for pool in seeds) for seeds in pools)
+    one, other = (np.stack([pool.replicates[name] for pool in seeds]) for seeds in pools)
+    replicates = metrics.replicate_difference(one, other, _paired(group, reference))
+    return {"value": value - base, "means": (value, base), **metrics.interval(replicates)}
 
 
-def _seeds(group: Sequence[Evaluation]) -> list[int]:
-    return sorted(evaluation.run.seed or 0 for evaluation in group)
-
-
-def format_difference(metric: Mapping[str, Any]) -> str:
-    """A result of `difference`, with its sign; "-" where it is unknown."""
-    return "{value:+.3f} [{low:+.3f}, {high:+.3f}]".format(**metric) if metric else "-"
-
-
-def read_evaluations(group: Mapping[str, Sequence[tuple[RunSummary, str]]], exclude: Sequence[str] = ()) -> Evaluations:
-    """The evaluations of arms on the same images, of `by_images`, where they are more than published scores."""
-    arms = {
-        arm: [
-            read_evaluation(run, name, exclude) for run, name in scored if (run.folder / name / PREDICTIONS).is_file()
-        ]
-        for arm, scored in group.items()
-    }
-    return {arm: evaluations for arm, evaluations in arms.items() if evaluations}
+def _paired(group: Sequence[Evaluation], reference: Sequence[Evaluation]) -> bool:
+    return [evaluation.run.seed or 0 for evaluation in group] == [evaluation.run.seed or 0 for evaluation in reference]
 
 
 def difference_tables(arms: Evaluations, pooled: str, sources: Sequence[str] | None = None) -> list[Table]:
     """A table for each pair of `pairs_of`: the difference by source and metric. pooled: OVERALL's name. sources: None
     for all."""
     tables = []
-    for arm, base in pairs_of({arm: [evaluation.run for evaluation in group] for arm, group in arms.items()}):
+    for arm, base in pairs_of(arms):
         group, reference = arms[arm], arms[base]
         rows = [
-            [source or pooled, *(format_difference(difference(group, reference, source, name)) for name in METRICS)]
+            [source or pooled, *(format_interval(difference(group, reference, source, name), "+") for name in METRICS)]
             for source in (reference[0].pools if sources is None else sources)
         ]
-        paired = ", paired" if _seeds(group) == _seeds(reference) else ""
+        paired = ", paired" if _paired(group, reference) else ""
         title = f"{arm} minus {base} ({len(group)} and {len(reference)} seeds{paired})"
-        tables.append(Table(title, ["source", *map(metric_title, METRICS)], rows))
+        tables.append(Table(title, ["source", *TITLES], rows))
     return tables
 
 
@@ -143,13 +117,14 @@ def overall_differences(arms: Evaluations) -> Table:
     """The rows for all images of `difference_tables`."""
     tables = difference_tables(arms, "all", [OVERALL])
     rows = [[table.title, *table.rows[0][1:]] for table in tables]
-    return Table("differences on the same images", ["networks", *map(metric_title, METRICS)], rows)
+    return Table("differences on the same images", ["networks", *TITLES], rows)
 
 
 def format_table(runs: Sequence[RunSummary]) -> str:
     """`run_tables` and `overall_differences` by images as Markdown, and the paths of the contact sheets."""
     arms = arms_of(runs)
-    tables = run_tables(arms) + [overall_differences(read_evaluations(group)) for group in by_images(arms).values()]
+    groups = by_images(arms)
+    tables = run_tables(arms, groups) + [overall_differences(read_evaluations(group)) for group in groups.values()]
     sheets = [f"image: {run.folder / name / 'contact_sheet.png'}" for run in runs for name in run.photographs]
     return "\n\n".join(filter(None, [*(str(table) for table in tables if table.rows), "\n".join(sheets)]))
 
@@ -160,26 +135,26 @@ def format_comparison(runs: Sequence[RunSummary], exclude: Sequence[str], photog
     Runs that differ only in the seed are a group; a table for each group shows how far it is from another (`pairs_of`).
     exclude: sources that the pooled metrics leave out; photographs: the sub-folder of each run with its scores.
 
-    InputError as of `read_evaluation`, for runs whose sub-folders are of different images or classes, and for a
+    InputError as of `read_evaluations`, for runs whose sub-folders are of different images or classes, and for a
     sub-folder (but the usual one) that no run has.
     """
     arms = arms_of(runs)
-    tables = run_tables(arms)
-    groups = [
+    groups = by_images(arms)
+    tables = run_tables(arms, groups)
+    compared = [
         group
-        for group in by_images(arms).values()
+        for group in groups.values()
         if any(name == photographs or run.seed is None for scored in group.values() for run, name in scored)
     ]
-    named = [next(iter(group.values()))[0] for group in groups]
-    if len(groups) > 1:
-        (other, second), (first, name) = named[1], named[0]
+    folders = [run.folder / name for group in compared for run, name in next(iter(group.values()))[:1]]
+    if len(folders) > 1:
         raise InputError(
-            f"{other.folder / second} has other photographs or sources than {first.folder / name}: score both "
-            "networks on the same folder with pnb-evaluate"
+            f"{folders[1]} has other photographs or sources than {folders[0]}: score both networks on the same folder "
+            "with pnb-evaluate"
         )
-    if not groups and photographs != PHOTOGRAPHS:
+    if not folders and photographs != PHOTOGRAPHS:
         raise InputError(f"photographs={photographs}: no run has a sub-folder of that name with an evaluation's files")
-    for group in groups:
+    for group in compared:
         pooled = f"all but {', '.join(exclude)}" if exclude else "all"
         evaluations = read_evaluations(group, exclude)
         tables += [source_table(evaluations, pooled), *difference_tables(evaluations, pooled)]

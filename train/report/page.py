@@ -18,25 +18,13 @@ from renderer.errors import InputError
 from train.attack_examples import SUFFIX, Side, read_attack_examples
 from train.errors import one_sentence
 from train.loop import attack_success
-from train.photographs.metrics import METRICS, OVERALL, find_metric, metric_title
+from train.photographs.metrics import OVERALL, metric_title
 from train.photographs.sheet import evenly
-from train.report import compare, plots
+from train.report import compare, plots, summary
 from train.report.plots import Picture
-from train.report.summary import (
-    Arms,
-    AttackSummary,
-    Findings,
-    RunSummary,
-    arms_of,
-    by_images,
-    find,
-    pairs_of,
-    run_table,
-    run_tables,
-    seconds_table,
-)
-from train.run_folder import BEFORE, CONFIG, read_config
-from train.tables import as_text
+from train.report.summary import Arms, RunSummary, Scored
+from train.run_folder import CONFIG, read_config
+from train.tables import as_text, format_interval
 
 PAGE = "report.html"
 MOST_ARMS, MOST_SEEDS = 6, 5  # in plots and comparisons
@@ -44,10 +32,7 @@ MOST_UNFINISHED, MOST_ATTACKS = 3, 12  # unfinished runs in plots, attacks with 
 ATTACK_EXAMPLES = 4  # with images of an attack
 GRID, SHEET = 720, 1100  # pixels: the widest grid of renders, and the widest image of an attack or contact sheet
 HEADLINE = "recall_at/0.10"  # of METRICS, in the first sentence
-CURVES = {
-    "train/accuracy": "training accuracy",
-    "validation/accuracy": "validation accuracy",
-}
+CURVES = {"train/accuracy": "training accuracy", "validation/accuracy": "validation accuracy"}
 ROUNDS = "attack success on clean-correct renders"
 
 
@@ -58,29 +43,34 @@ def write_report(folders: Sequence[Path], out: Path) -> Path:
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    findings = find(folders)
-    arms = arms_of(findings.runs)
+    runs, attacks, unfinished = summary.find(folders)
+    arms = summary.arms_of(runs)
     drawn = {name: runs[:MOST_SEEDS] for name, runs in islice(arms.items(), MOST_ARMS)}
-    photographs = [_photographs(title, group) for title, group in by_images(drawn).items()]
-    loader = PackageLoader("train.report", ".")
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    epochs = {arm: [run.epochs for run in group] for arm, group in drawn.items()}
+    for folder, _, lines in [run for run in unfinished if run[2]][:MOST_UNFINISHED]:
+        epochs[f"unfinished: {folder.name[-24:]}"] = [lines]
+    trained = {arm: group[0] for arm, group in drawn.items() if group[0].epochs}
+    read = [*(run.folder for run in runs), *(attack["folder"] for attack in attacks)]
+    times = [file.stat().st_mtime for folder in read for file in folder.iterdir() if file.name != PAGE]
+    options: dict[str, Any] = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=PackageLoader("train.report", "."), undefined=StrictUndefined, **options)
     environment.filters |= {"as_text": as_text, "yaml": OmegaConf.to_yaml}
     page = environment.get_template("page.html.jinja").render(
         arms=arms,
-        findings=findings,
-        **_about(folders, arms, findings),
-        lead=[*_accuracy_sentences(arms), _attack_sentence(findings.attacks)],
-        tables=[table for table in run_tables(arms, photographs=False) if table.rows],
-        unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in findings.unfinished],
-        curves=_curves(drawn, findings),
-        seconds=seconds_table(drawn),
-        photographs=photographs,
-        renders={arm: _renders(group[0]) for arm, group in drawn.items() if group[0].epochs},
-        examples={arm: _attack_examples(group[0]) for arm, group in drawn.items() if group[0].epochs},
-        attacks=[_attack(attack) for attack in findings.attacks[:MOST_ATTACKS]],
-        further=findings.attacks[MOST_ATTACKS:],
+        title=_title(arms) if arms else "Attacks" if attacks else "Unfinished runs",
+        networks=len(runs),
+        place=", ".join(map(str, folders)),
+        date=f"{datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}" if times else "",
+        lead=_accuracy_sentences(arms),
+        tables=[table for table in summary.run_tables(arms, {}) if table.rows],
+        unfinished=[[str(folder), state, len(epochs)] for folder, state, epochs in unfinished],
+        curves=_curves(epochs),
+        seconds=summary.seconds_table(drawn),
+        photographs=[_photographs(title, group) for title, group in summary.by_images(drawn).items()],
+        renders={arm: _renders(run) for arm, run in trained.items()},
+        examples={arm: _attack_examples(run) for arm, run in trained.items()},
+        attacks=attacks,
+        shown=[_attack(attack) for attack in attacks[:MOST_ATTACKS]],
     )
     page = re.sub(rf"(?<![\w./-]){re.escape(os.getcwd())}/", "", page)  # paths are relative, as in commands
     out.mkdir(parents=True, exist_ok=True)
@@ -96,23 +86,15 @@ def report_of(folders: Sequence[Path], out: Path) -> str:
         return f"no report: {one_sentence(error) or traceback.format_exc()}"
 
 
-def _curves(arms: Arms, findings: Findings) -> list[Picture]:
-    epochs = {arm: [run.epochs for run in group] for arm, group in arms.items()}
-    for folder, _, lines in [run for run in findings.unfinished if run[2]][:MOST_UNFINISHED]:
-        epochs[f"unfinished: {folder.name[-24:]}"] = [lines]
+def _curves(arms: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> list[Picture]:
+    """Plots of the epochs' lines of each arm's runs."""
     pictures = []
     for name, title in CURVES.items():
-        known = {arm: [[line for line in lines if name in line] for lines in seeds] for arm, seeds in epochs.items()}
         series = {
-            arm: [([line["epoch"] for line in lines], [line[name] for line in lines]) for lines in seeds]
-            for arm, seeds in known.items()
+            arm: [[(line["epoch"], line.get(name)) for line in run] for run in runs] for arm, runs in arms.items()
         }
         pictures.append(plots.curves(series, title))
-    rounds = {arm: [[*enumerate(_attacks_by_round(lines), 1)] for lines in seeds] for arm, seeds in epochs.items()}
-    rates = {
-        arm: [([n for n, value in line if value is not None], [v for _, v in line if v is not None]) for line in lines]
-        for arm, lines in rounds.items()
-    }
+    rates = {arm: [[*enumerate(_attacks_by_round(run), 1)] for run in runs] for arm, runs in arms.items()}
     pictures.append(plots.curves(rates, ROUNDS, "round of renders"))
     return [picture for picture in pictures if picture]
 
@@ -122,8 +104,7 @@ def _attacks_by_round(epochs: Sequence[Mapping[str, float]]) -> list[float | Non
     rates = []
     for line in epochs:
         rounds = sorted({int(name[6 : name.index("/")]) for name in line if name.startswith("round_")})
-        for prefix in [f"round_{number}/" for number in rounds] or ["augment/"]:
-            rates.append(attack_success(line, prefix))
+        rates += [attack_success(line, f"round_{number}/") for number in rounds] or [attack_success(line, "augment/")]
     return rates
 
 
@@ -163,15 +144,10 @@ def _side(label: str, when: str, side: Side) -> Picture:
     return plots.encoded(pair, f"{label} {when}: {predicted}; a ball in its light", f"{when}: {predicted}")
 
 
-def _about(folders: Sequence[Path], arms: Arms, findings: Findings) -> dict[str, str]:
-    """The page's title, of what it is, and where and when that was made."""
-    labels = " and ".join(dict.fromkeys(group[0].label for group in arms.values() if group[0].label))
-    paths = [item.folder for part in (findings.runs, findings.attacks) for item in part]
-    last = max((file.stat().st_mtime for path in paths for file in path.iterdir() if file.name != PAGE), default=None)
-    names = [arm for arm, group in arms.items() if group[0].arm != BEFORE]
-    subject = f"{labels}: {', '.join(names)}" if arms else "Attacks" if findings.attacks else "Unfinished runs"
-    date = f"{datetime.fromtimestamp(last):%Y-%m-%d %H:%M}" if last else ""
-    return {"title": subject, "place": ", ".join(map(str, folders)), "date": date}
+def _title(arms: Arms) -> str:
+    labels = dict.fromkeys(group[0].label for group in arms.values() if group[0].label)
+    names = [arm for arm, group in arms.items() if group[0].arm != summary.INITIAL]
+    return f"{' and '.join(labels)}: {', '.join(names)}"
 
 
 def _accuracy_sentences(arms: Arms) -> list[str]:
@@ -186,33 +162,23 @@ def _accuracy_sentences(arms: Arms) -> list[str]:
     return sentences
 
 
-def _photographs(title: str, group: Mapping[str, Sequence[tuple[RunSummary, str]]]) -> dict[str, Any]:
+def _photographs(title: str, group: Scored) -> dict[str, Any]:
     """What the page shows of the scores on the same images: plots, tables, and a contact sheet of each arm."""
-    scored = {
-        arm: [(run.seed, [run.metric(name, metric) for metric in METRICS]) for run, name in runs]
-        for arm, runs in group.items()
+    sheets = {
+        arm: plots.from_file(run.folder / name / "contact_sheet.png", f"predictions of {arm} on {title}", SHEET)
+        for arm, ((run, name), *_) in group.items()
     }
-    content: dict[str, Any] = {
-        "name": title,
-        "sheets": {
-            arm: plots.from_file(run.folder / name / "contact_sheet.png", f"predictions of {arm} on {title}", SHEET)
-            for arm, ((run, name), *_) in group.items()
-        },
-        "roc": None,
-        "tables": [run_table("", [*map(metric_title, METRICS)], scored)],
-        "sentences": [],
-    }
+    tables = [summary.score_table("", group)]
+    content: dict[str, Any] = {"name": title, "sheets": sheets, "roc": None, "tables": tables, "sentences": []}
     try:
-        evaluations = compare.read_evaluations(group)
-        if not evaluations:
-            return content
-        scores = {arm: [run.pools[OVERALL].scores for run in runs] for arm, runs in evaluations.items()}
-        content["roc"] = plots.roc(scores, next(iter(evaluations.values()))[0].label)
-        content["sentences"] = _difference_sentences(evaluations, title)
-        sources = len(next(iter(evaluations.values()))[0].pools) > 1
-        content["tables"].append(compare.overall_differences(evaluations))
-        if sources:
-            content["tables"].append(compare.source_table(evaluations))
+        if evaluations := compare.read_evaluations(group):
+            first = next(iter(evaluations.values()))[0]
+            scores = {arm: [run.pools[OVERALL].scores for run in runs] for arm, runs in evaluations.items()}
+            content["roc"] = plots.roc(scores, first.pools[OVERALL].label)
+            content["sentences"] = _difference_sentences(evaluations, title)
+            tables.append(compare.overall_differences(evaluations))
+            if len(first.pools) > 1:
+                tables.append(compare.source_table(evaluations))
     except InputError as error:
         content["sentences"] = [str(error)]
     return content
@@ -221,43 +187,27 @@ def _photographs(title: str, group: Mapping[str, Sequence[tuple[RunSummary, str]
 def _difference_sentences(arms: compare.Evaluations, images: str) -> list[str]:
     """How far recall at a fixed false positive rate is from that of the arm that an arm is compared with."""
     sentences = []
-    for arm, base in pairs_of({arm: [evaluation.run for evaluation in group] for arm, group in arms.items()}):
-        result = compare.difference(arms[arm], arms[base], OVERALL, HEADLINE)
-        if result:
-            means = [
-                fmean(find_metric(run.metrics[OVERALL], HEADLINE)["value"] for run in arms[a]) for a in (base, arm)
-            ]
-            surely = result["low"] > 0 or result["high"] < 0
+    for arm, base in compare.pairs_of(arms):
+        if result := compare.difference(arms[arm], arms[base], OVERALL, HEADLINE):
+            after, before = result["means"]
+            is_shown = result["low"] > 0 or result["high"] < 0
             sentences.append(
-                f"{images}: {metric_title(HEADLINE)} is {means[0]:.2f} with {base} and {means[1]:.2f} with {arm}. "
-                f"The difference is {compare.format_difference(result)}"
-                f"{'' if surely else ', so that no difference is shown'}."
+                f"{images}: {metric_title(HEADLINE)} is {before:.2f} with {base} and {after:.2f} with {arm}. "
+                f"The difference is {format_interval(result, '+')}"
+                f"{'' if is_shown else ', so that no difference is shown'}."
             )
     return sentences
 
 
-def _attack_sentence(attacks: Sequence[AttackSummary]) -> str:
-    if not attacks:
-        return ""
-    total, correct = sum(len(attack.rows) for attack in attacks), sum(attack.correct for attack in attacks)
-    sentence = f"Attacks succeed on {sum(attack.successes for attack in attacks)} of {correct} examples"
-    if total > correct:
-        sentence += f"; {total - correct} more were wrong before any step"
-    rates = [rate for attack in attacks if isinstance(rate := attack.checks.get("random_search"), int | float)]
-    if rates:
-        sentence += f"; random search with as many renders succeeds on {sum(rates) / len(rates):.0%}"
-    return f"{sentence}."
-
-
-def _attack(attack: AttackSummary) -> dict[str, Any]:
-    """An attack's images by title, numbers, and configuration, which is {} where it is missing or damaged."""
+def _attack(attack: Mapping[str, Any]) -> dict[str, Any]:
+    """An attack with its checks as rows, its images by title, and its configuration, {} where that is damaged."""
     images = {}
-    for number, label, before, after, outcome in evenly(attack.rows, ATTACK_EXAMPLES):
+    for number, label, before, after, outcome in evenly(attack["rows"], ATTACK_EXAMPLES):
         title = f"Example {number}, {label}: {outcome}"
         alt = f"{title}; before, after, their difference and the lights; predicted {before}, then {after}"
-        images[title] = plots.from_file(attack.folder / f"example_{number:03d}.png", alt, SHEET)
+        images[title] = plots.from_file(attack["folder"] / f"example_{number:03d}.png", alt, SHEET)
     config: Mapping[str, Any] = {}
     with suppress(InputError):
-        config = read_config(attack.folder.parent / CONFIG)
-    checks = {name.replace("_", " "): value for name, value in attack.checks.items() if not isinstance(value, dict)}
-    return {"folder": attack.folder, "images": images, "rows": attack.rows, "checks": checks, "config": config}
+        config = read_config(attack["folder"].parent / CONFIG)
+    checks = [(key.replace("_", " "), value) for key, value in attack["checks"].items() if not isinstance(value, dict)]
+    return {**attack, "checks": checks, "images": images, "config": config}

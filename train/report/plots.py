@@ -37,7 +37,7 @@ PLOT = {
     "legend.frameon": False,
     "legend.fontsize": 9,
 }
-Line = tuple[Sequence[float], Sequence[float]]  # x and y
+Points = Sequence[tuple[float, float | None]]  # x and y, which may be unknown
 
 
 @dataclass(frozen=True)
@@ -61,21 +61,23 @@ def style(index: int) -> dict[str, Any]:
     return {"color": COLORS[index % len(COLORS)], "linestyle": LINES[index % len(LINES)]}
 
 
-def curves(arms: Mapping[str, Sequence[Line]], title: str, x_title: str = "epoch") -> Picture | None:
+def curves(arms: Mapping[str, Sequence[Points]], title: str, x_title: str = "epoch") -> Picture | None:
     """A line per seed in the color of its arm, over epochs or rounds; None where no line has two points that differ."""
-    if not any(len(set(y)) > 1 for lines in arms.values() for _, y in lines):
+    known = {arm: [[(x, y) for x, y in seed if y is not None] for seed in seeds] for arm, seeds in arms.items()}
+    if not any(len({y for _, y in line}) > 1 for lines in known.values() for line in lines):
         return None
 
     def draw(axes: "Axes") -> None:
-        for index, (arm, lines) in enumerate(arms.items()):
-            for number, (x, y) in enumerate(line for line in lines if len(line[0]) > 1):
-                marker = MARKERS[index % len(MARKERS)] if len(x) < 30 else None
-                axes.plot(x, y, marker=marker, ms=4, label=None if number else arm, **style(index))
+        for index, (arm, lines) in enumerate(known.items()):
+            for number, line in enumerate(line for line in lines if len(line) > 1):
+                marker = MARKERS[index % len(MARKERS)] if len(line) < 30 else None
+                axes.plot(*zip(*line, strict=True), marker=marker, ms=4, label=None if number else arm, **style(index))
         axes.set(xlabel=x_title)
         axes.locator_params(axis="x", integer=True, min_n_ticks=1)
 
-    ends = [f"{arm} {np.mean(last):.2f}" for arm, lines in arms.items() if (last := [y[-1] for _, y in lines if y])]
-    return _plot(draw, title, f"{title} by {x_title}, at the end: {', '.join(ends)}")
+    ends = {arm: [line[-1][1] for line in lines if line] for arm, lines in known.items()}
+    means = ", ".join(f"{arm} {np.mean(values):.2f}" for arm, values in ends.items() if values)
+    return _plot(draw, title, f"{title} by {x_title}, at the end: {means}")
 
 
 def roc(arms: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
@@ -84,10 +86,9 @@ def roc(arms: Mapping[str, Sequence[Pair]], label: str) -> Picture | None:
     if not any(known.values()):
         return None
     styles = {arm: style(index) for index, arm in enumerate(arms)}
-    areas = [
-        f"{arm} {np.mean([auc_and_recalls(*pair)[0] for pair in pairs]):.3f}" for arm, pairs in known.items() if pairs
-    ]
-    return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", f"ROC; AUC: {', '.join(areas)}")
+    areas = {arm: [auc_and_recalls(*pair)[0] for pair in pairs] for arm, pairs in known.items() if pairs}
+    means = ", ".join(f"{arm} {np.mean(values):.3f}" for arm, values in areas.items())
+    return _plot(lambda axes: draw_roc(axes, known, label, styles), "ROC", f"ROC; AUC: {means}")
 
 
 def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:

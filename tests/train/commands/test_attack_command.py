@@ -42,9 +42,9 @@ def test_one_parameter_and_several_at_once_run_and_write_what_they_promise(run, 
     folder = tmp_path / "out" / "0_solid_orange_0"
     assert {path.name for path in folder.iterdir()} == {"attack.jsonl", "example_000.png", "example_000"}
     files = {str(path.relative_to(folder / "example_000")) for path in (folder / "example_000").rglob("*.*")}
-    maps = {"light.hdr", "light.exr"} if example_is_physical(folder) else set()
-    assert files == ALWAYS | maps | ({"pixels.npy"} if "pixels" in names else set())
     example, last = map(json.loads, (folder / "attack.jsonl").read_text().splitlines())
+    maps = {"light.hdr", "light.exr"} if example["negative_light"] < 1e-6 else set()
+    assert files == ALWAYS | maps | ({"pixels.npy"} if "pixels" in names else set())
     assert list(example["largest_change"]) == names.split("+")
     assert all(example["largest_change"].values()) and ("shape" in example) == ("geometry" in names)
     assert example["cost"] < example["cost_before"]
@@ -53,11 +53,6 @@ def test_one_parameter_and_several_at_once_run_and_write_what_they_promise(run, 
     config = OmegaConf.load(tmp_path / "out" / "config.yaml")
     assert set(config.attack) >= set(names.split("+"))
     assert config.command == shlex.join(["python", "scripts/attack.py", "out=out", *SMALL, f"attack={parameters}"])
-
-
-def example_is_physical(folder: Path) -> bool:
-    line, *_ = (folder / "attack.jsonl").read_text().splitlines()
-    return json.loads(line)["negative_light"] < 1e-6
 
 
 def test_each_mesh_has_a_folder_and_what_was_written_is_attacked_again(run, tmp_path, capsys):
@@ -81,9 +76,8 @@ def test_an_adversary_is_rendered_again_and_gone_on_from(run, tmp_path, capsys):
     assert run(f"reload={first / 'example_000'}", "out=none") == 0
     lines = capsys.readouterr().out.splitlines()
     assert not (tmp_path / "none").exists() and len(lines) == 2
-    for view, (text, predicted, confidence) in enumerate(
-        zip(lines, line["predicted"], line["confidence"], strict=True)
-    ):
+    for view, text in enumerate(lines):
+        predicted, confidence = line["predicted"][view], line["confidence"][view]
         assert text.startswith(f"view {view}: orange is classified as {predicted} ({confidence:.1%}); values differ ")
         assert float(text.rpartition("by ")[2].partition("/255")[0]) <= 1
     assert run(f"reload={first / 'example_000'}", "attack=lighting", "attack.checks=false", "out=again") == 0
@@ -111,11 +105,9 @@ def test_success_against_radius_is_a_table_and_a_figure(run, tmp_path, capsys):
 
 def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_other_meshes(run, tmp_path, capsys):
     networks = f"transfer.classifiers=[run:{ROOT / 'pretrained' / 'none'},run:{ROOT / 'pretrained' / 'best'}]"
-    elsewhere = [
-        "transfer.azimuths=[-20,0]",
-        "transfer.meshes=['solid:orange:0',{mesh: 'solid:apple:0', label: apple}]",
-    ]
-    assert run("attack=lighting", "attack.checks=false", "scene.views=2", networks, *elsewhere) == 0
+    meshes = "transfer.meshes=['solid:orange:0',{mesh: 'solid:apple:0', label: apple}]"
+    views = "scene.views=2", "transfer.azimuths=[-20,0]"
+    assert run("attack=lighting", "attack.checks=false", *views, networks, meshes) == 0
     folder = tmp_path / "out" / "0_solid_orange_0"
     lines = [json.loads(line) for line in (folder / "transfer.jsonl").read_text().splitlines()]
     attacked = [json.loads(line) for line in (folder / "attack.jsonl").read_text().splitlines()]
@@ -130,18 +122,12 @@ def test_adversaries_are_shown_to_other_networks_from_other_azimuths_and_on_othe
 
 REFUSED = [
     (["transfer.classifiers=[{network: x}]"], "transfer.classifiers: network is not known: give names"),
-    (["transfer.classifiers=[squeezenet]"], "classifier=squeezenet is not known"),
-    (
-        ["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"],
-        "'paer' is not a class of the model: choose one, such as",
-    ),
+    (["transfer.meshes=[{mesh: 'solid:pear', label: paer}]"], "'paer' is not a class of the model: choose one, such"),
     (["attack=geometry", "transfer.meshes=[a.glb]"], "meshes: attacked geometry cannot be transferred"),
     (["attack=pixels", "transfer.azimuths=[3]"], "azimuths: attacked pixels cannot be transferred"),
     (["attack.radius_scales=[0.1,-1]"], "radius_scales=-1.0 must be at least 1e-05"),
-    (["attack=lihgting"], "In 'attack': Could not load 'attack/lihgting'"),
     (["attack=[]"], "attack: name what to change"),
     (["attack=lighting+skylight"], "lighting and skylight both set the light: choose one of them"),
-    (["scene.backgrounds=[absent.png]"], "scene.backgrounds: absent.png does not exist"),
     (["attack.verify=blender"], "verify=blender: choose one of reload, mitsuba"),
     (["reload=absent"], "absent/adversary.json does not exist: give a folder that an attack wrote"),
 ]

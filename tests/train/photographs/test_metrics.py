@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from scipy.stats import bootstrap, mannwhitneyu
 
 from train.photographs.metrics import (
+    RANKED,
     RATES,
     REPLICATES,
     auc_and_recalls,
+    find_metric,
     replicate_difference,
     roc_curve,
     roc_metrics,
@@ -46,25 +48,16 @@ def scores() -> tuple[np.ndarray, np.ndarray]:
     return generator.normal(1, 1, 80).round(1), generator.normal(0, 1.5, 120).round(1)
 
 
-def statistic_of(name: str, positives: np.ndarray, negatives: np.ndarray) -> np.ndarray:
-    """Of samples along the last axis; AUC by comparing all pairs, recall by sorting the negatives."""
-    if name == "auc":
-        pairs = positives[..., :, None] - negatives[..., None, :]
-        return ((pairs > 0) + (pairs == 0) / 2).mean(axis=(-2, -1))
-    allowed = int(Fraction(name.removeprefix("recall_at/")) * negatives.shape[-1])
-    return (positives > np.sort(negatives)[..., -1 - allowed, None]).mean(axis=-1)
-
-
 @pytest.mark.parametrize("name", ["auc", "recall_at/0.10"])
 def test_intervals_are_those_of_scipys_stratified_percentile_bootstrap(scores, name):
     """Up to the replicates' chance: an end's own standard error is below 0.006 here, and a recall's step is 1/80."""
     reference = bootstrap(
         scores,
-        lambda positives, negatives, axis: statistic_of(name, positives, negatives),
+        lambda positives, negatives, axis: auc_and_recalls(positives, negatives)[RANKED.index(name)],
         vectorized=True, method="percentile", n_resamples=2000, batch=50, rng=np.random.default_rng(8),
     ).confidence_interval  # fmt: skip
     metrics = roc_metrics(*scores)
-    metric = metrics["auc"] if name == "auc" else metrics["recall_at"]["0.10"]
+    metric = find_metric(metrics, name)
     assert (metric["low"], metric["high"]) == pytest.approx(tuple(reference), rel=0, abs=0.02)
     assert metrics == roc_metrics(*scores)  # the same at every call
 
@@ -84,7 +77,7 @@ def test_the_curve_has_a_point_per_threshold_and_the_trapezoids_below_it_are_the
     assert len(rates) == len(np.unique([*positives, *negatives])) + 1 and (np.diff(thresholds) < 0).all()
     for rate, recall, threshold in zip(rates, recalls, thresholds, strict=True):
         assert (rate, recall) == ((negatives > threshold).mean(), (positives > threshold).mean())
-    assert np.trapezoid(recalls, rates) == pytest.approx(statistic_of("auc", positives, negatives), rel=0, abs=1e-12)
+    assert np.trapezoid(recalls, rates) == pytest.approx(auc_and_recalls(positives, negatives)[0], rel=0, abs=1e-12)
 
 
 def test_pairing_cancels_what_both_runs_share():

@@ -47,11 +47,7 @@ def test_every_metric_of_a_known_model_is_right(fruit, tmp_path):
     summary = evaluate_photographs(*fruit, "orange", tmp_path / "new" / "out")
     assert json.loads((tmp_path / "new" / "out" / "summary.json").read_text(encoding="utf-8")) == summary
     assert summary["n"] == {"photographs": 10, "positives": 5, "negatives": 5, "unreadable": 0, "left_out": 0}
-    assert {source: metrics["n"] for source, metrics in summary["by_source"].items()} == {
-        "lab": 2,
-        "shop": 2,
-        "street": 4,
-    }
+    assert {source: row["n"] for source, row in summary["by_source"].items()} == {"lab": 2, "shop": 2, "street": 4}
     for source, metrics in {None: summary, **summary["by_source"]}.items():
         expected = score([(name, order) for name, other, order in FRUIT if source in (None, other)])
         auc = metrics["auc"]
@@ -194,7 +190,7 @@ def test_the_contact_sheet_frames_each_hit_miss_and_false_positive(fruit, tmp_pa
         assert count_tiles(sheet) == [1, 4, 2]
 
 
-def test_the_contact_sheet_shows_at_most_40_images_from_the_surest_to_the_least_sure(known_model, tmp_path):
+def test_the_contact_sheet_shows_at_most_40_images_evenly_by_probability(known_model, tmp_path):
     """Of 101 true positives 40 are shown, image 100 being the surest and image 0 the least."""
     names = [f"{index:03}.png" for index in range(101)]
     table = np.stack([np.arange(1, 102), np.zeros(101)], axis=1) / 20
@@ -205,8 +201,6 @@ def test_the_contact_sheet_shows_at_most_40_images_from_the_surest_to_the_least_
     areas = np.bincount(red[(green == 0) & (blue == 0)])
     shown = np.flatnonzero(areas >= IMAGE**2)
     assert len(shown) == 40 and shown[0] == 0 and shown[-1] == 100 and set(np.diff(shown)) == {2, 3}
-    lines = np.where((green == 0) & (blue == 0), red, -1)
-    assert any(list(dict.fromkeys(line[line >= 0])) == list(shown[::-1][:10]) for line in lines)
 
 
 def test_the_roc_table_has_the_curve_of_all_photographs_and_of_sources_with_both_classes(fruit, tmp_path):

@@ -60,8 +60,11 @@ def page(finished, made_up_run, tiny, tmp_path_factory) -> Path:
         "example": 0, "label": [HOSTILE], "predicted_before": ["a"], "confidence_before": [0.5], "predicted": ["b"],
         "confidence": [0.5], "success": True, "success_before": False, "steps": 3,
     }  # fmt: skip
-    lines = [line, line | {"example": 1, "steps": 0, "success_before": True}]
-    (attack / "attack.jsonl").write_text("".join(json.dumps(each) + "\n" for each in lines))
+    others = line | {"example": 1, "steps": 0, "success_before": True}, line | {"example": 2, "success": False}
+    lines = [*map(json.dumps, (line, *others, {"checks": {"random_search": 0.5}}))]
+    (attack / "attack.jsonl").write_text("\n".join(lines))
+    (folder / "other").mkdir()
+    (folder / "other" / "attack.jsonl").write_text(json.dumps(line | {"confidence": "high"}))
     Image.new("RGB", (8, 8)).save(attack / "example_000.png")
     with locked(folder / "begun"):
         return write_report([folder], folder / "out")
@@ -82,18 +85,22 @@ def test_runs_in_every_state_are_shown_or_named(page):
     states = {Path(cells[0]).name: cells[1:] for cells in parsed.rows if cells and "/" in cells[0]}
     assert states["going"] == ["interrupted", "2"] and states["weights"] == ["interrupted", "0"]
     assert states["failed"] == [f"failed: {HOSTILE}", "0"] and states["begun"] == ["in training", "0"]
-    assert all(states[name][0].startswith(f"cannot be read: {page.parents[1]}/{name}") for name in ("damaged", "old"))
+    for name in ("damaged", "old", "other"):
+        assert states[name][0].startswith(f"cannot be read: {page.parents[1]}/{name}")
     assert any(cells[:3] == ["none", "2 seeds", "0.765 ± 0.000"] for cells in parsed.rows)
     assert any(alt.startswith("training accuracy") and "unfinished: going 0.75" in alt for alt in parsed.alts)
     assert any(alt.startswith("orange before: ") and alt.endswith("; a ball in its light") for alt in parsed.alts)
     assert any(alt.startswith(f"Example 0, {HOSTILE}: success in 3 steps; ") for alt in parsed.alts)
-    assert "Attacks succeed on 1 of 1 examples; 1 more were wrong before any step" in text
+    sentence = "Attacks succeed on 1 of 2 examples; 1 more were wrong before any step; random search with as many"
+    assert f"{sentence} renders succeeds on 50%." in text
+    outcomes = [cells[-1] for cells in parsed.rows if cells[1:2] == [HOSTILE]]
+    assert outcomes == ["success in 3 steps", "wrong before any step", "no success in 3 steps"]
     assert text.count(f"<pre>{COMMAND}</pre>") == 1
 
 
 def test_a_line_is_drawn_where_it_has_points_that_differ():
-    assert plots.curves({"a": [([1], [0.5])], "b": [([1, 2], [1, 1])]}, "x") is None
-    assert plots.curves({"a": [([1], [0.5])], "b": [([1, 2], [0, 1])]}, "x") is not None
+    assert plots.curves({"a": [[(1, 0.5)]], "b": [[(1, 1), (2, 1)]]}, "x") is None
+    assert plots.curves({"a": [[(1, 0.5)]], "b": [[(1, 0), (2, 1)]]}, "x") is not None
 
 
 def test_paths_below_the_current_folder_are_relative(tmp_path, made_up_run, monkeypatch):

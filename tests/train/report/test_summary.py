@@ -1,10 +1,8 @@
-import json
-
 import pytest
 
 from renderer.errors import InputError
 from train.report.compare import format_table
-from train.report.summary import read_attack, summarize
+from train.report.summary import summarize
 from train.tables import format_interval, fraction
 
 
@@ -21,15 +19,11 @@ def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_
     settings = {2: ["seed=0"], 4: ["seed=1"], 9: ["seed=2"], 5: ["seed=0", "train.epochs=9"]}
     runs = []
     for hits, overrides in settings.items():
-        summary = {
-            "images": "same",
-            "label": "orange",
-            "recall": fraction(hits, 10),
-            "false_positive_rate": fraction(1, 10),
-        }
+        scores = {"recall": fraction(hits, 10), "false_positive_rate": fraction(1, 10)}
+        summary = {"images": "same", "label": "orange", **scores}
         runs.append(summarize(made_up_run(tmp_path / str(hits), "random", {"lab": summary}, *overrides)))
     tables = read_markdown(format_table(runs))
-    first, second = "random, train.epochs=3", "random, train.epochs=9"
+    first, second = "random, epochs=3", "random, epochs=9"
     assert [row[:3] for row in tables["lab"][1:]] == [
         *([first, str(seed), format_interval(fraction(hits, 10))] for seed, hits in enumerate((2, 4, 9))),
         [first, "3 seeds", "0.500 ± 0.361"],
@@ -38,23 +32,3 @@ def test_tables_show_in_which_settings_runs_differ_and_how_far_seeds_spread(tmp_
     assert tables[""][4][:3] == [first, "3 seeds", "0.765 ± 0.000"]
     assert tables["lab"][4][3:] == ["0.100 ± 0.000", *"----"]
     assert tables["settings in which the arms differ"][1:] == [[first, "3"], [second, "9"]]
-
-
-LINE = {
-    "example": 0, "label": ["orange", "orange"], "predicted_before": ["orange", "plum"],
-    "confidence_before": [0.875, 0.5], "predicted": ["plum", "plum"], "confidence": [0.75, 0.625], "success": True,
-    "success_before": False, "steps": 7,
-}  # fmt: skip
-
-
-def test_an_attack_counts_successes_on_examples_that_were_correct_before(tmp_path):
-    lines = [LINE, {**LINE, "example": 1, "success_before": True}, {**LINE, "example": 2, "success": False}]
-    lines.append({"checks": {"random_search": 0.5}})
-    (tmp_path / "attack.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    attack = read_attack(tmp_path)
-    assert (attack.successes, attack.correct, attack.checks) == (1, 2, {"random_search": 0.5})
-    outcomes = ["success in 7 steps", "wrong before any step", "no success in 7 steps"]
-    assert [(row[0], row[-1]) for row in attack.rows] == list(enumerate(outcomes))
-    (tmp_path / "attack.jsonl").write_text(json.dumps(LINE | {"confidence": "high"}))
-    with pytest.raises(InputError, match=rf"^{tmp_path}/attack.jsonl is damaged or was written by no attack \("):
-        read_attack(tmp_path)
