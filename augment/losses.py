@@ -16,7 +16,7 @@ from renderer.errors import require_range
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-NO_CLASS = -1  # in place of a source or target class, where there is none
+NO_CLASS = -(10**9)  # in place of a source or target class, where there is none; no complementary label
 
 
 def adversarial_cost(
@@ -27,7 +27,7 @@ def adversarial_cost(
     target: None leaves the second term out. NO_CLASS in either leaves its term out. InputError for a class beyond the
     logits.
     """
-    require_known(source, logits)
+    require_known(source.clamp(min=0), logits)  # NO_CLASS passes
     cost = -F.cross_entropy(logits, source, reduction="none", ignore_index=NO_CLASS)
     if target is not None:
         cost = cost + F.cross_entropy(logits, target, reduction="none", ignore_index=NO_CLASS)
@@ -94,5 +94,4 @@ def is_right(predicted: Tensor, labels: Tensor) -> Tensor:
 
 
 def _class_of(labels: Tensor) -> Tensor:
-    """The class of each label, complementary or not."""
     return torch.where(labels < 0, -1 - labels, labels)
