@@ -16,7 +16,6 @@ __getattr__, __dir__, __all__ = attach(
         "objects": ["PropSettings", "ObjectSettings"],
         "scene": ["Scene"],
         "service": ["AugmentationService", "AugmentationSettings"],
-        "camera_effects": ["CameraEffectSettings"],
-        "variation": ["VariationSettings"],
+        "variation": ["CameraEffectSettings", "VariationSettings"],
     },
 )

@@ -1,6 +1,7 @@
-"""A scene from meshes in one call, with the settings of scene, renderer and local lights."""
+"""A scene from meshes in one call, its backgrounds, and the settings of scene, renderer and local lights."""
 
 import math
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -9,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from augment.backgrounds import load_background, load_backgrounds
 from augment.objects import ObjectSettings, SceneObject, load_object, on_ground
 from augment.scene import Scene
 from renderer.cache import OperatorCache, cache_folder
 from renderer.camera import MOST_VIEWS, orbit_cameras
 from renderer.errors import FACTOR, InputError, as_device, require_choice, require_range
 from renderer.image import ImageSettings
+from renderer.io.images import read_image
 from renderer.io.lights import read_light
 from renderer.light.basis import with_local_lights
 from renderer.light.local import Lamps, Projector
@@ -69,9 +70,8 @@ class LampsSettings:
             positions = tuple((float(x), float(y), float(z)) for x, y, z in self.positions)
             start = torch.tensor(self.start, dtype=torch.float32).expand(len(positions), 3)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise InputError(
-                f"lamps: give positions [x, y, z], and a number or [r, g, b]s as start ({error})"
-            ) from error
+            remedy = "give positions [x, y, z], and a number or [r, g, b]s as start"
+            raise InputError(f"lamps: {remedy} ({error})") from error
         basis = Lamps(positions, self.power, self.radius)
         if not ((start >= 0) & (start <= self.power)).all():  # NaN is not
             raise InputError(f"start={self.start}: give powers from 0 to power={self.power:g}")
@@ -196,6 +196,31 @@ def _object(item: ObjectSettings | tuple[Shown, str], vertices: int) -> SceneObj
     return load_object(ObjectSettings(str(mesh), label), vertices)
 
 
+def load_backgrounds(choices: Sequence[float | str | Path], size: int) -> Tensor:
+    """(B, 3, size, size) of gray values or image files, or (B, 1, size, size) where all are gray; in [0, 1]."""
+    if not choices:
+        raise InputError("backgrounds is empty: give gray values in [0, 1] or image files")
+    images = [load_background(choice, size) for choice in choices]
+    channels = max(len(image) for image in images)
+    return torch.stack([image.expand(channels, -1, -1) for image in images])
+
+
+def load_background(choice: float | str | Path, size: int, name: str = "backgrounds") -> Tensor:
+    """A gray value (1, size, size), or an image's center square (3, size, size), in [0, 1]. name: for errors."""
+    try:
+        gray = float(choice)  # type: ignore[arg-type]  # of a path it raises
+    except (ValueError, TypeError, OverflowError):
+        gray = math.nan
+    if math.isnan(gray) and isinstance(choice, str | Path):
+        try:
+            return read_image(Path(choice), size)
+        except InputError as error:
+            raise InputError(f"{name}: {error} or a gray value") from error
+    if not 0 <= gray <= 1:
+        raise InputError(f"{name}={reprlib.repr(choice)}: give gray values in [0, 1] or image files")
+    return torch.full((1, size, size), gray)
+
+
 def count_views(examples: int | None, objects: int, backgrounds: int, views: int | None) -> int:
     """Views per mesh, so that meshes × views × backgrounds are the examples; either is derived where it is None.
 
@@ -208,8 +233,6 @@ def count_views(examples: int | None, objects: int, backgrounds: int, views: int
     derived, rest = divmod(examples or 0, objects * backgrounds)
     if rest or derived < 1 or views not in (None, derived):
         product = f"{objects} meshes × {views or 'some'} views × {backgrounds} backgrounds"
-        raise InputError(
-            f"augment.examples={examples} is not {product}: change one of them, or derive the one from the other by "
-            "scene.views=null or augment.examples=null"
-        )
+        remedy = "derive the one from the other by scene.views=null or augment.examples=null"
+        raise InputError(f"augment.examples={examples} is not {product}: change one of them, or {remedy}")
     return derived

@@ -1,6 +1,7 @@
 """Images of objects in other light: stacked transfer operators, and nothing is rasterized again."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -31,13 +32,10 @@ class Layer(NamedTuple):
     composite: Tensor
 
 
-def in_place(canvas: Tensor, layers: Sequence[Layer], covered: Sequence[Tensor]) -> Tensor:
-    """Canvases (N, 3, size²), overwritten at each layer's pixels by its values (B, 3, P), and differentiable in
-    these."""
-    return _InPlace.apply(canvas, [(layer.rows, layer.pixels) for layer in layers], *covered)
+class InPlace(torch.autograd.Function):
+    """Canvases (N, 3, size²), overwritten at the rows and pixels of each layer by its values (B, 3, P), and
+    differentiable in these."""
 
-
-class _InPlace(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, canvas: Tensor, targets: Sequence[tuple[Rows, Tensor]], *covered: Tensor) -> Tensor:
         ctx.targets = targets
@@ -129,30 +127,27 @@ class OperatorStack:
 STACKED = 2**16  # pixels of the images in one stack; larger stacks are no faster
 
 
+@dataclass(eq=False, repr=False)
 class Relighting:
     """N images, each of an object from a camera over one of the backgrounds (B, 3 or 1, size²).
 
     Equal views share an operator, and background terms are cached. Operators are built when they are first needed, a
-    stack at a time.
+    stack at a time. views: (object's number, camera) of each image. behind: (N,) the background of each. build: the
+    operators of a mesh from cameras, for an albedo_scale.
     """
 
-    def __init__(
-        self,
-        objects: Sequence[SceneObject],
-        views: Sequence[tuple[int, Camera]],
-        behind: Tensor,
-        backgrounds: Tensor,
-        settings: ImageSettings,
-        build: Callable[..., Sequence[TransferOperator]],
-    ):
-        """views: (object's number, camera) of each image. behind: (N,) the background of each. build: the operators
-        of a mesh from cameras, for an albedo_scale."""
-        self._objects, self._behind, self._backgrounds = objects, behind, backgrounds
-        self._settings, self._build = settings, build
-        self._distinct = sorted(dict.fromkeys(views), key=itemgetter(0))  # (object, camera) of each operator
+    objects: Sequence[SceneObject]
+    views: Sequence[tuple[int, Camera]]
+    behind: Tensor
+    backgrounds: Tensor
+    settings: ImageSettings
+    build: Callable[..., Sequence[TransferOperator]]
+
+    def __post_init__(self) -> None:
+        self._distinct = sorted(dict.fromkeys(self.views), key=itemgetter(0))  # (object, camera) of each operator
         number = {view: index for index, view in enumerate(self._distinct)}
-        self._operator = torch.tensor([number[view] for view in views], device=backgrounds.device)
-        self._per_stack = max(1, STACKED // settings.size**2)
+        self._operator = torch.tensor([number[view] for view in self.views], device=self.backgrounds.device)
+        self._per_stack = max(1, STACKED // self.settings.size**2)
         self._count = -(-len(self._distinct) // self._per_stack)
         self._stacks: dict[int, tuple[OperatorStack, Tensor, Tensor]] = {}
 
@@ -160,40 +155,28 @@ class Relighting:
     def stacks(self) -> list[OperatorStack]:
         """All stacks, built where they are missing."""
         self._require(range(self._count))
-        return [self._stack(index)[0] for index in range(self._count)]
+        return [self._stacks[index][0] for index in range(self._count)]
 
     def layers(self, light: Tensor, images: Tensor) -> Iterator[Layer]:
         """The layers of images (A,), each in its light (A, size, 3); differentiable in the light."""
-        if self._count == 1:
-            self._require([0])
-            yield self._layer(0, None, light, images)
-            return
-        stack = self._operator[images] // self._per_stack
-        indices = stack.unique().tolist()
+        whole, number = self._count == 1, self._operator[images] // self._per_stack
+        indices = [0] if whole else number.unique().tolist()
         self._require(indices)
         for index in indices:
-            rows = torch.nonzero(stack == index).squeeze(1)
-            yield self._layer(index, rows.tolist(), light[rows], images[rows])
-
-    def _layer(self, index: int, rows: Rows, light: Tensor, images: Tensor) -> Layer:
-        stack, rank, behind = self._stack(index)
-        images = rank[images]
-        return Layer(rows, stack.pixels, stack.radiance(light, images) + behind[images])
+            rows: Any = slice(None) if whole else torch.nonzero(number == index).squeeze(1)
+            stack, rank, behind = self._stacks[index]
+            ranks = rank[images[rows]]
+            composite = stack.radiance(light[rows], ranks) + behind[ranks]
+            yield Layer(None if whole else rows.tolist(), stack.pixels, composite)
 
     def _require(self, indices: Iterable[int]) -> None:
-        """Build the stacks that are missing."""
-        if missing := [index for index in indices if index not in self._stacks]:
-            for index in progress(missing, "rendering views"):
-                self._stack(index)
-
-    def _stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
-        if index not in self._stacks:
+        missing = [index for index in indices if index not in self._stacks]
+        for index in progress(missing, "rendering views") if missing else ():
             self._stacks[index] = stack, _, behind = self._build_stack(index)
             if len(self._stacks) == 1:  # the others are as large
                 rest = (self._count - 1) * (stack.transfer.nbytes + stack.albedo.nbytes + behind.nbytes)
-                views = f"{len(self._distinct)} views of {self._settings.size} pixels per side (views)"
-                require_memory(views, rest, self._backgrounds.device)
-        return self._stacks[index]
+                views = f"{len(self._distinct)} views of {self.settings.size} pixels per side (views)"
+                require_memory(views, rest, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> tuple[OperatorStack, Tensor, Tensor]:
         """(a stack; (N,) each image's rank among the A images of the stack; the background terms of these (A, C,
@@ -201,10 +184,10 @@ class Relighting:
         first = index * self._per_stack
         views, operators = self._distinct[first : first + self._per_stack], list[TransferOperator]()
         for number, group in groupby(views, key=itemgetter(0)):
-            item, cameras = self._objects[number], [camera for _, camera in group]
-            operators += self._build(item.mesh, cameras, albedo_scale=item.albedo_scale)
+            item, cameras = self.objects[number], [camera for _, camera in group]
+            operators += self.build(item.mesh, cameras, albedo_scale=item.albedo_scale)
         here = self._operator // self._per_stack == index
-        stack = OperatorStack(operators, (self._operator[here] - first).cpu(), self._backgrounds.device)
-        backgrounds = self._backgrounds.index_select(2, stack.pixels)
-        behind = background_term(stack.coverage[stack.shown], backgrounds[self._behind[here]], self._settings.encoding)
+        stack = OperatorStack(operators, (self._operator[here] - first).cpu(), self.backgrounds.device)
+        backgrounds = self.backgrounds.index_select(2, stack.pixels)
+        behind = background_term(stack.coverage[stack.shown], backgrounds[self.behind[here]], self.settings.encoding)
         return stack, here.cumsum(0) - 1, behind

@@ -5,7 +5,7 @@ those of the moved shape itself (`renderer.transport.local`).
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -70,20 +70,20 @@ def _by_pixel(fragments: Fragments, albedo: Tensor) -> Tensor:
     return albedo.new_zeros(3, fragments.size**2).index_add(1, pixel, albedo.T)
 
 
+@dataclass(eq=False, repr=False)
 class Reshading:
-    """Views of objects, which are given by their numbers; views of the unmoved objects are cached."""
+    """Views of objects, which are given by their numbers; views of the unmoved objects are cached.
 
-    def __init__(
-        self,
-        objects: Sequence[SceneObject],
-        settings: ImageSettings,
-        rasterizer: Rasterizer,
-        basis: Basis,
-        like: Tensor,
-    ):
-        """basis: of the lights' coefficients. like: has the dtype and the device of the images."""
-        self._objects, self._settings, self._rasterizer = objects, settings, rasterizer
-        self._basis, self._like = basis, like
+    basis: of the lights' coefficients. like: has the dtype and the device of the images.
+    """
+
+    objects: Sequence[SceneObject]
+    settings: ImageSettings
+    rasterizer: Rasterizer
+    basis: Basis
+    like: Tensor
+
+    def __post_init__(self) -> None:
         self._views: dict[tuple[int, Camera], tuple[Fragments, Tensor]] = {}
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
         self._rays: dict[int, Rays] = {}
@@ -93,26 +93,22 @@ class Reshading:
     @cached_property
     def vertices(self) -> list[Tensor]:
         """(V, 3) of each unmoved object."""
-        return [torch.from_numpy(item.mesh.vertices).to(self._like) for item in self._objects]
-
-    @cached_property
-    def _faces(self) -> list[Tensor]:
-        return [torch.from_numpy(item.mesh.faces).to(self._like.device) for item in self._objects]
+        return [torch.from_numpy(item.mesh.vertices).to(self.like) for item in self.objects]
 
     def view(self, number: int, camera: Camera) -> tuple[Fragments, Tensor]:
         """Fragments of an unmoved object, and its albedo at the samples (S, 3)."""
         key = number, camera
         if key not in self._views:
-            self._views[key] = self._rasterized(number, camera, self._objects[number].mesh.vertices)
+            self._views[key] = self._rasterized(number, camera, self.objects[number].mesh.vertices)
         return self._views[key]
 
     def local_view(self, number: int, camera: Camera) -> LocalLightView:
         """An unmoved object in local light."""
         key = number, camera
         if key not in self._local_views:
-            mesh, (fragments, _) = self._objects[number].mesh, self.view(*key)
+            mesh, (fragments, _) = self.objects[number].mesh, self.view(*key)
             rays = self._rays.setdefault(number, Rays(mesh))
-            self._local_views[key] = LocalLightView(rays, mesh, fragments, self._settings)
+            self._local_views[key] = LocalLightView(rays, mesh, fragments, self.settings)
         return self._local_views[key]
 
     def radiance(
@@ -130,7 +126,7 @@ class Reshading:
         example: whose shapes change little from call to call. vertices: (V, 3), and positions of lamps: (L, 3); None
         where they have not moved. added: offsets of each face's linear albedo, (F, 3).
         """
-        item, settings = self._objects[number], self._settings
+        item, settings = self.objects[number], self.settings
         if vertices is None:
             corners, shape = self.vertices[number], item.mesh.vertices
             fragments, albedo = self.view(number, camera)
@@ -139,8 +135,8 @@ class Reshading:
             fragments, albedo = self._rasterized(number, camera, shape)
         if added is not None:
             albedo = painted_albedo(item.mesh, fragments, settings.encoding, item.albedo_scale, added)
-        smooth_faces = self._faces[number] if settings.normals == "smooth" else None
-        lights = [(part, light[where]) for where, part in parts_of(self._basis)]
+        faces = torch.from_numpy(item.mesh.faces).to(self.like.device) if settings.normals == "smooth" else None
+        lights = [(part, light[where]) for where, part in parts_of(self.basis)]
 
         @cache  # called only where the scene has local lights
         def local_view() -> LocalLightView:
@@ -154,11 +150,11 @@ class Reshading:
             return frozen.radiance(camera, fragments, albedo, light)
 
         extra = indirect if settings.global_illumination else None
-        return fragments, view_radiance(fragments, corners, albedo, lights, smooth_faces, local_view, extra, positions)
+        return fragments, view_radiance(fragments, corners, albedo, lights, faces, local_view, extra, positions)
 
     def _transport_near(self, example: int, number: int, camera: Camera, vertices: np.ndarray) -> FrozenTransport:
         """The transport of a shape near the vertices (V, 3) of an example, with the camera's view of that shape."""
-        mesh, fixed = self._objects[number].mesh, (self._settings, self._objects[number].albedo_scale, self._basis)
+        mesh, fixed = self.objects[number].mesh, (self.settings, self.objects[number].albedo_scale, self.basis)
         if number not in self._unmoved_transport:
             self._unmoved_transport[number] = FrozenTransport(mesh, *fixed)
         frozen = self._unmoved_transport[number]
@@ -173,7 +169,7 @@ class Reshading:
 
     def _rasterized(self, number: int, camera: Camera, vertices: np.ndarray) -> tuple[Fragments, Tensor]:
         """Fragments of an object with these vertices, and its albedo at the samples (S, 3)."""
-        item, settings = self._objects[number], self._settings
-        drawn = vertices, item.mesh.faces, [camera], settings, self._rasterizer
-        fragments = build_fragments(*drawn, closed=item.mesh.closed)[0].to(self._like.device)
-        return fragments, (surface_albedo(item.mesh, fragments, settings.encoding) * item.albedo_scale).to(self._like)
+        item, settings = self.objects[number], self.settings
+        drawn = vertices, item.mesh.faces, [camera], settings, self.rasterizer
+        fragments = build_fragments(*drawn, closed=item.mesh.closed)[0].to(self.like.device)
+        return fragments, (surface_albedo(item.mesh, fragments, settings.encoding) * item.albedo_scale).to(self.like)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from augment.objects import SceneObject
-from augment.relighting import Layer, OperatorStack, Relighting, in_place
+from augment.relighting import InPlace, Layer, OperatorStack, Relighting
 from augment.reshading import Reshading
 from augment.utils import require_memory
 from renderer.cache import OperatorCache
@@ -97,10 +97,8 @@ class Scene:
         if not (self.backgrounds.min() >= 0 and self.backgrounds.max() <= 1):
             raise InputError("backgrounds: give values in [0, 1]")
         radii = [item.radius for item in self.objects]  # a camera's depth range holds the whole object
-        self.examples = [
-            replace(row, cameras=tuple(camera.seeing(radii[row.object]) for camera in row.cameras))
-            for row in self.examples
-        ]
+        cameras = [tuple(camera.seeing(radii[row.object]) for camera in row.cameras) for row in self.examples]
+        self.examples = [replace(row, cameras=views) for row, views in zip(self.examples, cameras, strict=True)]
         self.backgrounds = self.backgrounds.to(self.lights)
         self.lights = self.lights.expand(len(self.examples), *self.lights.shape[-2:])
         self.views = len(self.examples[0].cameras)  # per example
@@ -178,7 +176,8 @@ class Scene:
         layers = list(self._layers(conditions, examples))
         canvas = self.backgrounds.flatten(2).index_select(0, self._background[examples].repeat_interleave(self.views))
         covered = [tonemap_composite(layer.composite, self.settings.encoding) for layer in layers]
-        images = in_place(canvas.expand(-1, 3, -1).contiguous(), layers, covered)
+        targets = [(layer.rows, layer.pixels) for layer in layers]
+        images = InPlace.apply(canvas.expand(-1, 3, -1).contiguous(), targets, *covered)
         images = images.view(len(examples), self.views, 3, self.settings.size, self.settings.size)
         images = self.camera_effects(images, examples) if self.camera_effects else images
         return images if conditions.pixels is None else clamp(images + conditions.pixels)
@@ -216,7 +215,6 @@ class Scene:
             yield Layer(rows, pixels, composite + torch.stack(added))
 
     def _reshaded(self, light: Tensor, conditions: Conditions, examples: Tensor) -> Iterator[Layer]:
-        """View by view."""
         for image, (row, view) in enumerate(product(range(len(examples)), range(self.views))):
             index = int(examples[row])
             example, mesh = self.examples[index], self.mesh(index)

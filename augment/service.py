@@ -111,11 +111,6 @@ class AugmentationSettings:
         """Whether any example is rendered at all."""
         return self.arm != "none" and self.examples != 0
 
-    @property
-    def relights(self) -> bool:
-        """Whether nothing but the light changes, so that precomputed transfer lasts from epoch to epoch."""
-        return not (self.vary.moves or {"geometry", "albedo"} & self.attack.parameters.keys())
-
 
 @dataclass(frozen=True)
 class AttackExamples:
@@ -144,11 +139,8 @@ class Label(Tensor):
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]  # results are plain
 
 
-def _collate_labels(batch: Sequence[Any], *, collate_fn_map: Any = None) -> Tensor:
-    return torch.tensor([int(label) for label in batch])
-
-
-default_collate_fn_map[Label] = _collate_labels  # of batches that begin with a render
+# of batches that begin with a render
+default_collate_fn_map[Label] = lambda batch, **_: torch.tensor([int(label) for label in batch])
 
 
 @dataclass(frozen=True)
@@ -308,17 +300,15 @@ class AugmentationService:
         return Renders(result.images[:, 0], self.labels, diagnostics | _changes(problem, result.values), examples)
 
     def _random_values(self, problem: AttackProblem, number: int) -> Tensor:
-        """Random values (E, D) within the norm-balls."""
         random, parts = self.settings.random_light, []
-        for parameter, start in zip(problem.parameters, problem.split(problem.start), strict=True):
+        for parameter, start in problem.by_parameter(problem.start):
             if parameter.name == "lighting":
                 zero = torch.zeros(start.shape[1] // 3, 3, dtype=start.dtype)
                 draws = generator(self.seed, number, "lights")
                 offsets = perturb(zero, len(start), random.amplitude, random.radius, draws)
                 parts.append(start + offsets.flatten(1).to(start))
             else:
-                draws = generator(self.seed, number, parameter.name)
-                parts.append(parameter.sample(draws, problem.everything).to(start))
+                parts.append(parameter.sample(generator(self.seed, number, parameter.name)).to(start))
         return problem.project(torch.cat(parts, dim=1), problem.everything)
 
 

@@ -17,9 +17,8 @@ from torch import Tensor, nn
 
 from augment import classifiers, utils
 from augment.classifiers import Classifier
-from augment.classifiers.adapter import Normalized
+from augment.classifiers.adapter import Normalized, call_python
 from augment.classifiers.imagenet import require_architecture
-from augment.classifiers.python_function import call_python
 from augment.utils import eval_mode
 from renderer.errors import InputError, in_one_line
 from train.checkpoint import BEST, VERSION, checked, load

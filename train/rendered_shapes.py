@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 import augment
-from augment.backgrounds import load_backgrounds
+from augment.build import load_backgrounds
 from augment.objects import SceneObject
 from augment.scene import Conditions, Scene
 from augment.utils import generator, progress

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from augment.backgrounds import load_background
+from augment.build import load_background
 from augment.objects import SceneObject
 from augment.scene import Conditions, Example, Scene
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
@@ -160,10 +160,8 @@ def reload(folder: str | Path) -> Adversary:
 
 def _described(folder: Path, description: dict[str, Any]) -> Adversary:
     settings = ImageSettings(**description["image"])
-    cameras = tuple(
-        (PerspectiveCamera if "distance" in camera else OrthographicCamera)(**camera)
-        for camera in description["cameras"]
-    )
+    kinds = [PerspectiveCamera if "distance" in camera else OrthographicCamera for camera in description["cameras"]]
+    cameras = tuple(kind(**camera) for kind, camera in zip(kinds, description["cameras"], strict=True))
     mesh, own = load_mesh(folder / MESH), description["own_faces"]
     for camera in cameras:
         camera.depths(mesh.vertices)  # which refuses a mesh around the camera

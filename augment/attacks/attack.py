@@ -214,10 +214,8 @@ def target_labels(
     views = logits.shape[1]
     names = [target] * views if isinstance(target, str) else [str(name) for name in target]
     if len(names) != views:
-        raise InputError(
-            f"target={names} names {len(names)} classes for {views} views that share what is attacked: give one class "
-            "per view, and shared=True"
-        )
+        counts = f"{len(names)} classes for {views} views that share what is attacked"
+        raise InputError(f"target={names} names {counts}: give one class per view, and shared=True")
     labels = torch.tensor([classifier.label(name) for name in names], device=logits.device).expand(len(logits), views)
     if torch.eq(labels, source).any():
         raise InputError(f"target={target} is the right class of an example: name another class")
@@ -258,7 +256,6 @@ def require_clean_correct(scene: Scene, logits: Tensor, labels: Tensor, classifi
         confidence, best = logits[example, view].softmax(0).topk(min(5, len(classifier.classes)))
         names = (classifier.classes[index] for index in best.tolist())
         most_probable = ", ".join(f"{name} {p:.1%}" for name, p in zip(names, confidence.tolist(), strict=True))
-        raise NotCleanCorrectError(
-            f"{len(wrong)} of {logits[..., 0].numel()} images of {item.name} are not classified as {item.label!r} "
-            f"before any attack (the first: {most_probable}): change the scene, or set force=True"
-        )
+        images = f"{len(wrong)} of {logits[..., 0].numel()} images of {item.name} are not classified as {item.label!r}"
+        remedy = "change the scene, or set force=True"
+        raise NotCleanCorrectError(f"{images} before any attack (the first: {most_probable}): {remedy}")

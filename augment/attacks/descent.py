@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
     from augment.attacks.attack import AttackSettings
+    from augment.attacks.parameters import AttackProblem
 
 
 @dataclass(frozen=True)
@@ -56,23 +57,6 @@ class Goal:
         return erred if self.target is None else torch.where(self.target == NO_CLASS, erred, predicted == self.target)
 
 
-class Problem(Protocol):
-    """What is attacked: E examples of V views each, rendered from values (E, D)."""
-
-    @property
-    def start(self) -> Float[Tensor, "E D"]:
-        """The values where descent begins."""
-
-    def render(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Float[Tensor, "A V 3 H W"]:
-        """Images in [0, 1] of some examples under these values."""
-
-    def step(self, gradient: Float[Tensor, "A D"]) -> Float[Tensor, "A D"]:
-        """The step for a gradient, to be subtracted."""
-
-    def project(self, values: Float[Tensor, "A D"], examples: Int[Tensor, " A"]) -> Float[Tensor, "A D"]:
-        """The nearest permitted values."""
-
-
 @dataclass(frozen=True)
 class DescentResult:
     """The end of a descent, per example; all tensors lie on the values' device.
@@ -97,7 +81,7 @@ class DescentResult:
 
 def descend(
     model: nn.Module,
-    problem: Problem,
+    problem: AttackProblem,
     goal: Goal,
     settings: AttackSettings,
     phases: Phases | None = None,
@@ -149,7 +133,7 @@ def descend(
 @torch.enable_grad()
 def _descend_once(
     model: nn.Module,
-    problem: Problem,
+    problem: AttackProblem,
     examples: Tensor,
     start: Tensor,
     goal: Goal,

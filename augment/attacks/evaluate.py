@@ -71,7 +71,7 @@ def random_search(result: AttackResult) -> Tensor:
     torch.Size([1])
     """
     draws = generator(result.seed, "random search")
-    draw = partial(result.problem.sample_as_far, result.descent.values, draws)
+    draw = partial(result.problem.sample, draws, result.descent.values)
     return _success_by_draws(result, result.success_before, draw)
 
 
@@ -181,10 +181,8 @@ def transfer(
     problem, attacked, scene = result.problem, result.classifier, result.problem.scene
     ends = problem.conditions(problem.start, problem.everything), result.conditions
     chosen = torch.nonzero(result.clean_correct & result.success).flatten().tolist()
-    images = [(result.images_before[example], result.images[example]) for example in chosen]
-    sides = [
-        [Adversary.of(scene, example, end, *pair) for example, pair in zip(chosen, images, strict=True)] for end in ends
-    ]
+    images = [*zip(result.images_before, result.images, strict=True)]
+    sides = [[Adversary.of(scene, row, end, *images[row]) for row in chosen] for end in ends]
 
     def elsewhere(
         kind: str, name: str, change: Callable[[Adversary], Adversary], classifier: Classifier = attacked
@@ -231,7 +229,6 @@ def require_transferable(parameters: Collection[str], azimuths: Collection[float
 
 
 def _resized(adversary: Adversary, size: int) -> Adversary:
-    """For a network of another size."""
     if adversary.settings.size == size:
         return adversary
 

@@ -75,13 +75,10 @@ def require_renderers(names: Sequence[str]) -> None:
             pass
 
 
-# ------------------------------------------------------------------------------------- numbers
-
-
 def _numbers(result: AttackResult, example: int) -> dict[str, object]:
     descent, classes = result.descent, result.classifier.classes
     before = predictions(result.logits_before[example], classes)
-    ends = [result.problem.split(values[[example]]) for values in (descent.values, result.problem.start)]
+    changes = result.problem.by_parameter(descent.values[[example]] - result.problem.start[[example]])
     return {
         "clean_correct": bool(result.clean_correct[example]),
         "success_before": bool(result.success_before[example]),
@@ -93,10 +90,7 @@ def _numbers(result: AttackResult, example: int) -> dict[str, object]:
         "label": [classes[index] for index in result.goal.source[example].tolist()],
         **{f"{key}_before": value for key, value in before.items()},
         **predictions(result.logits[example], classes),
-        "largest_change": {
-            parameter.name: float((part - start).abs().max())
-            for parameter, part, start in zip(result.problem.parameters, *ends, strict=True)
-        },
+        "largest_change": {parameter.name: float(change.abs().max()) for parameter, change in changes},
     }
 
 
@@ -151,9 +145,6 @@ def render_again(folder: Path, renderers: Sequence[str], rasterizer: Rasterizer)
         tonemapped = tonemap_composite(composite, encoding)
         images[MITSUBA] = tonemapped if adversary.pixels is None else clamp(tonemapped + adversary.pixels)
     return images
-
-
-# ------------------------------------------------------------------------------------- figure
 
 
 def figure(result: AttackResult, example: int) -> Image.Image:

@@ -1,8 +1,8 @@
 """Norm-balls in a space of parameters: the exact projection into them, uniform draws from them, steps within them."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 import torch.nn.functional as F
@@ -13,13 +13,8 @@ from renderer.light.convex import Ball, nearest_in_box
 
 NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")
-
-
-class Domain(Protocol):
-    """A convex set of values (D,)."""
-
-    def __call__(self, values: Tensor, within: Ball | None = None) -> Tensor:
-        """Its nearest points to values (A, D), within a ball whose centers it contains."""
+# A convex set of values (D,): its nearest points to values (A, D), also `within` a ball whose centers it contains.
+Domain = Callable[..., Tensor]
 
 
 def anywhere(values: Tensor, within: Ball | None = None) -> Tensor:
@@ -75,15 +70,11 @@ class StepSettings:
 
     def along(self, gradient: Tensor) -> Tensor:
         """The step (A, D) for a gradient (A, D), to be subtracted; a gradient of zero gives a step of zero."""
-        return self.step_size * direction(gradient, self.step)
-
-
-def direction(gradient: Tensor, step: str) -> Tensor:
-    """The gradient (A, D) at unit L2 norm per example (a zero gradient stays zero), raw, or its sign."""
-    if step == "raw":
-        return gradient
-    if step == "sign":
-        return gradient.sign()
-    # Scaling by the largest entry first keeps tiny gradients from underflowing when squared.
-    tiny = torch.finfo(gradient.dtype).tiny
-    return F.normalize(gradient / gradient.abs().amax(1, keepdim=True).clamp(min=tiny), eps=tiny)
+        if self.step == "raw":
+            return self.step_size * gradient
+        if self.step == "sign":
+            return self.step_size * gradient.sign()
+        # Scaling by the largest entry first keeps tiny gradients from underflowing when squared.
+        tiny = torch.finfo(gradient.dtype).tiny
+        scaled = gradient / gradient.abs().amax(1, keepdim=True).clamp(min=tiny)
+        return self.step_size * F.normalize(scaled, eps=tiny)

@@ -51,22 +51,17 @@ class Parameter:
         """The nearest values (A, D) of the examples (A,) within the norm-ball and the domain."""
         return self.settings.project(values, self.start[examples], self.domain)
 
-    def sample(self, generator: torch.Generator, examples: Tensor) -> Tensor:
-        """Uniform draws (A, D) from the balls of the examples (A,), within the domain."""
-        used = None if self.used is None else self.used[examples]
-        return self.project(self.settings.sample(self.start[examples], generator, used), examples)
-
-    def sample_as_far(self, values: Tensor, generator: torch.Generator, examples: Tensor) -> Tensor:
-        """`sample` where there is a radius; else a random direction at the L2 distance of values (A, D) from the
-        start, within the domain."""
-        if self.settings.radius is not None:
-            return self.sample(generator, examples)
-        start = self.start[examples].to(values)
-        offset = torch.randn(values.shape, generator=generator).to(values)
+    def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
+        """Uniform draws (E, D) from the norm-balls, within the domain. Without a radius: random directions, as far from
+        the start as values (E, D) that an attack reached; InputError where these are not given."""
+        if self.settings.radius is not None or reached is None:
+            draws = self.settings.sample(self.start, generator, self.used)
+            return self.settings.project(draws, self.start, self.domain)
+        offset = torch.randn(reached.shape, generator=generator).to(reached)
         if self.used is not None:
-            offset = offset * self.used[examples]
-        reach = (values - start).norm(dim=1, keepdim=True)
-        return self.domain(start + offset * reach / offset.norm(dim=1, keepdim=True))
+            offset = offset * self.used
+        distance = (reached - self.start).norm(dim=1, keepdim=True)
+        return self.domain(self.start + offset * distance / offset.norm(dim=1, keepdim=True))
 
 
 def lighting(scene: Scene, settings: StepSettings, nonnegative: bool = False) -> Parameter:
@@ -160,20 +155,13 @@ def skylight(scene: Scene, settings: SkylightSettings) -> Parameter:
 
 def geometry(scene: Scene, settings: StepSettings) -> Parameter:
     """Displacements of the object's vertices, in world units; it spans [-1, 1]. The gradient sees how normals turn."""
-
-    def change(conditions: Conditions, examples: Tensor, displacements: Tensor) -> Conditions:
-        return replace(conditions, vertices=scene.vertices[scene.object_of[examples]] + displacements)
-
-    return _of_mesh(scene, settings, "geometry", [item.own_vertices for item in scene.objects], change)
+    own = [item.own_vertices for item in scene.objects]
+    return _of_mesh(scene, settings, "geometry", own, "vertices", scene.vertices)
 
 
 def albedo(scene: Scene, settings: StepSettings) -> Parameter:
     """What is added to the linear albedo of each face, per channel; the sum is clamped to [0, 1]."""
-
-    def change(conditions: Conditions, examples: Tensor, added: Tensor) -> Conditions:
-        return replace(conditions, albedo=added)
-
-    return _of_mesh(scene, settings, "albedo", [item.own_faces for item in scene.objects], change)
+    return _of_mesh(scene, settings, "albedo", [item.own_faces for item in scene.objects], "albedo")
 
 
 def _of_mesh(
@@ -181,21 +169,23 @@ def _of_mesh(
     settings: StepSettings,
     name: str,
     own: Sequence[np.ndarray],
-    change: Callable[[Conditions, Tensor, Tensor], Conditions],
+    condition: str,
+    of_objects: Tensor | None = None,
 ) -> Parameter:
     """Three values for each of the items, vertices or faces, of a mesh; the first of them in a smaller mesh, and used
     where they are the object's own.
 
-    own: (items,) bool, of each object. change: the conditions of examples (A,) with values (A, items, 3), which are
-    zero where they are not used.
+    own: (items,) bool, of each object. condition: the one to change. of_objects: (M, items, 3), to add the values to.
     """
     items = pad_sequence([torch.from_numpy(mask) for mask in own], batch_first=True).to(scene.lights.device)
     used = items.repeat_interleave(3, dim=1)[scene.object_of]
     all_used = bool(used.all())
 
     def apply(values: Tensor, conditions: Conditions, examples: Tensor) -> Conditions:
-        own_values = values if all_used else values * used[examples]
-        return change(conditions, examples, own_values.unflatten(1, (-1, 3)))
+        changed = (values if all_used else values * used[examples]).unflatten(1, (-1, 3))
+        if of_objects is not None:
+            changed = of_objects[scene.object_of[examples]] + changed
+        return replace(conditions, **{condition: changed})
 
     return Parameter(name, settings, scene.lights.new_zeros(used.shape), apply, used=None if all_used else used)
 
@@ -220,7 +210,7 @@ PARAMETERS: dict[str, Callable[..., Parameter]] = {
 
 
 class AttackProblem:
-    """Parameters side by side: values (E, D) are theirs, one after the other. See `augment.attacks.descent.Problem`."""
+    """Parameters side by side: values (E, D) are theirs, one after the other; start: where descent begins."""
 
     def __init__(self, scene: Scene, parameters: Sequence[Parameter]):
         self.scene, self.parameters = scene, parameters
@@ -236,6 +226,7 @@ class AttackProblem:
         return conditions
 
     def render(self, values: Tensor, examples: Tensor) -> Tensor:
+        """Images (A, V, 3, size, size) in [0, 1] of examples (A,) under values (A, D)."""
         return self.scene.render(self.conditions(values, examples), examples)
 
     @torch.no_grad()
@@ -248,21 +239,18 @@ class AttackProblem:
         return images
 
     def step(self, gradient: Tensor) -> Tensor:
+        """The step for a gradient (A, D), to be subtracted."""
         return torch.cat([parameter.settings.along(part) for parameter, part in self.by_parameter(gradient)], dim=1)
 
     def project(self, values: Tensor, examples: Tensor) -> Tensor:
+        """The nearest permitted values (A, D) of examples (A,)."""
         return torch.cat([parameter.project(part, examples) for parameter, part in self.by_parameter(values)], dim=1)
 
-    def sample(self, generator: torch.Generator) -> Tensor:
-        """Uniform draws (E, D) from every parameter's ball around its start, within its domain."""
-        drawn = [parameter.sample(generator, self.everything).to(self.start) for parameter in self.parameters]
-        return torch.cat(drawn, dim=1)
-
-    def sample_as_far(self, values: Tensor, generator: torch.Generator) -> Tensor:
-        """Draws (E, D) as far as values went; see `Parameter.sample_as_far`."""
-        parts = self.by_parameter(values)
-        drawn = [parameter.sample_as_far(part, generator, self.everything).to(self.start) for parameter, part in parts]
-        return torch.cat(drawn, dim=1)
+    def sample(self, generator: torch.Generator, reached: Tensor | None = None) -> Tensor:
+        """Draws (E, D), one parameter after the other; see `Parameter.sample`."""
+        parts: Sequence[Tensor | None] = [None] * len(self.parameters) if reached is None else self.split(reached)
+        pairs = zip(self.parameters, parts, strict=True)
+        return torch.cat([parameter.sample(generator, part).to(self.start) for parameter, part in pairs], dim=1)
 
     def by_parameter(self, values: Tensor) -> list[tuple[Parameter, Tensor]]:
         """Each parameter with its part (A, D_k) of values (A, D)."""

@@ -7,14 +7,13 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
-from augment.classifiers.adapter import Classifier
+from augment.classifiers.adapter import Classifier, load_python
 from augment.classifiers.imagenet import (
     SQUEEZENET_CAFFE,
     load_efficientnet_lite,
     load_squeezenet_caffe,
     load_torchvision,
 )
-from augment.classifiers.python_function import load_python
 from renderer.errors import InputError
 
 __all__ = ["SOURCES", "Classifier", "load_classifier"]

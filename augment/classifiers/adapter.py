@@ -1,9 +1,16 @@
-"""The adapter of a classifier: one module that takes images as the renderer makes them, and names its classes."""
+"""The adapter of a classifier: one module that takes images as the renderer makes them, and names its classes.
+
+Its network may be a user's own, returned by a function of a Python module.
+"""
 
 from __future__ import annotations
 
 import difflib
+import importlib
+import sys
+import traceback
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import torch
@@ -39,28 +46,25 @@ class Classifier(nn.Module):
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N C"]:
         """InputError for images of another size, and for a callable that fails or returns something else than finite
         logits with a gradient."""
-        if images.shape[1:] != (3, self.size, self.size):
-            raise InputError(
-                f"classifier={self.name} takes images (N, 3, {self.size}, {self.size}), not {tuple(images.shape)}: "
-                f"render at {self.size} pixels per side"
-            )
+        name, size, shape = f"classifier={self.name}", self.size, tuple(images.shape)
+        if shape[1:] != (3, size, size):
+            remedy = f"render at {size} pixels per side"
+            raise InputError(f"{name} takes images (N, 3, {size}, {size}), not {shape}: {remedy}")
         try:
             logits = self.function(images)
         except Exception as error:
             if isinstance(error, InputError) or is_out_of_memory(error):
                 raise
-            raise InputError(
-                f"classifier={self.name} fails on float32 images {tuple(images.shape)} "
-                f"({type(error).__name__}: {in_one_line(error)}): make it take these"
-            ) from error
+            reason = f"{type(error).__name__}: {in_one_line(error)}"
+            raise InputError(f"{name} fails on float32 images {shape} ({reason}): make it take these") from error
         expected = (len(images), len(self.classes))
         if not isinstance(logits, Tensor) or logits.shape != expected:
             returned = tuple(logits.shape) if isinstance(logits, Tensor) else type(logits).__name__
-            raise InputError(f"classifier={self.name} returned {returned}: make it return logits {expected}")
+            raise InputError(f"{name} returned {returned}: make it return logits {expected}")
         if not logits.is_floating_point() or not logits.isfinite().all():
-            raise InputError(f"classifier={self.name} returned NaN or infinite logits: check its weights")
+            raise InputError(f"{name} returned NaN or infinite logits: check its weights")
         if torch.is_grad_enabled() and images.requires_grad and not logits.requires_grad:
-            raise InputError(f"classifier={self.name} returned logits without a gradient: compute them in torch")
+            raise InputError(f"{name} returned logits without a gradient: compute them in torch")
         return logits
 
     def train(self, mode: bool = True) -> Self:
@@ -104,3 +108,36 @@ def class_index(classes: Sequence[str], name: str, key: str) -> int:
 def nearest(name: str, choices: Sequence[str]) -> str:
     """The three choices most like a name: 'a, b, c'."""
     return ", ".join(difflib.get_close_matches(name, choices, n=3, cutoff=0))
+
+
+def load_python(name: str, weights: str | Path | None = None) -> Classifier:
+    """`package.module:function`, found from the current folder or installed, called without arguments.
+
+    The function returns (module, size, classes): a torch.nn.Module from images (N, 3, size, size), RGB in [0, 1], to
+    logits, and the names of its classes in order. InputError where there is no such function, where it or its module
+    raises or returns something else, and for weights=, since the function loads its own.
+    """
+    if weights is not None:
+        raise InputError(f"weights={weights} is not for classifier=python:{name}, which loads its own: leave it out")
+    return Classifier(*call_python(name, f"classifier=python:{name}"), f"python:{name}")
+
+
+def call_python(name: str, setting: str) -> tuple[nn.Module, int, Sequence[str]]:
+    """The result of `package.module:function`; errors name the setting that it came from."""
+    module, _, function = name.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        network, size, classes = getattr(importlib.import_module(module), function)()
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # of the user's code, or where there is none
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        reason = f"{type(error).__name__}: {in_one_line(error)}, in line {at.lineno} of {at.filename}"  # type: ignore[arg-type]
+        expected = "python:package.module:function, which returns (module, size, classes)"
+        raise InputError(f"{setting} fails ({reason}): give {expected}") from error
+    ordered = isinstance(classes, Sequence) and not isinstance(classes, str)
+    if not (isinstance(network, nn.Module) and type(size) is int and ordered and all(type(c) is str for c in classes)):
+        kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
+        raise InputError(f"{setting} returns ({kinds}): return (torch.nn.Module, pixels per side, class names)")
+    return network, size, classes

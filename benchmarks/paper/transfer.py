@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from augment import AttackSettings, Classifier
-from augment.attacks.descent import Goal, Problem, descend
+from augment.attacks.descent import Goal, descend
 from augment.attacks.parameters import AttackProblem
 from augment.objects import SceneObject
 from augment.utils import generator
@@ -43,7 +43,7 @@ def as_one_example(problem: AttackProblem) -> Any:
 
 
 def adversaries(
-    classifier: Classifier, problem: Problem, settings: AttackSettings, label: str, views: int
+    classifier: Classifier, problem: AttackProblem, settings: AttackSettings, label: str, views: int
 ) -> tuple[Tensor, Tensor]:
     """(E, D) values where a descent first succeeds or ends, and the best of `FURTHER` steps on. views: of each."""
     goal = Goal(torch.full((len(problem.start), views), classifier.label(label)))

@@ -55,7 +55,7 @@ def test_patterns_and_powers_stay_in_range_and_in_their_norm_ball(norm):
     for parameter, most in (("projector", 2.0), ("lamps", 10.0)):
         changed = PARAMETERS[parameter](shown, StepSettings(norm, 0.4))
         wanted = changed.start + 9 * torch.randn(changed.start.shape, generator=torch.Generator().manual_seed(1))
-        for values in (changed.project(wanted, EVERY), changed.sample(torch.Generator().manual_seed(2), EVERY)):
+        for values in (changed.project(wanted, EVERY), changed.sample(torch.Generator().manual_seed(2))):
             assert values.min() >= 0 and values.max() <= most
             reach = (values - changed.start).norm(dim=1) if norm == "l2" else (values - changed.start).abs()
             assert reach.max() <= 0.4 * (1 + 1e-5)

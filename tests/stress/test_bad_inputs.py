@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from augment import utils
-from augment.backgrounds import load_background
+from augment.build import load_background
 from renderer import InputError, load_light, load_mesh
 from train import checkpoint
 from train.data import load_folder, load_npz

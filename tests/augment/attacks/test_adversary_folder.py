@@ -28,10 +28,9 @@ SOFTWARE = choose("numpy")
 def attacked(kinds: set[str], scene: Scene) -> augment.AttackResult:
     classifier = augment.Classifier(lambda images: 30 * images.mean((2, 3)), scene.settings.size, CLASSES)
     radii = {"albedo": 0.2, "geometry": 0.01, "pixels": 0.05, "lighting": 0.3}
-    settings = {name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name]) for name in kinds}
-    return augment.attack(
-        classifier, scene, settings=augment.AttackSettings(**settings, allow_negative=True, max_steps=3), force=True
-    )
+    steps = {name: augment.StepSettings("linf", radii[name], "sign", 0.5 * radii[name]) for name in kinds}
+    settings = augment.AttackSettings(**steps, allow_negative=True, max_steps=3)
+    return augment.attack(classifier, scene, settings=settings, force=True)
 
 
 def textured() -> Mesh:
@@ -64,9 +63,8 @@ def adversary_of(done: augment.AttackResult) -> Adversary:
 )
 def test_an_adversary_is_read_back_to_the_same_images_within_a_255th(tmp_path, kinds, encoding):
     """And exactly but for rounding to float32 where no texture is painted."""
-    scene = augment.build_scene(
-        [(textured(), "orange")], 24, views=2, shared=True, rasterizer="numpy", encoding=encoding, width=2.4
-    )
+    choices = {"shared": True, "rasterizer": "numpy", "encoding": encoding, "width": 2.4}
+    scene = augment.build_scene([(textured(), "orange")], 24, views=2, **choices)
     done = attacked(kinds, scene)
     write_adversary(adversary_of(done), tmp_path)
     found = reload(tmp_path)
@@ -161,7 +159,6 @@ DAMAGES = {
     "a pipe for images": (pipe, "after.npy is not a regular file"),
     "images of 10 TB": (announced, "after.npy cannot be read"),
     "images of 1e300": (lambda folder: np.save(folder / "after.npy", np.full((1, 3, 8, 8), 1e300)), "cannot be read"),
-    "no such lamps": (described(local_lights=["lamps"]), "lamps.json does not exist"),
 }
 
 

@@ -49,18 +49,10 @@ def test_random_search_that_does_as_well_is_a_warning(attacked):
     assert warnings(checks) == ["random search does as well or better"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "warning"),
-    [
-        ({}, None),
-        ({"random_search": 0.0, "success": 0.0}, None),
-        ({"cost_fell": 0.9}, "the cost rose in some examples"),
-        ({"zero_gradient": 0.1}, "some first gradients are exactly zero"),
-    ],
-)
-def test_warnings_follow_from_the_numbers(changes, warning):
+def test_warnings_follow_from_the_numbers():
     good = {"cost_fell": 1.0, "zero_gradient": 0.0, "success": 0.8, "random_search": 0.5}
-    assert warnings(good | changes) == ([warning] if warning else [])
+    assert warnings(good) == warnings(good | {"random_search": 0.0, "success": 0.0}) == []
+    assert len(warnings(good | {"cost_fell": 0.9, "zero_gradient": 0.1})) == 2
 
 
 # ------------------------------------------------------------------------------------- success by radius
@@ -136,11 +128,8 @@ def test_another_network_gets_a_render_at_its_size_and_has_its_own_order_of_clas
     (row,) = augment.transfer(result, [other])
     assert row["predicted"] == [["sky"]] * 2 and all(row["clean_correct"] + row["success"])
     scene = result.problem.scene
-    finer = replace(
-        scene,
-        settings=replace(scene.settings, size=36),
-        backgrounds=scene.backgrounds[..., :1, :1].expand(-1, -1, 36, 36),
-    )
+    behind = scene.backgrounds[..., :1, :1].expand(-1, -1, 36, 36)
+    finer = replace(scene, settings=replace(scene.settings, size=36), backgrounds=behind)
     images = finer.render(result.conditions, torch.arange(2))
     assert row["confidence"] == confidence(other(images[:, 0])[:, None])
     with pytest.raises(InputError, match="'sky' is not a class of the model"):

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image, ImageDraw, ImageFont
 
 import augment
 from augment.attacks.adversary import MAP_HEIGHT
 from augment.attacks.attack import AttackResult
 from augment.attacks.evaluate import warnings
-from augment.attacks.files import LINES, SIDE, figure
+from augment.attacks.files import LINES, SIDE, _captions, figure
 from renderer.io.mitsuba import mitsuba_map
-from renderer.io.tiles import CAPTION_SIZE, FAINT, GAP, INK, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
+from renderer.io.tiles import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.light.environment import read_map, to_map
 from renderer.light.presets import load_light
 from renderer.mesh import load_mesh
@@ -90,15 +89,11 @@ def test_the_shape_is_read_back_where_the_attack_left_it(attacked, tmp_path):
 
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
-def test_the_meshs_file_has_the_normals_that_the_renderer_shades_with_and_the_view(attacked, tmp_path, normals):
+def test_the_meshs_file_has_the_normals_that_the_renderer_shades_with(attacked, tmp_path, normals):
     augment.save(attacked("geometry", {"normals": normals}, force=True, max_steps=1), tmp_path)
-    path = tmp_path / "example_000" / "mesh.glb"
-    (part,) = trimesh.load(path, process=False).geometry.values()
+    (part,) = trimesh.load(tmp_path / "example_000" / "mesh.glb", process=False).geometry.values()
     turns = np.linalg.norm(part.vertex_normals[part.faces] - part.face_normals[:, None], axis=2)
     assert (turns.max() < 1e-4) == (normals == "flat")
-    blob = path.read_bytes()
-    tree = json.loads(blob[20 : 20 + int.from_bytes(blob[12:16], "little")])
-    assert [node["name"] for node in tree["nodes"] if "camera" in node] == ["view 0"]
 
 
 # ------------------------------------------------------------------------------------- figure
@@ -159,24 +154,11 @@ def test_the_difference_is_gray_where_there_is_none_and_reaches_white_or_black(r
     expected[0, 0, 1, 2], expected[1, :, 3, 0], expected[:, 1, 0, 0] = 255, 64, 159
     sheet = drawn(replace(result, images_before=before, images=after))
     assert [column for image in expected for _, column in found(sheet, image / 255)] == [MARGIN + 2 * (SIDE + GAP)] * 2
-    for text, color in (("largest 0.200", INK), ("largest 0.100", INK), ("shown 5 times", FAINT)):
-        assert positions(sheet, written(text, color))
-
-
-def written(text: str, color: str) -> np.ndarray:
-    """The text as Pillow draws it on a sheet of its own, cropped to its ink."""
-    sheet = Image.new("RGB", (900, 40), "white")
-    ImageDraw.Draw(sheet).text((10, 10), text, color, ImageFont.load_default(CAPTION_SIZE))
-    pixels = np.asarray(sheet)
-    rows, columns = np.nonzero((pixels != 255).any(axis=2))
-    return pixels[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
 
 
 def test_captions_are_the_predicted_class_and_the_right_one_where_it_is_another(result):
     logits = torch.tensor([[[0.123, 0.0004, 0.8766, 1e-6], [0.85, 0.1, 0.05, 1e-6]]]).log()
-    below = drawn(replace(result, logits=logits))[MARGIN + TITLE_HEIGHT + SIDE :]
-    for text, color in (("87.7% sky", INK), ("12.3% orange", FAINT), ("85.0% orange", INK)):
-        assert positions(below, written(text, color))
+    assert _captions(result, logits, 0) == [("87.7% sky", "12.3% orange"), ("85.0% orange",)]
 
 
 def test_the_light_is_shown_where_the_attack_has_changed_it(attacked, result):

@@ -69,9 +69,8 @@ def test_the_same_seed_gives_the_same_result(attacked, parameter):
 
 @pytest.mark.parametrize("bounces", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_final_images_have_the_shadows_of_the_final_shape_and_colors(by_color, tmp_path, bounces):
-    scene = augment.build_scene(
-        [("solid:cup:3", "orange")], 8, **SHARED, shadows=True, bounces=bounces, rasterizer="numpy", width=2.4
-    )
+    choices = {**SHARED, "shadows": True, "bounces": bounces, "rasterizer": "numpy", "width": 2.4}
+    scene = augment.build_scene([("solid:cup:3", "orange")], 8, **choices)
     steps = {name: augment.StepSettings("linf", 0.05, "sign", 0.03) for name in ("geometry", "albedo")}
     result = augment.attack(by_color, scene, settings=augment.AttackSettings(**steps, max_steps=2), force=True)
     with_initial_shadows = result.problem.images(result.descent.values)

@@ -1,6 +1,7 @@
 """Where a classifier is wrong about a mesh, a scene is found in which it is right."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -35,10 +36,8 @@ def built(settings: SceneSettings, shared: bool = False) -> augment.Scene:
 
 def found(score, cameras: int = 40, shared: bool = False, **scene) -> tuple[SceneSettings, SceneSettings]:
     """The settings, and those that the search finds in their place."""
-    settings = SceneSettings(**scene)
-    return settings, find_scene(
-        classifier_of(score), settings, ATTACK, lambda changed: built(changed, shared), cameras, generator(0)
-    )
+    settings, build = SceneSettings(**scene), partial(built, shared=shared)
+    return settings, find_scene(classifier_of(score), settings, ATTACK, build, cameras, generator(0))
 
 
 def test_a_scene_that_is_classified_correctly_stays_as_it_is():
@@ -53,9 +52,8 @@ def test_a_camera_and_a_light_are_found_in_which_all_views_are_classified_correc
     settings, chosen = found(bright_and_small, shared=shared, **scene)
     assert chosen != settings and chosen == found(bright_and_small, shared=shared, **scene)[1]
     assert replace(chosen, **{name: getattr(settings, name) for name in CHANGED}) == settings
-    result = augment.attack(
-        classifier_of(bright_and_small), built(chosen, shared), settings=replace(ATTACK, max_steps=0)
-    )
+    before = replace(ATTACK, max_steps=0)
+    result = augment.attack(classifier_of(bright_and_small), built(chosen, shared), settings=before)
     assert result.clean_correct.all()
 
 
