@@ -6,9 +6,9 @@ from pathlib import Path
 
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
+from torch.distributed import DistError
 
 from renderer.errors import InputError, is_out_of_memory
-from train.processes import is_process_lost
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LONGEST_NAME = 200  # characters
@@ -29,7 +29,7 @@ def one_sentence(error: BaseException) -> str | None:
             return f"{error.filename or 'the output'} cannot be written ({error.strerror}): make room and start again"
         case OSError() if error.filename is not None:
             return f"{error.filename} cannot be read or written: {error.strerror}"
-        case RuntimeError() if is_process_lost(error):
+        case RuntimeError() if isinstance(error, DistError) or "/gloo/" in str(error):  # NCCL's, gloo's, by its file
             return "another process of this run has ended: fix what ended it, and go on with train.resume=true"
         case RuntimeError() | MemoryError() if is_out_of_memory(error):
             return "memory ran out: ask for fewer or smaller images, views or meshes, or for a smaller batch_size"

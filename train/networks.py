@@ -29,6 +29,7 @@ DROPOUT_LEVELS = 2**16
 Color = Sequence[float]  # (3,) RGB
 MEAN, STD = (0.5, 0.5, 0.5), (0.25, 0.25, 0.25)  # where those of the data are not given
 PUBLISHED = "model.safetensors"
+FACTS = ("version", "encoding", "validation")  # stored with a network, which is not built from them
 SHAPE = ("classes", "size", "name", "depth", "width")  # what a network has in common with one that it starts from
 _WITHOUT_AUXILIARY = {"aux_logits": False, "init_weights": True}
 _OPTIONS = {"googlenet": _WITHOUT_AUXILIARY, "inception_v3": _WITHOUT_AUXILIARY}
@@ -206,9 +207,7 @@ def load_run(run: str | Path, weights: str | Path | None = None, model: str | No
     if weights is not None:
         raise InputError(f"weights={weights} is not for classifier=run:{run}, which has its own: leave it out")
     path, state = load_selected(Path(run))
-    shape = {
-        key: value for key, value in state["architecture"].items() if key not in ("version", "encoding", "validation")
-    }
+    shape = {key: value for key, value in state["architecture"].items() if key not in FACTS}
     name = str(shape.get("name", WIDERESNET))
     if name.startswith(PYTHON) and name != model:
         raise InputError(

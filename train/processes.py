@@ -34,11 +34,6 @@ def process_group() -> Iterator[None]:
         dist.destroy_process_group()
 
 
-def is_process_lost(error: Exception) -> bool:
-    """Whether another process, which this one waited for, has ended: NCCL's error, or gloo's, known by its file."""
-    return isinstance(error, dist.DistError) or "/gloo/" in str(error)
-
-
 @contextmanager
 def first_process_first() -> Iterator[None]:
     """Let the first process do alone what the others then find done, such as a download."""

@@ -171,10 +171,9 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
     phases, process = Phases(device), (utils.rank(), utils.world_size())
     if settings.augment.renders:
         label, objects = class_index(data.classes, settings.label, "label"), settings.objects
-        numbers = {OTHER: complementary_label(label)}
-        for key, item in objects.items():
-            if item.label != OTHER:
-                numbers[item.label] = class_index(data.classes, item.label, f"label of {key}")
+        named = {item.label: key for key, item in objects.items() if item.label != OTHER}
+        numbers = {name: class_index(data.classes, name, f"label of {key}") for name, key in named.items()}
+        numbers[OTHER] = complementary_label(label)
         rasterizer = chosen_rasterizer(settings.renderer)
         console.info("rasterizer: %s", rasterizer.description)
         options: dict[str, Any] = {"scene": settings.scene, "renderer": settings.renderer, "rasterizer": rasterizer}

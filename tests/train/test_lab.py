@@ -48,6 +48,7 @@ def laboratory(tmp_path_factory) -> Path:
 
 
 def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_the_source_and_its_settings(laboratory):
+    """Each setup shows one object of the label and one other under the same light."""
     photographs = find_photographs(laboratory, sorted(SOLIDS), "orange")
     assert Counter((item.label, item.source) for item in photographs) == {
         (label, pattern): count
@@ -58,14 +59,11 @@ def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_the_source_
     assert len(images.unique(dim=0)) == 8
     described = json.loads((laboratory / "lab.json").read_text())
     assert described["meshes"] == MESHES and described["setups"] == 4 and described["seed"] == 0
-
-
-def test_a_setup_shows_one_object_of_the_label_and_one_other_under_the_same_light(laboratory):
     pairs = [{"solid:orange:7", "solid:lemon:7"}, {"solid:orange:8", "solid:pear:7"}] * 2
     for setup, (pair, source) in enumerate(zip(pairs, ["stripes"] * 2 + ["half"] * 2, strict=True)):
-        photographs = [row for row in rows(laboratory) if int(row["setup"]) == setup]
-        assert len(photographs) == 2 and {row["mesh"] for row in photographs} == pair
-        (light,) = {(row["source_tag"], row["brightness"]) for row in photographs}
+        shown = [row for row in rows(laboratory) if int(row["setup"]) == setup]
+        assert len(shown) == 2 and {row["mesh"] for row in shown} == pair
+        (light,) = {(row["source_tag"], row["brightness"]) for row in shown}
         assert light[0] == source and 0.2 <= float(light[1]) <= 2.5
 
 
@@ -140,19 +138,12 @@ def test_a_pattern_mixes_two_colors_one_of_which_is_darkness_in_some_families(fa
         assert (colors.min(axis=0).max() == 0) == (family not in (*lab.TWO_COLORED, "solid"))
 
 
-@pytest.fixture(scope="module")
-def shots() -> list[Shot]:
-    return list(draw_shots(120, list(FAMILIES), (0.2, 2.5), seed=3, environments={}))
-
-
-def test_every_family_has_as_many_setups_evenly_from_dim_to_bright(shots):
+def test_every_family_has_as_many_setups_from_dim_to_bright_that_differ_and_stay_within_their_ranges():
+    shots = list(draw_shots(120, list(FAMILIES), (0.2, 2.5), seed=3, environments={}))
     assert [shot.family for shot in shots] == [name for name in FAMILIES for _ in range(20)]
     edges = np.geomspace(0.2, 2.5, 21)
     brightness = np.array([shot.brightness for shot in shots]).reshape(-1, 20)
     assert (edges[:-1] <= brightness).all() and (brightness <= edges[1:]).all()
-
-
-def test_shots_differ_and_stay_within_their_ranges(shots):
     other = draw_shots(6, list(FAMILIES), (0.2, 2.5), 4, {})
     assert len({tuple(shot.camera) for shot in [*shots, *other]}) == 126
     for shot in shots:
