@@ -31,7 +31,7 @@ from train.errors import writable_folder
 from train.networks import load_classifier
 from train.run_folder import sole_writer, write_config
 from train.settings import LARGEST_SEED, chosen_rasterizer, keyed, program, read_object
-from train.tables import aligned, format_fraction, fraction
+from train.tables import Table, format_fraction, fraction
 
 TRANSFERS, TABLE, FIGURE = "transfer.jsonl", "sweep.csv", "sweep.png"
 METHODS = {"adversarial": "adversarial", "random": "random search, as many renders"}
@@ -259,7 +259,15 @@ def format_attack(
             *(f"warning: {warning}" for warning in warnings(checks)),
         ]
     adversaries = [line["versions"] for line in lines if line["success"] and line["clean_correct"]]
-    return "\n".join(text + [_survival(version, adversaries) for version in (adversaries or [{}])[0]])
+    for version in adversaries[0] if adversaries else ():
+        numbers = [versions[version] for versions in adversaries]
+        largest = 255 * max(line["largest_difference"] for line in numbers)
+        mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
+        text.append(
+            f"{version}: {sum(line['success'] for line in numbers)} of {len(numbers)} still succeed; "
+            f"values differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
+        )
+    return "\n".join(text)
 
 
 def _success(result: AttackResult) -> str:
@@ -272,17 +280,6 @@ def _success(result: AttackResult) -> str:
     text = f"success on {format_fraction(rate)} examples"
     text += f", {int(views.sum())} of {views.numel()} views" if views.shape[1] > 1 else ""
     return text + (f"; {wrong} wrong before, which do not count" if wrong else "")
-
-
-def _survival(version: str, adversaries: Sequence[Mapping[str, Any]]) -> str:
-    """How many of the adversaries succeed in another version, and how far its values are from theirs, of 255."""
-    numbers = [versions[version] for versions in adversaries]
-    largest = 255 * max(line["largest_difference"] for line in numbers)
-    mean = 255 * sum(line["mean_difference"] for line in numbers) / len(numbers)
-    return (
-        f"{version}: {sum(line['success'] for line in numbers)} of {len(numbers)} still succeed; "
-        f"values differ by {mean:.3g}/255 on average, {largest:.3g}/255 at most"
-    )
 
 
 def format_reloaded(adversary: Adversary, images: Tensor, logits: Tensor, classes: Sequence[str]) -> str:
@@ -309,7 +306,7 @@ def write_transfers(transfers: Sequence[dict[str, Any]], path: Path) -> str:
         lines.append(json.dumps({kind: found[kind], **rate, **found}) + "\n")
         rows.append([f"{kind} {found[kind]}", f"{rate['n']} of {len(clean)}", format_fraction(rate)])
     path.write_text("".join(lines), encoding="utf-8")
-    return aligned(["adversaries shown to", "correct before", "success"], rows)
+    return str(Table("", ["adversaries shown to", "correct before", "success"], rows))
 
 
 def format_sweep(sweep: Sequence[Mapping[str, Any]]) -> str:
@@ -318,7 +315,7 @@ def format_sweep(sweep: Sequence[Mapping[str, Any]]) -> str:
     for row in sweep:
         radii = " + ".join(f"{name} {radius:g}" for name, radius in row["radii"].items())
         rows.append([radii, *(format_fraction(_rate(row[method])) for method in METHODS)])
-    return aligned(["radius", *METHODS.values()], rows)
+    return str(Table("", ["radius", *METHODS.values()], rows))
 
 
 def _rate(success: Tensor) -> dict[str, Any]:

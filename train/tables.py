@@ -1,6 +1,6 @@
 """Fractions with their intervals, and tables, as text for people."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from typing import Any
@@ -10,24 +10,19 @@ NORMAL_95 = 1.959963984540054  # standard deviations on either side of the mean:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a title, which may be empty. As text: aligned Markdown below the title."""
+    """A table with a title, which may be empty. As text: Markdown below the title, aligned on a console, too."""
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[object]]
 
     def __str__(self) -> str:
-        table = aligned(self.header, self.rows)
+        lines = [[as_text(cell) for cell in line] for line in (self.header, *self.rows)]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        lines.insert(1, ["-" * width for width in widths])
+        padded = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
+        table = "\n".join(f"| {' | '.join(cells)} |" for cells in padded)
         return f"{self.title}:\n\n{table}" if self.title else table
-
-
-def aligned(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A Markdown table whose columns are aligned on a console, too."""
-    lines = [[as_text(cell) for cell in line] for line in (header, *rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    lines.insert(1, ["-" * width for width in widths])
-    padded = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in padded)
 
 
 def as_text(value: object) -> str:

@@ -163,7 +163,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.figure is not None and settings["study"] != "norm_balls":
         options.error(f"--figure draws norm_balls, and {args.records} holds {settings['study']}")
     header, *cells = TABLES[settings["study"]](rows)
-    print(tables.aligned(header, cells))
+    print(tables.Table("", header, cells))
     if args.figure is not None:
         draw_norm_balls(rows, args.figure)
 

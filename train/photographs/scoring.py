@@ -13,7 +13,7 @@ from train.photographs.folder import find_photographs, left_out, load_photograph
 from train.photographs.metrics import OVERALL, RANKED, find_metric, metric_title, pool_by_source
 from train.photographs.predictions import PREDICTIONS, Model, Prediction, compute_logits, predict, write_predictions
 from train.photographs.sheet import contact_sheet, write_roc
-from train.tables import aligned, format_fraction, format_interval, fraction
+from train.tables import Table, format_fraction, format_interval, fraction
 
 SUMMARY = "summary.json"
 WRONG_CLASSES = 5  # the most common ones, which are named
@@ -121,14 +121,14 @@ def format_summary(summary: dict[str, Any]) -> str:
     for name, metrics in summary["by_class"].items():
         wrong = ", ".join(f"{other} {count}" for other, count in metrics["most_common_wrong"].items())
         by_class.append([name, *(format_fraction(metrics[key]) for key in BY_CLASS), wrong])
-    paragraphs = [
+    paragraphs: list[object] = [
         f"{n['positives']} images of {label}, {n['negatives']} of other things",
-        aligned(["", "recall", "top-5", "FPR"], counts),
-        aligned(["", *map(metric_title, RANKED)], ranked),
-        aligned(["class", "recall", "top-5", f"predicted {label}", "most common wrong classes"], by_class),
+        Table("", ["", "recall", "top-5", "FPR"], counts),
+        Table("", ["", *map(metric_title, RANKED)], ranked),
+        Table("", ["class", "recall", "top-5", f"predicted {label}", "most common wrong classes"], by_class),
     ]
     if summary["unreadable"]:
         paragraphs.append(f"{n['unreadable']} unreadable: {', '.join(summary['unreadable'])}")
     if files:
         paragraphs.append(f"{len(files)} left out, of kinds that are not read, like {files[0]}")
-    return "\n\n".join(paragraphs)
+    return "\n\n".join(map(str, paragraphs))
