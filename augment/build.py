@@ -17,13 +17,11 @@ from renderer.camera import MOST_VIEWS, orbit_cameras
 from renderer.errors import FACTOR, InputError, as_device, require_choice, require_range
 from renderer.image import ImageSettings
 from renderer.io.images import read_image
-from renderer.io.lights import read_light
 from renderer.light.basis import with_local_lights
 from renderer.light.local import Lamps, Projector
-from renderer.light.presets import load_light
-from renderer.mesh import Mesh, normalize
+from renderer.light.presets import load_light, read_light
+from renderer.mesh import MOST_VERTICES, Mesh, normalize, subdivide
 from renderer.rasterizer import NAMES, choose
-from renderer.subdivision import MOST_VERTICES, subdivide
 
 
 @dataclass

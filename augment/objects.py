@@ -10,9 +10,8 @@ from functools import cached_property
 import numpy as np
 
 from renderer.errors import FACTOR, InputError, require_range
-from renderer.mesh import Mesh, concatenate, load_mesh, normalize
+from renderer.mesh import Mesh, concatenate, load_mesh, normalize, subdivide
 from renderer.shapes import solid
-from renderer.subdivision import subdivide
 
 TABLE = 1.2  # half a table's width: its corners are within the depth that cameras see
 FARTHEST = 10.0  # position and size of props, in world units

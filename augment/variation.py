@@ -17,9 +17,8 @@ from renderer.camera import Camera
 from renderer.errors import FACTOR, InputError, require_limits, require_range
 from renderer.image import ImageSettings, clamp, decode, encode
 from renderer.io.images import SUFFIXES, read_image
-from renderer.light.harmonics import irradiance_basis, nonzero_coefficients
+from renderer.light.basis import HARMONICS
 from renderer.light.presets import directional, load_light
-from renderer.transfer import DEGREE
 
 UNCHANGED = (1.0, 1.0)
 DIRECTIONAL_ANGLE = math.radians(70)  # between camera and directional light, around the mesh and up or down, at most
@@ -189,8 +188,8 @@ def _with_lit_walls(scene: Scene) -> Scene:
     """Each row before its own background, times the irradiance of a surface that faces the row's first camera."""
     towards = torch.from_numpy(np.stack([row.cameras[0].axes()[2] for row in scene.examples]))
     exposures = torch.tensor([row.exposure for row in scene.examples])[:, None]
-    coefficients = scene.lights.cpu().double()[:, nonzero_coefficients(DEGREE)]
-    irradiance = torch.einsum("ek,ekc->ec", irradiance_basis(towards, DEGREE), coefficients) * exposures
+    coefficients = scene.lights.cpu().double()[:, HARMONICS.nonzero]
+    irradiance = torch.einsum("ek,ekc->ec", HARMONICS.irradiance(towards), coefficients) * exposures
     images = scene.backgrounds[[row.background for row in scene.examples]]
     encoding = scene.settings.encoding
     lit = encode(clamp(decode(images, encoding) * irradiance.to(images)[:, :, None, None]), encoding)

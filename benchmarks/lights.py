@@ -36,10 +36,9 @@ from renderer.light.basis import HARMONICS, Basis, SumBasis
 from renderer.light.environment import write_map
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light
-from renderer.mesh import Mesh, concatenate, normalize
+from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.rasterizer import choose
 from renderer.shapes import solid
-from renderer.subdivision import subdivide
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport import precomputed, rays
 

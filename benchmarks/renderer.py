@@ -80,7 +80,7 @@ def vertex_step(
 
 def shade_by_face(fragments: Fragments, vertices: Tensor, light: Tensor, albedo: Tensor) -> Tensor:
     """`shading.radiance` by plain autograd at its cheapest: each face is shaded once, not each sample."""
-    normals = reference.unit(reference.doubled_area_vectors(vertices[fragments.corners]))
+    normals = reference.face_normals(vertices[fragments.corners])
     irradiance = reference.irradiance(normals * fragments.facing.to(vertices), light)
     shade = irradiance[fragments.face] * albedo / fragments.samples**2
     return shade.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel, shade).T

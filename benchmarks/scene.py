@@ -113,7 +113,7 @@ class Converged:
         visible, index = face.unique(return_inverse=True)
         vertices = view.vertices(torch.float64).cpu().requires_grad_()
         light = torch.zeros(21**2, 3, dtype=torch.float64, requires_grad=True)
-        normals = reference.unit(reference.doubled_area_vectors(vertices[torch.from_numpy(view.mesh.faces)[visible]]))
+        normals = reference.face_normals(vertices[torch.from_numpy(view.mesh.faces)[visible]])
 
         def image(at_faces: Tensor) -> Tensor:
             shade = (at_faces * torch.tensor(ALBEDO, dtype=torch.float64))[index] * weight[:, None]

@@ -43,11 +43,7 @@ class ImageSettings:
     def __post_init__(self) -> None:
         require_range("size", self.size, 1, MOST_SAMPLES)
         require_range("samples", self.samples, 1, FINEST)
-        if self.size * self.samples > MOST_SAMPLES:
-            raise InputError(
-                f"samples={self.samples} for each of {self.size} pixels in a row are more than "
-                f"{MOST_SAMPLES}: choose fewer"
-            )
+        require_range("size × samples", self.size * self.samples, 1, MOST_SAMPLES)
         require_choice("encoding", self.encoding, ENCODINGS)
         require_choice("normals", self.normals, NORMALS)
         require_range("bounces", self.bounces, 0, MOST_BOUNCES)

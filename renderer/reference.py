@@ -47,12 +47,8 @@ def clamped_cosine(l: int) -> float:
     return sign * 2 * math.pi * math.comb(l, l // 2) / ((l + 2) * (l - 1) * 2**l)
 
 
-def doubled_area_vectors(corners: Tensor) -> Tensor:
-    """(F, 3) from corners (F, 3 corners, 3): normal to each face, outward for counter-clockwise ones."""
+def face_normals(corners: Tensor) -> Tensor:
+    """(F, 3) unit normals from corners (F, 3 corners, 3), outward for counter-clockwise faces; NaN without area."""
     first, second, third = corners.unbind(1)
-    return torch.linalg.cross(second - first, third - first)
-
-
-def unit(vectors: Tensor) -> Tensor:
-    """Vectors (..., 3) over their lengths; NaN for zero ones."""
-    return vectors / vectors.norm(dim=-1, keepdim=True)
+    doubled_areas = torch.linalg.cross(second - first, third - first)
+    return doubled_areas / doubled_areas.norm(dim=-1, keepdim=True)

@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from renderer.errors import require_bounded, require_finite
+from renderer.errors import require_bounded
 from renderer.fragments import Fragments
 from renderer.light.harmonics import (
     bands,
@@ -64,31 +64,27 @@ def radiance(
     if smooth_faces is None:
         pixel, face, weights = fragments.merge(albedo)
         normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
-        shade = _irradiance(normals, light, wide).index_select(1, face)
+        shade = irradiance(normals, light, wide).index_select(1, face)
     else:
         pixel, weights = fragments.pixel, albedo / fragments.samples**2
         normals = smooth_normals(fragments, vertices.to(wide), smooth_faces)
-        shade = _irradiance(normals.T, light, wide)
+        shade = irradiance(normals.T, light, wide)
     seen = shade * weights.T
     if fragments.samples > 1:  # a sample is a pixel otherwise
         seen = seen.new_zeros(3, len(fragments.pixels)).index_add(1, pixel, seen)
     return seen.to(vertices.dtype)
 
 
-def irradiance(normals: Float[Tensor, "N 3"], light: Float[Tensor, "coefficients 3"]) -> Float[Tensor, "3 N"]:
-    """Irradiance on surfaces with normals of any length under a light of (degree + 1)² coefficients.
+def irradiance(
+    normals: Float[Tensor, "3 N"], light: Float[Tensor, "coefficients 3"], dtype: torch.dtype
+) -> Float[Tensor, "3 N"]:
+    """Irradiance on surfaces with finite normals of any length under a light of (degree + 1)² coefficients.
 
-    Differentiable in both, in the dtype of `normals`; half precision is computed in float32. The gradient by bands that
-    cannot reach a diffuse surface is exactly zero. InputError: NaN, or a light of another shape.
+    Differentiable in both. Normals become unit vectors in their own dtype, the rest is computed in `dtype`, not half
+    precision. The gradient by bands that cannot reach a diffuse surface is exactly zero.
+    InputError: NaN in the light, or a light of another shape.
     Source: the paper's equation for R in appendix B.2; its derivative by n in appendix D, here a polynomial too.
     """
-    require_finite(normals=normals)
-    wide = torch.promote_types(normals.dtype, torch.float32)
-    return _irradiance(normals.T.to(wide), light, wide).to(normals.dtype)
-
-
-def _irradiance(normals: Tensor, light: Tensor, dtype: torch.dtype) -> Tensor:
-    """`irradiance` of finite normals (3, N), which become unit vectors in their own dtype, computed in another."""
     require_bounded(light=light)
     degree_of(light)
     return _Irradiance.apply(normals, light.to(dtype))

@@ -20,13 +20,12 @@ from renderer.errors import FACTOR, InputError, in_one_line, require_bounded, re
 from renderer.image import ImageSettings, to_bytes
 from renderer.io.export import export_mesh
 from renderer.io.images import read_numbers
-from renderer.io.lights import read_light, save_light
 from renderer.io.mitsuba import mitsuba_map, write_mitsuba_scene
 from renderer.io.texture_bake import with_added_albedo
 from renderer.light.basis import Basis, parts_of, with_local_lights
 from renderer.light.environment import negative_fraction, to_map, write_map
 from renderer.light.local import Lamps, Projector
-from renderer.light.presets import load_light
+from renderer.light.presets import load_light, read_light, save_light
 from renderer.mesh import load_mesh
 from renderer.rasterizer import Rasterizer, choose
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from renderer.errors import FACTOR, LARGEST, InputError, require_choice, require_range
-from renderer.light.convex import Ball, nearest_in_box
+from renderer.light.basis import Ball, nearest_in_box
 
 NORMS = ("linf", "l2")
 STEPS = ("unit", "raw", "sign")

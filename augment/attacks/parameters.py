@@ -13,8 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 from augment.attacks.norm_ball import Domain, StepSettings, anywhere
 from augment.scene import Conditions, Scene
 from renderer.errors import InputError
-from renderer.light.basis import parts_of
-from renderer.light.convex import Ball, nearest_in_box
+from renderer.light.basis import Ball, nearest_in_box, parts_of
 from renderer.light.local import Lamps
 from renderer.light.presets import mean_luminance
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients

@@ -1,1 +1,1 @@
-"""Meshes, images, lights and whole scenes as files, in and out."""
+"""Meshes, images and whole scenes as files, in and out."""

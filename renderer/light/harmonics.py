@@ -209,12 +209,6 @@ def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
     return torch.nonzero(lambertian_factors(degree)).squeeze(1)
 
 
-def irradiance_basis(normals: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch K"]:
-    """A_l Y_lm(n) of the K nonzero coefficients: irradiance at unit normals per unit coefficient."""
-    nonzero = nonzero_coefficients(degree)
-    return basis(normals, degree)[..., nonzero.to(normals.device)] * lambertian_factors(degree)[nonzero].to(normals)
-
-
 def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:
     """Directions and weights that integrate polynomials of this degree exactly over the sphere.
 

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from torch import Tensor
 
-from renderer.light.convex import Ball
+from renderer.light.basis import Ball
 from renderer.light.harmonics import bands, gradient_matrices, monomial_coefficients, per_degree
 from renderer.normals import tangent_axes
 

@@ -28,8 +28,7 @@ from renderer.errors import InputError
 from renderer.fragments import Fragments
 from renderer.image import ImageSettings
 from renderer.light.basis import Basis, Harmonics, LocalBasis, parts_of
-from renderer.mesh import Mesh
-from renderer.subdivision import refine
+from renderer.mesh import Mesh, refine
 from renderer.transport import rays
 from renderer.transport.rays import RayHits, Rays, Surface, sphere
 

@@ -49,13 +49,12 @@ FINITE = [  # the tensor's name, a good one, who takes it: positions and directi
     ("vertices", torch.ones(4, 3), lambda x: build_fragments(x.numpy(), MESH.faces, [CAMERA], SETTINGS, RASTERIZER)),
     ("vertices", GOOD["vertices"], lambda x: lit(None, "vertices", x)),
     ("vertices", GOOD["vertices"], lambda x: lit(FACES, "vertices", x)),
-    ("normals", torch.ones(2, 3), lambda x: irradiance(x, torch.ones(9, 3))),
 ]  # fmt: skip
 BOUNDED = [  # what is multiplied with each other
     ("texture", torch.ones(2, 2, 3), lambda x: surface_albedo(MESH, FRAGMENTS, "linear", [torch.ones(3, 3, 3), x])),
     ("albedo", torch.ones(2, 3), lambda x: face_albedo(x, FRAGMENTS)),
     ("corner_colors", torch.ones(2, 3, 3), lambda x: surface_albedo(painted(x), FRAGMENTS, "srgb")),
-    ("light", torch.ones(9, 3), lambda x: irradiance(torch.ones(2, 3), x)),
+    ("light", torch.ones(9, 3), lambda x: irradiance(torch.ones(3, 2), x, x.dtype)),
     ("light", GOOD["light"], lambda x: lit(None, "light", x)),
     ("albedo", GOOD["albedo"], lambda x: lit(None, "albedo", x)),
     ("albedo", GOOD["albedo"], lambda x: lit(FACES, "albedo", x)),

@@ -7,9 +7,8 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 
-from renderer.mesh import Mesh, concatenate
+from renderer.mesh import Mesh, concatenate, refine, subdivide
 from renderer.shapes import solid
-from renderer.subdivision import refine, subdivide
 
 EPS, EPS32 = np.finfo(np.float64).eps, np.finfo(np.float32).eps
 

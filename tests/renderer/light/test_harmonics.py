@@ -53,10 +53,10 @@ def test_bands_3_and_5_reach_no_diffuse_surface():
 def test_constants_first_computed_in_inference_mode_serve_training_later():
     """They are cached, and autograd refuses to save tensors made in that mode."""
     with torch.inference_mode():
-        irradiance(draw(2, 3), draw(64, 3))
+        irradiance(draw(3, 2), draw(64, 3), torch.float64)
         basis(draw(2, 3), 7)
-    inputs = [draw(2, 3).requires_grad_(), draw(64, 3).requires_grad_()]
-    (irradiance(*inputs).sum() + basis(inputs[0], 7).sum()).backward()
+    inputs = [draw(3, 2).requires_grad_(), draw(64, 3).requires_grad_()]
+    (irradiance(*inputs, torch.float64).sum() + basis(inputs[0].T, 7).sum()).backward()
     assert all(tensor.grad.isfinite().all() for tensor in inputs)
 
 

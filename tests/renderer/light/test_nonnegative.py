@@ -5,7 +5,7 @@ import trimesh
 from scipy import optimize
 from torch import Tensor
 
-from renderer.light.convex import Ball
+from renderer.light.basis import Ball
 from renderer.light.harmonics import basis, project
 from renderer.light.nonnegative import TOLERANCE, project_nonnegative
 from renderer.light.presets import ambient, load_light

@@ -6,8 +6,9 @@ import torch
 from oracles import random_directions
 
 from renderer.errors import InputError
+from renderer.light.basis import HARMONICS
 from renderer.light.environment import write_map
-from renderer.light.harmonics import basis, irradiance_basis, nonzero_coefficients
+from renderer.light.harmonics import basis, nonzero_coefficients
 from renderer.light.presets import PROBES, ambient, directional, load_light, perturb, probe
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
@@ -34,7 +35,7 @@ MORE_DIGITS = {
 
 
 def irradiance(light: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
-    return irradiance_basis(normals, 6) @ light.double()[nonzero_coefficients(6)]
+    return HARMONICS.irradiance(normals) @ light.double()[nonzero_coefficients(6)]
 
 
 @pytest.mark.parametrize("name", PROBES)
