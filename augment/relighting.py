@@ -121,7 +121,7 @@ class OperatorStack:
         first, count = self._first[shown], self._first[shown + 1] - self._first[shown]
         image = torch.arange(len(shown), device=shown.device).repeat_interleave(count)
         entry = torch.arange(len(image), device=shown.device) + (first - count.cumsum(0) + count)[image]
-        return sparse.taken(entry), image
+        return SparseTransfer(*(field[entry] for field in sparse)), image
 
 
 STACKED = 2**16  # pixels of the images in one stack; larger stacks are no faster

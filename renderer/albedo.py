@@ -88,9 +88,8 @@ def painted_albedo(mesh: Mesh, fragments: Fragments, encoding: str, albedo_scale
     texture_ids = torch.from_numpy(mesh.texture_ids.take(faces)).to(fragments.face.device)[fragments.face]
     for index, texture in enumerate(mesh_textures(mesh, encoding, added)):
         here = torch.nonzero(texture_ids == index).squeeze(1)
-        texels = [
-            (weight.to(added), colors[here] * texture.texels(at).T) for weight, at in _taps(texture, uvs[:, here])
-        ]
+        taps = _taps(texture, uvs[:, here])
+        texels = [(weight.to(added), colors[here] * texture.texels(at).T) for weight, at in taps]
         value = reduce(torch.add, (weight[:, None] * _within(texel + offset[here], texel) for weight, texel in texels))
         albedo = albedo.index_copy(0, here, value)
     return albedo
@@ -102,12 +101,9 @@ def _within(changed: Tensor, albedo: Tensor) -> Tensor:
 
 def _colors(mesh: Mesh, faces: np.ndarray, fragments: Fragments, encoding: str) -> Tensor:
     """(S, 3) the corners' colors, as authored for display, as linear albedo, float64 on the fragments' device."""
-    colors = mesh.corner_colors[:1] if mesh.one_color else mesh.corner_colors.take(faces, axis=0)
-    corner_colors = torch.from_numpy(colors).to(fragments.coverage)
+    corner_colors = torch.from_numpy(mesh.corner_colors.take(faces, axis=0)).to(fragments.coverage)
     require_bounded(corner_colors=corner_colors)
     corner_colors = decode(corner_colors, encoding)
-    if mesh.one_color:
-        return corner_colors[0, 0][:, None].expand(3, len(fragments.face)).T
     if mesh.one_color_per_face:
         return _of_faces(corner_colors[:, 0], fragments)
     return fragments.interpolate(corner_colors)

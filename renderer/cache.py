@@ -30,10 +30,8 @@ from renderer.transport.local import SparseTransfer
 
 
 def cache_folder(choice: str | None) -> Path | None:
-    """The folder that `renderer.cache` chooses: "auto" is the user's (XDG_CACHE_HOME or ~/.cache), None is no cache.
-
-    None as well where "auto" finds no home.
-    """
+    """The folder that `renderer.cache` chooses: "auto" is the user's (XDG_CACHE_HOME or ~/.cache), or None without a
+    home; None is no cache."""
     if choice != "auto":
         return Path(os.path.expanduser(choice)) if choice else None
     caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")

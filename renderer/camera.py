@@ -77,10 +77,10 @@ class Camera(ABC):
         stay planes in it.
         """
 
-    @abstractmethod
     def depths(self, points: np.ndarray) -> np.ndarray | None:
         """(V,) along the view from the camera to world points (V, 3), by which an image with perspective is divided;
         None of one without."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,6 @@ class OrthographicCamera(Camera):
     def project(self, points: np.ndarray) -> np.ndarray:
         scale = np.array([2 / self.width, 2 / self.width, -1 / self.reach])
         return points @ (self.axes() * scale[:, None]).T + np.array([self.right, self.up, 0.0]) * scale
-
-    def depths(self, points: np.ndarray) -> None:
-        return None
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ BLOCK = 2**14  # samples at a time
 
 @dataclass(frozen=True)
 class Fragments:
-    """S covered samples of an image of size² pixels and samples² samples each; they see G faces in P pixels.
+    """S covered samples of an image of size² pixels; they see G faces in P pixels. samples: per side of a pixel.
 
     pixels: (P,) int64, row-major indices of the covered pixels, ascending; row 0 is the top of the image.
     coverage: (P,) float64 in (0, 1], the fraction of a pixel's samples that the mesh covers.
@@ -167,13 +167,9 @@ def _fragments(
     by_pixel = within.swapaxes(1, 2).reshape(-1).view(ids.dtype)
     hits = np.flatnonzero(by_pixel >= 0)
     visible, face = _compact(by_pixel[hits], len(faces))
-    if samples == 1:  # a sample is a pixel
-        pixels, pixel, counts = hits, np.arange(len(hits)), np.ones(len(hits), dtype=np.int64)
-    else:
-        counts = np.bincount(hits // samples**2, minlength=size**2)
-        pixels = np.flatnonzero(counts > 0)
-        counts = counts[pixels]
-        pixel = np.repeat(np.arange(len(pixels)), counts)
+    counts = np.bincount(hits // samples**2, minlength=size**2)
+    pixels = np.flatnonzero(counts > 0)
+    counts = counts[pixels]
     corners = np.ascontiguousarray(faces.take(visible, axis=0).T)
     outlines = projected[:, :2].T.take(corners, axis=1)
     (ax, bx, cx), (ay, by, cy) = outlines
@@ -187,7 +183,7 @@ def _fragments(
         corners=torch.from_numpy(corners).T,  # with all first corners side by side in memory, as they are read
         facing=torch.from_numpy(np.where(behind, -1.0, 1.0))[:, None],
         outlines=torch.from_numpy(outlines.T),
-        pixel=torch.from_numpy(pixel),
+        pixel=torch.from_numpy(np.repeat(np.arange(len(pixels)), counts)),
         face=torch.from_numpy(face),
         sample=torch.from_numpy(hits),
         depths=None if depths is None else torch.from_numpy(depths.take(corners)).T,

@@ -24,7 +24,7 @@ FINEST = 64  # samples per pixel side: coverage is resolved to 1/4096
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """Image size in pixels, samples per pixel side, encoding, a normal per face or interpolated vertex normals.
+    """Image size in pixels, samples per side of a pixel, encoding, a normal per face or interpolated vertex normals.
 
     shadows: of the mesh on itself. bounces: how often light goes on from one surface to another, which includes
     shadows. InputError: a number out of range, an unknown choice.
@@ -91,14 +91,12 @@ def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor
     values = torch.as_tensor(background).to(like)
     if values.ndim < 2:
         values = values.view(-1, 1, 1).expand(-1, size, size)
-    if values.ndim >= 3 and values.shape[-3:] in ((1, size, size), (3, size, size)):
-        if not (values.min() >= 0 and values.max() <= 1):
-            raise InputError("background holds values beyond [0, 1]: give a gray value, a color or an image in [0, 1]")
-        return values.expand(*values.shape[:-3], 3, size, size)
-    raise InputError(
-        f"background of shape {tuple(values.shape)} is none: give a gray value, a color (3,) or images "
-        f"(3, {size}, {size})"
-    )
+    advice = f"give a gray value, a color (3,) or images (3, {size}, {size}), in [0, 1]"
+    if values.ndim < 3 or values.shape[-3:] not in ((1, size, size), (3, size, size)):
+        raise InputError(f"background of shape {tuple(values.shape)} is none: {advice}")
+    if not (values.min() >= 0 and values.max() <= 1):
+        raise InputError(f"background holds values beyond [0, 1]: {advice}")
+    return values.expand(*values.shape[:-3], 3, size, size)
 
 
 def background_term(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:

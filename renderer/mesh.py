@@ -92,11 +92,6 @@ class Mesh:
         return np.linalg.norm(doubled_area_vectors(self.vertices, self.faces), axis=1) / 2
 
     @cached_property
-    def one_color(self) -> bool:
-        """Whether all corners have the same color."""
-        return len(self.faces) > 0 and bool((self.corner_colors == self.corner_colors[:1, :1]).all())
-
-    @cached_property
     def one_color_per_face(self) -> bool:
         """Whether the corners of each face have the same color."""
         return bool((self.corner_colors == self.corner_colors[:, :1]).all())
@@ -173,7 +168,9 @@ def load_mesh(path: str | Path, up: str = "auto") -> Mesh:
     placed = [transformed(*part) for part in read_parts(path, linear=is_gltf)]
     if not placed:
         raise InputError(f"{path} has no faces: give a surface mesh, not points or lines")
-    mesh = _weld(concatenate(placed))
+    mesh = concatenate(placed)
+    vertices, corners = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)
+    mesh = replace(mesh, vertices=vertices, faces=corners.reshape(-1, 3))
     if not (np.abs(mesh.vertices) <= LARGEST).all():  # where its nodes put it; NaN is not
         raise InputError(f"{path} has coordinates that are not finite or beyond {LARGEST:g}: export it again")
     if not mesh.face_areas().sum() > 0:
@@ -209,13 +206,6 @@ def transformed(mesh: Mesh, matrix: np.ndarray) -> Mesh:
         corner_colors=mesh.corner_colors[:, order],
         corner_uvs=mesh.corner_uvs[:, order],
     )
-
-
-def _weld(mesh: Mesh) -> Mesh:
-    """One vertex for each position that the faces use."""
-    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
-    vertices, indices = np.unique(corners, axis=0, return_inverse=True)
-    return replace(mesh, vertices=vertices, faces=indices.reshape(-1, 3))
 
 
 def subdivide(mesh: Mesh, vertices: int) -> Mesh:

@@ -21,6 +21,7 @@ from renderer.light.harmonics import degree_of
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.shading import radiance
+from renderer.shapes import sphere
 from renderer.transfer import TransferOperator, build_operators
 from renderer.transport.local import LocalLightView
 from renderer.transport.precomputed import build_transport
@@ -177,10 +178,7 @@ def light_sphere(light: Tensor, size: int, camera: Camera = _OBLIQUE, basis: Bas
 
 @cache
 def _ball() -> Mesh:
-    from trimesh.creation import icosphere  # trimesh takes half a second
-
-    ball = icosphere(subdivisions=5)
-    return Mesh.plain(ball.vertices, ball.faces)
+    return Mesh.plain(*sphere(5))
 
 
 def _listed(cameras: Camera | Sequence[Camera]) -> Sequence[Camera]:

@@ -31,6 +31,7 @@ DEFINED, USED = (re.compile(rb"^[ \t]*%b[ \t]+(.*?)[ \t\r]*$" % key, re.MULTILIN
 OMISSION = re.compile(r"(unable|failed) to (load|store|convert)|unsupported|index failed")  # in trimesh's log
 FLOAT = 5126  # a component type of glTF 2.0 (section 3.6.2.2)
 TRIANGLES, STRIP, FAN = 4, 5, 6  # modes of a primitive (section 5.24.4); trimesh skips fans
+TRANSFORM = "KHR_texture_transform"
 HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")  # extensions that move no vertex, as they begin
 
 
@@ -138,9 +139,7 @@ def _textured_parts(content: bytes) -> int:
         glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
         colors = material.get("pbrMetallicRoughness", {}).get("baseColorTexture"), glossy.get("diffuseTexture")
         textures = [texture for texture in colors if texture is not None]
-        if any(
-            texture.get("texCoord") or "KHR_texture_transform" in texture.get("extensions", {}) for texture in textures
-        ):
+        if any(texture.get("texCoord") or TRANSFORM in texture.get("extensions", {}) for texture in textures):
             raise ValueError("a texture has a second set of coordinates or is transformed, which is not supported")
         textured += bool(textures)
     return textured

@@ -152,10 +152,8 @@ def _color_channels(names: Sequence[str]) -> list[int]:
 
 
 def _openimageio() -> ModuleType:
-    try:
-        import OpenImageIO
-    except ImportError as error:
-        raise InputError("this needs OpenImageIO: pip install openimageio") from error
+    import OpenImageIO  # takes long to import
+
     OpenImageIO.attribute("threads", 1)  # no pool of threads beside torch's own
     OpenImageIO.attribute("exr_threads", -1)
     OpenImageIO.attribute("limits:imagesize_MB", LARGEST_MAP)

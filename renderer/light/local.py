@@ -36,7 +36,7 @@ class Lamps(LocalBasis):
     def __post_init__(self) -> None:
         if not self.positions or not all(len(position) == 3 and any(position) for position in self.positions):
             raise InputError(
-                f"lamps.positions={self.positions}: give [x, y, z] of at least one lamp, none at the origin"
+                f"lamps.positions={self.positions}: give [x, y, z] of a lamp or more, none at the origin"
             )
         for value in chain(*self.positions):
             require_range("a coordinate of lamps.positions", value, -FACTOR, FACTOR)

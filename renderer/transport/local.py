@@ -40,10 +40,6 @@ class SparseTransfer(NamedTuple):
         whole = len(self.function.unique()) * pixels
         return whole > SMALL and len(self.function) < SPARSE * whole
 
-    def taken(self, entries: Tensor) -> SparseTransfer:
-        """Some of the entries (M,), or the same more than once."""
-        return SparseTransfer(*(field[entries] for field in self))
-
     def to(self, device: torch.device | str) -> SparseTransfer:
         return SparseTransfer(*(field.to(device) for field in self))
 
