@@ -25,9 +25,7 @@ class Texture:
 
 def surface_albedo(mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None) -> Tensor:
     """(S, 3) float64 linear albedo at the samples: corner color × texture, each decoded before it is interpolated.
-
-    textures: in place of the mesh's: linear albedo (H, W, 3), float; differentiable in them. InputError: NaN.
-    """
+    textures: in place of the mesh's: linear albedo (H, W, 3), float; differentiable in them. InputError: NaN."""
     faces = fragments.faces.cpu().numpy()
     albedo = _colors(mesh, faces, fragments, encoding)
     if textures is None:
@@ -116,9 +114,7 @@ def _of_faces(values: Tensor, fragments: Fragments) -> Tensor:
 
 def bilinear(texture: Texture, uvs: Tensor) -> Tensor:
     """(3, S) linear albedo of a texture that repeats, at uvs (2, S).
-
-    Texel centers are at half-integers, v = 0 is the bottom row's lower edge.
-    """
+    Texel centers are at half-integers, v = 0 is the bottom row's lower edge."""
     blocks = []
     for block in uvs.split(BLOCK, dim=1):
         blocks.append(reduce(torch.add, (weight * texture.texels(index) for weight, index in _taps(texture, block))))

@@ -40,9 +40,7 @@ def cache_folder(choice: str | None) -> Path | None:
 
 def content_key(*parts: object) -> str:
     """SHA-256, in hexadecimal, of arrays (type, shape and bytes), plain values, and sequences and data classes of such.
-
-    TypeError for anything else, since a key that misses a change would be worse than no key.
-    """
+    TypeError for anything else, since a key that misses a change would be worse than no key."""
     digest = hashlib.sha256()
     for part in parts:
         if is_dataclass(part):

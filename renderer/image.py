@@ -76,10 +76,7 @@ def composite(
     background: Float[Tensor, "*#batch 3 size size"],
     encoding: str = "linear",
 ) -> Float[Tensor, "*batch 3 size size"]:
-    """Whole images: `tonemap` at the covered pixels, the background elsewhere.
-
-    pixels: row-major.
-    """
+    """Whole images: `tonemap` at the covered pixels, the background elsewhere. pixels: row-major."""
     behind_all = background.expand(*radiance.shape[:-2], *background.shape[-3:]).flatten(-2)
     covered = tonemap(radiance, coverage[None], behind_all.index_select(-1, pixels), encoding)
     return behind_all.index_copy(-1, pixels, covered).unflatten(-1, background.shape[-2:])
@@ -101,9 +98,7 @@ def as_background(background: float | Tensor, size: int, like: Tensor) -> Tensor
 
 def background_term(coverage: Tensor, background: Tensor, encoding: str = "linear") -> Tensor:
     """What a background adds to the radiance in front of it, linear (..., 3 or 1, P); shapes as in `tonemap`.
-
-    InputError: NaN.
-    """
+    InputError: NaN."""
     require_bounded(coverage=coverage, background=background)
     return (1 - coverage) * decode(background, encoding)
 

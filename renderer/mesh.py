@@ -228,9 +228,7 @@ def subdivide(mesh: Mesh, vertices: int) -> Mesh:
 
 def refine(mesh: Mesh, area: float) -> Mesh:
     """The same surface with faces of at most an area: larger ones are divided into four until none is left.
-
-    The faces come in another order; the old vertices keep their indices, and new ones may lie on a neighbor's edge.
-    """
+    The faces come in another order; the old vertices keep their indices, and new ones may lie on a neighbor's edge."""
     large = mesh.face_areas() > area
     if not large.any():
         return mesh

@@ -28,8 +28,7 @@ SLIVER = 1 / 16  # sine of a corner's angle below which plain float64 would lose
 def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
     """Unit normals, outward for counter-clockwise faces, in the dtype of `vertices`.
 
-    A face without area has the zero vector and a gradient of zero.
-    InputError: NaN.
+    A face without area has the zero vector and a gradient of zero. InputError: NaN.
     Source: the paper's Section 3, ∂n/∂v = -h nᵀ/|h|² with h from the opposite edge to the corner v; the sign in print
     is the wrong way round.
     """

@@ -257,14 +257,13 @@ def fruit(rng: np.random.Generator) -> Mesh:
     return Mesh.plain(0.95 * vertices / np.abs(vertices).max(), faces, mix(first, second, weight))
 
 
-SOLIDS: dict[str, Callable[[np.random.Generator], Mesh]] = {
+Maker = Callable[[np.random.Generator], Mesh]
+SOLIDS: dict[str, Maker] = {
     make.__name__: make for make in (orange, apple, pear, sweet_pepper, mushroom, bottle, cup, plate, lamp, table)
 }
 # Hard negatives of an orange, beside the fruit above: not in CIFAR-100. `fruit` is for training, the others are for
 # evaluation.
-HARD_NEGATIVES: dict[str, Callable[[np.random.Generator], Mesh]] = {
-    make.__name__: make for make in (lemon, peach, ball, fruit)
-}
+HARD_NEGATIVES: dict[str, Maker] = {make.__name__: make for make in (lemon, peach, ball, fruit)}
 
 
 def sphere(subdivisions: int = 4) -> tuple[np.ndarray, np.ndarray]:

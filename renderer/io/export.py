@@ -133,9 +133,7 @@ def _baked_colors(mesh: Mesh) -> np.ndarray:
 
 def _split(faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One row for each vertex of faces (F, 3) and each of the values (F, 3, D) that its corners have.
-
-    Returns the vertices (N,), the values (N, D) and the faces in terms of these rows, by vertex.
-    """
+    Returns the vertices (N,), the values (N, D) and the faces in terms of these rows, by vertex."""
     rows = np.concatenate([faces[..., None], corners], axis=-1)  # float64, which holds either exactly
     rows, index = np.unique(rows.reshape(-1, rows.shape[-1]), axis=0, return_inverse=True)
     return rows[:, 0].astype(np.int64), rows[:, 1:], index.reshape(-1, 3)

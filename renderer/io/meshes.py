@@ -37,9 +37,7 @@ HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")  # extensions t
 
 def read_parts(path: Path, linear: bool) -> list[tuple[Mesh, np.ndarray]]:
     """Every part of a file in its own coordinates, with the affine matrix (4, 4) that its node places it by.
-
-    linear: the file's colors, textures aside, are linear. InputError: as `renderer.mesh.load_mesh`.
-    """
+    linear: the file's colors, textures aside, are linear. InputError: as `renderer.mesh.load_mesh`."""
     require_file(path, "give the path of a mesh file")
     suffix = path.suffix.lower().lstrip(".")
     formats = set(trimesh.available_formats()) - ARCHIVES
@@ -67,9 +65,7 @@ class _Files(FilePathResolver):  # type: ignore[misc]  # trimesh counts as untyp
 
     def get(self, name: str) -> bytes:
         """A file by its name from the mesh's folder, with \\ for / and %20 for a blank, or else of its last part.
-
-        FileNotFoundError: there is none. Regular files alone: a pipe would never end.
-        """
+        FileNotFoundError: there is none. Regular files alone: a pipe would never end."""
         plain = unquote(name.strip('" \t')).replace("\\", "/")
         for file in (Path(self.parent, plain), Path(self.parent, Path(plain).name)):
             if file.is_file() and file.suffix.lower() == ".mtl":
@@ -115,9 +111,7 @@ def _utf8(text: bytes) -> bytes:
 
 def _textured_parts(content: bytes) -> int:
     """How many parts of a glTF file have an image as their color.
-
-    ValueError, KeyError and the like where trimesh would read shape or texture coordinates otherwise than meant.
-    """
+    ValueError, KeyError and the like where trimesh would read shape or texture coordinates otherwise than meant."""
     if content.startswith(b"glTF"):
         (length,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + length]

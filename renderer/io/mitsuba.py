@@ -81,9 +81,7 @@ def load(module: Any, scene: Mapping[str, Any]) -> Any:
 
 def render_mitsuba_scene(path: Path, views: int) -> torch.Tensor:
     """(views, 4, size, size) float32 linear radiance and coverage of a scene's .xml file, a sensor each.
-
-    InputError: Mitsuba is not installed, or refuses the file.
-    """
+    InputError: Mitsuba is not installed, or refuses the file."""
     with mitsuba() as module:
         try:
             scene = module.load_file(str(path))
@@ -256,9 +254,7 @@ def _emitters(
     folder: Path, basis: Harmonics | LocalBasis, coefficients: torch.Tensor, albedo_scale: float
 ) -> Iterator[Scene]:
     """Lamps, or a projector, whose radiance is over π already.
-
-    Mitsuba's disks have radius 1 and shine along +z; their radiance is that of a far point's intensity on the area.
-    """
+    Mitsuba's disks have radius 1 and shine along +z; their radiance is that of a far point's intensity on the area."""
     if isinstance(basis, Lamps):
         for (x, y, z), color in zip(basis.positions, math.pi * albedo_scale * coefficients, strict=True):
             if not basis.radius:

@@ -43,9 +43,7 @@ class Tile:
 
 def draw_grid(rows: Sequence[Sequence[Tile]], titles: Sequence[str] = (), heading: str = "") -> Image.Image:
     """Rows of tiles, GAP apart, under a title per column, if any, and a heading over all columns, if any.
-
-    Columns and rows are as large as their largest tile; the last row may be shorter.
-    """
+    Columns and rows are as large as their largest tile; the last row may be shorter."""
     font = ImageFont.load_default(TITLE_SIZE)
     images = [[tile.captioned() for tile in row] for row in rows]
     columns = [[image.width for image in column if image] for column in zip_longest(*images)]

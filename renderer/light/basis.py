@@ -61,9 +61,7 @@ class Harmonics:
 
     def project_nonnegative(self, coefficients: Tensor, within: Ball | None = None) -> Tensor:
         """The nearest coefficients (..., size, 3) of light that can be emitted.
-
-        within: for coefficients (A, size, 3), a ball in which the result lies; its centers can be emitted.
-        """
+        within: for coefficients (A, size, 3), a ball in which the result lies; its centers can be emitted."""
         from renderer.light.nonnegative import project_nonnegative  # scipy's optimizers take long to import
 
         return project_nonnegative(coefficients, within)
@@ -100,8 +98,9 @@ class LocalBasis(ABC):
         return nearest_in_box(coefficients, 0, self.power, within)
 
     @abstractmethod
-    def connect(self, points: Tensor, normals: Tensor) -> LightPaths:
-        """The paths to surface points (S, 3) of unit normals (S, 3), occlusion ignored."""
+    def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
+        """The paths to surface points (S, 3) of unit normals (S, 3), occlusion ignored. positions: (L, 3) of lamps,
+        instead of the basis'; the irradiance is differentiable in them, too."""
 
 
 @dataclass(frozen=True)
@@ -163,9 +162,7 @@ class Ball:
 
 def nearest_in_box(values: Tensor, low: Any, high: Any, within: Ball | None = None) -> Tensor:
     """The values from `low` to `high`, numbers or tensors, that are nearest to values (A, ...) in the Euclidean sense.
-
-    within: a ball, whose centers lie there.
-    """
+    within: a ball, whose centers lie there."""
     if within is None:
         return values.clamp(low, high)
     if within.norm == "linf":

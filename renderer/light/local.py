@@ -35,9 +35,7 @@ class Lamps(LocalBasis):
 
     def __post_init__(self) -> None:
         if not self.positions or not all(len(position) == 3 and any(position) for position in self.positions):
-            raise InputError(
-                f"lamps.positions={self.positions}: give [x, y, z] of a lamp or more, none at the origin"
-            )
+            raise InputError(f"lamps.positions={self.positions}: give [x, y, z] of lamps, none at the origin")
         for value in chain(*self.positions):
             require_range("a coordinate of lamps.positions", value, -FACTOR, FACTOR)
         require_range("lamps.power", self.power, 1 / FACTOR, FACTOR)
@@ -51,7 +49,6 @@ class Lamps(LocalBasis):
         return len(self.positions)
 
     def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
-        """positions: (L, 3), instead of the basis'; the irradiance is differentiable in them, too."""
         positions = points.new_tensor(self.positions) if positions is None else positions
         sources = self._discs(positions) if self.radius else positions[None, :, None]
         of_point = torch.arange(len(points), device=points.device) % len(sources)
@@ -123,7 +120,7 @@ class Projector(LocalBasis):
     def size(self) -> int:
         return self.pixels**2
 
-    def connect(self, points: Tensor, normals: Tensor) -> LightPaths:
+    def connect(self, points: Tensor, normals: Tensor, positions: Tensor | None = None) -> LightPaths:
         """One path for each point within the pattern."""
         axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
         source = self.distance * axes[2]

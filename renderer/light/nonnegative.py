@@ -139,9 +139,7 @@ class _Program:
 
 def _motion(offset: Array, added: Array, rows: Array) -> tuple[Array, Array, Array]:
     """(derivative of x by t (K,), multipliers (M,), their derivative by t) while the rows (M, K) stay active.
-
-    offset: v − c. added: Rᵀ μ, of which the multipliers are found.
-    """
+    offset: v − c. added: Rᵀ μ, of which the multipliers are found."""
     change, multipliers = np.linalg.lstsq(rows.T, np.stack([-offset, added], axis=1))[0].T
     return offset + rows.T @ change, multipliers, change
 
@@ -170,9 +168,7 @@ def _least_distance(original: Array, rows: Array, low: Array, high: Array) -> tu
 
 def _dips(lights: Array, dim: Array, depth: float) -> tuple[Array, Array]:
     """(the light (D,), of (R, K), and the harmonics (D, K) in the direction of the bottom) of each of D dips.
-
-    depth: the least depth of a dip, of the light's largest radiance. dim: (R,) largest radiance that counts as none.
-    """
+    depth: the least depth of a dip, of the light's largest radiance. dim: (R,) largest radiance that counts as none."""
     degree = math.isqrt(lights.shape[1]) - 1
     directions, harmonics, neighbors = _grid(degree)
     radiance = lights @ harmonics
@@ -193,9 +189,7 @@ def _dips(lights: Array, dim: Array, depth: float) -> tuple[Array, Array]:
 
 def _lower(directions: Array, expansion: Array) -> Array:
     """A Newton step down from directions (D, 3) along the principal axes of the radiance's curvature on the sphere.
-
-    expansion: (D, 3 + 9, K), coefficients of each light's first and second derivatives.
-    """
+    expansion: (D, 3 + 9, K), coefficients of each light's first and second derivatives."""
     derivatives = expansion @ _harmonics(directions, math.isqrt(expansion.shape[2]) - 1)[..., None]
     gradient, hessian = derivatives[:, :3], derivatives[:, 3:].reshape(-1, 3, 3)
     x, y, z = directions.T

@@ -41,9 +41,7 @@ void main() {
 
 def rasterize(points: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
     """Ids by the contract in `renderer.rasterizer`, for finite points.
-
-    InputError: no EGL device, or a driver that renders wrong ids or fails.
-    """
+    InputError: no EGL device, or a driver that renders wrong ids or fails."""
     least = faces.argmin(axis=1)[:, None]  # first, so that duplicate faces have one depth, and tie
     ordered = np.take_along_axis(faces, (least + np.arange(3)) % 3, axis=1) if closed else np.sort(faces, axis=1)
     with _context() as context:

@@ -63,7 +63,7 @@ def local_transfer(rays: Rays, surface: Surface, albedo: Tensor, basis: LocalBas
     is not installed.
     """
     fragments = surface.fragments
-    paths = unoccluded(rays, surface, basis.connect(surface.points, surface.normals))
+    paths = unoccluded(rays, surface, basis)
     index, entry = (fragments.pixel[paths.point] * basis.size + paths.function).unique(return_inverse=True)
     weights = albedo[paths.point] * paths.irradiance[:, None] / fragments.samples**2
     summed = weights.new_zeros(len(index), albedo.shape[1]).index_add_(0, entry, weights)
@@ -78,8 +78,9 @@ def local_radiance(fragments: Fragments, albedo: Tensor, paths: LightPaths, ligh
     return weights.new_zeros(len(fragments.pixels), 3).index_add(0, fragments.pixel[paths.point], weights).T
 
 
-def unoccluded(rays: Rays, surface: Surface, paths: LightPaths) -> LightPaths:
-    """The paths that no surface blocks and that arrive above the tangent plane."""
+def unoccluded(rays: Rays, surface: Surface, basis: LocalBasis, positions: Tensor | None = None) -> LightPaths:
+    """The paths to samples that no surface blocks and that arrive above the tangent plane."""
+    paths = basis.connect(surface.points, surface.normals, positions)
     with torch.no_grad():
         planes = surface.planes[paths.point]
         origins = surface.points[paths.point] + rays.offset * planes
@@ -105,15 +106,11 @@ class LocalLightView:
 
     def radiance(self, basis: LocalBasis, albedo: Tensor, light: Tensor, positions: Tensor | None = None) -> Tensor:
         """(3, P) radiance of a light (size, 3), in its dtype and on its device; albedo: (S, 3), at the samples.
-
-        positions: (L, 3) of lamps, None where the basis has them. Differentiable in all and in the vertices.
-        """
-        surface = self._surface
+        positions: (L, 3) of lamps, None where the basis has them. Differentiable in all and in the vertices."""
         if isinstance(basis, Lamps) and positions is not None:
-            paths = basis.connect(surface.points, surface.normals, positions.cpu().double())
-            paths = unoccluded(self._rays, surface, paths)
+            paths = unoccluded(self._rays, self._surface, basis, positions.cpu().double())
         else:
             if basis not in self._fixed:
-                self._fixed[basis] = unoccluded(self._rays, surface, basis.connect(surface.points, surface.normals))
+                self._fixed[basis] = unoccluded(self._rays, self._surface, basis)
             paths = self._fixed[basis]
-        return local_radiance(surface.fragments, albedo.cpu().double(), paths, light.cpu().double()).to(light)
+        return local_radiance(self._surface.fragments, albedo.cpu().double(), paths, light.cpu().double()).to(light)

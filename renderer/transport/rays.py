@@ -98,9 +98,7 @@ class Rays:
 
     def hits(self, surface: Surface, directions: Tensor) -> Iterator[RayHits]:
         """Blocks of a view's pixels that may see another surface, in directions (D, 3) of a `sphere`.
-
-        No ray is cast below the plane of a sample's face, from where smooth normals may still be lit.
-        """
+        No ray is cast below the plane of a sample's face, from where smooth normals may still be lit."""
         fragments = surface.fragments
         pixels = self._pixels_to_cast(surface)
         if not len(pixels):
