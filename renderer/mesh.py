@@ -103,10 +103,8 @@ class Mesh:
 
     @cached_property
     def closed(self) -> bool:
-        """Whether no face is ever seen from behind: every part is watertight, and its faces counter-clockwise outside.
-
-        That is, each edge occurs once in either direction, and the faces that edges connect enclose a positive volume.
-        """
+        """Whether no face is ever seen from behind: every part is watertight, its faces counter-clockwise from outside.
+        Then each edge occurs once in either direction, and the faces that edges connect enclose a positive volume."""
         from trimesh.graph import connected_component_labels  # trimesh takes half a second
 
         edges = self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)

@@ -37,9 +37,7 @@ def face_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> F
 
 def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
     """Unit normals: those of the faces around a vertex, weighted with their areas.
-
-    Vertices of no face, or whose faces cancel, have the zero vector. Errors as in `face_normals`.
-    """
+    Vertices of no face, or whose faces cancel, have the zero vector. Errors as in `face_normals`."""
     weighted, corners = area_vectors(vertices, faces).repeat(1, 3), faces.T.flatten()
     summed = weighted.new_zeros(3, len(vertices)).index_add(1, corners, weighted)
     areas = weighted.new_zeros(len(vertices)).index_add(0, corners, _length(weighted.detach()))
@@ -60,10 +58,7 @@ def corner_normals(mesh: Mesh, normals: str, crease: float = -2.0) -> np.ndarray
 
 
 def area_vectors(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float64[Tensor, "3 F"]:
-    """Normals with the faces' areas as their lengths, up to one factor for all of them.
-
-    Errors as in `face_normals`.
-    """
+    """Normals with the faces' areas as their lengths, up to one factor for all of them. Errors as in `face_normals`."""
     require_finite(vertices=vertices)
     return _AreaVectors.apply(vertices, faces)
 

@@ -150,9 +150,7 @@ def look_at(origin: np.ndarray, target: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class Part:
     """F faces of one texture (H, W, 3) uint8, or of none, with corners of their own.
-
-    positions, normals, colors: (F, 3, 3), the last linear. uvs: (F, 3, 2), as in `Mesh`.
-    """
+    positions, normals, colors: (F, 3, 3), the last linear. uvs: (F, 3, 2), as in `Mesh`."""
 
     positions: np.ndarray
     normals: np.ndarray

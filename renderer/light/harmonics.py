@@ -59,9 +59,7 @@ def basis(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "
 
 def unit_vectors(vectors: Tensor) -> tuple[Tensor, Tensor]:
     """(unit vectors (3, ...), lengths (...)) of vectors (3, ...); a zero vector stays zero.
-
-    Nothing under- or overflows on the way. Components come first, since rows are what a processor adds fastest.
-    """
+    Nothing under- or overflows on the way. Components come first, since rows are what a processor adds fastest."""
     largest = vectors.abs().amax(0)
     scaled = vectors / largest.masked_fill(largest == 0, 1)
     norm = scaled.square().sum(0).sqrt()  # at least 1, unless the vector is zero
@@ -120,9 +118,7 @@ def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor]:
 @per_degree
 def gradient_matrices(degree: int) -> Tensor:
     """(3, (degree + 1)², (degree + 1)²) float64: ∂(r^l Y_k)/∂x_d = Σ_j r^(l-1) Y_j [d, j, k], for k in band l.
-
-    Source: the ladder operators of solid harmonics, in real form and without the Condon-Shortley sign.
-    """
+    Source: the ladder operators of solid harmonics, in real form and without the Condon-Shortley sign."""
     matrices = torch.zeros(3, (degree + 1) ** 2, (degree + 1) ** 2, dtype=torch.float64)
     for l in range(1, degree + 1):
         below, norm = (l - 1) * l, (2 * l + 1) / (2 * l - 1)  # `below`: the index of m = 0 in band l - 1
@@ -160,9 +156,7 @@ def homogeneous_gradients(degree: int) -> Tensor:
 @per_degree
 def monomial_coefficients(degree: int) -> Tensor:
     """(J, (degree + 1)²) float64: r^degree Y_k = Σ_j [j, k] × `monomials` j, for k in the bands of the degree's parity.
-
-    Each by derivatives: that of x^a y^b z^c is ∂^degree / (∂x^a ∂y^b ∂z^c) / (a! b! c!).
-    """
+    Each by derivatives: that of x^a y^b z^c is ∂^degree / (∂x^a ∂y^b ∂z^c) / (a! b! c!)."""
     if degree == 0:
         return torch.full((1, 1), 1 / math.sqrt(4 * math.pi), dtype=torch.float64)
     below = monomial_coefficients(degree - 1)

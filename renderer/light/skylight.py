@@ -50,9 +50,7 @@ def coefficients(
 
 class _FittedSky(torch.autograd.Function):
     """Polynomials turned about z by the azimuth φ: U_lm = Ũ_lm cos(mφ), U_l,-m = Ũ_lm sin(mφ) for m ≥ 0.
-
-    The paper prints the rotation by -φ, and ∂U/∂θ without the power of turbidity in its second sum.
-    """
+    The paper prints the rotation by -φ, and ∂U/∂θ without the power of turbidity in its second sum."""
 
     @staticmethod
     def forward(ctx: Any, zenith: Tensor, azimuth: Tensor, turbidity: Tensor, fit: Tensor) -> Tensor:

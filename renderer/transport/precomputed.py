@@ -99,9 +99,7 @@ class Patches:
 
 class Transport:
     """The shadows that a mesh casts on itself and the light that bounces within it, per unit of a basis.
-
-    colors: whether bounced light has another color than the sky's. rays: among the mesh's faces.
-    """
+    colors: whether bounced light has another color than the sky's. rays: among the mesh's faces."""
 
     def __init__(self, mesh: Mesh, settings: ImageSettings, albedo_scale: float, basis: Harmonics):
         """albedo_scale: of the surfaces that light bounces off."""

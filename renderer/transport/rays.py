@@ -33,9 +33,7 @@ BLOCK = 2**17  # directions of pixels at a time: bounds the memory
 @dataclass(frozen=True)
 class Surface:
     """Points and normals at the S samples of a view, in float64, as they are needed; differentiable in vertices (V, 3).
-
-    smooth_faces: (F, 3), all faces of the mesh, to shade with interpolated vertex normals.
-    """
+    smooth_faces: (F, 3), all faces of the mesh, to shade with interpolated vertex normals."""
 
     fragments: Fragments
     vertices: Tensor
@@ -88,9 +86,7 @@ class RayHits(NamedTuple):
 
 class Rays:
     """Rays among the faces of one mesh. InputError, when the first ray is cast, where Embree is not installed.
-
-    offset: how far above its surface a ray starts.
-    """
+    offset: how far above its surface a ray starts."""
 
     def __init__(self, mesh: Mesh):
         self.offset = OFFSET * float(np.abs(mesh.vertices).max())

@@ -1,14 +1,14 @@
-"""What several tests compare with: scipy's harmonics, a many-colored mesh, and scenes for Mitsuba 3."""
+"""What several tests compare with: scipy's harmonics, the sRGB standard, and meshes."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import torch
+import trimesh
+from numpy.typing import ArrayLike
 from scipy.special import sph_harm_y_all
 
-from renderer.camera import Camera
-from renderer.io.mitsuba import load, sensor_of, shape
 from renderer.light.harmonics import lambertian_factors
 from renderer.mesh import Mesh
 
@@ -59,14 +59,22 @@ def patchwork(vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> Mesh:
     )
 
 
-def mitsuba_scene(mi, mesh: Mesh, camera: Camera, size: int, light: dict, integrator: dict):
-    """A diffuse mesh with two sides, flat faces and its texture if it has one, before a camera with alpha."""
-    albedo = {"type": "mesh_attribute", "name": "vertex_color"}
-    if mesh.textures:
-        albedo = {"type": "bitmap", "bitmap": mesh.textures[0], "raw": True}
-    surface = {"type": "twosided", "material": {"type": "diffuse", "reflectance": albedo}}
-    corners = (mesh.vertices[mesh.faces], mesh.corner_uvs, mesh.corner_colors)
-    positions, uvs, colors = (values.reshape(-1, values.shape[-1]) for values in corners)
-    body = shape(mi, surface, positions, np.arange(len(positions)).reshape(-1, 3), uvs=uvs, colors=colors)
-    parts = {"sensor": sensor_of(camera, size), "mesh": body, "light": light, "integrator": integrator}
-    return load(mi, {"type": "scene", **parts})
+def mesh_of(shape: trimesh.Trimesh, color: ArrayLike = (1.0, 1.0, 1.0)) -> Mesh:
+    return Mesh.plain(shape.vertices, shape.faces, color)
+
+
+def corners_of(mesh: Mesh) -> np.ndarray:
+    """(F, 3, 3) positions."""
+    return mesh.vertices[mesh.faces]
+
+
+def srgb_of(linear: ArrayLike) -> np.ndarray:
+    """IEC 61966-2-1."""
+    linear = np.asarray(linear)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def linear_of(srgb: ArrayLike) -> np.ndarray:
+    """The inverse of `srgb_of`."""
+    srgb = np.asarray(srgb)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

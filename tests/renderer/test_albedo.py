@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import patchwork
+from oracles import linear_of, patchwork
 from scipy.ndimage import map_coordinates
 
 from renderer.albedo import face_albedo, painted_albedo, surface_albedo
@@ -51,11 +51,8 @@ def dented() -> Mesh:
     return patchwork(sphere.vertices, sphere.faces)
 
 
-def linear_of(colors: np.ndarray, encoding: str) -> np.ndarray:
-    """IEC 61966-2-1."""
-    if encoding == "linear":
-        return np.asarray(colors)
-    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+def decoded(colors: np.ndarray, encoding: str) -> np.ndarray:
+    return linear_of(colors) if encoding == "srgb" else colors
 
 
 # ---------------------------------------------------------------------------- as the mesh has it
@@ -70,7 +67,7 @@ def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repe
     x, y = (fragments.positions().numpy().T + 1) / 2
     u, v = (uvs[0] + np.outer(x, uvs[1] - uvs[0]) + np.outer(y, uvs[3] - uvs[0])).T
     at = np.stack([(1 - v) * 5 - 0.5, u * 7 - 0.5])
-    texels = linear_of(texture / 255, encoding)
+    texels = decoded(texture / 255, encoding)
     expected = [map_coordinates(texels[..., c], at, order=1, mode="grid-wrap") for c in range(3)]
     np.testing.assert_allclose(surface_albedo(mesh, fragments, encoding), np.stack(expected, axis=1), atol=64 * EPS)
 
@@ -82,14 +79,14 @@ def test_corner_colors_are_decoded_and_then_interpolated(encoding):
     mesh = Mesh.plain([[-1, -1, 0], [3, -1, 0], [-1, 3, 0]], [[0, 1, 2]], colors)
     fragments = view(mesh, 8)
     x, y = (fragments.positions().numpy().T + 1) / 4
-    expected = np.stack([1 - x - y, x, y], axis=1) @ linear_of(colors, encoding)
+    expected = np.stack([1 - x - y, x, y], axis=1) @ decoded(colors, encoding)
     np.testing.assert_allclose(surface_albedo(mesh, fragments, encoding), expected, rtol=0, atol=16 * EPS)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_texture_multiplies_the_corner_color(encoding):
     mesh = poster(np.full((3, 3, 3), 51, dtype=np.uint8), color=(1, 0.5, 0))
-    expected = linear_of(np.array(0.2), encoding) * linear_of(np.array([1, 0.5, 0]), encoding)
+    expected = decoded(np.array(0.2), encoding) * decoded(np.array([1, 0.5, 0]), encoding)
     albedo = surface_albedo(mesh, view(mesh, 3), encoding)
     np.testing.assert_allclose(albedo, np.tile(expected, (9, 1)), rtol=16 * EPS)
 
@@ -103,7 +100,7 @@ TEXTURED = [(dented(), OrthographicCamera(1.0, 0.4, 1.7)), (poster(random_textur
 @pytest.mark.parametrize(("mesh", "camera"), TEXTURED)
 def test_the_textures_of_a_mesh_as_parameters_give_its_albedo(mesh, camera, encoding):
     fragments = view(mesh, 6, 3, camera)
-    textures = [torch.from_numpy(linear_of(texture / 255, encoding)) for texture in mesh.textures]
+    textures = [torch.from_numpy(decoded(texture / 255, encoding)) for texture in mesh.textures]
     albedo = surface_albedo(mesh, fragments, encoding, textures)
     torch.testing.assert_close(albedo, surface_albedo(mesh, fragments, encoding), rtol=0, atol=16 * EPS)
 
@@ -164,9 +161,8 @@ def test_colors_and_textures_hold_the_added_albedo(encoding, albedo_scale):
     painted, new_albedo_scale = with_added_albedo(mesh, added.numpy(), encoding, albedo_scale)
     assert 1 <= new_albedo_scale <= max(1, albedo_scale)
     bare = torch.from_numpy(mesh.texture_ids < 0)
-    step = {"linear": 0.5 / 255, "srgb": 0.5 / 255 * 2.4 / 1.055}[
-        encoding
-    ] * new_albedo_scale  # the curve's steepest, at 1
+    steepest = 2.4 / 1.055 if encoding == "srgb" else 1.0  # slope of the curve, at 1
+    step = 0.5 / 255 * steepest * new_albedo_scale
     for polar in (0.3, 1.5, 2.8):
         fragments = view(mesh, 24, 2, OrthographicCamera(polar, polar, 2.0))
         expected = painted_albedo(mesh, fragments, encoding, albedo_scale, added)

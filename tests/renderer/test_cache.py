@@ -163,15 +163,6 @@ def test_tensors_come_back_to_the_bit_and_not_under_another_key(written):
     assert tensors.read("another key") is None
 
 
-def test_a_damaged_file_is_built_anew_and_written_over(tmp_path, rasterized):
-    expected = OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, RASTERIZER)
-    (path,) = tmp_path.iterdir()
-    path.write_bytes(b"not a file of tensors" * 20)
-    for _ in range(2):
-        assert same(OperatorCache(tmp_path).operators(PLATE, [CAMERA], SETTINGS, RASTERIZER), expected)
-    assert rasterized == [1, 1]
-
-
 def test_no_flipped_bit_and_no_cut_is_taken_for_the_file(written):
     """Every bit of every byte, header and checksum as well, and every length."""
     tensors, path = written

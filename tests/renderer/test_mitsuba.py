@@ -5,20 +5,20 @@ times π is one of ours. It draws directions by the cosine: its noise is then th
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from types import ModuleType
+from pathlib import Path
 
 import hard_meshes as hard
 import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import mitsuba_scene
+from oracles import mesh_of
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
-from renderer.io.mitsuba import environment, integrator, mitsuba, mitsuba_map
+from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
+from renderer.light.environment import write_map
 from renderer.mesh import Mesh
 from renderer.rasterizer import choose
 from renderer.transfer import ImageSettings, build_operators
@@ -40,12 +40,6 @@ VIEWS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def mi() -> Iterator[ModuleType]:
-    with mitsuba() as module:
-        yield module
-
-
 def positive_light(seed: int) -> np.ndarray:
     """(49, 3): every coefficient at random, over just enough ambient light to be positive everywhere."""
     weights = np.repeat(BAND_WEIGHTS, 2 * np.arange(7) + 1)
@@ -58,13 +52,11 @@ LIGHT = positive_light(1)
 
 
 def ball() -> Mesh:
-    sphere = trimesh.creation.icosphere(subdivisions=1)
-    return Mesh.plain(sphere.vertices, sphere.faces, (0.9, 0.5, 0.2))
+    return mesh_of(trimesh.creation.icosphere(subdivisions=1), (0.9, 0.5, 0.2))
 
 
 def colored_cube() -> Mesh:
-    cube = trimesh.creation.box((1.1, 1.1, 1.1))
-    return Mesh.plain(cube.vertices, cube.faces, np.random.default_rng(1).uniform(0.1, 1, (8, 3)))
+    return mesh_of(trimesh.creation.box((1.1, 1.1, 1.1)), np.random.default_rng(1).uniform(0.1, 1, (8, 3)))
 
 
 def textured_hull() -> Mesh:
@@ -98,11 +90,17 @@ def our_image(mesh: Mesh, camera: Camera, size: int, samples: int, **settings) -
     return canvas.reshape(size, size, 4)
 
 
-def mitsuba_image(mi, mesh: Mesh, camera: Camera, size: int, spp: int, bounces: int = 0) -> tuple[np.ndarray, ...]:
-    """The mean (size, size, 4) of SEEDS images of so many rays per pixel, and its standard error."""
-    sky = environment({"bitmap": mitsuba_map(torch.from_numpy(LIGHT), MAP_ROWS).float().numpy()}, math.pi)
-    scene = mitsuba_scene(mi, mesh, camera, size, sky, integrator(bounces))
-    images = np.stack([np.array(mi.render(scene, spp=spp, seed=seed)) for seed in range(SEEDS)]).astype(float)
+def mitsuba_image(
+    folder: Path, mesh: Mesh, camera: Camera, size: int, spp: int, bounces: int = 0
+) -> tuple[np.ndarray, ...]:
+    """The mean (size, size, 4) of SEEDS images of files, of so many rays per pixel, and its standard error."""
+    write_map(folder / "light.exr", mitsuba_map(torch.from_numpy(LIGHT), MAP_ROWS))
+    write_mitsuba_scene(folder, mesh, 1.0, [camera], ImageSettings(size, bounces=bounces), "light.exr")
+    file = folder / SCENE
+    file.write_text(file.read_text().replace("multijitter", "independent"))
+    with mitsuba() as mi:
+        scene = mi.load_file(str(file))
+        images = np.stack([np.array(mi.render(scene, spp=spp, seed=seed)) for seed in range(SEEDS)]).astype(float)
     return images.mean(axis=0), images.std(axis=0, ddof=1) / math.sqrt(SEEDS)
 
 
@@ -117,7 +115,7 @@ def mitsuba_image(mi, mesh: Mesh, camera: Camera, size: int, spp: int, bounces: 
 @pytest.mark.parametrize(
     ("size", "samples", "rays"), [(24, 32, 128), pytest.param(64, 64, 512, marks=pytest.mark.slow)]
 )
-def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(mi, solid, view, size, samples, rays):
+def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(tmp_path, solid, view, size, samples, rays):
     """Our error, in Mitsuba's standard errors: its root mean square is one and its mean is zero.
 
     A standard error from n images makes a Student's t of n - 1 degrees of freedom: the mean and the variance of its
@@ -127,7 +125,7 @@ def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(mi, solid, v
     a pixel, against Mitsuba's noise of up to 0.8 % there (0.06 and 0.4 % in the slow runs), too little to show.
     """
     ours = our_image(solid(), VIEWS[view], size, samples)
-    theirs, noise = mitsuba_image(mi, solid(), VIEWS[view], size, rays)
+    theirs, noise = mitsuba_image(tmp_path, solid(), VIEWS[view], size, rays)
     covered = np.maximum(ours, theirs)[..., 3] > FEW
     errors = (ours - theirs)[covered, :3] / noise[covered, :3]
     freedom = SEEDS - 1
@@ -152,10 +150,10 @@ def test_a_convex_mesh_looks_as_mitsuba_renders_it_within_its_noise(mi, solid, v
         ),
     ],
 )
-def test_shadows_and_bounces_are_mitsubas_within_its_noise(mi, solid, view, bounces, monkeypatch):
+def test_shadows_and_bounces_are_mitsubas_within_its_noise(tmp_path, solid, view, bounces, monkeypatch):
     """With rays enough for a quadrature of 0.5 % of the brightest, root mean square, and 0.1 % on average."""
     monkeypatch.setattr(rays, "DIRECTIONS", 2**12)
-    theirs, noise = mitsuba_image(mi, solid(), VIEWS[view], 32, 128, bounces)
+    theirs, noise = mitsuba_image(tmp_path, solid(), VIEWS[view], 32, 128, bounces)
     inside, brightest = theirs[..., 3] == 1, theirs[..., :3].max()
     ours, less = (
         our_image(solid(), VIEWS[view], 32, 8, **options)

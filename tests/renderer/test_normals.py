@@ -8,6 +8,7 @@ import torch
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import draw
 from scipy.spatial.transform import Rotation
 from torch.autograd.functional import jacobian
 
@@ -16,10 +17,6 @@ from renderer.normals import face_normals, vertex_normals
 
 EPS = torch.finfo(torch.float64).eps
 ONE = torch.tensor([[0, 1, 2]])
-
-
-def draw(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
 def shape(name: str = "icosahedron") -> tuple[torch.Tensor, torch.Tensor]:

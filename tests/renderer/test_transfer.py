@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw, patchwork
+from oracles import draw, mesh_of, patchwork
 
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
@@ -26,16 +26,6 @@ def square(half: float, center=(0.0, 0.0, 0.0)) -> Mesh:
     return Mesh.plain(corners + center, [[0, 1, 2], [0, 2, 3]])
 
 
-def sphere(subdivisions: int, color=(1.0, 1.0, 1.0)) -> Mesh:
-    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return Mesh.plain(shape.vertices, shape.faces, color)
-
-
-def dented() -> Mesh:
-    shape = sphere(2)
-    return patchwork(shape.vertices, shape.faces)
-
-
 def test_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
     """Half-width 5/8 at 8 pixels of 1/4: two pixels' worth and a half on either side of the center."""
     (operator,) = build_operators(square(0.625), [ABOVE], ImageSettings(size=8, samples=4), RASTERIZER)
@@ -52,10 +42,12 @@ def test_the_image_is_upright():
     assert operator.pixels.tolist() == [3]
 
 
+BALL, FINE = (trimesh.creation.icosphere(subdivisions=count) for count in (1, 2))
+DENTED = patchwork(FINE.vertices, FINE.faces)
 LAYOUTS = {  # mesh, samples, channels of the transfer
-    "one color": (sphere(1, (0.8, 0.4, 0.1)), 3, 1),
-    "one sample per pixel": (dented(), 1, 1),
-    "mixed albedos": (dented(), 3, 3),
+    "one color": (mesh_of(BALL, (0.8, 0.4, 0.1)), 3, 1),
+    "one sample per pixel": (DENTED, 1, 1),
+    "mixed albedos": (DENTED, 3, 3),
     "empty": (square(0.1, center=(20, 0, 0)), 2, 1),
 }
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
+from oracles import corners_of, linear_of, srgb_of
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera, orbit_cameras
 from renderer.errors import InputError
@@ -18,14 +19,6 @@ from renderer.mesh import Mesh, load_mesh
 from renderer.shapes import solid
 
 EPS32 = np.finfo(np.float32).eps
-
-
-def srgb(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
-
-
-def linear(srgb: np.ndarray) -> np.ndarray:
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def painted(mesh: Mesh, textures: int, seed: int = 0) -> Mesh:
@@ -69,14 +62,10 @@ MESHES = {
 }
 
 
-def corners(mesh: Mesh) -> np.ndarray:
-    return mesh.vertices[mesh.faces]
-
-
 def assert_same_surface(loaded: Mesh, mesh: Mesh) -> None:
     """Positions are rounded to float32 once; so are colors, in linear light, where sRGB's curve only makes their
     relative error smaller, and encoded ones, once more; v is stored as 1 - v, which is at most 2 here."""
-    assert_array_equal(corners(loaded), corners(mesh).astype(np.float32))
+    assert_array_equal(corners_of(loaded), corners_of(mesh).astype(np.float32))
     assert_allclose(loaded.corner_colors, mesh.corner_colors, rtol=2 * EPS32, atol=0)
     assert_allclose(loaded.corner_uvs, mesh.corner_uvs, rtol=0, atol=2 * EPS32)
     assert_array_equal(loaded.texture_ids, mesh.texture_ids)
@@ -104,9 +93,9 @@ def test_a_glb_holds_y_up_positions_linear_colors_and_diffuse_two_sided_material
     parts, plain = read_glb(tmp_path / "mesh.glb"), mesh.texture_ids < 0
     assert len(parts) == 2 and plain.any() and not plain.all()
     for part, here in zip(parts, (plain, ~plain), strict=True):
-        x, y, z = np.moveaxis(corners(mesh)[here], -1, 0)
+        x, y, z = np.moveaxis(corners_of(mesh)[here], -1, 0)
         assert_array_equal(part.triangles, np.stack([x, z, -y], axis=-1).astype(np.float32))
-        colors = linear(mesh.corner_colors[here].astype(np.float64))
+        colors = linear_of(mesh.corner_colors[here].astype(np.float64))
         assert_allclose(part.visual.vertex_attributes["color"][part.faces], colors, rtol=EPS32, atol=0)
         assert_allclose(part.visual.uv[part.faces], mesh.corner_uvs[here], rtol=0, atol=2 * EPS32)
         material = part.visual.material
@@ -120,7 +109,7 @@ def test_a_glb_has_the_normals_that_the_renderer_shades_with(tmp_path, normals):
     mesh = solid("pear")
     export_mesh(mesh, tmp_path / "mesh.glb", normals)
     [part] = read_glb(tmp_path / "mesh.glb")
-    a, b, c = np.moveaxis(corners(mesh), 1, 0)
+    a, b, c = np.moveaxis(corners_of(mesh), 1, 0)
     expected = np.cross(b - a, c - a)[:, None].repeat(3, axis=1)
     if normals == "smooth":
         sums = np.zeros_like(mesh.vertices)
@@ -166,7 +155,7 @@ def test_faces_are_ordered_by_texture_and_textures_of_no_face_left_out(tmp_path)
     mesh = replace(mesh, texture_ids=np.arange(12, dtype=np.int32) % 2 * 2, textures=painted(box(), 3).textures)
     export_mesh(mesh, tmp_path / "mesh.glb")
     loaded = load_mesh(tmp_path / "mesh.glb")
-    assert_array_equal(corners(loaded), corners(mesh)[[0, 2, 4, 6, 8, 10, 1, 3, 5, 7, 9, 11]])
+    assert_array_equal(corners_of(loaded), corners_of(mesh)[[0, 2, 4, 6, 8, 10, 1, 3, 5, 7, 9, 11]])
     assert_array_equal(loaded.texture_ids, [0] * 6 + [1] * 6)
     for texture, index in zip(loaded.textures, (0, 2), strict=True):
         assert_array_equal(texture, mesh.textures[index])
@@ -177,13 +166,13 @@ def test_a_ply_gives_back_the_shape_and_colors_of_eight_bits(tmp_path, name):
     mesh = solid(name)
     export_mesh(mesh, tmp_path / "mesh.ply")
     loaded = load_mesh(tmp_path / "mesh.ply")
-    assert_array_equal(corners(loaded), corners(mesh).astype(np.float32))
+    assert_array_equal(corners_of(loaded), corners_of(mesh).astype(np.float32))
     assert_allclose(loaded.corner_colors, mesh.corner_colors, rtol=0, atol=0.5 / 255 + 2 * EPS32)
     assert loaded.closed is mesh.closed
 
 
 TEXELS = np.array([[[0, 50, 100], [200, 250, 30]], [[90, 0, 255], [10, 20, 30]]], dtype=np.uint8)  # rows from the top
-MEAN = srgb(linear(TEXELS / 255).mean(axis=(0, 1)))
+MEAN = srgb_of(linear_of(TEXELS / 255).mean(axis=(0, 1)))
 
 
 @pytest.mark.parametrize(
@@ -195,7 +184,7 @@ MEAN = srgb(linear(TEXELS / 255).mean(axis=(0, 1)))
         ((2.75, -0.25), TEXELS[0, 1] / 255),
         ((0.5, 0.5), MEAN),
         ((0.0, 1.0), MEAN),
-        ((0.375, 0.75), srgb(linear(TEXELS[0] / 255).T @ [0.75, 0.25])),
+        ((0.375, 0.75), srgb_of(linear_of(TEXELS[0] / 255).T @ [0.75, 0.25])),
     ],
 )
 @pytest.mark.parametrize("color", [(1.0, 1.0, 1.0), (0.5, 0.2, 0.9)])
@@ -208,7 +197,7 @@ def test_ply_colors_are_texel_times_vertex_color_in_linear_light(tmp_path, uv, t
         textures=(TEXELS,),
     )
     export_mesh(mesh, tmp_path / "mesh.ply")
-    expected = srgb(linear(texel) * linear(np.array(color)))
+    expected = srgb_of(linear_of(texel) * linear_of(np.array(color)))
     assert_allclose(load_mesh(tmp_path / "mesh.ply").corner_colors[0], expected[None].repeat(3, 0), atol=0.51 / 255)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
+from oracles import corners_of, srgb_of
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
@@ -43,10 +44,6 @@ end_header
 
 
 PLAIN_PLY = trimesh.Trimesh(np.eye(3), [[0, 1, 2]]).export(file_type="ply", encoding="ascii")
-
-
-def srgb(linear: float) -> float:
-    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
 
 
 def png(texture: np.ndarray = TEXTURE) -> bytes:
@@ -92,10 +89,6 @@ def has_texture(mesh: Mesh) -> bool:
     return len(mesh.textures) == 1 and np.array_equal(mesh.textures[0], TEXTURE)
 
 
-def corner_positions(mesh: Mesh) -> np.ndarray:
-    return mesh.vertices[mesh.faces]
-
-
 # Colors and textures
 
 
@@ -108,7 +101,7 @@ def test_an_obj_has_its_texture_times_its_diffuse_color(tmp_path):
     lines += [f"vt {u} {v}" for u, v in uvs] + ["f 1/1 2/2 3/3", "f 1/4 3/5 4/6"]
     mesh = load_mesh(write(tmp_path / "square.obj", "\n".join(lines)))
     assert len(mesh.vertices) == 4
-    assert_array_equal(corner_positions(mesh)[:, :, :2], [[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
+    assert_array_equal(corners_of(mesh)[:, :, :2], [[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
     assert_allclose(mesh.corner_uvs.reshape(6, 2), uvs, **FLOAT32)
     assert has_texture(mesh)
     assert_array_equal(mesh.texture_ids, [0, 0])
@@ -150,7 +143,7 @@ def test_an_stl_is_white_and_its_corners_are_joined(tmp_path):
     box.export(tmp_path / "box.stl")
     mesh = load_mesh(tmp_path / "box.stl")
     assert len(mesh.vertices) == 8
-    assert_array_equal(corner_positions(mesh), box.triangles)
+    assert_array_equal(corners_of(mesh), box.triangles)
     assert_array_equal(mesh.corner_colors, np.ones((12, 3, 3)))
 
 
@@ -176,15 +169,15 @@ def test_a_glb_scene_has_its_parts_placed_z_up_with_their_materials(tmp_path):
     is_fruit = mesh.texture_ids == 0
     assert is_fruit.sum() == 12
     uv_of = dict(zip(map(tuple, fruit), np.random.default_rng(2).random((8, 2)), strict=True))
-    expected = [[uv_of[x, z, -y] for x, y, z in face] for face in corner_positions(mesh)[is_fruit]]
+    expected = [[uv_of[x, z, -y] for x, y, z in face] for face in corners_of(mesh)[is_fruit]]
     assert_allclose(mesh.corner_uvs[is_fruit], expected, **FLOAT32)
     for part, vertices in ((is_fruit, fruit), (~is_fruit, leaf)):
         z_up = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
-        corners = np.unique(corner_positions(mesh)[part].reshape(-1, 3), axis=0)
+        corners = np.unique(corners_of(mesh)[part].reshape(-1, 3), axis=0)
         assert_allclose(corners, np.unique(z_up, axis=0), **FLOAT32)
-        outward = ((corner_positions(mesh)[part].mean(axis=1) - z_up.mean(axis=0)) * mesh.face_normals()[part]).sum(1)
+        outward = ((corners_of(mesh)[part].mean(axis=1) - z_up.mean(axis=0)) * mesh.face_normals()[part]).sum(1)
         assert (outward > 0).all()
-    encoded = [srgb(0.2), srgb(0.4), 1]
+    encoded = [srgb_of(0.2), srgb_of(0.4), 1]
     assert_allclose(mesh.corner_colors[~is_fruit], np.broadcast_to(encoded, (12, 3, 3)), **FLOAT32)
     assert_array_equal(mesh.corner_colors[is_fruit], np.ones((12, 3, 3)))
     assert has_texture(mesh)
@@ -194,13 +187,13 @@ def test_glb_vertex_colors_are_linear_and_multiply_the_material(tmp_path):
     box = trimesh.creation.box()
     box.visual.vertex_colors = np.tile([51, 102, 255, 255], (8, 1))
     box.export(tmp_path / "colors.glb")
-    expected = np.broadcast_to([srgb(0.2), srgb(0.4), 1], (12, 3, 3))
+    expected = np.broadcast_to([srgb_of(0.2), srgb_of(0.4), 1], (12, 3, 3))
     assert_allclose(load_mesh(tmp_path / "colors.glb").corner_colors, expected, **FLOAT32)
 
     box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[102, 255, 51, 255]))
     box.visual.vertex_attributes["color"] = np.tile(np.array([51, 102, 255, 255], dtype=np.uint8), (8, 1))
     box.export(tmp_path / "both.glb")
-    expected = np.broadcast_to([srgb(0.4 * 0.2), srgb(0.4), srgb(0.2)], (12, 3, 3))
+    expected = np.broadcast_to([srgb_of(0.4 * 0.2), srgb_of(0.4), srgb_of(0.2)], (12, 3, 3))
     assert_allclose(load_mesh(tmp_path / "both.glb").corner_colors, expected, **FLOAT32)
 
 
@@ -214,7 +207,7 @@ def test_up_becomes_z(tmp_path, suffix, up, turned):
     box.export(tmp_path / f"box.{suffix}")
     mesh = load_mesh(tmp_path / f"box.{suffix}", up)
     assert_allclose(mesh.vertices.mean(axis=0), [10, -30, 20] if turned else [10, 20, 30], **FLOAT32)
-    outward = corner_positions(mesh).mean(axis=1) - mesh.vertices.mean(axis=0)
+    outward = corners_of(mesh).mean(axis=1) - mesh.vertices.mean(axis=0)
     assert ((outward * mesh.face_normals()).sum(axis=1) > 0).all()
 
 

@@ -78,23 +78,6 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, encoding, norm
         assert off[:3, inside].mean().abs() < 0.5 / 255 and off[:3, inside].square().mean().sqrt() < 0.005
 
 
-@pytest.mark.parametrize("bounces", [0, 2])
-def test_a_bowl_has_the_shadows_and_bounces_of_its_settings(tmp_path, bounces):
-    """To the quadrature of a pixel's rays, and far from what direct light makes of it."""
-    shell = trimesh.creation.icosphere(subdivisions=3)
-    lower = shell.vertices[shell.faces].mean(axis=1)[:, 2] < 0
-    bowl, settings = Mesh.plain(shell.vertices, shell.faces[lower], (0.8, 0.7, 0.5)), ImageSettings(24, 4)
-    camera, light = OrthographicCamera(0.3, 0.0, 2.2), load_light("st_peters")
-    write_mitsuba_scene(tmp_path, bowl, 1.0, [camera], replace(settings, shadows=True, bounces=bounces), "light.exr")
-    write_map(tmp_path / "light.exr", mitsuba_map(light, 128))
-    theirs = render_mitsuba_scene(tmp_path / SCENE, 1)[0].flatten(1)
-    for options, close in (({"shadows": True, "bounces": bounces}, True), ({}, False)):
-        [operator] = build_operators(bowl, [camera], replace(settings, **options), choose("numpy"))
-        inside = (operator.coverage == 1) & (theirs[3, operator.pixels] == 1)
-        off = (operator.radiance(light) - theirs[:3, operator.pixels])[:, inside]
-        assert (off.square().mean().sqrt() < 0.02 * theirs[:3].max()) == close
-
-
 def test_a_scene_is_rendered_on_a_single_core_too(tmp_path):
     """Mitsuba then has one thread, which would wait for its own reader of .exr, and this process with it."""
     write_mitsuba_scene(tmp_path, ball(), 1.0, [OrthographicCamera(1.0, 0.0, 2.0)], ImageSettings(8), "light.exr")

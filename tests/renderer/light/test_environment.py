@@ -11,7 +11,7 @@ from oracles import draw
 from renderer.errors import InputError
 from renderer.light.environment import negative_fraction, read_map, to_map, write_map
 from renderer.light.harmonics import project
-from renderer.light.presets import load_light, probe
+from renderer.light.presets import load_light
 
 EPS, EPS32 = torch.finfo(torch.float64).eps, torch.finfo(torch.float32).eps
 RGBE = 2.0**-8  # of a texel's largest channel, which is at least 128 units of its exponent: half a unit
@@ -151,15 +151,3 @@ def test_a_map_with_few_texels_or_another_aspect_ratio_is_refused(tmp_path, size
     np.save(tmp_path / "map.npy", np.ones((*size, 3)))
     with pytest.raises(InputError, match=rf"map\.npy has {size[1]} × {size[0]} texels: give an equirectangular one"):
         load_light(str(tmp_path / "map.npy"))
-
-
-@pytest.mark.parametrize(("suffix", "fate"), [(".hdr", "stored as 0"), (".exr", "kept")])
-def test_the_script_writes_the_map_of_a_probe_and_reports_its_negative_fraction(tmp_path, call, capsys, suffix, fate):
-    out = tmp_path / f"grace{suffix}"
-    radiance = to_map(probe("grace"), 32)
-    assert call("light", "light=grace", f"out={out}", "height=32") == 0
-    output = capsys.readouterr().out
-    assert output.startswith(f"{out}: 64 × 32 texels, radiance {radiance.min():.3g} to {radiance.max():.3g}; ")
-    assert output.endswith(f"{negative_fraction(radiance):.2%} of it is negative and {fate}\n")
-    expected = radiance.clamp(min=0) if suffix == ".hdr" else radiance
-    torch.testing.assert_close(read_map(out).double(), expected, rtol=EPS32, atol=RGBE * float(radiance.max()))

@@ -12,7 +12,6 @@ from renderer.light.harmonics import (
     MAX_DEGREE,
     basis,
     lambertian_factors,
-    nonzero_coefficients,
     project,
     rotate,
 )
@@ -44,10 +43,6 @@ def test_lambertian_factors_are_the_legendre_coefficients_of_the_clamped_cosine(
     ]
     by_coefficient = np.repeat(expected, 2 * np.arange(MAX_DEGREE + 1) + 1)
     np.testing.assert_allclose(lambertian_factors(MAX_DEGREE), by_coefficient, rtol=0, atol=1e-12)  # quad's own bound
-
-
-def test_bands_3_and_5_reach_no_diffuse_surface():
-    assert nonzero_coefficients(6).tolist() == [*range(9), *range(16, 25), *range(36, 49)]
 
 
 def test_constants_first_computed_in_inference_mode_serve_training_later():

@@ -255,21 +255,12 @@ def test_opengl_draws_in_another_thread():
     np.testing.assert_array_equal(drawn[0], rasterizer.rasterize(points, faces, 32))
 
 
-FULL_IMAGE, LARGE_TRIANGLE = (triangle(*rectangle(-1, 1, -1, 1, 0)), triangle([-1, -1, 0], [3, -1, 0], [-1, 3, 0]))
-
-
-@pytest.mark.parametrize(
-    ("points", "faces", "resolution", "bound"),
-    [(*FULL_IMAGE, 1024, 1024**2 * 5 * 8), (LARGE_TRIANGLE[0], np.tile([0, 1, 2], (2**20, 1)), 1, 2**20 * 3 * 8)],
-    ids=["a face of a million samples", "a million faces"],
-)
-def test_numpy_takes_bounded_memory(points, faces, resolution, bound):
-    """Less than a list of all (face, sample) candidates, and less than the faces."""
+def test_numpy_takes_less_memory_than_a_list_of_all_candidates():
     tracemalloc.start()
-    ids = choose("numpy").rasterize(points, faces, resolution)
+    ids = choose("numpy").rasterize(*triangle(*rectangle(-1, 1, -1, 1, 0)), 1024)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert (ids >= 0).all() and peak < bound
+    assert (ids >= 0).all() and peak < 1024**2 * 5 * 8
 
 
 GPU, NO_GPU, SOFTWARE = "NVIDIA H200/PCIe/SSE2", "llvmpipe (LLVM 15.0.6, 256 bits)", "Google SwiftShader"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from oracles import mesh_of
 
 from renderer.albedo import surface_albedo
 from renderer.camera import OrthographicCamera
@@ -34,8 +35,7 @@ SIZE, SAMPLES = 24, 16
 
 
 def ball(subdivisions: int = 2) -> Mesh:
-    sphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.9)
-    return Mesh.plain(sphere.vertices, sphere.faces, (0.9, 0.5, 0.2))
+    return mesh_of(trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.9), (0.9, 0.5, 0.2))
 
 
 def ball_on_a_table() -> Mesh:

@@ -10,6 +10,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 import trimesh
+from oracles import mesh_of
 
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
@@ -45,10 +46,6 @@ def sky_fraction(operator: TransferOperator) -> torch.Tensor:
     return operator.radiance(ambient(torch.ones(3, dtype=torch.float64))) / operator.coverage / math.pi
 
 
-def plain(shape: trimesh.Trimesh) -> Mesh:
-    return Mesh.plain(shape.vertices, shape.faces)
-
-
 def dented(seed=0) -> Mesh:
     """A closed, lumpy ball: dents that see their own other side."""
     ball = trimesh.creation.icosphere(subdivisions=1)
@@ -65,8 +62,8 @@ def pit(depth: float) -> Mesh:
 
 
 CONVEX = {
-    "a ball": plain(trimesh.creation.icosphere(subdivisions=3)),
-    "a cube": plain(trimesh.creation.box()),
+    "a ball": mesh_of(trimesh.creation.icosphere(subdivisions=3)),
+    "a cube": mesh_of(trimesh.creation.box()),
     "an open square": Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]),
 }
 
