@@ -20,11 +20,11 @@ def test_the_surface_covers_the_background_in_linear_light_and_the_clamp_comes_l
     image = tonemap(pixel(0.1, 0.2, 0.3), one(0.25), one(0.4))
     torch.testing.assert_close(image, pixel(0.4, 0.5, 0.6), rtol=4 * EPS, atol=0)
     image = tonemap(pixel(0.1, 0.2, 0.3), one(0.25), one(0.5), "srgb")
-    expected = pixel(*(srgb_of(surface + 0.75 * linear_of(0.5)) for surface in (0.1, 0.2, 0.3)))
+    expected = pixel(*srgb_of(np.array([0.1, 0.2, 0.3]) + 0.75 * linear_of(0.5)))
     torch.testing.assert_close(image, expected, rtol=8 * EPS, atol=0)
     # Half a pixel at radiance 1.5, -0.4 and 2.5: clamped before compositing, the first two would be 0.5 and 0.5.
     image = tonemap(pixel(0.75, -0.2, 1.25), one(0.5), pixel(0, 1, 1), "srgb")
-    torch.testing.assert_close(image, pixel(*map(srgb_of, (0.75, 0.3, 1.0))), rtol=8 * EPS, atol=0)
+    torch.testing.assert_close(image, pixel(*srgb_of([0.75, 0.3, 1.0])), rtol=8 * EPS, atol=0)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
