@@ -32,7 +32,7 @@ from benchmarks.common import Row, machine, medians, relative_error, seconds, wr
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
 from renderer.image import ImageSettings
 from renderer.io.mitsuba import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
-from renderer.light.basis import HARMONICS, Basis, SumBasis
+from renderer.light.basis import HARMONICS, Basis
 from renderer.light.environment import write_map
 from renderer.light.local import Lamps, Projector
 from renderer.light.presets import load_light
@@ -55,14 +55,7 @@ LIGHT_PATHS: dict[str, Case] = {
     "bounces:3": (HARMONICS, {"bounces": 3}),
 }
 LAMPS = Lamps(((2.0, 2.0, 2.0), (-2.0, 2.0, 2.0), (2.0, -2.0, 2.0)))
-LOCAL_LIGHTS: dict[str, Case] = {
-    "harmonics": DIRECT,
-    "3 lamps": (LAMPS, {}),
-    "3 discs": (replace(LAMPS, radius=0.5), {}),
-    "projector of 16²": (Projector(16), {}),
-    "projector of 32²": (Projector(32), {}),
-    "harmonics and projector of 16²": (SumBasis((HARMONICS, Projector(16))), {}),
-}
+LOCAL_LIGHTS: dict[str, Case] = {"harmonics": DIRECT, "3 lamps": (LAMPS, {}), "projector of 16²": (Projector(16), {})}
 
 
 def operators(
@@ -74,24 +67,17 @@ def operators(
 
 def converged(mesh: Mesh, size: int, samples: int, case: Case) -> TransferOperator:
     """With many more rays per pixel, patches, and rays per patch."""
-    with (
-        patch.object(rays, "DIRECTIONS", RAYS),
-        patch.multiple(precomputed, PATCHES=PATCHES, PATCH_DIRECTIONS=RAYS_OF_PATCH),
-    ):
+    more_patches = patch.multiple(precomputed, PATCHES=PATCHES, PATCH_DIRECTIONS=RAYS_OF_PATCH)
+    with patch.object(rays, "DIRECTIONS", RAYS), more_patches:
         return operators(mesh, size, samples, case)[0]
-
-
-# ---------------------------------------------------------------------------- costs
 
 
 def costs(table: str, cases: Mapping[str, Case], cup: Mesh, sizes: Sequence[int], rounds: int) -> Iterator[Row]:
     """A row per case and size; errors are at the first size."""
     samples, finest = SAMPLES[table]
     built = {(name, size): operators(cup, size, samples, cases[name])[0] for name, size in product(cases, sizes)}
-    bases = {name: basis for name, (basis, _) in cases.items()}
-    lights = {
-        name: load_light("grace") if bases[name] == HARMONICS else torch.rand(bases[name].size, 3) for name in bases
-    }
+    lights = {name: torch.rand(basis.size, 3) for name, (basis, _) in cases.items()}
+    lights |= {name: load_light("grace") for name, (basis, _) in cases.items() if basis == HARMONICS}
     steps = {key: partial(light_step, operator, lights[key[0]].requires_grad_()) for key, operator in built.items()}
     times = medians(steps, rounds)
     for (name, size), operator in built.items():
@@ -118,9 +104,6 @@ def image_and_gradient(operator: TransferOperator, light: Tensor) -> tuple[Tenso
     weights = torch.randn(3, size**2, generator=torch.Generator().manual_seed(0))
     image = light.new_zeros(3, size**2).index_copy(1, operator.pixels, operator.radiance(light))
     return image, operator.light_gradient(weights[:, operator.pixels])
-
-
-# ---------------------------------------------------------------------------- Mitsuba
 
 
 def hard_meshes() -> dict[str, Mesh]:

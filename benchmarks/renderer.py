@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks import scene
@@ -221,14 +222,9 @@ def savings(view: View, folder: Path) -> Iterator[tuple[str, Call, Call]]:
 
 def draw(path: Path, panels: Sequence[Sequence[Row]]) -> None:
     """A set of axes per panel: all settings, their front and the default."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     lines = -(-len(panels) // 4)
-    figure, axes = plt.subplots(lines, 4, figsize=(24, 6 * lines), squeeze=False)
-    for ax, rows in zip(axes.flat, panels, strict=False):
+    figure = Figure(figsize=(24, 6 * lines))
+    for ax, rows in zip(figure.subplots(lines, 4, squeeze=False).flat, panels, strict=False):
         by_degree = len({row["degree"] for row in rows}) > 1
         points: dict[str, list[tuple[float, float]]] = {"front": [], "default": []}
         for row in sorted(rows, key=lambda row: row["time_ms"]):
@@ -236,14 +232,11 @@ def draw(path: Path, panels: Sequence[Sequence[Row]]) -> None:
             for name in names + [mark for mark in ("front", "default") if row[mark]]:
                 points.setdefault(name, []).append((row["time_ms"], error_of(row)))
         for name, group in points.items():
-            style = {"front": "k-", "default": "r*"}.get(name, "o")
-            ax.loglog(
-                *zip(*group, strict=True), style, label=name, ms=14 if style == "r*" else 5, zorder=3 - (style == "o")
-            )
+            style, size, layer = {"front": ("k-", 5, 3), "default": ("r*", 14, 3)}.get(name, ("o", 5, 2))
+            ax.loglog(*zip(*group, strict=True), style, label=name, ms=size, zorder=layer)
         ax.set(title=rows[0]["panel"], xlabel="milliseconds", ylabel="relative error")
         ax.legend(fontsize=7)
     figure.savefig(path, dpi=100)
-    plt.close(figure)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -267,8 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with TemporaryDirectory() as folder:
             for name, everything, needed in savings(view, Path(folder)):
                 slow, fast = medians({0: everything, 1: needed}, options.rounds, options.device).values()
-                row = {"panel": f"skipped, {size}²", "setting": name, "time_ms": fast, "saved": slow / fast}
-                skipped.append(row)
+                skipped += [{"panel": f"skipped, {size}²", "setting": name, "time_ms": fast, "saved": slow / fast}]
     write_csv(options.out / "renderer_pareto.csv", [*chain.from_iterable(panels), *skipped])
     draw(options.out / "renderer_pareto.png", panels)
 

@@ -42,20 +42,13 @@ GRAYS = (0.0, 0.25, 0.5, 0.75, 1.0)
 SURE = 30.0  # a logit beyond all others, whose gradient float32 still holds: every attack takes all its steps
 
 
-# ---------------------------------------------------------------------------- speed
-
-
 def train(run: Path, options: argparse.Namespace, *overrides: str) -> dict[str, float]:
     """The last epoch's metrics of two of `python -m train`; the first compiles and warms up."""
     command = [sys.executable, "-m", "train", "experiment=paper", "data=npz", f"data.path={options.data}", f"run={run}"]
-    command += [
-        "data.validation=0.05",
-        "train.epochs=2",
-        f"train.images_per_epoch={options.images}",
-        f"train.device={options.device}",
-    ]
+    command += ["data.validation=0.05", "train.epochs=2", f"train.images_per_epoch={options.images}"]
     command += [f"model.depth={options.depth}", f"model.width={options.width}", f"scene.meshes={options.meshes}"]
-    subprocess.run([*command, *overrides, *options.overrides], check=True, stdout=subprocess.DEVNULL)
+    command += [f"train.device={options.device}", *overrides, *options.overrides]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     return next(line for line in reversed(lines) if "epoch" in line)
 
@@ -130,9 +123,6 @@ def speed(options: argparse.Namespace) -> list[Row]:
     return [*rows, {"round": "median", **median}]
 
 
-# ---------------------------------------------------------------------------- renders
-
-
 def peak_memory() -> int:
     """Bytes. What `getrusage` reports begins with the peak of the process that started this one."""
     status = Path("/proc/self/status").read_text()
@@ -146,15 +136,10 @@ def attack_cost(renders: int, size: int, meshes: int, steps: int) -> Row:
     network = WideResNet(10, 10, 1, 0.0).eval()
     make_sure(network.head.state_dict())
     views, before, start = renders // (meshes * len(GRAYS)), peak_memory(), time.process_time()
-    service = AugmentationService.from_meshes(
-        [(f"solid:orange:{seed}", 0) for seed in range(meshes)],
-        size,
-        AugmentationSettings(attack=TrainingAttackSettings(max_steps=steps)),
-        views=views,
-        backgrounds=GRAYS,
-        samples=2,
-        rasterizer="numpy",
-    )
+    solids = [(f"solid:orange:{seed}", 0) for seed in range(meshes)]
+    settings = AugmentationSettings(attack=TrainingAttackSettings(max_steps=steps))
+    scene = {"views": views, "backgrounds": GRAYS, "samples": 2, "rasterizer": "numpy"}
+    service = AugmentationService.from_meshes(solids, size, settings, **scene)
     assert service.scene is not None
     _ = service.scene.stacks  # what is precomputed of each view
     built = time.process_time()

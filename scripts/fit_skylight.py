@@ -5,21 +5,17 @@ The model is that of `renderer.light.skylight`, and its coefficients are integra
 
 import math
 import sys
-from dataclasses import dataclass
-
-sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
-from train import cli  # isort: skip (first, since the others take seconds to import)
 
 import numpy as np
 import torch
 from numpy.polynomial.chebyshev import chebpts1, chebvander2d
-from numpy.polynomial.legendre import leggauss
-from safetensors.torch import save
+from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
+from scipy.special import roots_legendre
 
-from renderer.errors import InputError
+sys.path[0] = sys.path[0].removesuffix("/scripts")  # in a clone, packages are found in its root
 from renderer.light.harmonics import basis
 from renderer.light.skylight import TURBIDITY, ZENITH, coefficients
-from train.errors import writable_file
 
 # Preetham et al., appendix A.2: A to E of Perez's formula for Y, x and y, as slope and offset in turbidity.
 PEREZ = np.array(
@@ -39,19 +35,10 @@ DEGREES = (13, 11)  # in the zenith, the paper's, and in 1/turbidity: with the p
 UPRIGHT = [l * l + l + m for l in range(7) for m in range(l + 1)]  # the 28 coefficients that are fitted
 
 
-@dataclass
-class Settings:
-    out: str = "renderer/light/skylight_fit.safetensors"  # the file that the renderer reads
-
-
-@cli.command()
-def main(settings: Settings) -> None:
-    out = writable_file(settings.out, "out")
-    if out.suffix != ".safetensors":  # or a mistaken name would cost another file
-        raise InputError(f"out={out}: name a .safetensors file")
+def main(out: str = "renderer/light/skylight_fit.safetensors") -> None:
+    """out: the file that the renderer reads, unless another is named as the script's argument."""
     fit = fit_polynomials(*DEGREES).float()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(save({"fit": fit}))
+    save_file({"fit": fit}, out)
     error = fit_error(fit, 50, np.random.default_rng(0))
     print(f"{out}: off by up to {error:.1e} of the coefficients' norm on 50 random skies")
 
@@ -82,64 +69,43 @@ def fit_error(fit: torch.Tensor, skies: int, rng: np.random.Generator) -> float:
 
 
 def coefficients_by_quadrature(zenith: float, azimuth: float, turbidity: float, nodes: int = 48) -> np.ndarray:
-    """(49, 3) coefficients of the sky by quadrature over the upper hemisphere.
+    """(49, 3) coefficients of the sky by quadrature over 4 nodes² directions of the upper hemisphere.
 
     48 nodes leave an error of up to 2e-8 of the coefficients' norm (in the clearest air with the sun overhead; mostly
-    1e-9) and 24 of up to 1e-5.
+    1e-9) and 24 of up to 1e-5. In polar coordinates around the sun, so that the cusp there is an end of the
+    integration: whole circles until they touch the horizon, and from there arcs above it, at angles
+    π/2 - zenith cos t, in which their length is smooth.
     """
-    directions, solid_angles = quadrature_around_sun(zenith, azimuth, nodes)
-    sky = radiance(directions, zenith, azimuth, turbidity)
-    return basis(torch.from_numpy(directions), 6).numpy().T @ (solid_angles[:, None] * sky)
+    tilt = max(zenith, 1e-8)  # overhead there are no arcs, and the ratio of the tangents is 0/0
+    (u, weights), (v, along) = (((1 + x) / 2, weight / 2) for x, weight in map(roots_legendre, (nodes, 2 * nodes)))
+    t, lowest = math.pi * u, math.pi / 2 - tilt
+    angles = np.concatenate([lowest * u, math.pi / 2 - tilt * np.cos(t)])[:, None]
+    steps = np.concatenate([lowest * weights, tilt * np.sin(t) * math.pi * weights])[:, None]
+    arcs = np.concatenate([np.full(nodes, math.pi), np.arccos(-np.tan(tilt * np.cos(t)) / math.tan(tilt))])[:, None]
+    solid_angles = np.sin(angles) * steps * 2 * arcs * along
+    angles, bearings = np.broadcast_arrays(angles, arcs * (2 * v - 1))  # a bearing of 0 is up
+    x, y = -np.sin(angles) * np.cos(bearings), np.sin(angles) * np.sin(bearings)
+    around_sun = np.stack([x, y, np.cos(angles)], axis=-1).reshape(-1, 3)
+    directions = Rotation.from_euler("yz", [tilt, azimuth]).apply(around_sun)
+    sky = radiance(directions[:, 2], angles.ravel(), zenith, turbidity)
+    return basis(torch.from_numpy(directions), 6).numpy().T @ (solid_angles.reshape(-1, 1) * sky)
 
 
-def radiance(directions: np.ndarray, zenith: float, azimuth: float, turbidity: float) -> np.ndarray:
-    """Sky radiance (N, 3), linear RGB in kcd/m², from unit directions (N, 3) above the horizon.
+def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: float) -> np.ndarray:
+    """Sky radiance (N, 3), linear RGB in kcd/m², from (N,) cosines of the zenith angle and angles to the sun.
 
     Saturated skies leave the gamut and are not clamped: around a clear sunset blue falls to -2.6 % of the largest.
     """
-    sun = polar(zenith, azimuth)
-    apart, together = (np.linalg.norm(directions + sign * sun, axis=1) for sign in (-1, 1))
-    angle = 2 * np.arctan2(apart, together)  # accurate near the sun, too, unlike the arccosine
     chi = (4 / 9 - turbidity / 120) * (math.pi - 2 * zenith)
     luminance = (4.0453 * turbidity - 4.9710) * math.tan(chi) - 0.2155 * turbidity + 2.4192
     overhead = [luminance, *(np.polyval([np.polyval(row, zenith) for row in rows], turbidity) for rows in CHROMATICITY)]
-    scale = np.array(overhead) / perez(np.ones(1), np.full(1, zenith), turbidity)[:, 0]
     # 1/cos overflows at the horizon; from a cosine of 1e-3 on, its exponential is below 1e-57.
-    luminance, x, y = scale[:, None] * perez(directions[:, 2].clip(1e-3), angle, turbidity)
+    cosine, angle = np.append(cosine.clip(1e-3), 1), np.append(angle, zenith)  # the last direction is overhead
+    a, b, c, d, e = (PEREZ @ [turbidity, 1]).T[:, :, None]
+    perez = (1 + a * np.exp(b / cosine)) * (1 + c * np.exp(d * angle) + e * np.cos(angle) ** 2)
+    luminance, x, y = np.array(overhead)[:, None] * perez[:, :-1] / perez[:, -1:]
     return (np.stack([x, y, 1 - x - y], axis=1) * (luminance / y)[:, None]) @ np.linalg.inv(RGB_TO_XYZ).T
 
 
-def perez(cosine: np.ndarray, angle: np.ndarray, turbidity: float) -> np.ndarray:
-    """Perez's distribution of Y, x, y (3, N), up to a factor, from the cosine of the zenith angle and the angle to the
-    sun, each (N,)."""
-    a, b, c, d, e = (PEREZ @ [turbidity, 1]).T[:, :, None]
-    return (1 + a * np.exp(b / cosine)) * (1 + c * np.exp(d * angle) + e * np.cos(angle) ** 2)
-
-
-def polar(zenith: float, azimuth: float) -> np.ndarray:
-    """The unit vector (3,) at a polar angle off +z and an azimuth off +x."""
-    return np.array([math.sin(zenith) * math.cos(azimuth), math.sin(zenith) * math.sin(azimuth), math.cos(zenith)])
-
-
-def quadrature_around_sun(zenith: float, azimuth: float, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (4 nodes², 3) above the horizon and their solid angles (4 nodes²,).
-
-    In polar coordinates around the sun, so that the cusp there is an end of the integration: whole circles until they
-    touch the horizon, and from there arcs above it, at angles π/2 - zenith cos t, in which their length is smooth.
-    """
-    zenith = max(zenith, 1e-8)  # overhead there are no arcs, and the ratio of the tangents is 0/0
-    (u, weights), (v, along) = (((1 + node) / 2, weight / 2) for node, weight in map(leggauss, (nodes, 2 * nodes)))
-    t, lowest = math.pi * u, math.pi / 2 - zenith
-    angles = np.concatenate([lowest * u, math.pi / 2 - zenith * np.cos(t)])
-    steps = np.concatenate([lowest * weights, zenith * np.sin(t) * math.pi * weights])
-    half_arcs = np.concatenate([np.full(nodes, math.pi), np.arccos(-np.tan(zenith * np.cos(t)) / math.tan(zenith))])
-    bearings = half_arcs[:, None] * (2 * v - 1)  # 0 is up
-    solid_angles = (np.sin(angles) * steps * 2 * half_arcs)[:, None] * along
-    sun, up = polar(zenith, azimuth), polar(zenith - math.pi / 2, azimuth)
-    around = np.cos(bearings)[..., None] * up + np.sin(bearings)[..., None] * np.cross(sun, up)
-    directions = np.cos(angles)[:, None, None] * sun + np.sin(angles)[:, None, None] * around
-    return directions.reshape(-1, 3), solid_angles.ravel()
-
-
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

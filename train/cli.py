@@ -32,10 +32,6 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-_loading = threading.Timer(5, print, ["loading PyTorch and other libraries ..."], {"file": sys.stderr, "flush": True})
-if "torch" not in sys.modules:
-    _loading.daemon = True
-    _loading.start()
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's background jobs ignore SIGINT
     signal.signal(signal.SIGINT, _interrupt)
 
@@ -54,6 +50,11 @@ def _complete() -> None:
 
 if sys.argv[1:2] in (["-sc"], ["--shell-completion"]):
     _complete()
+
+_loading = threading.Timer(5, print, ["loading PyTorch and other libraries ..."], {"file": sys.stderr, "flush": True})
+if "torch" not in sys.modules:
+    _loading.daemon = True
+    _loading.start()
 
 
 @contextmanager

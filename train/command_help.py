@@ -13,18 +13,17 @@ import conf
 
 CONF = Path(conf.__path__[0])
 LINE = re.compile(r"( *)(\w+):(?: .*?)?(?: +# (.*))?$")  # of YAML, or a dataclass's field: its key and comment
-GROUPS = {  # of the command line, by command: folders of conf/ whose files are choices
-    "train": {name: name for name in ("experiment", "data", "augment", "launcher")}
-    | {"attack@augment.attack": "attack"},
-    "attack": {"attack": "attack"},
+GROUPS = {  # by command: folders of conf/ whose files are choices, some for a key of another name
+    "train": ("experiment", "data", "augment", "launcher", "attack@augment.attack"),
+    "attack": ("attack",),
 }
 
 
 def format_help(name: str, about: str, settings: type, config: DictConfig) -> str:
     """The text of a command, from its docstring, the dataclass of its settings, and its composed configuration."""
-    file, groups = CONF / f"{name}.yaml", GROUPS.get(name, {})
+    file, groups = CONF / f"{name}.yaml", GROUPS.get(name, ())
     parts, comments = [about.strip(), ""], dict(_comments(inspect.getsource(settings)))
-    packages = {group: key.rpartition("@")[2] for key, group in groups.items()}
+    packages = {key.partition("@")[0]: key.rpartition("@")[2] for key in groups}
     if file.exists():
         parts += [f"The defaults are in {file}", ""]
         for path in sorted(CONF.glob("*/*.yaml")):
@@ -32,7 +31,7 @@ def format_help(name: str, about: str, settings: type, config: DictConfig) -> st
             if group not in ("experiment", "launcher"):
                 comments |= _comments(path.read_text(encoding="utf-8"), f"{packages.get(group, group)}.")
         comments |= _comments(file.read_text(encoding="utf-8"))
-    for key, group in groups.items():
+    for key, group in zip(groups, packages, strict=True):
         choices = [path for path in sorted((CONF / group).glob("*.yaml")) if path.stem != "default"]
         parts += [_aligned(f"{key}={path.stem}", _summary(path)) for path in choices]
     plain: Any = OmegaConf.to_container(config)

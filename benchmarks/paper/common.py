@@ -1,6 +1,6 @@
 """What the paper's benchmarks share: options, networks, meshes, clean-correct views, and JSON lines.
 
-Run from the root of the clone: python -m benchmarks.paper.norm_balls --help. A mesh is a file, solid:NAME:SEED, or a
+docs/results.md has the commands, which run in the root of the clone. A mesh is a file, solid:NAME:SEED, or a
 YAML mapping such as '{mesh: banana.glb, label: banana, albedo_scale: 2}'.
 """
 
@@ -64,12 +64,9 @@ def prepare(
     """
     arguments = options.parse_args(argv)
     torch.set_num_threads(arguments.threads)
-    try:
-        classifier = load_classifier(arguments.classifier, arguments.weights)
-        items = [read_item(mesh, arguments.label) for mesh in arguments.meshes]
-        subjects = [replace(load_object(item, vertices), name=Path(item.mesh).stem) for item in items]
-    except (InputError, TypeError, yaml.YAMLError) as error:
-        options.exit(2, f"error: {' '.join(str(error).split())}\n")
+    classifier = load_classifier(arguments.classifier, arguments.weights)
+    items = [read_item(mesh, arguments.label) for mesh in arguments.meshes]
+    subjects = [replace(load_object(item, vertices), name=Path(item.mesh).stem) for item in items]
     begin(arguments)
     return arguments, classifier, subjects
 

@@ -1,9 +1,5 @@
 """Adversarial against random perturbations in norm-balls (the paper's Section 4.1 and appendix A).
 
-python -m benchmarks.paper.norm_balls --out norm_balls.jsonl --examples 50 --meshes orange_studio.glb \\
-    '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
-python -m benchmarks.paper.table norm_balls.jsonl --figure norm_balls.png
-
 Every ball is searched by a descent and by as many uniform draws. The space "physical" is light whose radiance is
 nowhere negative, which the paper's light may be; "clipped" counts adversaries of any light, without its negative
 radiance.

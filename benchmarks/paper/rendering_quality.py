@@ -1,9 +1,5 @@
 """How surely a classifier recognizes the renders (the paper's appendix "Evaluate Rendering Quality").
 
-python -m benchmarks.paper.rendering_quality --out rendering_quality.jsonl --renders 10000 \\
-    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
-python -m benchmarks.paper.table rendering_quality.jsonl
-
 Cameras are random, and each sees the mesh on five grays. Intervals resample cameras, whose renders resemble each other.
 """
 
@@ -50,11 +46,11 @@ def summary(views: np.ndarray, seed: int) -> Row:
     """Counts, and each statistic with its 95 % bootstrap interval over cameras."""
     draws = np.random.default_rng(seed)
     resampled = [views[draws.integers(len(views), size=len(views))] for _ in range(RESAMPLES)]
-    statistics = {
-        name: [statistic(views), *np.quantile([statistic(sample) for sample in resampled], [0.025, 0.975]).tolist()]
-        for name, statistic in STATISTICS.items()
-    }
-    return {"cameras": len(views), "rendered": views.size, **statistics}
+    row: Row = {"cameras": len(views), "rendered": views.size}
+    for name, statistic in STATISTICS.items():
+        interval = np.quantile([statistic(sample) for sample in resampled], [0.025, 0.975])
+        row[name] = [statistic(views), *interval.tolist()]
+    return row
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -1,9 +1,5 @@
 """The cost of an attack's iteration, and the number of iterations it takes (the paper's Section 4.2, "Runtime").
 
-python -m benchmarks.paper.run_time --out run_time.jsonl --turns 5 --passes 10 --examples 20 \\
-    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
-python -m benchmarks.paper.table run_time.jsonl
-
 An iteration renders, asks the classifier, differentiates both, steps and projects. The attack and the classifier's own
 forward and input-gradient pass are timed in turns, in processor time, which leaves out other processes.
 """

@@ -1,9 +1,5 @@
 """Do adversaries still succeed in 8 bits, as JPEG, read back from their files, and in Mitsuba?
 
-python -m benchmarks.paper.survival --out survival.jsonl --meshes orange_studio.glb \\
-    '{mesh: banana.glb, label: banana}' '{mesh: "solid:cup:3", label: coffee mug}'
-python -m benchmarks.paper.table survival.jsonl
-
 Each is found and rendered anew by pnb-attack; --overrides are its own, such as renderer.shadows=false to
 count how many lights that were found without shadows succeed where Mitsuba casts them.
 """

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks.common import Row
 from benchmarks.paper.common import last_run
@@ -41,9 +42,6 @@ def groups(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]
     for row in rows:
         result.setdefault(tuple(row.get(name) for name in names), []).append(row)
     return result
-
-
-# ---------------------------------------------------------------------------------------- tables
 
 
 COUNTS = {"adversarial": "adversarial", "random": "one random draw", "search": "any of the draws"}
@@ -89,11 +87,8 @@ def views(rows: Rows) -> Table:
     states = {"first": "as found", "further": "10 steps on", "random": "random, as large"}
     yield ["attack", "views attacked", *states.values()]
     for (kind, count), group in groups(rows, "kind", "attacked").items():
-        yield [kind, count, *(fraction(error for row in group for error in errors(row, state)) for state in states)]
-
-
-def errors(row: Row, state: str) -> list[bool]:
-    return [name != row["label"] for name in row["predictions"][state]]
+        errors = ([name != row["label"] for row in group for name in row["predictions"][state]] for state in states)
+        yield [kind, count, *map(fraction, errors)]
 
 
 def run_time(rows: Rows) -> Table:
@@ -135,23 +130,18 @@ TABLES: dict[str, Callable[[Rows], Table]] = {
 
 def draw_norm_balls(rows: Rows, path: Path) -> None:
     """Success against the radius with intervals, a set of axes per space."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     spaces = groups((ball for ball in pooled(rows) if ball["radius"]), "space")
-    figure, axes = plt.subplots(1, len(spaces), figsize=(3.7 * len(spaces), 3.4), squeeze=False, layout="tight")
-    for ax, ((space,), balls) in zip(axes[0], spaces.items(), strict=True):
+    figure = Figure(figsize=(3.7 * len(spaces), 3.4), layout="tight")
+    axes = figure.subplots(1, len(spaces), squeeze=False)[0]
+    for ax, ((space,), balls) in zip(axes, spaces.items(), strict=True):
         for method in ("adversarial", "random", "search"):
             results = [tables.fraction(ball[method], ball["n"]) for ball in balls]
             value, low, high = (np.array([result[name] for result in results]) for name in ("value", "low", "high"))
             error = np.maximum([value - low, high - value], 0)  # below 0 by rounding alone
             ax.errorbar([ball["radius"] for ball in balls], value, error, label=method, marker="o", capsize=3)
         ax.set(title=space, xscale="log", xlabel="L∞ radius", ylabel="success", ylim=(-0.03, 1.03))
-    axes[0, 0].legend(fontsize=8)
+    axes[0].legend(fontsize=8)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

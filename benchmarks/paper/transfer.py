@@ -1,10 +1,5 @@
 """Do lights and shapes that deceive one network, from one side, deceive others, or from other sides (Tables 3 and 4)?
 
-python -m benchmarks.paper.transfer networks --out transfer.jsonl --examples 50 \\
-    --meshes orange_studio.glb '{mesh: orange_sketchfab.glb, albedo_scale: 3}'
-python -m benchmarks.paper.transfer views --out unseen_views.jsonl --sets 10 --examples 25 --meshes ...
-python -m benchmarks.paper.table transfer.jsonl
-
 An adversary is recorded at the first step that succeeds, and after ten further steps, beside random changes that are as
 large in every coefficient or coordinate.
 """

@@ -90,18 +90,6 @@ def test_mitsubas_image_is_in_the_place_of_ours(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("paths", ["shadows", "bounces:3"])
-@pytest.mark.parametrize("mesh", ["convex: a ball", "open: half a ball", "rugged: a dented ball"])
-def test_images_go_to_mitsubas_noise(mesh, paths):
-    """Which is itself known from eight renders to a fifth or so; a convex mesh has nothing to converge."""
-    pytest.importorskip("mitsuba")
-    row = lights.differences(lights.hard_meshes()[mesh], 32, paths)
-    error, converged, direct = (row[f"image_error{end}"] for end in ("", "_converged", "_direct"))
-    assert 0 < row["image_noise"] < 0.006 and converged < 1.3 * row["image_noise"]
-    assert error < 1.3 * row["image_noise"] if mesh.startswith("convex") else converged < error < 0.02 < direct
-
-
-@pytest.mark.slow
 def test_training_is_timed_beside_a_plain_loop(tmp_path):
     """With attacks that take all their steps."""
     rng, data = np.random.default_rng(0), tmp_path / "data.npz"

@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from augment import AttackSettings, Classifier, StepSettings, attack
+from augment import Classifier, attack
 from augment.objects import SceneObject
 from augment.utils import generator
 from benchmarks.paper import common, norm_balls, rendering_quality, run_time, survival, table, transfer
@@ -85,13 +85,6 @@ def test_adversaries_are_found_and_rendered_again_by_the_attack_script(tmp_path,
     assert capsys.readouterr().out.splitlines()[2].split()[:4] == ["|", "lighting", "|", "1"]
 
 
-def test_a_mesh_that_is_missing_is_refused_in_one_line(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        norm_balls.main(["--out", "never.jsonl", "--meshes", "missing.glb", "--classifier", "run:pretrained/none"])
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and "missing.glb" in error and error.count("\n") == 1
-
-
 @pytest.mark.parametrize(("excess", "success"), [(0.9, True), (1.1, False)])
 def test_a_pixel_attack_lowers_a_mean_by_its_radius_and_random_draws_do_not(excess, success):
     """All values lie further than the radius from 0 and 1, so that the sign step takes it off each of them."""
@@ -110,30 +103,6 @@ def test_light_without_its_negative_radiance_is_the_same_where_there_is_none():
     sky[0] = 1.0
     torch.testing.assert_close(norm_balls.without_negative(sky), sky, rtol=0, atol=1e-5)  # of a quadrature in float32
     assert norm_balls.without_negative(-sky).abs().max() == 0
-
-
-class Line:
-    """Images of a value's gray."""
-
-    start = torch.tensor([[0.42], [0.92]])
-
-    def render(self, values, examples):
-        return values.view(-1, 1, 1, 1, 1).expand(-1, 1, 3, SIZE, SIZE)
-
-    def step(self, gradient):
-        return 0.05 * gradient.sign()
-
-    def project(self, values, examples):
-        return values
-
-
-def test_the_descent_stops_at_a_success_and_then_goes_on_for_as_many_steps_as_were_asked():
-    """From 0.42 in steps of 0.05 it is 5 steps to below 0.2, and from 0.92 it is 15."""
-    settings = AttackSettings(lighting=StepSettings(), margin=0.0, rounded=False)
-    first, further = transfer.adversaries(by_brightness(), Line(), settings, "orange", views=1)
-    # Sums of at most 25 float32 steps of size 0.05, each rounded to 2⁻²⁵.
-    torch.testing.assert_close(first, torch.tensor([[0.17], [0.17]]), rtol=0, atol=1e-6)
-    torch.testing.assert_close(further, first - 0.05 * transfer.FURTHER, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", common.STEPS)

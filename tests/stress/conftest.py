@@ -4,10 +4,9 @@ import contextlib
 import os
 import re
 import runpy
-import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -136,20 +135,3 @@ def corpus(tmp_path_factory) -> Path:
     assert run_here("train", "run=finished", "train.epochs=2", *TRAINING, folder=folder) == 0
     assert run_here("publish", "run=finished", "out=published", folder=folder) == 0
     return folder
-
-
-class Hang(BaseException):
-    """Raised by the alarm; no handler of errors catches it."""
-
-
-@pytest.fixture
-def time_limit() -> Iterator[Callable[[float], object]]:
-    """Ends with `Hang` what takes longer than so many seconds."""
-
-    def ring(*_: object) -> None:
-        raise Hang
-
-    before = signal.signal(signal.SIGALRM, ring)
-    yield lambda seconds: signal.setitimer(signal.ITIMER_REAL, seconds)
-    signal.setitimer(signal.ITIMER_REAL, 0)
-    signal.signal(signal.SIGALRM, before)

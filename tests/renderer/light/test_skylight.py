@@ -123,7 +123,7 @@ def test_a_new_fit_is_the_committed_one():
 
 @pytest.mark.slow
 def test_the_script_makes_the_committed_fit(tmp_path, call, capsys):
-    assert call("fit_skylight", f"out={tmp_path}/fit.safetensors") == 0
+    assert call("fit_skylight", f"{tmp_path}/fit.safetensors") == 0
     assert float(re.search(r"off by up to (\S+)", capsys.readouterr().out)[1]) < 7e-5
     torch.testing.assert_close(load_file(tmp_path / "fit.safetensors"), load_file(FIT), rtol=0, atol=140 * EPS32)
 
