@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 
@@ -47,20 +48,30 @@ def cache_home(tmp_path_factory) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def parsed_once() -> Iterator[None]:
-    """Hydra parses each file of conf/ once, and not again at every composition."""
+def composed_once() -> Iterator[None]:
+    """Hydra parses each file of conf/ once, and merges the files of a command's choices once, and not again at every
+    composition; it then sets the values of the overrides."""
     Plugins.instance()  # which defines the class of these sources anew
     source = SourcesRegistry.instance().resolve("pkg")
-    load, configs = source.load_config, {}
+    load, merge, files, merged = source.load_config, ConfigLoaderImpl._compose_config_from_defaults_list, {}, {}
 
     def load_once(self, config_path):
         key = self.path, config_path
-        if key not in configs:
-            configs[key] = load(self, config_path)
-        return deepcopy(configs[key])
+        if key not in files:
+            files[key] = load(self, config_path)
+        return deepcopy(files[key])
+
+    def merge_once(self, defaults, repo):
+        if {"train", "attack"}.isdisjoint(default.config_path for default in defaults):  # commands without a file
+            return merge(self, defaults, repo)
+        key = repr(defaults)
+        if key not in merged:
+            merged[key] = merge(self, defaults, repo)
+        return deepcopy(merged[key])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(source, "load_config", load_once)
+        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge_once)
         yield
 
 
