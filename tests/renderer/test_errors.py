@@ -26,7 +26,7 @@ FACES = torch.from_numpy(MESH.faces)
 GOOD = {
     "vertices": torch.from_numpy(MESH.vertices),
     "light": torch.ones(49, 3),
-    "albedo": surface_albedo(MESH, FRAGMENTS, "linear"),
+    "albedo": surface_albedo(MESH, FRAGMENTS, "linear").contiguous(),
 }
 
 
