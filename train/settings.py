@@ -241,7 +241,7 @@ def read_settings(kind: type[Settings], config: DictConfig, key: str = "") -> Se
     InputError names the key that is unknown, unset, of the wrong type or, by the dataclass's own check, out of range.
     """
     try:
-        merged: Any = OmegaConf.merge(_schema(kind), config)
+        merged: Any = OmegaConf.merge(_schema(kind), config)  # type: ignore[arg-type]  # types are hashable
         if unset := OmegaConf.missing_keys(config) | OmegaConf.missing_keys(merged):
             raise InputError(f"{_join(key, min(unset))} is not set: give {_join(key, min(unset))}=...")
         _check(merged, key)
