@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import MISSING
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from augment.objects import load_object
@@ -53,7 +54,7 @@ ROUGHNESS = 0.5  # of the objects' surface: a soft gloss, as peel has
 # ------------------------------------------------------------------------------------- projected patterns
 
 # Points are (..., 2) in the projector's image, which spans [-1, 1]; an object in its middle spans about [-0.3, 0.3]. A
-# family gives each point a weight in [0, 1] between two colors of light.
+# family gives each point a weight in [0, 1] between two colors of light, or one for each channel (..., 3).
 
 
 def solid(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -91,7 +92,60 @@ def spots(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return lit.astype(float)
 
 
-FAMILIES = {family.__name__: family for family in (solid, gradient, stripes, checkers, half, spots)}
+def rings(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Rings of one width about a random point."""
+    radius = np.linalg.norm(points - rng.uniform(-0.5, 0.5, 2), axis=-1)
+    return ((radius / rng.uniform(0.12, 0.4) + rng.uniform()) % 1 < rng.uniform(0.3, 0.7)).astype(float)
+
+
+def window(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The panes of a window with bars between them and darkness around."""
+    panes, size = rng.integers(2, 5, 2), rng.uniform(0.15, 0.4, 2)
+    places = (points - rng.uniform(-0.15, 0.15, 2)) / size + panes / 2
+    inside = (places > 0) & (places < panes) & (abs(places % 1 - 0.5) < rng.uniform(0.3, 0.45))
+    return inside.all(axis=-1).astype(float)
+
+
+def leaves(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The shadows of leaves: ellipses at all angles, over about half of the image."""
+    length = rng.uniform(0.15, 0.35)
+    lit = np.ones(points.shape[:-1], dtype=bool)
+    for _ in range(round(2.8 / (math.pi * length**2 / 3))):
+        angle, offset = rng.uniform(0, math.pi), points - rng.uniform(-1, 1, 2)
+        along = offset @ [math.cos(angle), math.sin(angle)]
+        across = offset @ [-math.sin(angle), math.cos(angle)]
+        lit &= (along / length) ** 2 + (across / length * 3) ** 2 > 1
+    return lit.astype(float)
+
+
+def text(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Lines of random capitals, bright, on a dark slide."""
+    height = int(rng.integers(40, 120))
+    slide, font = Image.new("L", (RESOLUTION, RESOLUTION)), ImageFont.load_default(float(height))
+    for top in range(0, RESOLUTION, int(1.2 * height)):
+        line = "".join(rng.choice(list("ABCDEFGHIJKLMNOPQRSTUVWXYZ "), 24))
+        ImageDraw.Draw(slide).text((-int(rng.integers(height)), top), line, 255, font)
+    return _sampled(np.asarray(slide, dtype=np.float32)[..., None] / 255, points, order=1)[..., 0]
+
+
+def colors(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A smooth field of colors, each channel by itself."""
+    grid = rng.uniform(0, 1, (rng.integers(3, 6), rng.integers(3, 6), 3))
+    return _sampled(grid, points, order=3).clip(0, 1)
+
+
+def _sampled(image: np.ndarray, points: np.ndarray, order: int) -> np.ndarray:
+    """The image (H, W, C), which spans [-1, 1], at points (..., 2), by splines; mirrored beyond its sides."""
+    places = np.moveaxis((points[..., ::-1] + 1) / 2 * image.shape[:2] - 0.5, -1, 0)
+    channels = [map_coordinates(channel, places, order=order, mode="reflect") for channel in np.moveaxis(image, -1, 0)]
+    return np.stack(channels, axis=-1)
+
+
+TRAINED = ("solid", "gradient", "stripes", "checkers", "half", "spots")  # all but gradients are thrown in training, too
+FAMILIES = {
+    family.__name__: family
+    for family in (solid, gradient, stripes, checkers, half, spots, rings, window, leaves, text, colors)
+}
 TWO_COLORED = ("gradient", "stripes", "checkers")  # the other families have darkness beside their color
 
 
@@ -103,7 +157,8 @@ def draw_pattern(family: str, rng: np.random.Generator) -> np.ndarray:
     angle = rng.uniform(0, 2 * math.pi)
     rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     points = np.stack(np.meshgrid(centers, centers, indexing="xy"), axis=-1) @ rotation
-    weight = FAMILIES[family](points, rng)[..., None]
+    weight = FAMILIES[family](points, rng)
+    weight = weight if weight.ndim == 3 else weight[..., None]
     return (second + weight * (first - second)).astype(np.float32)
 
 
@@ -274,7 +329,7 @@ class LabSettings:
     label: str = "orange"  # the class under study: one of its objects and one other stand in each setup
     meshes: list[Any] = field(default_factory=lambda: [f"solid:{name}" for name in SOLIDS])
     setups: int = 180  # draws of light, camera and pose; two photographs each
-    patterns: list[str] = field(default_factory=lambda: list(FAMILIES))  # of the projector, for as many setups each
+    patterns: list[str] = field(default_factory=lambda: list(TRAINED))  # of the projector, for as many setups each
     environments: list[str] = field(default_factory=list)  # maps (.npy, .hdr, .exr) instead, for as many setups each
     brightness: list[float] = field(default_factory=lambda: [0.2, 2.5])  # of white surfaces that face the light
     exposure: float = 1.0  # multiplies radiance; at 1, a radiance of 1 is white
