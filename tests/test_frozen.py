@@ -109,12 +109,14 @@ ATTACKS = {
 }
 
 SMALL = """
-data=shapes data.train_per_class=10 data.test_per_class=4 data.size=16 data.images=null model.depth=10 model.width=1
+data=shapes data.train_per_class=10 data.test_per_class=4 data.size=16 model.depth=10 model.width=1
 train.epochs=2 train.batch_size=16 train.precision=float32 train.device=cpu train.threads=1 renderer.rasterizer=numpy
 renderer.samples=2 scene.backgrounds=[0.2,0.8]
 """
 RUNS = {
-    "demonstration": "experiment=demo augment.examples=4 augment.attack.max_steps=3 augment.attack.step_size=0.3",
+    "demonstration": """
+experiment=paper compare=[none] model.dropout=0.0 train.schedule=one_cycle augment.examples=4
+augment.attack.max_steps=3 augment.attack.step_size=0.3""",
     "best": """
 experiment=best augment.examples=null scene.views=1 scene.meshes=['solid:orange',solid:orange:1] augment.every=30
 train.images_per_epoch=60 train.ema_decay=0.8 train.distillation=1.0 augment.random_light.radius=1.0""",

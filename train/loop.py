@@ -11,6 +11,7 @@ from typing import Any, cast
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 from torch.optim.swa_utils import AveragedModel, get_swa_avg_fn
 
 from augment import utils
@@ -95,6 +96,8 @@ class Trainer:
         self.optimizer = torch.optim.SGD(
             model.parameters(), settings.learning_rate, settings.momentum, fused=True, **options
         )
+        norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
+        self._frozen_norms = norms if settings.freeze_statistics else []
         compiled = compiles(settings.compile, self.device)
         teacher = self.initial if settings.distillation else None
         self._loss = training_loss(replica, settings, service.label, teacher)
@@ -150,6 +153,8 @@ class Trainer:
             with self.phases("training"):
                 put_last(mixed, state.renders)
                 self.model.train()
+                for norm in self._frozen_norms:
+                    norm.eval()
                 first = state.step - sum(steps[:index])
                 batches = training_batches(mixed, settings.batch_size, self.seed, rounds[index], settings.flips, first)
                 for batch in progress(batches, f"epoch {self.epoch + 1}", total, state.step):

@@ -52,6 +52,7 @@ class TrainSettings:
     distillation: float = 0.0
     ema_decay: float = 0.0
     soup: bool = False
+    freeze_statistics: bool = False
     precision: str = "auto"
     device: str = "auto"
     threads: int | None = None
@@ -71,8 +72,8 @@ class TrainSettings:
                 raise InputError(f"{name}={getattr(self, name)} must be at least 0 and below 1")
         for name in ("ranking", "distillation", "weight_decay"):
             require_range(name, getattr(self, name), 0, FACTOR)
-        if (self.distillation or self.soup) and not self.init_from:
-            raise InputError("distillation and soup need a network to begin with: set train.init_from")
+        if (self.distillation or self.soup or self.freeze_statistics) and not self.init_from:
+            raise InputError("distillation, soup and freeze_statistics need a network to begin with: set init_from")
         if not 0 < self.learning_rate <= FACTOR:
             raise InputError(f"learning_rate={self.learning_rate} must be positive and at most {FACTOR:g}")
 
@@ -82,7 +83,8 @@ def training_loss(model: nn.Module, settings: TrainSettings, label: int | None, 
     of correct predictions.
 
     The loss is the mean `label_loss`; plus, by their weights in the settings, the `ranking_loss` of the class `label`
-    and, on images that are no renders, the `divergence` from the teacher's predictions.
+    and the `divergence` from the teacher's predictions: on renders, of all classes but `label`, which are to change
+    in nothing; none without a label.
     """
 
     def loss_and_hits(images: Tensor, labels: Tensor, rendered: Tensor) -> tuple[Tensor, Tensor]:
@@ -91,7 +93,11 @@ def training_loss(model: nn.Module, settings: TrainSettings, label: int | None, 
         if teacher is not None:
             with torch.no_grad():
                 targets = teacher(to_unit(images))
-            loss = loss + settings.distillation * (divergence(logits, targets) * ~rendered).mean()
+            changed = divergence(logits, targets) * ~rendered
+            if label is not None:
+                kept = torch.arange(logits.shape[1], device=logits.device) != label
+                changed = changed + divergence(logits[:, kept], targets[:, kept]) * rendered
+            loss = loss + settings.distillation * changed.mean()
         if label is not None and settings.ranking:
             loss = loss + settings.ranking * ranking_loss(logits, labels, label)
         return loss, is_right(logits.detach().argmax(1), labels).sum()

@@ -69,6 +69,11 @@ def test_the_loss_is_the_smoothed_cross_entropy_and_on_images_of_the_data_the_di
     torch.testing.assert_close(loss, (1 - smoothing) * cross_entropy + smoothing * uniform + 4 * divergence)
     assert hits == (logits.argmax(1) == LABELS).sum()
 
+    kept = [0, 2, 3]  # on renders, the classes beside the label, among themselves
+    p, q = logits[:2, kept].softmax(1), teacher(images[:2] / 255)[:, kept].softmax(1)
+    ranked = training_loss(model, settings, 1, teacher)(images, LABELS, rendered)[0]
+    torch.testing.assert_close(ranked, loss + 4 * (q * (q / p).log()).sum() / 6)
+
 
 def test_the_ranking_is_added_by_its_weight(model, images):
     labels = LABELS - 1  # two of "anything but class 0"
