@@ -15,7 +15,7 @@ from omegaconf import MISSING
 from renderer.errors import InputError
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.errors import writable_folder
-from train.networks import load_classifier, load_run
+from train.networks import load_classifier, load_run, published
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.run_folder import sole_writer
 
@@ -26,7 +26,7 @@ class Settings:
     model: str | None = None  # python:package.module:function, if such a function made the run's network
     classifier: str | None = None  # instead of run, any other network, by a name that conf/attack.yaml explains
     weights: str | None = None  # the classifier's local weights file, if it brings none
-    photos: str = MISSING  # a folder of class folders, or of images of `label`
+    photos: str = MISSING  # a folder of class folders, or of images of `label`; pretrained/laboratory is installed
     label: str = "orange"  # the class whose recall and false positives count, and that of a flat folder's images
     out: str = "runs/photographs/${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"  # the folder of the scores
     skip_unreadable: bool = False  # skip broken photographs
@@ -50,7 +50,7 @@ def main(settings: Settings) -> None:
     network.label(settings.label)  # or InputError that names the network
     model = MixedPrecision(network.to(device), choose_precision(settings.precision, device))
     out = writable_folder(settings.out, "out")
-    photos, label, skip = Path(settings.photos), settings.label, settings.skip_unreadable
+    photos, label, skip = published(Path(settings.photos)), settings.label, settings.skip_unreadable
     with sole_writer("out", out):
         summary = evaluate_photographs(model, network.classes, photos, label, out, network.size, skip, device)
     print(f"{format_summary(summary)}\n\ntable, scores and image: {out}")

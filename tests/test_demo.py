@@ -18,16 +18,16 @@ def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report
     done = subprocess.run(
         [sys.executable, "-m", "train"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
     )
-    *_, images = re.findall(r"^image: (.*)$", done.stdout, re.M)
-    folder = Path(images).parents[1]
-    assert Path(images).read_bytes().startswith(b"\x89PNG")
-    recall = {
-        arm: json.loads((path / "photographs" / "summary.json").read_text())["recall"]["value"]
-        for arm, path in [("none", folder / "none"), ("adversarial", folder)]
+    *_, sheet = re.findall(r"^image: (.*)$", done.stdout, re.M)
+    folder = Path(sheet).parents[1]
+    assert Path(sheet).read_bytes().startswith(b"\x89PNG")
+    auc = {
+        network: json.loads((path / "laboratory" / "summary.json").read_text())["auc"]["value"]
+        for network, path in [("the initial network", folder / "before"), ("random", folder)]
     }
-    assert recall["adversarial"] > recall["none"]
-    for arm, value in recall.items():
-        assert re.search(rf"^\| {arm} .*\b{value:.3f}\b", done.stdout, re.M)
+    assert auc["random"] > auc["the initial network"] + 0.05
+    for network, value in auc.items():
+        assert re.search(rf"^\| {network} .*\b{value:.3f}\b", done.stdout, re.M)
     *_, last = done.stdout.splitlines()
     page = Path(last.removeprefix("report: "))
     assert page.parent == folder and "Attack examples" in page.read_text()

@@ -20,15 +20,15 @@ from omegaconf import DictConfig
 
 from augment import utils
 from renderer.errors import InputError
-from train import checkpoint, console
+from train import console
 from train.command_help import format_help
 from train.errors import writable_file, writable_folder
-from train.processes import Interrupted, broadcast, first_process_first, process_group
+from train.processes import Interrupted, broadcast, process_group
 from train.report.compare import format_table
 from train.report.page import report_of
 from train.report.summary import summarize
-from train.run import load_data, prepare, write_images
-from train.run_folder import require_same_run, resumed, sole_writer
+from train.run import load_data, prepare
+from train.run_folder import CONFIG, require_same_run, resumed, sole_writer
 from train.settings import ExperimentSettings, as_override, compose, given_command, keyed, program, read_settings
 from train.sweep import run_in_sweep, sweep
 
@@ -86,15 +86,12 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
             arms[folder / arm] = replace(settings, compare=[], augment=replace(settings.augment, arm=arm))
     arms[folder] = settings
     for path, arm_settings in arms.items():
-        if settings.train.resume and checkpoint.exists(path):
+        if settings.train.resume and (path / CONFIG).is_file():
             require_same_run(path, arm_settings)  # before anything is written
     if first:
         log_to(writable_file(writable_folder(run, "run") / LOG, "run"))
     data = load_data(settings)
     with sole_writer("run", *arms) if first else nullcontext():
-        with first_process_first():
-            if first:
-                write_images(settings, data.size)
         runs = {path: prepare(arm, data, path, command) for path, arm in arms.items()}  # all, to meet every mistake
         for path, train_and_score in runs.items():
             console.info("\n== augment=%s%s", arms[path].augment.arm, "" if path == folder else ", for comparison")

@@ -13,19 +13,20 @@ from augment.classifiers.adapter import class_index
 from augment.losses import complementary_label
 from augment.service import AugmentationService
 from augment.utils import Phases, stream_seed
-from renderer.cache import TensorCache, cache_folder
+from renderer.cache import TensorCache, cache_folder, content_key
 from renderer.errors import InputError, require_choice, require_range
 from renderer.image import LARGEST_SIZE, to_unit
 from train import checkpoint, console
 from train.data import DataSet, Split, channel_statistics, load_cifar100, load_folder, load_npz, stratified_split
 from train.device import MixedPrecision, choose_device, choose_precision, choose_threads, set_deterministic
 from train.loop import Trainer, evaluate
-from train.networks import build_network, describe, load_selected, start_from
+from train.networks import PYTHON, build_network, describe, load_selected, start_from
 from train.photographs.folder import find_photographs, require_outside
 from train.photographs.metrics import METRICS, find_metric
+from train.photographs.predictions import Model, compute_logits
 from train.photographs.scoring import evaluate_photographs, format_summary
 from train.processes import first_process_first
-from train.rendered_shapes import load_shapes, write_held_out
+from train.rendered_shapes import load_shapes
 from train.run_folder import BEFORE, RunLog, require_same_run, write_config
 from train.settings import OTHER, SMALLEST_SIZE, ExperimentSettings, chosen_rasterizer, keyed
 
@@ -89,12 +90,19 @@ def prepare(settings: ExperimentSettings, data: DataSet, folder: Path, command: 
 
 def load_data(settings: ExperimentSettings) -> DataSet:
     """The data set that `settings.data` names; InputError naming a key where it cannot be had."""
-    data, cache = settings.data, TensorCache(cache_folder(settings.renderer.cache))
+    data, cache, base = settings.data, TensorCache(cache_folder(settings.renderer.cache)), settings.train.init_from
     loaders = {
         "cifar100": lambda: load_cifar100(data.path),
         "npz": lambda: load_npz(data.path),
         "folder": lambda: load_folder(data.path, data.size, data.test_fraction),
-        "shapes": lambda: load_shapes(data.train_per_class, data.test_per_class, data.size, data.seed, cache),
+        "shapes": lambda: load_shapes(
+            data.train_per_class,
+            data.test_per_class,
+            data.size,
+            data.seed,
+            cache,
+            load_selected(Path(base))[1]["architecture"]["classes"] if base else None,
+        ),
     }
     require_choice("data.name", data.name, loaders)
     console.info("data: %s", data.name)
@@ -103,14 +111,6 @@ def load_data(settings: ExperimentSettings) -> DataSet:
     with keyed("data.path"):
         require_range("image size", loaded.size, SMALLEST_SIZE, LARGEST_SIZE)
     return loaded
-
-
-def write_images(settings: ExperimentSettings, size: int) -> None:
-    """Write the rendered held-out images that `data=shapes` is scored on, where the settings ask for them."""
-    data = settings.data
-    if data.name == "shapes" and data.images:
-        console.info("held-out renders in hard light (not photographs): %s", data.images)
-        write_held_out(Path(data.images), size, data.seed, TensorCache(cache_folder(settings.renderer.cache)))
 
 
 def _validation(
@@ -129,7 +129,7 @@ def _validation(
     stored = base[1]["architecture"].get("validation")
     known = stored.get("fraction") if isinstance(stored, dict) else None
     if not isinstance(known, float) or own | {"fraction": known} != stored:
-        console.info("validation: %s does not say which of these images it learned from; perhaps these, too", init_from)
+        console.info("validation: %s does not say whether it learned from these images, too", init_from)
         return fraction, None
     fraction = known if asked is None else asked
     if fraction > known:
@@ -167,8 +167,9 @@ def build_trainer(
 
 def build_service(settings: ExperimentSettings, data: DataSet, device: torch.device) -> AugmentationService:
     """The scene, its labels and the service that regenerates its renders; logs the rasterizer."""
-    scene, labels, ranked = None, torch.zeros(0, dtype=torch.int64, device=device), None
+    scene, labels = None, torch.zeros(0, dtype=torch.int64, device=device)
     phases, process = Phases(device), (utils.rank(), utils.world_size())
+    ranked = class_index(data.classes, settings.label, "label") if settings.scene.hard_negatives else None
     if settings.augment.renders:
         label, objects = class_index(data.classes, settings.label, "label"), settings.objects
         named = {item.label: key for key, item in objects.items() if item.label != OTHER}
@@ -180,17 +181,32 @@ def build_service(settings: ExperimentSettings, data: DataSet, device: torch.dev
         with phases("operators"), first_process_first(), keyed("scene", vars(settings.scene)):
             scene = build_scene(list(objects.values()), data.size, settings.views, **options, device=device)
         labels = torch.tensor([numbers[name] for name in scene.labels], device=device)
-        ranked = label if settings.scene.hard_negatives else None
     return AugmentationService(settings.augment, scene, labels, settings.seed, phases, ranked, *process)
 
 
 def _scores_before(settings: ExperimentSettings, trainer: Trainer, data: DataSet) -> dict[str, float]:
-    """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs."""
-    if not trainer.initial:
+    """Score the network of train.init_from on the test set and, in the folder BEFORE, on the photographs.
+
+    Its predictions are cached under a hash of weights and images, for all runs that begin with it.
+    """
+    model, device = trainer.initial, trainer.device
+    if not model or utils.rank():
         return {}
-    accuracy = evaluate(trainer.initial, data.test.to(trainer.device))["accuracy"]
+    is_ours = not settings.model.name.startswith(PYTHON)  # the code of others may change unseen
+    cache = TensorCache(cache_folder(settings.renderer.cache) if is_ours else None)
+    key = checkpoint.content_hash([torch.__version__, str(model), model.precision, str(device), model.state_dict()])
+
+    def predict(images: torch.Tensor) -> torch.Tensor:
+        batch = content_key(key, images.cpu().numpy())
+        if (stored := cache.read(batch)) is None:
+            stored = {"logits": model(images).cpu().contiguous()}
+            cache.write(batch, stored)
+        return stored["logits"]
+
+    logits = compute_logits(predict, data.test.images, len(data.classes), device)
+    accuracy = (logits.argmax(1) == data.test.labels).float().mean().item()
     console.info("before: %s has test accuracy %.4f", settings.train.init_from, accuracy)
-    _score_photographs(settings, trainer.initial, data, trainer.folder / BEFORE, trainer.device)
+    _score_photographs(settings, predict, data, trainer.folder / BEFORE, device)
     return {"test/accuracy_before": accuracy}
 
 
@@ -207,7 +223,7 @@ def _test_scores(trainer: Trainer, data: DataSet) -> dict[str, float]:
 
 
 def _score_photographs(
-    settings: ExperimentSettings, model: MixedPrecision, data: DataSet, folder: Path, device: torch.device
+    settings: ExperimentSettings, model: Model, data: DataSet, folder: Path, device: torch.device
 ) -> dict[str, Any]:
     """Score a model on each folder of photographs, in a sub-folder of its name; the summaries by name.
 

@@ -27,17 +27,17 @@ from renderer.errors import InputError, in_one_line, require_range
 from renderer.image import LARGEST_SIZE
 from renderer.rasterizer import Rasterizer, choose
 from train.errors import one_sentence
-from train.networks import WIDERESNET
+from train.networks import WIDERESNET, published
 from train.recipe import TrainSettings
 
 Settings = TypeVar("Settings")
 OTHER = "other"  # in place of the class of a hard negative that the classifier has no class for
 PHOTOGRAPHS = "photographs"  # the sub-folder of a run with the scores on a folder of photographs that has no other name
-RESERVED = ("renders", "rendered_images", "test", "before")  # other sub-folders and scores of a run
+RESERVED = ("renders", "test", "before")  # other sub-folders and scores of a run
 SMALLEST_SIZE = 5  # pixels per side: 4 are padded by reflection
 MOST_IMAGES, LARGEST_SEED = 10**6, 2**63 - 1
 TEXTS = {  # keys whose values are names or paths, also where they look like numbers
-    *("run", "sweep", "init_from", "out", "photos", "path", "images", "cache"),
+    *("run", "sweep", "init_from", "out", "photos", "path", "cache"),
     *("weights", "light", "label", "target", "classifier", "name", "reload"),
 }
 
@@ -54,7 +54,6 @@ class DataSettings:
     train_per_class: int = 300
     test_per_class: int = 60
     seed: int = 0
-    images: str | None = None
 
     def __post_init__(self) -> None:
         require_range("size", self.size, SMALLEST_SIZE, LARGEST_SIZE)
@@ -116,7 +115,7 @@ class EvaluationSettings:
     def folders(self) -> dict[str, Path]:
         """The folders of photographs by the name of the run's sub-folder that gets their scores."""
         named = self.photos if isinstance(self.photos, dict) else {PHOTOGRAPHS: self.photos} if self.photos else {}
-        return {str(name): Path(folder) for name, folder in named.items()}
+        return {str(name): published(Path(folder)) for name, folder in named.items()}
 
 
 @dataclass

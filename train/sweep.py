@@ -24,7 +24,7 @@ from train.errors import one_sentence, writable_folder
 from train.report.compare import format_table
 from train.report.page import report_of
 from train.report.summary import is_finished, summarize
-from train.run import load_data, run, write_images
+from train.run import load_data, run
 from train.run_folder import CIRCUMSTANCES, FAILURE, locked, require_same_run, state
 from train.settings import ExperimentSettings, compose, given_command, read_settings
 
@@ -110,9 +110,7 @@ def run_in_sweep(config: DictConfig, folder: Path) -> None:
         try:
             settings = read_settings(ExperimentSettings, config)
             settings.train.resume = checkpoint.exists(folder)
-            data = load_data(settings)
-            write_images(settings, data.size)
-            run(settings, data, folder, given_command(HydraConfig.get().overrides.task))
+            run(settings, load_data(settings), folder, given_command(HydraConfig.get().overrides.task))
         except Exception as error:
             sentence = one_sentence(error)
             reason = sentence or traceback.format_exception_only(error)[-1].strip()

@@ -25,7 +25,14 @@ ROOT = Path(__file__).parents[2]
 PATIENCE = 300  # seconds for a process that should end
 RENDERER = ("renderer.rasterizer=numpy", "renderer.samples=1", "renderer.cache=null")
 TRAINING = (
-    *("data=npz", "data.path=data.npz", "data.validation=0.3", "compare=[]", "evaluate.photos=photographs"),
+    *(
+        "experiment=paper",
+        "data=npz",
+        "data.path=data.npz",
+        "data.validation=0.3",
+        "compare=[]",
+        "evaluate.photos=photographs",
+    ),
     *("model.depth=10", "model.width=1", "model.dropout=0.3", "train.batch_size=16", "train.precision=float32"),
     *("train.device=cpu", "train.threads=1", "train.learning_rate=0.02", "augment.examples=4"),
     *("augment.attack.max_steps=2", "scene.meshes=[mesh.obj]", "scene.backgrounds=[0.2,0.8]", *RENDERER),

@@ -62,7 +62,9 @@ def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
 
     @cache  # composing takes half a second
     def read(*overrides: str) -> ExperimentSettings:
-        return read_settings(ExperimentSettings, compose("train", [*TINY, f"data.path={tiny_npz}", *overrides]))
+        experiment = [] if any(item.startswith("experiment=") for item in overrides) else ["experiment=paper"]
+        all_overrides = [*experiment, *TINY, f"data.path={tiny_npz}", *overrides]
+        return read_settings(ExperimentSettings, compose("train", all_overrides))
 
     return lambda *overrides: deepcopy(read(*overrides))
 

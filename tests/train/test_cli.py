@@ -21,6 +21,7 @@ from train.run_folder import locked
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
+    "experiment=paper",
     "model.depth=10", "model.width=1", "train.epochs=1", "train.precision=float32", "augment.examples=4",
     "augment.attack.max_steps=2", "scene.backgrounds=[0,1]", "renderer.rasterizer=numpy", "renderer.samples=2",
     "train.threads=1",

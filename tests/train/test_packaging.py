@@ -15,10 +15,7 @@ from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("renderer", "augment", "train", "conf", "scripts")
-TINY = (
-    *("data.train_per_class=4", "data.test_per_class=2", "data.validation=0.5", "compare=[]", "augment=none"),
-    *("data.images=null", "evaluate.photos=null", "train.epochs=1", "model.depth=10", "model.width=1"),
-)
+TINY = (*("data.train_per_class=4", "data.test_per_class=2", "data.validation=0.5", "augment=none", "train.epochs=1"),)
 
 
 def sources() -> set[str]:

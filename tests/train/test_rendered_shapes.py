@@ -2,9 +2,9 @@ import pytest
 import torch
 
 from renderer.cache import TensorCache
+from renderer.errors import InputError
 from train import rendered_shapes
-from train.photographs.folder import find_photographs, load_photographs
-from train.rendered_shapes import SOURCE, load_shapes, write_held_out
+from train.rendered_shapes import load_shapes
 
 SIZE = 8
 FEW = ("apple", "orange", "plate")
@@ -15,7 +15,6 @@ def coarse(monkeypatch):
     """Few classes and images, one sample per pixel: the tests look at what is rendered, not at how well."""
     monkeypatch.setattr(rendered_shapes, "CLASSES", FEW)
     monkeypatch.setattr(rendered_shapes, "SETTINGS", rendered_shapes.ImageSettings(samples=1))
-    monkeypatch.setattr(rendered_shapes, "HELD_OUT_PER_CLASS", 3)
 
 
 @pytest.fixture
@@ -32,14 +31,13 @@ def instances(monkeypatch) -> list[tuple[str, int]]:
     return made
 
 
-def test_every_class_has_the_images_asked_for_of_instances_that_no_other_part_shows(instances, tmp_path):
+def test_every_class_has_the_images_asked_for_of_instances_that_no_other_part_shows(instances):
     data = load_shapes(train=21, test=2, size=SIZE, seed=0)
-    write_held_out(tmp_path, SIZE, seed=0)
     assert data.classes == FEW
     assert data.train.images.shape == (63, 3, SIZE, SIZE) and data.train.images.dtype == torch.uint8
     assert data.train.labels.tolist() == [label for label in range(3) for _ in range(21)]
     assert data.test.labels.tolist() == [label for label in range(3) for _ in range(2)]
-    assert [name for name, _ in instances] == [name for name in FEW for _ in range(2)] + 2 * list(FEW)
+    assert [name for name, _ in instances] == [name for name in FEW for _ in range(2)] + list(FEW)
     assert len(data.train.images.unique(dim=0)) == 63 and len(set(instances)) == len(instances)
 
 
@@ -57,17 +55,8 @@ def test_images_are_rendered_again_for_other_settings_or_other_code_alone(tmp_pa
     assert load()[1] == 6
 
 
-def test_every_class_is_held_out_under_the_same_lights_before_the_same_cameras(tmp_path, monkeypatch):
-    """With one and the same solid in every class's place, the classes' images are the same, byte for byte; they are
-    a folder of photographs that are marked as rendered."""
-    solid = rendered_shapes.solid
-    monkeypatch.setattr(rendered_shapes, "HELD_OUT_PER_CLASS", 21)
-    monkeypatch.setattr(rendered_shapes, "solid", lambda name, seed: solid("pear", 0))
-    write_held_out(tmp_path, SIZE, seed=0)
-    photographs = find_photographs(tmp_path, FEW, "orange")
-    assert [item.label for item in photographs] == [name for name in FEW for _ in range(21)]
-    assert {item.source for item in photographs} == {SOURCE}
-    _, images, _ = load_photographs(tmp_path, photographs, SIZE)
-    by_class = images.view(3, 21, 3, SIZE, SIZE)
-    assert torch.equal(by_class[0], by_class[1]) and torch.equal(by_class[0], by_class[2])
-    assert len(images.unique(dim=0)) == 21
+def test_labels_count_the_classes_of_another_network():
+    data = load_shapes(train=1, test=1, size=SIZE, seed=0, classes=("plate", "lamp", "orange", "apple"))
+    assert data.train.labels.tolist() == data.test.labels.tolist() == [3, 2, 0]
+    with pytest.raises(InputError, match="apple"):
+        load_shapes(train=1, test=1, size=SIZE, seed=0, classes=("plate", "orange"))

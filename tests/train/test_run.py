@@ -299,3 +299,11 @@ def test_the_network_begun_with_is_scored_on_the_same_images(tiny, finished, pho
         base, before = (folder / "photographs" / file for folder in (finished, tmp_path / "before"))
         assert base.read_text() == before.read_text()
     assert summarize(tmp_path).before.accuracy == scores["test/accuracy_before"]
+
+
+def test_frozen_statistics_are_those_of_the_network_begun_with_after_training(tiny, finished, tmp_path):
+    train(tiny("train.epochs=1", f"train.init_from={finished}", "train.freeze_statistics=true"), tmp_path)
+    begun, trained = (checkpoint.load(folder / checkpoint.BEST)["model"] for folder in (finished, tmp_path))
+    for name, value in trained.items():
+        is_statistic = name.rpartition(".")[2] in ("running_mean", "running_var", "num_batches_tracked", "mean", "std")
+        assert torch.equal(value, begun[name]) == is_statistic, name

@@ -26,7 +26,7 @@ from train.settings import ExperimentSettings, read_settings
 
 
 def test_a_configuration_is_read_as_it_was_written_and_trains_the_same_run(tiny, tmp_path):
-    settings = tiny("train.learning_rate=3e-7", "label=pear", "+data.images=null", "scene.lamps={power: 3}")
+    settings = tiny("train.learning_rate=3e-7", "label=pear", "scene.lamps={power: 3}")
     write_config(tmp_path, settings, precision="bfloat16", command="python -m train 'run=${label}'")
     config = read_config(tmp_path / CONFIG)
     assert "command" not in config  # which would be refused, as every interpolation is
@@ -58,10 +58,10 @@ def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
 
 def test_settings_that_change_no_weights_are_not_among_the_decisive_ones(tiny):
     here, there = (
-        decisive_settings(tiny("+data.images=${run}/images", *overrides))
+        decisive_settings(tiny("evaluate.photos=${run}/images", *overrides))
         for overrides in (["run=here"], ["run=there/a", "sweep=x", "train.resume=true", "renderer.cache=null"])
     )
-    assert here == there and here["data.images"] == "<run>/images" and here["augment.attack.max_steps"] == 3
+    assert here == there and here["evaluate.photos"] == "<run>/images" and here["augment.attack.max_steps"] == 3
 
 
 @pytest.mark.parametrize(

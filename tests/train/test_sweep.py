@@ -22,6 +22,7 @@ from train.sweep import format_sweep, run_name
 ROOT = Path(__file__).parents[2]
 USER_ERROR = 2
 SMALL = [
+    "experiment=paper",
     "augment=none", "data=npz", "model.depth=10", "model.width=1", "train.epochs=2", "train.batch_size=16",
     "train.learning_rate=0.05", "train.precision=float32", "train.device=cpu", "evaluate.photos=null",
 ]  # fmt: skip

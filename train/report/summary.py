@@ -165,10 +165,8 @@ def by_images(arms: Arms) -> dict[str, Scored]:
     titled: dict[str, Scored] = {}
     for group in groups.values():
         run, title = max((pair for scored in group.values() for pair in scored), key=lambda pair: bool(pair[0].epochs))
-        scores, rendered = run.photographs[title], OmegaConf.select(run.config, "data.images")
+        scores = run.photographs[title]
         auc, label = scores["auc"], scores["label"]
-        if rendered and OmegaConf.select(run.config, "evaluate.photos") == rendered:
-            title = "held-out renders"
         if "positives" in auc:
             title += f", {auc['positives']:,} of {label} and {auc['negatives']:,} of other things"
         titled[f"{title} ({len(titled) + 1})" if title in titled else title] = group
